@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from made_files import own_file, recordings_folder
 
 from spikeloom.compiler.formats import hdf5
 from spikeloom.runtime import cli
@@ -74,9 +75,19 @@ def hdf5_in_one_process(monkeypatch):
     monkeypatch.setattr(hdf5, "try_reading", len)
 
 
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """A folder with recordings, a checkpoint and its netlist; a test file that needs another has its own."""
+    folder = tmp_path_factory.mktemp("place")
+    recordings_folder(folder / "data")
+    own_file(folder / "net.pt")
+    assert cli.main(["compile", f"{folder}/net.pt", "-o", f"{folder}/net.loom", "--json"]) == 0
+    return folder
+
+
 @pytest.fixture
 def spikeloom(capsys, place, monkeypatch) -> Callable[..., tuple[int, str, str]]:
-    """Run a command in the folder `place` of a test file; gives exit code, standard output and standard error."""
+    """Run a command in the folder `place`; gives exit code, standard output and standard error."""
     monkeypatch.chdir(place)
 
     def command(*words):

@@ -73,22 +73,6 @@ def test_a_share_that_nothing_reaches_is_a_failed_check(spikeloom, place):
     assert best < 1
     assert (code, report["recommended"], report["command"], report["netlist"]) == (1, None, None, None)
     assert not (place / "no.loom").exists()
-    assert f"\nno combination reaches agreement 1; the best has {best:.4f}\n" in spikeloom(*words)[1]
-
-
-def test_the_text_shows_the_front_and_says_that_it_is_training(spikeloom):
-    code, out, _ = spikeloom(*COMMAND, "--agreement", "0.5")
-    assert code == 0
-    counts, told, model, most, head, *rows, needs, command = out.splitlines()
-    assert counts.endswith(" combinations of widths on 9 of 12 training recordings")
-    assert told.startswith("training figures: ")
-    assert model.startswith("float64 model: ")
-    assert most == "most agreement for the memory, least memory first:"
-    assert head.split() == ["conv1,fc1,fc2,fc3", "words", "cores", "accuracy", "agreement"]
-    assert [row.endswith("<-") for row in rows].count(True) == 1
-    assert needs.startswith("agreement 0.5 needs ")
-    assert command.startswith("  spikeloom compile net.pt --calibrate data --weight-bits ")
-    assert command.endswith(" -o NET.loom")
 
 
 def test_the_printed_command_repeats_every_option():
@@ -112,32 +96,15 @@ def test_agreement_needs_no_labels(spikeloom):
     report = json.loads(spikeloom(*words, "--json")[1])
     assert report["float_accuracy"] is None
     assert report["recommended"]["accuracy"] is None
-    assert "float64 model" not in spikeloom(*words)[1]
-
-
-@pytest.mark.recordings
-def test_released_recordings(spikeloom, objects_zip, released_checkpoint):
-    """One width and few recordings: the figure is that of the netlist on the same recordings."""
-    words = ("bits", released_checkpoint, "--graph", "manual", "--calibrate", objects_zip, "--samples", 12)
-    code, out, _ = spikeloom(*words, "--widths", "8", "--agreement", "0.5", "--json")
-    report = json.loads(out)
-    assert code == 0
-    assert report["combinations"] == 1
-    assert report["recommended"]["weight_bits"] == [8, 8, 8, 8]
-    assert report["recommended"]["agreement"] == 1.0
-    assert (report["recordings"], report["of"]) == (12, 576)
 
 
 @pytest.mark.parametrize(
     ("words", "telling"),
     [
         ("--accuracy 1.5", "--accuracy 1.5|from 0 to 1"),
-        ("--agreement nan", "--agreement nan|from 0 to 1"),
         ("--agreement 1 --samples 0", "--samples 0|1 or more"),
         ("--agreement 1 --widths two", "--widths two|8,4,4,8"),
         ("--agreement 1 --widths 7", "--widths 7|2, 3, 4, 5, 6, 8"),
-        ("--agreement 1 -o nowhere/x.loom", "-o nowhere/x.loom|folder"),
-        ("--agreement 1 -o net.pt", "-o net.pt|input"),
         ("--accuracy 0.5 --calibrate plain", "plain: grasp_0.csv: no label|--accuracy needs one"),
         ("", "--accuracy --agreement is required"),
     ],
@@ -146,9 +113,3 @@ def test_mistakes(spikeloom, words, telling):
     code, out, err = spikeloom(*COMMAND, *words.split())
     assert (code, out) == (2, "")
     assert all(word in err for word in telling.split("|"))
-
-
-def test_a_netlist_has_no_widths_left(spikeloom):
-    assert spikeloom("compile", "net.pt", "-o", "net.loom")[0] == 0
-    code, _, err = spikeloom("bits", "net.loom", "--calibrate", "data", "--agreement", "1")
-    assert (code, "net.loom: is a netlist" in err) == (2, True)

@@ -15,7 +15,6 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.equivalence.certain_spikes import SPARE, _layers, _Membranes, certain_spikes
 from spikeloom.runtime.equivalence.certificates import certify, wins
-from spikeloom.runtime.equivalence.sections import certificate_table, certificate_text
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
@@ -77,7 +76,7 @@ def runs(checkpoint, adjacency, recordings, seed=0):
     yield shuffled(checkpoint, adjacency, recordings, seed)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 10_000), gain=st.sampled_from([0.4, 1.6, 5.0]), beta=st.sampled_from([0.0, 0.2, 0.9, 0.99]))
 def test_certain_spikes_are_those_of_every_run(folder, seed, gain, beta):
     checkpoint, adjacency = model(folder, last=weights(seed, sizes=SIZES, gain=gain), beta=beta)
@@ -91,7 +90,7 @@ def test_certain_spikes_are_those_of_every_run(folder, seed, gain, beta):
     assert np.mean([doubt.mean() for _, doubt in certainty]) < 0.05
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 10_000), step=st.sampled_from([0.125, 0.25, 0.5]), decimal=st.booleans())
 def test_certain_spikes_among_many_ties(folder, seed, step, decimal):
     """Weights on a grid hit the threshold all the time; a grid of tenths does so up to a rounding."""
@@ -257,8 +256,6 @@ def test_a_network_far_from_its_thresholds_is_certified_whole(tmp_path):
     assert all(layer.equal == layer.entries > 0 for layer in found.layers.values())
     assert all(layer.chip > 0 for layer in verdict.spikes.values())
     assert (found.decisions, found.samples, found.unproven) == (6, 6, ())
-    assert certificate_text(found) == ("6 of 6 decisions certified equal; no register overflows for any input")
-    assert [row[2] for row in certificate_table(found).rows] == ["100.0000 %"] * 4
 
 
 def test_the_same_network_at_its_thresholds_is_not(tmp_path):
@@ -278,9 +275,6 @@ def test_registers_without_a_proof_are_named(tmp_path):
     recordings = events(2, steps=8)
     found = certify(checkpoint, adjacency, lift(netlist), recordings, *on_chip(netlist, recordings))
     assert found.unproven == ("conv1", "fc1", "fc2", "fc3")
-    assert certificate_text(found).endswith(
-        "decisions certified equal; some input may overflow a register of conv1, fc1, fc2, fc3: no proof of range"
-    )
 
 
 # -- votes -------------------------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import replace
 
 import pytest
 from browser import browsed
@@ -10,9 +9,9 @@ from made_chart import made_chart
 
 from spikeloom.runtime.report.encode import decode, encode
 from spikeloom.runtime.report.sections import terminal
-from spikeloom.runtime.studies.chart.files import csv_text, page
+from spikeloom.runtime.studies.chart.files import page
 from spikeloom.runtime.studies.chart.results import Chart
-from spikeloom.runtime.studies.chart.sections import panels, picture, printed, series_of
+from spikeloom.runtime.studies.chart.sections import panels, printed, series_of
 
 PARTS = ["Networks", "Which one to deploy", "Accuracy against cost", "Every point", "Provenance"]
 
@@ -33,35 +32,11 @@ def test_the_terminal_shows_choices_fronts_saving_and_budget(chart, golden):
     golden("chart.txt", told(chart))
 
 
-def test_what_is_not_to_be_had_is_said(chart):
-    nearest = told(made_chart("energy=1uJ", "accuracy=99"))
-    assert "energy=1uJ and accuracy=99: no point fits; the nearest is #" in nearest
-    assert re.search(r"misses energy: it takes [0-9.]+ µJ, allowed 1 µJ", nearest)
-    assert "misses accuracy: expected are " in nearest
-    assert "is not in the grid: no saving to tell" in told(replace(chart, saving=None))
-    assert "best: no point" in told(replace(chart, recommended={"best": None, "cheapest": 1}))
-
-
-def test_a_line_for_every_point(chart):
-    lines = csv_text(chart).splitlines()
-    assert len(lines) == 1 + len(chart.points)
-    assert lines[0].startswith("number,network,graph,bits,planes,groups,prune,fine_tuned,cores,window,n_cores,")
-    assert lines[0].endswith(",front_energy,front_latency,compile,run,measured_recordings_per_s")
-    assert lines[1].startswith("1,grasps,manual,2,1,1,False,False,cores,50,5,2580,385000,")
-
-
 def test_a_chart_is_read_back_as_it_was(chart):
     assert decode(Chart, json.loads(json.dumps(encode(chart)))) == chart
 
 
 # -- pictures ----------------------------------------------------------------------------------------------------------
-
-
-def test_pictures_are_the_same_for_the_same_chart(chart):
-    first = picture(chart).file("svg")
-    assert first == picture(chart).file("svg")
-    dearer = replace(chart.points[0], test=replace(chart.points[0].test, energy_j={"one": 1.0, "two": 1.0}))
-    assert picture(replace(chart, points=(dearer, *chart.points[1:]))).file("svg") != first
 
 
 def test_colours_are_for_networks_where_there_are_several_else_for_storage(chart):
@@ -77,13 +52,6 @@ def test_every_point_is_a_mark_that_tells_its_figures_and_commands(chart):
     (first,) = (tip for tip in tips if tip.startswith("#1 "))
     assert first.startswith("#1 grasps 2b, 50 %: test 68.00 % (58.3 … 76.3), float 70.00 %, expected ")
     assert first.splitlines()[1:] == list(chart.points[0].commands)
-
-
-def test_a_single_point_and_many_series_can_be_drawn(chart):
-    one = replace(chart, points=chart.points[:1], recommended={"cheapest": None, "fastest": None, "best": 1})
-    many = replace(chart, points=tuple(replace(point, network=f"net{point.number}") for point in chart.points))
-    assert len(picture(one).tips) == 4
-    assert len(picture(many).tips) == 4 * len(many.points)
 
 
 # -- page --------------------------------------------------------------------------------------------------------------
@@ -119,7 +87,7 @@ def test_in_a_browser_keys_and_pointer_read_the_points(page_file):
     assert second.startswith("#2 grasps 2b, 100 %")
 
 
-@pytest.mark.parametrize(("width", "scheme"), [(1100, "light"), (500, "dark")])
+@pytest.mark.parametrize(("width", "scheme"), [(500, "dark")])
 def test_the_page_fits_any_width_and_scheme(page_file, width, scheme):
     script = "return [document.documentElement.scrollWidth, background];"
     wide, colour = browsed(page_file, script, width=width, scheme=scheme)

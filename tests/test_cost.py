@@ -4,24 +4,23 @@ import dataclasses
 
 import numpy as np
 import pytest
+import timing_oracle
 from made_files import events, small_checkpoint
 from random_netlists import Axon, Neuron, build
 from random_networks import LOIHI, small_target
 
-from spikeloom.compiler import Packing
+from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import EnergyTable, Quantity
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
-from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.loihi1 import engine, spec, timing
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
-from spikeloom.runtime.machines.loihi1.costs.sections import sections
 from spikeloom.runtime.report.encode import encode
-from spikeloom.runtime.report.sections import terminal
 
 PICOJOULES = {
     "davies2018": {
@@ -115,17 +114,6 @@ def test_against_brute_force_on_many_cores(tmp_path):
     assert np.all(costs.synaptic_operations.sum(axis=1) > costs.zeros.sum(axis=1))
 
 
-def test_against_brute_force_on_one_core(tmp_path):
-    checkpoint, adjacency = small_checkpoint(tmp_path, theta=0.3)
-    integer, _ = choose_storage(expand(checkpoint, adjacency), LOIHI)
-    parts = partition(integer, LOIHI)
-    netlist = emit(integer, parts, place(core_traffic(integer, parts, None), LOIHI).tiles, LOIHI, {})
-    costs = check(netlist, events(6, samples=2).reshape(2, netlist.n_inputs, -1))
-    assert netlist.n_cores == 1
-    assert costs.events["hop_east_west"].sum() == costs.events["hop_north_south"].sum() == 0
-    assert costs.events["packet"].sum() > 0
-
-
 def counted_by_hand():
     """Two inputs, a neuron on core 0, two listeners on core 9 steps east and 2 south: all numbers fit on paper."""
     neurons = [Neuron(layer=0, core=0, threshold=1), Neuron(layer=1, core=1), Neuron(layer=1, core=1)]
@@ -165,13 +153,6 @@ def test_counted_by_hand():
     np.testing.assert_allclose(pico, expected, rtol=1e-12)
 
 
-def test_nothing_happens():
-    netlist = counted_by_hand()
-    costs = check(netlist, np.zeros((1, 2, 4), np.uint8))
-    assert costs.synaptic_operations.tolist() == [[0, 0]]
-    assert costs.events["neuron_idle"].tolist() == [[5, 10]]  # silence costs too
-
-
 # -- tables that do not know everything --------------------------------------------------------------------------------
 
 
@@ -205,7 +186,6 @@ def test_a_table_without_a_price_is_left_out(event):
     assert report.not_modelled == (f"lacking: no price for {event}",)
     for part in (report.per_inference, report.min, report.max, *(layer.amounts for layer in report.layers)):
         assert set(part.energy_j) == {"full"}
-    assert f"not modelled: lacking: no price for {event}\n" in terminal(sections(report))
 
 
 def test_every_lacking_price_is_named():
@@ -236,15 +216,6 @@ def test_one_price_for_both_forms_of_a_list():
     np.testing.assert_allclose(extra, [6e-12 * (1 + 3)] * 2)
 
 
-@pytest.mark.parametrize("tables", [(), (table("full", **FULL),)])
-def test_what_no_table_covers_is_always_listed(tables):
-    _, report = priced_by(*tables)
-    assert report.not_priced == cost.NOT_PRICED
-    assert report.not_modelled == ()
-    assert set(report.per_inference.energy_j) == set(report.min.energy_j) == {each.name for each in tables}
-    assert "synaptic operations" in terminal(sections(report))
-
-
 # -- the report --------------------------------------------------------------------------------------------------------
 
 
@@ -269,3 +240,104 @@ def test_report_has_means_and_extremes_over_recordings(tmp_path):
     assert report["per_inference"]["neuron_accesses"] == accesses
     assert report["min"]["synaptic_operations_on_zeros"] == min(sum(s["zeros"]) for s in samples)
     assert report["samples"] == 5
+
+
+LENGTHS = np.array([30, 7, 1, 30])
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
+    netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(Packing(planes=2),))).netlist
+    recordings = events(5, samples=4, steps=30)
+    return netlist, recordings.reshape(4, netlist.n_inputs, -1)
+
+
+@pytest.fixture(scope="module")
+def found(small):
+    netlist, recordings = small
+    return {
+        detail: estimate(netlist, LOIHI, recordings, lengths=LENGTHS, detail=detail) for detail in ("counts", "cycle")
+    }
+
+
+@pytest.mark.parametrize("stepwise", [False, True])
+def test_sums_of_the_engine_give_the_simple_times(small, stepwise):
+    netlist, recordings = small
+    (times,) = LOIHI.time
+    latencies = timing.prepare(netlist, LOIHI, times)
+    prepared = engine.prepare(netlist, stepwise=stepwise, charges=timing.charges(latencies))
+    trace = engine.simulate(prepared, recordings, lengths=LENGTHS, spikes=True, updated=True)
+    ran = LENGTHS + netlist.max_depth
+    cut = recordings.copy()
+    for recording, length in zip(cut, LENGTHS, strict=True):
+        recording[:, length:] = 0
+    expected = timing_oracle.simple(latencies, trace.spikes, trace.updated, cut, steps=ran)
+    quick = timing.simple_times(latencies, trace.charged, ran)
+    for field in dataclasses.fields(expected):
+        np.testing.assert_array_equal(getattr(quick, field.name), getattr(expected, field.name), err_msg=field.name)
+    assert (expected.duration_ns > 0).sum() == ran.sum()
+
+
+def test_all_details_have_the_same_spikes_and_events(small, found):
+    netlist, recordings = small
+    plain = engine.simulate(netlist, recordings, lengths=LENGTHS)
+    for counts, priced in found.values():
+        for field in dataclasses.fields(counts):
+            np.testing.assert_array_equal(getattr(counts, field.name), getattr(plain.counts, field.name))
+        for name, energy in found["counts"][1].costs.energy.items():
+            np.testing.assert_array_equal(priced.costs.energy[name], energy)
+
+
+def test_parts_and_cores_add_up_to_the_whole(found):
+    _, cost = found["cycle"]
+    for name, whole in cost.costs.energy.items():
+        assert set(cost.parts[name]) == {"synapse", "soma", "network"}
+        np.testing.assert_allclose(sum(cost.parts[name].values()), whole, rtol=1e-12)
+        np.testing.assert_allclose(cost.cores[name].sum(axis=1), whole.sum(axis=1), rtol=1e-12)
+
+
+def test_a_batch_is_its_recordings_one_by_one(small, found):
+    netlist, recordings = small
+    for index, length in enumerate(LENGTHS):
+        _, alone = estimate(netlist, LOIHI, recordings[index : index + 1, :, :length], detail="cycle")
+        for model in ("simple", "detailed"):
+            whole, part = (getattr(cost, model)["sanafe"] for cost in (found["cycle"][1], alone))
+            steps = length + netlist.max_depth
+            np.testing.assert_array_equal(whole.duration_ns[index, :steps], part.duration_ns[0])
+            assert not whole.duration_ns[index, steps:].any()
+
+
+def test_the_detailed_model_takes_at_least_the_work_of_the_busiest_core(found):
+    _, cost = found["cycle"]
+    simple, detailed = cost.simple["sanafe"].duration_ns, cost.detailed["sanafe"].duration_ns
+    assert (detailed >= simple - 1e-6).all()
+
+
+def test_the_report_says_power_and_pace(small, found):
+    netlist, _ = small
+    _, cost = found["cycle"]
+    report = encode(cost_report(netlist, LOIHI, cost, bin_s=0.02))
+    energy, seconds = cost.costs.energy["sanafe"].sum(axis=1), cost.simple["sanafe"].duration_ns.sum(axis=1) * 1e-9
+    (entry,) = [e for e in report["pace"]["full_speed"] if (e["energy_table"], e["model"]) == ("sanafe", "simple")]
+    assert entry["power_w"] == pytest.approx((energy / seconds).mean())
+    assert entry["energy_delay_js"] == pytest.approx((energy * seconds).mean())
+    assert report["pace"]["real_time_w"]["sanafe"] == pytest.approx((energy / (LENGTHS * 0.02)).mean())
+    assert report["detail"] == "cycle"
+    for times in report["time"]:
+        assert sum(core["share_of_steps"] for core in times["critical_core"]) == pytest.approx(1)
+    assert len(report["cores"]) == netlist.n_cores
+    assert sum(core["energy_j"]["sanafe"] for core in report["cores"]) == pytest.approx(energy.mean())
+
+
+def test_the_range_names_both_ends(small, found):
+    netlist, _ = small
+    _, cost = found["counts"]
+    report = encode(cost_report(netlist, LOIHI, cost, bin_s=0.02))
+    means = {name: energy.sum(axis=1).mean() for name, energy in cost.costs.energy.items()}
+    ends = report["energy_range_j"]
+    for end, choose in (("low", min), ("high", max)):
+        assert ends[end]["energy_j"] == pytest.approx(choose(means.values()))
+        assert means[ends[end]["table"]] == pytest.approx(choose(means.values()))
+    single = dataclasses.replace(cost, costs=dataclasses.replace(cost.costs, energy={"one": cost.costs.zeros}))
+    assert cost_report(netlist, LOIHI, single, bin_s=0.02).energy_range_j is None

@@ -98,15 +98,6 @@ def test_flipped_bits_are_as_many_as_asked_and_two_flips_undo_each_other():
     assert all(ours.weight is theirs.weight for ours, theirs in pairs)
 
 
-def test_every_bit_flips_at_a_probability_of_one_half_at_last():
-    pair = made(packing=(Packing(bits=3),))
-    seen = np.zeros(pair.netlist.n_synapses, int)
-    for seed in range(40):
-        after = damages.flip_bits(pair, 0.5, drawn(seed)).netlist.synapse_weight.astype(int) // 64
-        seen |= (after & 7) ^ ((pair.netlist.synapse_weight.astype(int) // 64) & 7)
-    assert np.all(seen == 7)
-
-
 def test_fewer_bits_round_to_a_coarser_grid_and_hold_the_rest():
     pair = made()
     code = pair.netlist.synapse_weight.astype(int) // 2
@@ -196,13 +187,6 @@ def test_a_tie_does_not_fire_and_does_with_the_threshold_one_unit_lower():
         assert model.packed.any() == fires
 
 
-def test_spread_thresholds_are_spread_and_positive():
-    pair = made(taxels=12)
-    factor = damages.spread_thresholds(pair, 0.2, drawn(4)).netlist.threshold / pair.netlist.threshold
-    assert 0.1 < factor.std() < 0.3
-    assert damages.spread_thresholds(pair, 50.0, drawn(4)).netlist.threshold.min() >= 1
-
-
 def test_shorter_decay_on_both_sides(tmp_path):
     pair = timed(tmp_path)
     network = pair.network
@@ -228,7 +212,7 @@ def test_windows_that_open_late_are_those_of_the_specification():
 # -- other networks ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("packing", [None, (Packing(planes=2),), (Packing(bits=4),)])
+@pytest.mark.parametrize("packing", [None, (Packing(planes=2),)])
 def test_an_unplaced_netlist_spikes_as_the_placed_one(packing):
     pair = made(packing=packing)
     flat = unplaced(lift(pair.netlist), pair.netlist)

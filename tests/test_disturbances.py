@@ -8,7 +8,7 @@ from numpy.testing import assert_array_equal
 
 from spikeloom.runtime.studies.stress import disturbances as d
 
-REPEATABLE = settings(max_examples=40, deadline=None, derandomize=True)
+REPEATABLE = settings(max_examples=20, deadline=None, derandomize=True)
 
 
 @st.composite

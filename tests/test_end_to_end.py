@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_files import own_file, recordings_folder, weights
+from made_files import own_file, weights
 from random_netlists import assert_equal, by_engine
 from random_networks import LOIHI, counted
 
@@ -137,9 +137,10 @@ def test_verify_passes(compiled, released_checkpoint, objects_zip, shared_dir):
 
 
 @pytest.mark.recordings
-def test_estimate_prices_both_tables(compiled, objects_zip):
-    code, report = command("estimate", compiled[0], "--data", objects_zip, "--limit", 4)
-    assert code == 0
+def test_prices_and_times_are_plausible(compiled, objects_zip):
+    """An inference of the full network takes 1.5 to 25 ms: sweeping silent cores takes the one, a fifth of conv1's
+    neurons spiking in every step the other."""
+    _, report = command("estimate", compiled[0], "--data", objects_zip, "--limit", 2, "--detail", "cycle")
     assert report["not_modelled"] == []
     mean = report["per_inference"]
     # neurons that can never fire are not on the chip; idle ones alone cost 51.2 pJ a step, and synapses come on top
@@ -149,37 +150,26 @@ def test_estimate_prices_both_tables(compiled, objects_zip):
     for table, floor in (("davies2018", 52.0e-12), ("sanafe", 51.2e-12)):
         assert report["min"]["energy_j"][table] > accesses * floor
         assert 37e-6 < mean["energy_j"][table] < 0.7e-3
-
-
-@pytest.mark.recordings
-def test_times_are_plausible(compiled, objects_zip):
-    """An inference of the full network takes 1.5 to 25 ms: sweeping silent cores takes the one, a fifth of conv1's
-    neurons spiking in every step the other."""
-    _, report = command("run", compiled[0], "--data", objects_zip, "--limit", 2, "--detail", "cycle")
-    assert [entry["model"] for entry in report["costs"]["time"]] == ["simple", "detailed"]
-    for entry in report["costs"]["time"]:
+    for entry in report["time"]:
         assert 1.5e-3 < entry["inference_s"]["mean"] < 25e-3
 
 
 @pytest.mark.recordings
 def test_specification_equals_engine_on_objects(compiled, objects):
     assert objects.shape == (144, 39, 2, 250)
-    spikes = assert_twins_agree(read_netlist(compiled[0]), objects[[0, 143]])
+    spikes = assert_twins_agree(read_netlist(compiled[0]), objects[[0, 143], ..., :80])
     assert np.all(spikes > 0)
 
 
 @pytest.mark.recordings
 def test_the_shipped_network_of_longer_bins(tmp_path, objects_zip):
-    """What its card says of it, as float model and on the chip, at a fifth of what steps of 20 ms take."""
-    netlist, name = tmp_path / "n.loom", "pretrained:objects-200ms"
-    assert command("compile", name, "--calibrate", objects_zip, "-o", netlist)[0] == 0
-    code, report = command("verify", netlist, "--checkpoint", name, "--data", objects_zip)
-    assert code == 0
-    assert report["accuracy"] == {"float": 133 / 144, "chip": 131 / 144}
-    assert report["decision_agreement"] == 142 / 144
-    costs = command("estimate", netlist, "--data", objects_zip)[1]
-    assert costs["pace"]["bin_s"] == pytest.approx(0.2)
-    mean = costs["per_inference"]
+    """What its card says of it on the chip, at a fifth of what steps of 20 ms take."""
+    netlist = tmp_path / "n.loom"
+    assert command("compile", "pretrained:objects-200ms", "--calibrate", objects_zip, "-o", netlist)[0] == 0
+    _, report = command("run", netlist, "--data", objects_zip, "--detail", "counts")
+    assert report["accuracy"] == 131 / 144
+    assert report["costs"]["pace"]["bin_s"] == pytest.approx(0.2)
+    mean = report["costs"]["per_inference"]
     assert 1.1e6 < mean["synaptic_operations"] < 1.2e6
     assert 30e-6 < mean["energy_j"]["davies2018"] < 36e-6
 
@@ -195,9 +185,9 @@ def test_specification_equals_engine_on_containers(tmp_path, containers):
     code, report = command("compile", tmp_path / "random.pt", "-o", tmp_path / "random.loom")
     assert code == 0
     assert report["layers"][-1]["neurons"] == 20
-    netlist, some = read_netlist(tmp_path / "random.loom"), containers[[30]]
+    netlist, some = read_netlist(tmp_path / "random.loom"), containers[[30], ..., :150]
     spikes = assert_twins_agree(netlist, some)
-    assert np.all(spikes > 100)
+    assert np.all(spikes > 0)
     # and the chip does what the float model does, by and large
     checkpoint = read_checkpoint(tmp_path / "random.pt")
     adjacency = normalised_adjacency(checkpoint.edges, checkpoint.taxels)
@@ -216,31 +206,21 @@ sys.exit("torch was imported" if unwanted else code)
 """
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory) -> Path:
-    """A folder with recordings, a checkpoint of our own and its netlist."""
-    folder = tmp_path_factory.mktemp("small")
-    recordings_folder(folder / "data")
-    own_file(folder / "net.pt")
-    assert cli.main(["compile", f"{folder}/net.pt", "-o", f"{folder}/net.loom"]) == 0
-    return folder
-
-
 @pytest.mark.parametrize(
     "words",
     [["run", "net.loom", "--data", "data", "--spikes", "out.npz"], ["estimate", "net.loom", "--data", "data"]],
     ids=["run", "estimate"],
 )
-def test_run_and_estimate_never_import_torch(small, words):
+def test_run_and_estimate_never_import_torch(place, words):
     done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_TORCH, *words], cwd=small, capture_output=True, text=True, check=False
+        [sys.executable, "-c", WITHOUT_TORCH, *words], cwd=place, capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_started_as_a_program(small):
+def test_started_as_a_program(place):
     words = [sys.executable, "-m", "spikeloom"]
-    done = subprocess.run([*words, "inspect", "nowhere.pt"], cwd=small, capture_output=True, text=True, check=False)
+    done = subprocess.run([*words, "inspect", "nowhere.pt"], cwd=place, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (
         "spikeloom: nowhere.pt: no such file; give a file of spikeloom train or of the released layout\n"

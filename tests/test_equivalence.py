@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_files import STEPS, events, own_file, recordings_folder, small_checkpoint, weights
+from made_files import STEPS, events, small_checkpoint, weights
 from random_netlists import Neuron, build
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
@@ -14,11 +14,9 @@ from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.networks.reference import float_membranes, float_spikes
-from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence.ladder import LADDER, realised
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine, spec
-from spikeloom.runtime.machines.loihi1.machine import Loihi
 from spikeloom.runtime.machines.votes import class_counts, predictions
 from spikeloom.runtime.report.intervals import wilson
 
@@ -81,7 +79,7 @@ def test_spikes_and_decisions(small, verdict):
     assert verdict.spec_samples == 3
 
 
-@pytest.mark.parametrize(("seed", "bits"), [(0, 4), (1, 6), (4, 6)])
+@pytest.mark.parametrize(("seed", "bits"), [(0, 4), (1, 6)])
 def test_the_first_divergence_is_the_first(tmp_path, seed, bits):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
     options = Options(packings=(Packing(bits=bits),), keep_all=bits == 6)
@@ -233,18 +231,6 @@ def test_every_asked_for_recording_is_compared(small, monkeypatch):
         found = verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES, spec_samples=asked)
         assert len(seen) == found.spec_samples == compared
         np.testing.assert_array_equal(seen[-1], events(2)[compared - 1].reshape(12, STEPS))
-
-
-def test_a_disagreement_ends_with_exit_code_one(tmp_path, monkeypatch, capsys):
-    own_file(tmp_path / "net.pt")
-    recordings_folder(tmp_path / "data")
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(["compile", "net.pt", "-o", "net.loom"]) == 0
-    monkeypatch.setattr(Loihi, "check", lambda *_, **_options: 1)
-    capsys.readouterr()
-    assert cli.main(["verify", "net.loom", "--checkpoint", "net.pt", "--data", "data", "--min-agreement", "0"]) == 1
-    said = "E0  specification = engine NOT in every spike, membrane and count of 3 recordings\n"
-    assert said in capsys.readouterr().out
 
 
 def test_the_ladder_carries_thresholds_that_differ(small):

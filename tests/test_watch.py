@@ -18,14 +18,10 @@ import pytest
 from random_netlists import Axon, Neuron, build
 from random_netlists import lively as lively_netlist
 
-from spikeloom.compiler import compile_network
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import read_only
-from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
-from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.commands.exchange import watch
 from spikeloom.runtime.machines.integer import integer_machine_of
@@ -125,7 +121,7 @@ def random_events(seed: int, length: int = 40) -> np.ndarray:
 @pytest.mark.parametrize("low", [0, -1])
 @pytest.mark.parametrize("inside", [0, 19_999])
 def test_any_recording_is_a_run(lively, lively_file, lines, objects, low, inside):
-    for seed in range(5):
+    for seed in range(2):
         events = random_events(seed)
         found = objects(lively_file, lines(as_lines(events, seed, low=low, inside=inside)))
         assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(lively, events)]
@@ -164,19 +160,6 @@ def test_several_grasps_are_runs_of_their_own(lively, lively_file, lines, object
         shown = [(grasp["grasp"], grasp["bins"], grasp["counts"]) for grasp in found["grasp"]]
         votes = [votes_of_run(lively, events) for events in grasps]
         assert shown == list(zip([1, 2, 3], [40, 25, 33], votes, strict=True))
-
-
-@pytest.mark.recordings
-def test_the_released_network_on_its_recordings(released_checkpoint, objects_zip, tmp_path, lines, objects):
-    graph = build_graph("manual")
-    adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
-    netlist = compile_network(expand(read_checkpoint(str(released_checkpoint)), adjacency)).netlist
-    write_netlist(netlist, tmp_path / "net.loom")
-    data = load_data(objects_zip, "test", limit=3).events
-    path = lines("\n".join(as_lines(recording, inside=19_999) for recording in data))
-    found = objects(tmp_path / "net.loom", path, "--bins", data.shape[-1])
-    assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(netlist, recording) for recording in data]
-    assert found["end"][0]["events"] == data.sum()
 
 
 def test_exact_edges_of_bins(pair_file, lines, objects):
@@ -236,41 +219,6 @@ def test_origin(lively, lively_file, lines, objects):
     assert counts[0] != counts[1]
 
 
-def test_times_before_the_first_event_are_late(pair_file, lines, objects):
-    found = objects(pair_file, "--origin", "first", lines("7.005,0,1\n7.0049,0,0\n7.0249,0,1\n7.025,0,0\n"))
-    assert [each["counts"] for each in found["bin"]] == [[0, 1], [1, 1]]
-    assert (found["end"][0]["late"], found["end"][0]["repeated"]) == (1, 1)
-
-
-def test_text(pair_file, lines, capsys, tmp_path):
-    content = "0.0,0,1\n0.02,0,1\n0.04,0,0\n0.06,0,0\n0.08,0,0\n0.06,0,1\n\n0.1,0,1\n0.1,0,1\n"
-    _, summary = command(pair_file, lines(content))
-    assert capsys.readouterr().out.splitlines() == [
-        "    0.02 s  class 1, 1 vote, 1 ahead",
-        "    0.08 s  class 0, 2 votes, a tie",
-        "grasp 1: class 0, 3 votes, 1 ahead, after 5 bins (0.10 s)",
-        "    0.12 s  class 1, 1 vote, 1 ahead",
-        "grasp 2: class 1, 1 vote, 1 ahead, after 6 bins (0.12 s)",
-    ]
-    assert summary == "2 grasps, 11 bins, 8 events, 1 repeated within a bin, 1 late"
-    mute = build([Neuron()], [], n_inputs=2, depths=[2])
-    write_netlist(replace(mute, taxels=1, polarities=2, readout_class=read_only([0])), tmp_path / "mute.loom")
-    command(tmp_path / "mute.loom", lines("0.01,0,1"))
-    assert capsys.readouterr().out == "grasp 1: class 0, no votes, after 1 bin (0.02 s)\n"
-
-
-def test_terminal(pair_file, lines, capsys, monkeypatch):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    monkeypatch.setattr(watch, "REFRESH_S", 0.0)
-    command(pair_file, lines("0.0,0,1\n0.02,0,1\n"))
-    captured = capsys.readouterr()
-    assert (
-        captured.out
-        == "    0.02 s  class 1, 1 vote, 1 ahead\ngrasp 1: class 1, 2 votes, 2 ahead, after 2 bins (0.04 s)\n"
-    )
-    assert captured.err == "\r\x1b[K\r\x1b[K    0.04 s  class 1, 2 votes, 2 ahead\r\x1b[K"
-
-
 def test_real_time_decides_alike(lively, lively_file, lines, objects):
     events = random_events(2, 15)
     path = lines(as_lines(events, inside=19_999) + "\n" + as_lines(events))
@@ -280,7 +228,6 @@ def test_real_time_decides_alike(lively, lively_file, lines, objects):
     assert end["late"] == 0
     assert 0 < end["step"]["median_ms"] <= end["step"]["p99_ms"]
     assert end["step"]["p99_share_of_bin"] == pytest.approx(end["step"]["p99_ms"] / 20)
-    assert "\nstep: median 0." in command(lively_file, "--timing", lines("0,0,0"))[1]
 
 
 def feed(descriptor: int, *parts: tuple[str, float]) -> threading.Thread:
@@ -317,23 +264,15 @@ def test_silence(pair_file, objects, speed):
     ("content", "line", "said"),
     [
         ("0,0,0\nhello\n", 2, "'hello' found"),
-        ("t,taxel,p\n", 1, "'t,taxel,p' found"),
         (f"{HEADER}\n# x\n{HEADER}\n", 3, f"'{HEADER}' found"),
-        (f"# {HEADER}\n0,0,0,4\n", 2, "'0,0,0,4' found"),
         ("time_s,taxel,polarity,label,label\n", 1, "label,label' found"),
-        ("0;0;0\n", 1, "'0;0;0' found"),
-        ("0,,0\n", 1, "'0,,0' found"),
         (b"\xff\xfe\x00\n", 1, "found"),
         ("-0.1,0,0\n", 1, "time -0.1 found, allowed are 0 to 1e+12"),
         ("\n\nnan,0,0\n", 3, "time nan found"),
-        ("1e13,0,0\n", 1, "time 1e13 found"),
         ("0,10,0\n", 1, "taxel 10 found, allowed are 0 to 9"),
-        ("0,-1,0\n", 1, "taxel -1 found"),
         ("0,1.5,0\n", 1, "taxel 1.5 found"),
         ("0,1,2\n", 1, "polarity 2 found"),
-        ("0,1,snan\n", 1, "polarity snan found"),
         ("0,1,0\n0,1,1\n0,2,-1\n", 3, "polarity -1 found after polarity 0"),
-        ("0,1,-1\n\n0,2,0", 3, "polarity 0 found after polarity -1"),
         ("0,1,0\n" + "7" * 1500, 2, "longer than 1000 bytes"),
         ("0,1,0\n2000.02,1,0\n", 2, "time 2000.02 s leaves 100001 bins without an event, allowed are 100000"),
     ],
@@ -350,10 +289,9 @@ def test_bad_lines(lively_file, lines, content, line, said):
         (["--until-sure"], OptionError, r"--until-sure: .* --bins"),
         (["--bins", 5, "--until-sure", "-1"], OptionError, "--until-sure -1: "),
         *(
-            ([f"--{option}", value], OptionError, f"^--{option} {value}: ")
-            for option, value in (*(("bin", v) for v in ("0", "nan", "inf", "20ms", "1e-7", "1001")), ("bins", "0"))
+            ([f"--{name}", value], OptionError, f"^--{name} {value}: ")
+            for name, value in (("bin", "nan"), ("bins", "0"))
         ),
-        (["--bin=-0.02"], OptionError, "^--bin -0.02: "),
     ],
 )
 def test_what_cannot_be_watched(lively_file, lines, words, error, said):
@@ -361,7 +299,7 @@ def test_what_cannot_be_watched(lively_file, lines, words, error, said):
         command(lively_file, lines("0,0,1\n"), *words)
 
 
-@pytest.mark.parametrize("content", ["", "\n\n", "# nothing\n", "time_s,taxel,polarity\n", "reset"])
+@pytest.mark.parametrize("content", ["", "# nothing\n", "time_s,taxel,polarity\n"])
 def test_empty_stream(lively_file, lines, content):
     with pytest.raises(DataError, match=r"events\.csv: empty stream"):
         command(lively_file, lines(content))
@@ -414,7 +352,7 @@ def test_standard_input_and_interruption(pair_file, end):
 @pytest.mark.parametrize("factor", [None, 1.5, 0.0])
 def test_a_grasp_ends_as_soon_as_it_is_sure(lively, lively_file, lines, objects, factor):
     ended = 0
-    for seed in range(3):
+    for seed in range(2):
         events = random_events(seed)
         given = () if factor is None else (factor,)
         found = objects(lively_file, lines(as_lines(events, seed)), "--bins", 40, "--until-sure", *given)
@@ -431,10 +369,3 @@ def test_a_grasp_ends_as_soon_as_it_is_sure(lively, lively_file, lines, objects,
         assert found["end"][0]["late"] == events[..., bins + 1 :].sum() + (events[..., bins].sum() if early else 0)
         ended += early
     assert ended or factor is None
-
-
-def test_a_sure_grasp_in_words(pair_file, lines, capsys):
-    _, text = command(pair_file, lines("0,0,1\n0.02,0,1\n0.04,0,1\n0.06,0,0\n"), "--bins", 5, "--until-sure")
-    out = capsys.readouterr().out.splitlines()
-    assert out[-1] == "grasp 1: class 1, 3 votes, 3 ahead, sure, after 3 bins (0.06 s)"
-    assert text == "1 grasp, 3 bins, 4 events, 0 repeated within a bin, 1 late, 1 ended early"

@@ -1,0 +1,198 @@
+"""Benchmarks: our netlist, references and the rivals' runners agree; the paper's tables are those of its cells."""
+
+import importlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.recordings.release import write_released
+from spikeloom.runtime.machines.loihi1.engine import prepare, simulate
+from spikeloom.runtime.machines.loihi1.trace import aligned
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def module():
+    """Import a benchmark by its name, as one that is run as a script finds its neighbours."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(BENCHMARKS / "paper"))
+        patch.syspath_prepend(str(BENCHMARKS))
+        yield importlib.import_module
+
+
+@pytest.fixture(scope="module")
+def workload(module):
+    return module("workload")
+
+
+@pytest.fixture(scope="module")
+def busy(workload):
+    """The busy network on random events: events, its layers in weight units, its netlist."""
+    events = np.random.default_rng(5).random((6, 12, 78)) < 0.13
+    layers = workload.build_chain(events)
+    return events, layers, workload.place_chain(layers, taxels=39)
+
+
+def channels_first(events):
+    return np.ascontiguousarray(events.transpose(0, 2, 1)).view(np.uint8)
+
+
+def test_recurrence_by_hand(workload):
+    # 100 stays; 100 * 819 / 4096 = 19 and 82 are 101: spike, zero; -7 decays to -1, toward zero
+    current = np.array([[[100], [82], [-7], [101], [101]]])
+    assert workload.recurrence(current, 100)[0, :, 0].tolist() == [False, True, False, False, True]
+
+
+def test_our_spikes_are_those_of_the_reference(workload, busy):
+    events, _, netlist = busy
+    trace = simulate(netlist, channels_first(events), threads=1, spikes=True)
+    for layer, expected in enumerate(workload.reference(workload.chain_of(netlist), events)):
+        assert expected.any()
+        assert np.array_equal(aligned(netlist, trace.spikes, layer), expected)
+
+
+def test_our_spikes_without_windows_are_those_of_the_pipelined_reference(workload, busy):
+    events, _, netlist = busy
+    events = np.concatenate([events, np.zeros_like(events[:, :4])], axis=1)
+    trace = simulate(prepare(netlist, gated=False), channels_first(events), threads=1, spikes=True)
+    for layer, expected in enumerate(workload.reference(workload.chain_of(netlist), events, delay=1)):
+        assert np.array_equal(trace.spikes[:, :, netlist.compartments_of(layer)], expected)
+
+
+@pytest.fixture(scope="module")
+def task(module, workload, busy, tmp_path_factory):
+    """What the workers read."""
+    events, _, netlist = busy
+    path = tmp_path_factory.mktemp("rivals") / "task.npz"
+    module("rivals").write_task(path, netlist, events, workload.typical(events, 2))
+    return module("worker").read_task(str(path))
+
+
+@pytest.mark.parametrize(("mode", "share"), [("spikes", "all"), ("totals", "few"), ("counts", "few"), ("cycle", "few")])
+def test_our_runner_agrees_in_every_mode(module, task, mode, share):
+    job = module("rival_ours").prepare_job(task, [mode, share])
+    assert job.recordings == (6 if share == "all" else 2)
+    assert job.differing([job.run(unit) for unit in range(job.units)]) == [0, 0, 0, 0]
+
+
+def test_the_runner_of_onnxruntime_agrees(module, task):
+    job = module("rival_onnx").prepare_job(task, ["few"])
+    assert job.differing([job.run(unit) for unit in range(job.units)]) == [0, 0, 0, 0]
+
+
+def test_both_loops_of_torch_give_nearly_our_spikes(module, task):
+    found = []
+    for loop in ("layers", "steps"):
+        job = module("rival_torch").prepare_job(task, [loop, "few"])
+        found.append([job.run(unit) for unit in range(job.units)])
+        spikes = sum(int(task.expected("aligned", layer).sum()) for layer in range(4))
+        # decay 0.2 for 819/4096, and no truncation
+        assert sum(job.differing(found[-1])) < 0.1 * spikes
+    for by_layers, by_steps in zip(*found, strict=True):
+        assert all(bool((a == b).all()) for a, b in zip(by_layers, by_steps, strict=True))
+
+
+def test_workers_run_in_pairs_and_those_that_cannot_are_skipped(module, task):
+    rivals = module("rivals")
+
+    def entry(name, mode, against=""):
+        return rivals.Entry(
+            name=name, rival="ours", options=(mode, "few"), computes="", together=False, against=against
+        )
+
+    entries = [
+        entry("ours", "spikes"),
+        entry("rival", "totals", "spikes"),
+        entry("odd", "fastest", "counts"),
+    ]
+    found = rivals.measure(task.path, entries, {}, rounds=1)
+    assert found["odd"]["skipped"].startswith("there is no mode fastest")
+    assert found["rival"]["against"] == "ours"
+    assert found["ours"]["differing_spikes"] == found["rival"]["differing_spikes"] == [0, 0, 0, 0]
+    assert [found[name]["laps"] for name in ("ours", "rival")] == [1, 1]
+    assert 0 < found["rival"]["ratio"]["min"] <= found["rival"]["ratio"]["median"] <= found["rival"]["ratio"]["max"]
+    assert found["rival"]["peak_mb"] > 1
+
+
+def test_charts_are_drawn(module, tmp_path):
+    spread = {"min": 0.4, "median": 0.5, "max": 0.7}
+    entries = {"ours": {"cpu_ms": spread}, "other": {"cpu_ms": spread, "ratio": spread}, "no": {"skipped": ""}}
+    workloads = {"tiny": {"synaptic_operations": 5e6, "entries": entries}}
+    module("rivals_chart").draw({"workloads": workloads}, str(tmp_path / "x"))
+    assert len(list(tmp_path.glob("x*"))) == 2
+
+
+def test_a_wrong_spike_is_found(task):
+    spikes = [task.expected("aligned", layer).copy() for layer in range(4)]
+    spikes[2][1, 3, 4] ^= True
+    assert task.differing("aligned", spikes) == [0, 0, 1, 0]
+
+
+@pytest.fixture(scope="module")
+def cells(module):
+    return module("cells").read_cells(module("cells").RESULTS)
+
+
+def test_stored_tables_are_those_of_the_stored_cells(module, cells):
+    written = module("tables").files(cells, drawn=False)
+    assert sorted(written) == ["graphs.csv", "graphs.md", "methods.csv", "methods.md"]
+    for name, content in written.items():
+        assert content == (module("cells").RESULTS / name).read_bytes()
+
+
+def test_every_planned_cell_is_there_and_adds_up(module, cells):
+    planned = [module("cells").planned(table) for table in ("methods", "graphs")]
+    assert {row.cell(seed) for rows in planned for row, seeds in rows.items() for seed in range(seeds)} == set(cells)
+    for cell in cells.values():
+        for which in ("last", "best", "clean"):
+            assert cell[which]["accuracy"] == cell[which]["correct"] / cell["test_samples"]
+
+
+def test_tables_of_some_cells(module, cells):
+    few = {name: cell for name, cell in cells.items() if name.endswith(("e100-s0", "e100-s1"))}
+    one = "objects-tactilesgnet-knn-1-e60-s0"
+    few[one] = cells[one]
+    written = module("tables").files(few)
+    assert b"16 of 36 trainings are there" in written["methods.md"]
+    accuracy = f"{100 * few[one]['best']['accuracy']:.2f} (one seed)"
+    assert f"| knn:1 | 1 | not available here | {accuracy} |" in written["graphs.md"].decode()
+    assert all(content.startswith(b"\x89PNG") for name, content in written.items() if name.endswith(".png"))
+
+
+def test_statistics(module):
+    spreads = module("spreads")
+    spread = spreads.Spread((90.0, 88.0))
+    assert (spread.mean, spread.std, spread.interval) == (
+        89.0,
+        pytest.approx(1.4142136),
+        (pytest.approx(76.2938, abs=1e-4), 100.0),
+    )
+    assert spreads.Spread((90.0, 90.0)).interval is None
+    found = spreads.variance([[6, 8, 4, 5, 3, 4], [8, 12, 9, 11, 6, 8], [13, 9, 11, 8, 7, 12]])
+    assert (found.rows, round(found.f, 2), round(found.p, 4)) == (3, 9.26, 0.0024)
+    assert spreads.variance([[1.0, 2.0], [3.0]]) is None
+    rho, p = spreads.rank_correlation([1, 2, 3, 4, 5], [5, 6, 7, 8, 7])
+    assert (round(rho, 2), round(p, 2)) == (0.82, 0.09)
+    assert spreads.rank_correlation([1, 2, 3], [1, 2, 3]) is None
+
+
+@pytest.mark.slow
+def test_a_cell_is_trained_measured_and_kept(module, tmp_path):
+    cells, train = module("cells"), module("train")
+    splits = [
+        replace(synthetic_grasps(per_class=2, steps=14, seed=seed), split=split)
+        for split, seed in (("train", 1), ("test", 2))
+    ]
+    write_released(tmp_path / "grasps", splits)
+    row = cells.Row(data="grasps", system="mlp", form="none", epochs=1)
+    name, cell = train.make(row, 0, str(tmp_path / "grasps"), tmp_path / "net.pt")
+    assert name == "grasps-mlp-none-e1-s0"
+    assert cell["chip"]["last"]["float_correct"] == cell["last"]["correct"]
+    assert cell["chip"]["last"]["first_layer"]["neurons"] == 64
+    assert train.make(row, 0, str(tmp_path / "grasps"), tmp_path / "net.pt") == (name, cell)  # taken over
+    cells.write_cells(tmp_path, {name: cell})
+    assert cells.read_cells(tmp_path) == {name: cell}
