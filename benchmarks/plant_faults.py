@@ -45,7 +45,7 @@ NUMERIC = {
     "models/networks": "currents layers lif quantised reference",
     "models/truenorth": "neurons",
     "runtime/costs": "yardsticks",
-    "runtime/equivalence": "certain_spikes certificates divergence float_engine rounding verdict",
+    "runtime/equivalence": "certain_spikes certificates float_engine reference rounding verdict verify",
     "runtime/machines": "votes",
     "runtime/machines/loihi1": "block_kernel blocks engine kernel spec timing timing_kernel",
     "runtime/machines/loihi1/costs": "cost cumulative",

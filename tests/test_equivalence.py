@@ -14,7 +14,7 @@ from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.networks.reference import float_membranes, float_spikes
-from spikeloom.runtime.equivalence.ladder import LADDER, realised
+from spikeloom.runtime.equivalence.reference import LADDER, realised
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.votes import class_counts, predictions

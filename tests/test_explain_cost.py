@@ -10,7 +10,7 @@ from random_netlists import Axon, Neuron, build, large_netlist
 
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.runtime.equivalence import ladder
+from spikeloom.runtime.equivalence import reference
 from spikeloom.runtime.machines.loihi1 import blocks, engine
 
 RUN = ("run", "net.loom", "--data", "data")
@@ -80,7 +80,7 @@ def test_parts_of_verify(spikeloom):
 
 def test_a_rung_that_is_proven_is_what_it_would_be(spikeloom, monkeypatch):
     proven = json.loads(spikeloom(*VERIFY, "--json")[1])["ladder"]
-    monkeypatch.setattr(ladder, "prove_ranges", lambda _: [type("Proof", (), {"holds": False})()])
+    monkeypatch.setattr(reference, "prove_ranges", lambda _: [type("Proof", (), {"holds": False})()])
     out = spikeloom(*VERIFY, "--explain-cost", "--json")[1]
     report = json.loads(out)
     assert report["ladder"] == proven

@@ -114,12 +114,11 @@ FILES = tuple("abcdef")
 LABELS = np.arange(6) % CLASSES
 
 
-def found(before, after, *, votes=None, recordings=None, lengths=None):
+def found(before, after, *, votes=None):
     """Breakdowns of one layer ``fc`` whose neurons 0 and 2 to 4 are compared."""
     votes = votes or (np.array([[3, 1], [1, 3]]), np.array([[3, 1], [1, 3]]))
-    recordings = np.ones((len(votes[0]), 4, 10), np.uint8) if recordings is None else recordings
     compared = [np.array([0, 2, 3, 4])]
-    made = breakdowns(["fc"], [before], [after], compared, votes, recordings, FILES[: len(votes[0])], lengths)
+    made = breakdowns(["fc"], [before], [after], compared, votes, FILES[: len(votes[0])])
     return [(b.kind, b.layer, b.count, b.text) for b in made]
 
 
@@ -162,16 +161,6 @@ def test_votes_that_decide_little(before, after, expected):
     made = found(spikes(), spikes(), votes=(before, np.array(after)))
     assert [breakdown[:3] for breakdown in made] == expected
     assert len(made) < 2 or (made[0][3].endswith("(a)") and made[1][3].endswith("(d)"))
-
-
-def test_nearly_empty_recordings():
-    votes = (np.array([[3, 1]] * 5), np.array([[3, 1]] * 4 + [[1, 3]]))
-    recordings = np.zeros((5, 10, 200), np.uint8)
-    recordings[:, 0, 0] = 1  # one event in two thousand entries
-    ((kind, layer, count, text),) = found(spikes(), spikes(), votes=votes, recordings=recordings)
-    assert (kind, layer, count) == ("nearly empty", None, 5)
-    assert "decided equally 4 times: 5 of 5 recordings" in text
-    assert found(spikes(), spikes(), votes=votes, recordings=recordings, lengths=np.full(5, 100)) == []
 
 
 def verified(folder, arrays, recordings, packing, **options):

@@ -15,7 +15,7 @@ from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 
-CHIP, FLOAT = "chip integers", "float"
+CHIP = "chip integers"
 
 
 class Kind(NamedTuple):
@@ -30,18 +30,17 @@ class Kind(NamedTuple):
     why: str
 
 
-RUNS = {
+SUMS = "energies and simple times are sums over events: added up in the same run, no spike kept"
+UNBOUNDED = "integer sums, no limits of registers"
+
+KINDS = {
+    # of run and estimate
     "spikes": Kind(CHIP, "all", "decisions need counts of spikes alone: none is kept, nothing is priced"),
     "spikes kept": Kind(CHIP, "all", "--spikes wants every spike: they are kept, nothing is priced"),
-    "counts": Kind(
-        CHIP, "all", "energies and simple times are sums over events: added up in the same run, no spike kept"
-    ),
+    "counts": Kind(CHIP, "all", SUMS),
     "cycle": Kind(CHIP, "all", "every message of every step is scheduled: spikes and updates kept, in the same run"),
-    "no float": Kind(FLOAT, "none", "the float model says nothing about the chip's decisions or costs"),
-}
-"""Parts of ``run`` and ``estimate``."""
-
-CHECKS = {
+    "no float": Kind("float", "none", "the float model says nothing about the chip's decisions or costs"),
+    # of verify
     "float32 reference": Kind("float32, released operator order", "all", "what the chip's spikes are held against"),
     "float64 beside it": Kind("float64, released operator order", "all", "shows spikes that rounding of sums decides"),
     "chip": Kind(CHIP, "all", "every spike kept, since every one is compared"),
@@ -52,24 +51,14 @@ CHECKS = {
     "ladder: beta": Kind("float64 sums", "all", "spikes that differ by the decay registers alone"),
     "ladder: weights": Kind("float64 sums", "all", "and by rounded weights"),
     "ladder: bias_threshold": Kind("float64 sums", "all", "and by rounded biases and thresholds"),
-    "ladder: rounding": Kind(
-        "integer sums, no limits of registers", "all", "a membrane might saturate: what that does"
-    ),
-    "ladder: proven": Kind(
-        "integer sums, no limits of registers", "none", "no register can leave its range, so that rung is the chip"
-    ),
+    "ladder: rounding": Kind(UNBOUNDED, "all", "a membrane might saturate: what that does"),
+    "ladder: proven": Kind(UNBOUNDED, "none", "no register can leave its range, so that rung is the chip"),
     "first divergence": Kind("membranes in float32 and on the chip", "one", "the recording that differs first"),
     "certificate": Kind("float64 intervals", "all", "which spikes no order of summation changes"),
-}
-"""Parts of ``verify``."""
-
-PAGE = {
-    "costs": RUNS["counts"],
+    # of report, beside those of verify
+    "costs": Kind(CHIP, "all", SUMS),
     "the recording": Kind(CHIP, "one", "spikes and membranes of the recording that is drawn"),
 }
-"""What ``report`` adds to ``verify``."""
-
-KINDS = RUNS | CHECKS | PAGE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,16 +106,12 @@ class Account:
         if KINDS[part].over != "none":
             progress(part)
 
-    def parts(self) -> tuple[Part, ...]:
-        """All parts in their order; the last one ends now."""
-        ends = [begun for _, begun in self._parts[1:]] + [time.perf_counter()]
-        return tuple(self._part(name, end - begun) for (name, begun), end in zip(self._parts, ends, strict=True))
-
     def explained(self, wanted: bool) -> tuple[Part, ...] | None:
-        """All parts, written to stderr too, if they are wanted."""
+        """All parts in their order, written to stderr too, if they are wanted; the last one ends now."""
         if not wanted:
             return None
-        parts = self.parts()
+        ends = [begun for _, begun in self._parts[1:]] + [time.perf_counter()]
+        parts = tuple(self._part(name, end - begun) for (name, begun), end in zip(self._parts, ends, strict=True))
         progress("")
         sys.stderr.writelines(f"spikeloom: {part}\n" for part in parts)
         return parts

@@ -10,16 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.types import BoolArray, IntArray
 
 OFTEN = 10
 """Spikes from which on a neuron that falls silent, or that wakes up, is worth a line."""
-
-NEARLY_EMPTY = 0.001
-"""A recording in which a smaller share of all entries (taxel, polarity, step) holds an event is nearly empty."""
 
 LISTED = 3
 """Neurons or recordings that a line names at most."""
@@ -29,8 +25,8 @@ LISTED = 3
 class Breakdown:
     """A known failure.
 
-    Its kind (``silent layer``, ``silenced neurons``, ``woken neurons``, ``one class``, ``no vote``, ``tied votes`` or
-    ``nearly empty``), the layer if it is in one, how many spikes of the float model, neurons or recordings it concerns,
+    Its kind (``silent layer``, ``silenced neurons``, ``woken neurons``, ``one class``, ``no vote`` or ``tied
+    votes``), the layer if it is in one, how many spikes of the float model, neurons or recordings it concerns,
     and a line for people.
     """
 
@@ -46,20 +42,17 @@ def breakdowns(
     chip: Sequence[BoolArray],
     neurons: Sequence[IntArray],
     votes: tuple[IntArray, IntArray],
-    events: npt.NDArray[np.uint8],
     files: Sequence[str],
-    lengths: IntArray | None = None,
 ) -> tuple[Breakdown, ...]:
     """Look for all of them.
 
     `reference` and `chip` are the spikes of each layer, (samples, steps, compared) bool, of those neurons that
-    `neurons` numbers; `votes` are those of float model and chip, (samples, classes). `events` is (samples, channels,
-    steps) uint8, named by `files`, of which the first `lengths` steps count.
+    `neurons` numbers; `votes` are those of float model and chip, (samples, classes), of recordings that `files` names.
     """
     found: list[Breakdown] = []
     for name, ours, theirs, ids in zip(names, reference, chip, neurons, strict=True):
         found += _fallen(name, ours.sum(axis=(0, 1)), theirs.sum(axis=(0, 1)), ids)
-    return (*found, *undecided(*votes, files), *_empty(votes, events, files, lengths))
+    return (*found, *undecided(*votes, files))
 
 
 def _fallen(name: str, before: IntArray, after: IntArray, ids: IntArray) -> list[Breakdown]:
@@ -100,22 +93,6 @@ def undecided(before: IntArray, after: IntArray, files: Sequence[str]) -> list[B
         text = f"decided among equal votes, the first class taken: {_listed(tied, files)}"
         found.append(Breakdown(kind="tied votes", layer=None, count=len(tied), text=text))
     return found
-
-
-def _empty(
-    votes: tuple[IntArray, IntArray], events: npt.NDArray[np.uint8], files: Sequence[str], lengths: IntArray | None
-) -> list[Breakdown]:
-    steps = np.full(len(events), events.shape[2]) if lengths is None else lengths
-    density = np.count_nonzero(events, axis=(1, 2)) / (events.shape[1] * steps)
-    empty = np.flatnonzero(density < NEARLY_EMPTY)
-    if not len(empty):
-        return []
-    equal = int(np.count_nonzero(vote(votes[0][empty]) == vote(votes[1][empty])))
-    text = (
-        f"events in less than {100 * NEARLY_EMPTY:g} % of all entries, decided equally {equal} times: "
-        f"{_listed(empty, files)}"
-    )
-    return [Breakdown(kind="nearly empty", layer=None, count=len(empty), text=text)]
 
 
 def _listed(places: IntArray, files: Sequence[str]) -> str:

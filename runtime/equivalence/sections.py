@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from spikeloom.runtime.equivalence.certificates import Certificate
-from spikeloom.runtime.equivalence.divergence import Divergence
-from spikeloom.runtime.equivalence.verdict import Verdict
+from spikeloom.runtime.equivalence.verdict import Divergence, Verdict
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Block, Section, Table, Text
 
@@ -21,7 +20,7 @@ def sections(verdict: Verdict) -> list[Section]:
         Section("Levels", [Text("\n".join(_lines(verdict)))]),
         Section("Spikes", [Table(["spikes", "float", "chip", "different", "ill-posed"], spikes)]),
         Section("Ladder", [Table(["different, adding", *verdict.spikes], ladder)]),
-        Section("Certificate", _certificate(verdict.certificate)),
+        Section("Certificate", certified(verdict.certificate)),
         Section("First divergence", [Text("no spike differs" if first is None else _divergence(first))]),
     ]
 
@@ -46,7 +45,7 @@ def _lines(verdict: Verdict) -> list[str]:
     return lines
 
 
-def _certificate(certificate: Certificate) -> list[Block]:
+def certified(certificate: Certificate) -> list[Block]:
     """Entries that no order of summation changes, certified decisions, and whether registers stay in range."""
     rows = [
         [

@@ -18,7 +18,6 @@ from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.costs.simulated import Part
 from spikeloom.runtime.equivalence.breakdowns import Breakdown
 from spikeloom.runtime.equivalence.certificates import Certificate
-from spikeloom.runtime.equivalence.divergence import Divergence
 from spikeloom.runtime.equivalence.rounding import Rounding
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
 
@@ -40,6 +39,29 @@ class LayerSpikes:
     chip: int
     different: int
     ill_posed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Divergence:
+    """The first entry in which chip and float model differ: first recording, then step, layer, neuron.
+
+    Membranes before the comparison and thresholds are in the float model's units, the register is as it stands. Taxel
+    and feature are the neuron in a graph convolution's own terms. It is ill-posed if the float64 model sides with the
+    chip.
+    """
+
+    file: str
+    step: int
+    layer: str
+    neuron: int
+    taxel: int | None
+    feature: int | None
+    float_membrane: float
+    chip_membrane: float
+    chip_register: int
+    theta: float
+    chip_theta: float
+    ill_posed: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,20 +13,25 @@ import numpy.typing as npt
 
 from spikeloom.compiler import Netlist
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError
+from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.interpret import channels_last, cut, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
 from spikeloom.runtime.equivalence.certificates import certify
-from spikeloom.runtime.equivalence.divergence import first_divergence
-from spikeloom.runtime.equivalence.ladder import rungs
-from spikeloom.runtime.equivalence.reference import float_network, require_match, spikes_of
+from spikeloom.runtime.equivalence.reference import (
+    float_network,
+    membranes_of,
+    require_match,
+    rungs,
+    spikes_of,
+    taxel_and_feature,
+)
 from spikeloom.runtime.equivalence.rounding import check_rounding
-from spikeloom.runtime.equivalence.verdict import LayerSpikes, Rung, Verdict
+from spikeloom.runtime.equivalence.verdict import Divergence, LayerSpikes, Rung, Verdict
 from spikeloom.runtime.machines.base import ENGINES
-from spikeloom.runtime.machines.integer import integer_machine_of
+from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_of
 from spikeloom.runtime.machines.votes import readout_counts
 
 
@@ -132,10 +137,9 @@ def verify(
     ladder.append(rung("saturation", chip))
 
     begin("first divergence")
-    divergence = first_divergence(machine, model, adjacency, reference, chip, wide, events, files)
+    divergence = _first_divergence(machine, model, adjacency, reference, chip, wide, events, files)
     float_counts = readout_counts(network.readout, network.classes, reference[network.readout.population])
     neurons = [np.arange(each.size)[keep] for each, keep in zip(integer.populations, kept, strict=True)]
-    flat = with_clocks(events, netlist.clocks)
     begin("certificate")
     certificate = certify(model, adjacency, integer, events, chip, ran.decisions, kept=kept, lengths=lengths)
     return Verdict(
@@ -161,10 +165,61 @@ def verify(
         ladder=tuple(ladder),
         same_checkpoint=_compiled_from(netlist, checkpoint, sha256),
         quantised_different=quantised_different,
-        breakdowns=breakdowns(names, reference, chip, neurons, (float_counts, ran.votes), flat, files, lengths),
+        breakdowns=breakdowns(names, reference, chip, neurons, (float_counts, ran.votes), files),
         not_compared={name: int(out.sum()) for name, out in zip(names, machine.unread, strict=True) if out.any()},
         certificate=certificate,
         engine=engine_name,
         engine_different=None if beside is None else beside.different,
         required={} if required is None else required,
+    )
+
+
+def _first_divergence(
+    machine: IntegerMachine,
+    model: Checkpoint | Network,
+    adjacency: FloatArray | None,
+    reference: list[BoolArray],
+    chip: list[BoolArray],
+    wide: list[BoolArray],
+    events: npt.NDArray[np.uint8],
+    files: tuple[str, ...],
+) -> Divergence | None:
+    """First entry in which spikes of the float32 model and the chip differ.
+
+    Spikes of each layer of these two and of the float64 model are (samples, steps, compared), of neurons that can be
+    compared.
+    """
+    differs = [(a != b) for a, b in zip(reference, chip, strict=True)]
+    broken = np.any([d.any(axis=(1, 2)) for d in differs], axis=0)
+    if not broken.any():
+        return None
+    sample = int(np.argmax(broken))
+    step, index, neuron = min(
+        (int(step), layer, int(neuron))
+        for layer, d in enumerate(differs)
+        for step, neuron in np.argwhere(d[sample])[:1]
+    )
+    layer = machine.integer.populations[index]
+    ill_posed = bool(wide[index][sample, step, neuron] != reference[index][sample, step, neuron])
+    neuron = int(np.arange(layer.size)[machine.compared()[index]][neuron])
+    recording = events[sample : sample + 1]
+    membranes = machine.run(recording, membranes=True).membranes
+    assert membranes is not None, "membranes were wanted"
+    register = int(membranes[layer.name][0, step, neuron])
+    held = not machine.absent[index][neuron]  # a neuron that the chip leaves out stays at zero
+    scale = float(layer.scale[neuron])
+    taxel, feature = taxel_and_feature(model, index, neuron)
+    return Divergence(
+        file=files[sample],
+        step=step,
+        layer=layer.name,
+        neuron=neuron,
+        taxel=taxel,
+        feature=feature,
+        float_membrane=float(membranes_of(model, adjacency, recording)[index][0, step, neuron]),
+        chip_membrane=register / (scale * (1 << MEMBRANE_SHIFT)),
+        chip_register=register,
+        theta=layer.theta,
+        chip_theta=int(layer.threshold[neuron]) / scale if held else layer.theta,
+        ill_posed=ill_posed,
     )

@@ -4,35 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.report.encode import key
 from spikeloom.runtime.report.sections import Outcome
-
-
-class Sizes(Protocol):
-    """What the page says of a netlist itself; the rest of its facts has the chip's layout."""
-
-    @property
-    def target(self) -> str:
-        """Name of the chip."""
-
-    @property
-    def neurons(self) -> int:
-        """Of the network."""
-
-    @property
-    def compartments(self) -> int:
-        """Neurons that the chip holds."""
-
-    @property
-    def synapses(self) -> int:
-        """Of the network."""
-
-    @property
-    def cores(self) -> int:
-        """How many."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

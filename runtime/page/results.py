@@ -15,7 +15,7 @@ from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.verdict import Verdict
 from spikeloom.runtime.inputs.network import LoadedNetwork, sensor_places
-from spikeloom.runtime.machines.page_parts import BatchParts, Cores, Sizes
+from spikeloom.runtime.machines.page_parts import BatchParts, Cores
 from spikeloom.runtime.page.provenance import Provenance
 from spikeloom.runtime.page.recording import Recording
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL, key
@@ -54,7 +54,7 @@ class Report:
 
     verify: Verdict
     decisions: Decisions
-    netlist: Sizes
+    netlist: object
     cores: Cores
     taxels: Taxels
     recording: Recording

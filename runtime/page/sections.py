@@ -52,13 +52,10 @@ def _of_chip(outcome: Outcome) -> Iterable[Block]:
 
 def about(report: Report) -> str:
     """The page in a sentence."""
-    net = report.netlist
     system = report.provenance.checkpoint.facts["system"] or "network"
     graph = f", graph {report.taxels.graph}" if report.taxels.graph else ""
-    return (
-        f"A {system}{graph}: {net.neurons:,} neurons and {net.synapses:,} synapses on {net.cores} cores of "
-        f"{net.target}, compared with its float model on {report.verify.samples} recordings."
-    )
+    cores, samples = len(report.cores.cores), report.verify.samples
+    return f"A {system}{graph}, on {cores} cores, compared with its float model on {samples} recordings."
 
 
 def _cards(report: Report) -> dict[str, tuple[str, str]]:
@@ -77,8 +74,8 @@ def _cards(report: Report) -> dict[str, tuple[str, str]]:
         cards["energy an inference"] = " … ".join(shown), ", ".join(costs.energy_j)
     for table, seconds in list(costs.time_s.items())[:1]:
         cards["time an inference"] = si(seconds, "s"), f"at full speed, {table}, simple model"
-    net = report.netlist
-    return cards | {"cores": (f"{net.cores}", f"{net.compartments:,} neurons on the chip")}
+    held = sum(core.compartments for core in report.cores.cores)
+    return cards | {"cores": (str(len(report.cores.cores)), f"{held:,} neurons on the chip")}
 
 
 def _decisions(found: Decisions) -> list[Block]:

@@ -13,8 +13,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.runtime.commands.options import add_netlist_and_model, add_recordings
 from spikeloom.runtime.equivalence.explanation.causes import explain, observe
-from spikeloom.runtime.equivalence.explanation.results import Explained
-from spikeloom.runtime.equivalence.explanation.sections import sections
+from spikeloom.runtime.equivalence.explanation.results import Explained, sections
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.inputs.network import load_network

@@ -4,21 +4,43 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-from spikeloom.compiler import DEFAULT_TARGET, GOALS, Compilation, compile_network, write_netlist
+from spikeloom.compiler import (
+    DEFAULT_TARGET,
+    GOALS,
+    Compilation,
+    Options,
+    __version__,
+    compile_network,
+    invariants,
+    write_netlist,
+)
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.formats.netx.reader import SUFFIX as NETX
+from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.runtime.commands.main_job.integers import brings_integers, compile_integers
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_bin_option, add_network, group
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
-from spikeloom.runtime.inputs.repeat import refuse
-from spikeloom.runtime.machines.base import chip_commands, compiled, trained_for
+from spikeloom.runtime.inputs.repeat import NETWORK, ROUNDING, refuse
+from spikeloom.runtime.machines.base import chip_commands, compiled, machine_of, trained_for
 from spikeloom.runtime.report.console import progress
-from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.report.encode import INLINE
+from spikeloom.runtime.report.sections import Outcome, Section, Text
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LaidOut:
+    """A netlist of integers as they stood, and what was read from their file."""
+
+    netlist: Any = field(metadata=INLINE)
+    path: str
+    facts: Sequence[str]
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
@@ -73,8 +95,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     require_place(arguments.output, "-o", arguments)
     chip = load_target(arguments.target)
-    if brings_integers(arguments.checkpoint):
-        return compile_integers(arguments)
+    if isinstance(arguments.checkpoint, str) and arguments.checkpoint.endswith(NETX):
+        return _compile_integers(arguments)
     if unknown := set(arguments.dump_after) - {step.name for step in chip.passes}:
         names = ", ".join(step.name for step in chip.passes)
         raise OptionError(f"--dump-after {', '.join(sorted(unknown))}: no such pass; allowed: {names}")
@@ -123,3 +145,38 @@ def run(arguments: argparse.Namespace) -> Outcome:
     )
     sha256 = write_netlist(compilation.netlist, arguments.output)
     return compiled(compilation, sha256, asked.facts)
+
+
+def _compile_integers(arguments: argparse.Namespace) -> Outcome:
+    """Compile a file that brings its integers: nothing is rounded, they are laid out as they stand."""
+    path = arguments.checkpoint
+    if load_target(arguments.target).options is not Options:
+        raise OptionError(f"--target {arguments.target}: {path} holds integers of another chip; omit it")
+    floats = ("in_time", "dt", "convention", *ROUNDING, "dump_after", "calibrate", "optimize")
+    refuse(arguments, floats, f"is for float networks, {path} holds integers")
+    refuse(arguments, NETWORK, f"is for checkpoints, the netx file {path} holds all it needs")
+    progress("reading the network")
+    read = read_netx(path, polarities=arguments.polarities, polarities_first=arguments.polarities_first)
+    invariants.verify(read.network)
+    progress("compiling")
+    cores_for = parse_cores(arguments.cores_for)
+    provenance = {
+        "spikeloom": __version__,
+        "checkpoint_sha256": read.sha256,
+        "format": "netx",
+        "keep_all": arguments.keep_all,
+        **({"cores_for": cores_for} if cores_for else {}),
+        **({"chips": arguments.chips} if arguments.chips != 1 else {}),
+    }
+    options = Options(keep_all=arguments.keep_all, cores_for=cores_for, chips=arguments.chips, provenance=provenance)
+    done = compile_network(read.network, options, target=arguments.target)
+    sha256 = write_netlist(done.netlist, arguments.output)
+    described = machine_of(done.netlist).describe(sha256)
+
+    def sections(made: LaidOut) -> Iterator[Section]:
+        yield Section("", [*map(Text, made.facts)])
+        *first, last = described.sections(made.netlist)
+        yield from first
+        yield Section("", [*last.blocks, Text(f"sha256 {sha256}")])
+
+    return Outcome(LaidOut(netlist=described.result, path=arguments.output, facts=read.facts), sections)
