@@ -40,23 +40,6 @@ class Tag(nn.Module):
         return out + self.bias
 
 
-class Chebyshev(nn.Module):
-    """``T_k = 2 L T_(k-1) - T_(k-2)``: polynomials of a scaled Laplacian."""
-
-    def __init__(self, channels, features, order=4):
-        super().__init__()
-        self.filters = nn.ModuleList(nn.Linear(channels, features, bias=False) for _ in range(order))
-        self.register_buffer("laplacian", -normalised(torch.float32))
-
-    def forward(self, x):
-        before, now = x, self.laplacian @ x
-        out = self.filters[0](before) + self.filters[1](now)
-        for linear in self.filters[2:]:
-            before, now = now, 2 * (self.laplacian @ now) - before
-            out = out + linear(now)
-        return out
-
-
 class Messages(nn.Module):
     """Attention-free message passing: gather, weigh by the degrees, scatter."""
 
@@ -122,10 +105,6 @@ def gcn():
     return seeded(lambda: graph_net(Messages(2, 8)))
 
 
-def chebyshev():
-    return seeded(lambda: graph_net(Chebyshev(2, 8)))
-
-
 def averaged():
     return seeded(lambda: graph_net(nn.Sequential(Mean(), nn.Linear(4, 8))))
 
@@ -148,7 +127,7 @@ def grid():
 
 
 EXAMPLES = {"mlp": (1, 2 * TAXELS), "grid": (1, 2, 4, 4)}
-NETS = {"tag": tag, "grid": grid, "mlp": mlp, "gcn": gcn, "chebyshev": chebyshev, "averaged": averaged}
+NETS = {"tag": tag, "grid": grid, "mlp": mlp, "gcn": gcn, "averaged": averaged}
 
 
 def example_of(name):

@@ -51,7 +51,6 @@ def cutting(sizes, **limits):
 
 
 OPTIONS = [
-    ("--target loihi2: not modelled|loihi1, truenorth", compiling("loihi2")),
     ("--prune-unused|--calibrate|--keep-all", compiling(prune_unused=True)),
     ("--prune-unused|--keep-all", compiling(prune_unused=True, training_events=EVENTS, keep_all=True)),
     ("--spike-exact|--calibrate", compiling(spike_exact=True)),
@@ -62,7 +61,6 @@ OPTIONS = [
     *((f"--scale-groups {n}|8 thresholds|1 to 8", rounding(packings=(Packing(groups=n),))) for n in (0, 9)),
     ("--weight-bits: 2 layers|the network has 1", rounding(packings=(Packing(), Packing()))),
     (f"--widths 7|{WIDTHS}", lambda: check_widths([7], 1, 4, LOIHI)),
-    ("--scale-groups 9|1 to 8", lambda: check_widths([4], 9, 4, LOIHI)),
     ("--optimize speed|cores, latency", goal("speed")),
     ("--optimize latency|--calibrate", goal("latency", calibrated=False)),
     ("--optimize latency|--cores-for", goal("latency", {"fc1": 2})),
@@ -71,14 +69,12 @@ OPTIONS = [
     ("--chips 0|1 or more", goal("cores", chips=0)),
     ("--cores-for fc9=2|fc1, fc2", laying_out((3, 200, 4), fc9=2)),
     ("--cores-for fc1=129|128 cores|128 or fewer", laying_out((3, 200, 4), fc1=129)),
-    ("--cores-for fc2=5|4 neurons|4 or fewer", laying_out((3, 200, 4), fc2=5)),
     ("--cores-for fc1=2|3 cores at least", laying_out((2496, 128), fc1=2)),
     # four neurons of seven output axons a core: three listening cores each let two of them sit together
     ("--cores-for fc1=1|2 cores at least", laying_out((1, 4, 9), small_target(core_axons_out=7), fc1=1, fc2=3)),
     ("--cores-for fc1=7|3 chips|6 cores", lambda: least_cores(full(6, 8), {"fc1": 7}, small_target(chip_cores=2), 3)),
 ]
 NETWORKS = [
-    ("graph has 4 taxels|trained on 5", compiling(graph=4)),
     ("fc1|6 bits|32767 units|more bits", rounding(1e6, packings=(Packing(bits=6),))),
 ]
 RECORDINGS = [
@@ -92,7 +88,6 @@ CAPACITIES = [
         laying_out((1, 1, 8), small_target(core_axons_out=7), fc2=8),
     ),
     ("chip: 129 used, 128 allowed (loihi1.chip.cores)", laying_out((3, 100, 100), fc1=100, fc2=29)),
-    ("chip: 129 used, 128 allowed (loihi1.chip.cores)", cutting((1, 129 * 8), core_compartments=8)),
     (
         "2 chips: 5 used, 4 allowed (loihi1.chip.cores)|--chips",
         lambda: partition(full(1, 5), small_target(core_compartments=1, chip_cores=2), chips=2),
@@ -102,10 +97,6 @@ CAPACITIES = [
         "neuron 0: 16385 used, 4096 allowed (loihi1.core.axons_in)|\n"
         "fc1 neuron 0: 16385 used, 16384 allowed (loihi1.core.synapse_words)",
         cutting((16385, 1)),
-    ),
-    (
-        "fc1 neuron 0: 6 used, 4 allowed (loihi1.core.axons_in)|\nfc3 neuron 0: 5 used, 4 allowed",
-        cutting((6, 3, 5, 1), core_axons_in=4),
     ),
     (
         "fc1 neuron 0: 5 used, 4 allowed (loihi1.core.axons_out); split the layers that it feeds",

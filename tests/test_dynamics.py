@@ -332,6 +332,20 @@ def test_the_tenth_layer_is_not_scaled_as_the_first():
     assert_array_equal(found["fc10.weight"], network.fc10.weight.detach().numpy().T)
 
 
+def test_a_penalty_on_spikes_makes_them_fewer():
+    training = grasps(1)
+    _, sizes = small_timed(training)
+    time_first = torch.from_numpy(training.events.transpose(3, 0, 1, 2).astype(np.float32))
+    shares = []
+    for penalty in (0.0, 50.0):
+        recipe, _ = small_timed(training, penalty=penalty, learning_rate=0.02)
+        trained = train(training, training, ADJACENCY, sizes, epochs=5, seed=0, recipe=recipe)
+        network = SpikingNet(sizes, ADJACENCY)
+        network.load_weights(trained.last)
+        shares.append(float(network.activity(network.layers(time_first)).detach()))
+    assert shares[1] < 0.8 * shares[0]
+
+
 def test_train_writes_what_the_recipe_asks_for(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     splits = [replace(synthetic_grasps(per_class=2, steps=14, seed=s), split=n) for n, s in (("train", 1), ("test", 2))]

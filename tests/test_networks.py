@@ -12,9 +12,8 @@ from made_files import events as made_events
 from made_files import small_checkpoint
 from numpy.testing import assert_allclose, assert_array_equal
 
-from spikeloom.compiler.passes.expand import hop_powers, synapses
 from spikeloom.models.graphs import build_graph, normalised_adjacency
-from spikeloom.models.networks.layers import lif, spike_linear, tag_convolution
+from spikeloom.models.networks.layers import lif, spike_linear
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.networks.reference import BATCH, float_membranes, float_spikes
 from spikeloom.models.recordings.events import load_data
@@ -31,24 +30,6 @@ def lif_step_by_step(current, beta=BETA, theta=THETA):
         spikes.append(spike)
         membranes.append(membrane)
     return torch.stack(spikes), torch.stack(membranes)
-
-
-def convolution_step_by_step(x, edges, hops, bias):
-    """One graph convolution of (taxels, channels), scattered edge by edge in float32 arithmetic."""
-    source, target = torch.tensor(edges.T)
-    degree = torch.zeros(len(x), dtype=x.dtype).index_add_(0, target, torch.ones(len(edges), dtype=x.dtype))
-    scale = torch.where(degree > 0, degree.pow(-0.5), 0.0)
-    norm = scale[source] * scale[target]
-    out = x @ hops[0].t()
-    for hop in hops[1:]:
-        x = torch.zeros_like(x).index_add_(0, target, norm[:, None] * x[source])
-        out = out + x @ hop.t()
-    return out + bias
-
-
-def random_events(seed, steps, samples, taxels, rate=0.15, kind=torch.float32):
-    generator = torch.Generator().manual_seed(seed)
-    return (torch.rand(steps, samples, taxels, 2, generator=generator) < rate).to(kind)
 
 
 def adjacency_of(name="manual"):
@@ -77,20 +58,6 @@ def test_spikes_and_membranes_equal_a_step_by_step_loop(kind, seed, steps, neuro
 
 
 # --- the convolution -----------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("graph", ["manual", "released:knn:3", "mst:2"])
-def test_convolution_equals_scattered_edges_and_the_expanded_matrix(graph):
-    generator = torch.Generator().manual_seed(3)
-    edges = build_graph(graph).edges
-    hops = torch.randn(4, 5, 2, generator=generator, dtype=torch.float64)
-    bias = torch.randn(5, generator=generator, dtype=torch.float64)
-    x = random_events(0, 6, 3, 39, kind=torch.float64)
-    adjacency = normalised_adjacency(edges, 39)
-    found = tag_convolution(x, torch.tensor(adjacency), hops, bias)
-    assert found.shape == (6, 3, 39 * 5)
-    one = convolution_step_by_step(x[2, 1], edges, hops, bias)
-    assert_allclose(found[2, 1], one.reshape(-1), rtol=1e-12, atol=1e-12)
-    matrix = synapses(hop_powers(adjacency, len(hops)), hops.numpy()).toarray()
-    assert_allclose(found, x.reshape(6, 3, 78).numpy() @ matrix.T + np.tile(bias.numpy(), 39), rtol=1e-10, atol=1e-12)
 
 
 # --- the dense layer -----------------------------------------------------------------------------------------------

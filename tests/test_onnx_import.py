@@ -115,9 +115,7 @@ def test_how_spikes_are_counted(read, last, inputs, label):
     assert network.classes == max(label) + 1
 
 
-@pytest.mark.parametrize(
-    ("name", "opset"), [("tag", 11), ("grid", 13), ("mlp", 17), ("gcn", 17), ("chebyshev", 20), ("averaged", 20)]
-)
+@pytest.mark.parametrize(("name", "opset"), [("tag", 11), ("grid", 13), ("mlp", 17), ("gcn", 17), ("averaged", 20)])
 def test_modules_come_back_with_the_same_integers(read, name, opset):
     """One step, and all steps."""
     net, example = NETS[name](), example_of(name)

@@ -197,6 +197,22 @@ def test_each_error_is_made_up_for_as_well_as_the_inputs_to_come_can():
     assert np.any(expected != np.rint(weight))
 
 
+def test_errors_cancel_on_the_recordings():
+    """Correlated inputs: the summed error of the membrane is smaller than with each weight at its nearest."""
+    rng = np.random.default_rng(0)
+    network = chain(rng.normal(0, 0.1, (16, 48)))
+    cause = rng.random((6, 60, 12)) < 0.25
+    calibration = calibrate(network, np.repeat(cause, 4, axis=2) & (rng.random((6, 60, 48)) < 0.9))
+    layer, form = layer_of(network, 0), Form(bits=4, exponents=(0,), threshold=np.full(16, 200))
+
+    def error(stored):
+        weight = sum(p.effective().toarray() for p in stored.projections) - network.projections[0].weight * 400
+        bias = stored.population.bias / 64 - network.populations[0].bias * 400
+        return float(np.square(calibration.events.reshape(-1, 48) @ weight.T + bias).mean())
+
+    assert error(compensated(layer, form, calibration)) < 0.6 * error(rounded(layer, form))
+
+
 def test_compensation_is_kept_only_where_it_keeps_spikes():
     network, calibration = uneven_layer(3)
     integer, (choice,) = choose_storage(network, LOIHI, packings=(Packing(bits=3),), calibration=calibration)
