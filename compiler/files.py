@@ -37,11 +37,18 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     target = Path(path).resolve()
     part = beside(target)
     try:
-        yield from _write_beside(target, part)
-    except OSError as error:
-        if error.filename not in (None, str(part)):
-            raise
-        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+        with part.open("xb") as file:
+            if target.exists():
+                part.chmod(stat.S_IMODE(target.stat().st_mode))
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(target)
+    except BaseException as error:
+        part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (None, str(part)):
+            raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+        raise
 
 
 def remove_leftovers(path: str | os.PathLike[str]) -> None:
@@ -54,20 +61,6 @@ def remove_leftovers(path: str | os.PathLike[str]) -> None:
 def beside(path: Path) -> Path:
     """A new name for what is to become `path`; known before the file is, so that a signal can never lose it."""
     return path.parent / f".{path.name}.{secrets.token_hex(RANDOM // 2)}.part"
-
-
-def _write_beside(path: Path, part: Path) -> Iterator[BinaryIO]:
-    try:
-        with part.open("xb") as file:
-            if path.exists():
-                part.chmod(stat.S_IMODE(path.stat().st_mode))
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
 
 
 def sha256_of(path: str | os.PathLike[str]) -> str:

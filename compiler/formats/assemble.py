@@ -7,7 +7,7 @@ threshold and affine stages from other layers, and with how the output is counte
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, Network, Population, Projection, Readout, Sparse, depths
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import IntArray
 
 N = TypeVar("N", bound=Network | IntegerNetwork)
 
@@ -31,17 +31,13 @@ class ReadNetwork(Generic[N]):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Layer:
-    """A spiking layer."""
+class Layer(Population):
+    """A spiking layer: its neurons, and the weights from its sources.
 
-    name: str  # for messages and as the population's name
-    beta: float
-    theta: float
-    bias: FloatArray
-    # by the place of their source in the sequence, or INPUT; from the own place the spikes of the step before
+    Those are known by their place in the sequence, or INPUT; from the own place come the spikes of the step before.
+    """
+
     sources: Mapping[int, Sparse]
-    alpha: float = 0.0  # share of the synaptic current that a step keeps
-    relays: int = 0  # last neurons that relay a channel that always has an event, see :mod:`compiler.dynamics`
 
 
 def class_of_each(counts: Sparse) -> IntArray | None:
@@ -100,16 +96,7 @@ def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArra
     for layer in (layers[index] for index in order):
         _require_neuron(layer)
         post = len(populations)
-        populations.append(
-            Population(
-                name=layer.name,
-                beta=layer.beta,
-                theta=layer.theta,
-                bias=layer.bias,
-                alpha=layer.alpha,
-                relays=layer.relays,
-            )
-        )
+        populations.append(Population(**{each.name: getattr(layer, each.name) for each in fields(Population)}))
         for source, weight in sorted(layer.sources.items(), key=lambda entry: place[entry[0]]):
             weight.sort_indices()
             projections.append(Projection(pre=place[source], post=post, weight=weight))

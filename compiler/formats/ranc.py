@@ -53,8 +53,7 @@ def export(netlist: CrossbarNetlist, events: EventArray | None = None) -> Iterat
     missing = unsupported(netlist)
     if missing:
         raise ModelError(f"--to ranc: RANC has no {', no '.join(missing)}; leave them out of the network")
-    left, low = int(netlist.core_x.min()), int(netlist.core_y.min())
-    x, y = netlist.core_x - left, netlist.core_y - low
+    x, y = netlist.core_x - netlist.core_x.min(), netlist.core_y - netlist.core_y.min()
     voters = np.flatnonzero(netlist.readout_class >= 0)
     bus = (0, int(y.max()) + 1)  # a row of its own above all cores
     chip = load_target(netlist.target)
@@ -79,7 +78,7 @@ def export(netlist: CrossbarNetlist, events: EventArray | None = None) -> Iterat
     yield ",\n".join(json.dumps(tick, separators=(",", ":")) for tick in packets)
     yield "],"
     yield '"cores": ['
-    aims = _aims(netlist, x, y, left, low, bus, voters)
+    aims = _aims(netlist, bus, voters)
     for core in range(netlist.n_cores):
         end = "," if core + 1 < netlist.n_cores else ""
         yield json.dumps(_core(netlist, core, int(x[core]), int(y[core]), aims), separators=(",", ":")) + end
@@ -112,16 +111,10 @@ def _packets(
     ]
 
 
-def _aims(
-    netlist: CrossbarNetlist,
-    x: IntArray,
-    y: IntArray,
-    left: int,
-    low: int,
-    bus: tuple[int, int],
-    voters: IntArray,
-) -> list[tuple[int, int, int, int]]:
-    """Offset, axon and destination tick of each neuron."""
+def _aims(netlist: CrossbarNetlist, bus: tuple[int, int], voters: IntArray) -> list[tuple[int, int, int, int]]:
+    """Offset, axon and destination tick of each neuron; the place of the `bus` is that in the file."""
+    left, low = netlist.core_x.min(), netlist.core_y.min()
+    x, y = netlist.core_x - left, netlist.core_y - low
     core = netlist.core_of_neuron()
     aim = np.stack([bus[0] - x[core], bus[1] - y[core], np.full(len(core), len(voters)), np.zeros(len(core))], axis=1)
     aim[voters, 2] = np.arange(len(voters))

@@ -59,7 +59,20 @@ def export(netlist: Netlist, dt: float) -> bytes:
     nodes: dict[str, Tree] = {"input": {"type": "Input", "shape": np.array([network.input.size])}}
     edges: list[tuple[str, str]] = []
     for post, (population, name) in enumerate(zip(network.populations, names, strict=True)):
-        _layer(network, post, population, name, names, dt, nodes, edges)
+        bias = population.bias / (1 << MEMBRANE_SHIFT)
+        sources: dict[int, Sparse] = {}
+        for projection in network.projections:
+            if projection.post == post:
+                weight = projection.effective()
+                sources[projection.pre] = sources[projection.pre] + weight if projection.pre in sources else weight
+        for number, (pre, weight) in enumerate(sorted(sources.items())):
+            source = "input" if pre == INPUT else names[pre]
+            synapses = f"{source}_to_{name}"
+            nodes[synapses] = {"type": "Linear", "weight": _dense(population, weight)}
+            if population.decay_u == FORGETS and not number:
+                nodes[synapses] |= {"type": "Affine", "bias": bias.astype(np.float32)}
+            edges += [(source, synapses), (synapses, name)]
+        nodes[name] = _neurons(population, bias, dt)
     voters, label = names[network.readout.population], network.readout.label
     if np.array_equal(label, np.arange(network.classes)):
         edges.append((voters, "output"))
@@ -69,41 +82,20 @@ def export(netlist: Netlist, dt: float) -> bytes:
         nodes["votes"] = {"type": "Linear", "weight": votes}
         edges += [(voters, "votes"), ("votes", "output")]
     nodes["output"] = {"type": "Output", "shape": np.array([network.classes])}
-    return _file(nodes, edges, dt)
+    said = {"dt": np.array(dt), "writer": "spikeloom"}
+    graph = {"type": "NIRGraph", "edges": edges, "metadata": said, "nodes": nodes}
+    return hdf5_bytes({"version": VERSION, "node": graph})
 
 
-def _layer(
-    network: IntegerNetwork,
-    post: int,
-    population: IntegerPopulation,
-    name: str,
-    names: tuple[str, ...],
-    dt: float,
-    nodes: dict[str, Tree],
-    edges: list[tuple[str, str]],
-) -> None:
-    """Nodes and edges of one layer: its synapses from each source, its neurons."""
-    lasting = population.decay_u != FORGETS
-    bias = population.bias / (1 << MEMBRANE_SHIFT)
-    sources: dict[int, Sparse] = {}
-    for projection in network.projections:
-        if projection.post == post:
-            weight = projection.effective()
-            sources[projection.pre] = sources[projection.pre] + weight if projection.pre in sources else weight
-    for number, (pre, weight) in enumerate(sorted(sources.items())):
-        if weight.shape[0] * weight.shape[1] > DENSE_LIMIT:
-            raise ModelError(
-                f"{population.name}: has {weight.shape[0]} x {weight.shape[1]} weights, zeros among them, "
-                f"{DENSE_LIMIT} are allowed; NIR keeps whole matrices"
-            )
-        source = "input" if pre == INPUT else names[pre]
-        synapses = f"{source}_to_{name}"
-        dense = weight.toarray().astype(np.float32)
-        nodes[synapses] = {"type": "Linear", "weight": dense}
-        if not lasting and not number:
-            nodes[synapses] = {"type": "Affine", "weight": dense, "bias": bias.astype(np.float32)}
-        edges += [(source, synapses), (synapses, name)]
-    nodes[name] = _neurons(population, bias, dt)
+def _dense(population: IntegerPopulation, weight: Sparse) -> Float32:
+    """Weights into a layer as a whole matrix; ModelError if it is too large."""
+    if weight.shape[0] * weight.shape[1] > DENSE_LIMIT:
+        raise ModelError(
+            f"{population.name}: has {weight.shape[0]} x {weight.shape[1]} weights, zeros among them, "
+            f"{DENSE_LIMIT} are allowed; NIR keeps whole matrices"
+        )
+    dense: Float32 = weight.toarray().astype(np.float32)
+    return dense
 
 
 def _neurons(population: IntegerPopulation, bias: npt.NDArray[np.float64], dt: float) -> Tree:
@@ -131,9 +123,3 @@ def _neurons(population: IntegerPopulation, bias: npt.NDArray[np.float64], dt: f
     if not lost:
         return {"type": "IF", "r": each(1 / dt), **common}
     return {"type": "LIF", "tau": each(dt / lost), "r": each(1 / lost), "v_leak": each(0), **common}
-
-
-def _file(nodes: dict[str, Tree], edges: list[tuple[str, str]], dt: float) -> bytes:
-    said = {"dt": np.array(dt), "writer": "spikeloom"}
-    graph = {"type": "NIRGraph", "edges": edges, "metadata": said, "nodes": nodes}
-    return hdf5_bytes({"version": VERSION, "node": graph})

@@ -8,7 +8,7 @@ that float32 (0.2, not 0.200000003); the float32 model is the same, the float64 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -73,16 +73,10 @@ class Graph:
     inputs: tuple[Declared, ...]
     outputs: tuple[str, ...]
     constants: Mapping[str, Array]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Model:
-    """A file: its graph, the version of its operators and the hash of all its bytes."""
-
-    graph: Graph
-    opset: int
-    producer: str
-    sha256: str
+    # of the outermost graph, about the file
+    opset: int = 0  # version of its operators
+    producer: str = ""
+    sha256: str = ""  # of all its bytes
 
 
 def decimal(value: Any) -> float:
@@ -101,11 +95,7 @@ def _text(value: str | bytes) -> str:
     return value.decode("utf-8", "backslashreplace") if isinstance(value, bytes) else value
 
 
-def _texts(values: Iterable[str | bytes]) -> tuple[str, ...]:
-    return tuple(_text(value) for value in values)
-
-
-def read_model(path: Path) -> Model:
+def read_graph(path: Path) -> Graph:
     """Read a file.
 
     Raises ModelError if it is no ONNX file, or names, sizes, types or places in it cannot be right; the message lacks
@@ -132,8 +122,8 @@ def read_model(path: Path) -> Model:
     digest = hashlib.sha256(content)
     _bring_data(proto.graph, path.absolute().parent, digest)
     _check(proto)
-    return Model(
-        graph=_graph(proto.graph),
+    return replace(
+        _graph(proto.graph),
         opset=opset,
         producer=printable(_text(proto.producer_name)),
         sha256=digest.hexdigest(),
@@ -218,8 +208,8 @@ def _node(proto: Any) -> Node:
     node = Node(
         name=named,
         op=SAME.get(_text(proto.op_type), _text(proto.op_type)),
-        inputs=_texts(proto.input),
-        outputs=_texts(proto.output),
+        inputs=tuple(map(_text, proto.input)),
+        outputs=tuple(map(_text, proto.output)),
         attributes={},
     )
     if _text(proto.domain) not in ("", "ai.onnx"):

@@ -19,7 +19,7 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble
 from spikeloom.compiler.formats.names import printable, unique_names
 from spikeloom.compiler.formats.onnx.affine import INPUT_ATOM, Affine, Table, as_affine, require_finite
-from spikeloom.compiler.formats.onnx.file import BOOL, DOUBLE, Declared, Graph, Model, read_model
+from spikeloom.compiler.formats.onnx.file import BOOL, DOUBLE, Declared, Graph, read_graph
 from spikeloom.compiler.formats.onnx.lif import Neurons, is_output, neurons_of
 from spikeloom.compiler.formats.onnx.run import inner, run
 from spikeloom.compiler.formats.onnx.steps import Unrolled, group, readout
@@ -57,16 +57,15 @@ def read_onnx(
     try:
         # A constant may divide by zero on its way, as degrees of lonely taxels do; what counts is checked at the end.
         with np.errstate(all="ignore"):
-            model = read_model(Path(path))
-            return _network(model, polarities, polarities_first)
+            return _network(read_graph(Path(path)), polarities, polarities_first)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
 
 
-def _network(model: Model, polarities: int | None, polarities_first: bool | None) -> ReadNetwork[Network]:
-    table = Table(opset=model.opset)
+def _network(file: Graph, polarities: int | None, polarities_first: bool | None) -> ReadNetwork[Network]:
+    table = Table(opset=file.opset)
     facts: list[str] = []
-    graph = _undecided(model.graph, facts)
+    graph = _undecided(file, facts)
     loops = any(node.op == "Scan" for node in graph.nodes)
     shapes: dict[int, tuple[int, ...]] = {}
     given = {}
@@ -94,9 +93,9 @@ def _network(model: Model, polarities: int | None, polarities_first: bool | None
         for name, layer, sources in zip(names, found.layers, found.sources, strict=True)
     ]
     network = assemble(layers, sensor, voters, label)
-    facts += _facts(model, table, found, outputs, names, words)
+    facts += _facts(file, table, found, outputs, names, words)
     facts.append(f"classes: the spikes of {names[voters]} in output {printable(counted)}")
-    return ReadNetwork(network=network, facts=tuple(facts), sha256=model.sha256)
+    return ReadNetwork(network=network, facts=tuple(facts), sha256=file.sha256)
 
 
 def _fixed(declared: Declared, graph: Graph, facts: list[str], *, loops: bool) -> tuple[int, ...]:
@@ -168,13 +167,13 @@ def _names(graph: Graph, table: Table, found: Unrolled) -> tuple[str, ...]:
 
 
 def _facts(
-    model: Model, table: Table, found: Unrolled, outputs: Mapping[str, Affine], names: tuple[str, ...], words: str
+    file: Graph, table: Table, found: Unrolled, outputs: Mapping[str, Affine], names: tuple[str, ...], words: str
 ) -> list[str]:
     """What a reader of the file would want to check."""
     steps = len(found.layers[0])
     form = "one step, state in and out from zero" if steps == 1 else f"{steps} steps unrolled"
     facts = [
-        f"{model.producer or 'unknown producer'}, operators of version {model.opset}: {form}",
+        f"{file.producer or 'unknown producer'}, operators of version {file.opset}: {form}",
         f"input {table.atoms[found.data]}: {words}",
     ]
     used = {found.data}
