@@ -42,7 +42,7 @@ NUMERIC = {
     "compiler/targets/loihi1/storage": "choose_storage compensate scales spike_exact weight_storage",
     "compiler/targets/truenorth": "codebook in_time legalize lower native",
     "models": "graphs",
-    "models/networks": "currents layers lif quantised reference",
+    "models/networks": "layers lif quantised reference",
     "models/truenorth": "neurons",
     "runtime/costs": "yardsticks",
     "runtime/equivalence": "certain_spikes certificates float_engine reference rounding verdict verify",

@@ -90,27 +90,10 @@ def check_edges(edges: ArrayLike, n: int) -> IntArray:
 def build_graph(name: str, coordinates: ArrayLike = NEUTOUCH) -> Graph:
     """Build a graph by name.
 
-    Parameters
-    ----------
-    name : str
-        ``manual``, ``knn:K`` or ``mst:SIGMA``, with or without the prefix ``released:``.
-    coordinates : (n, d) array, millimetres
-        The layout; the hand-drawn graph exists for `NEUTOUCH` only.
+    The name is ``manual``, ``knn:K`` or ``mst:SIGMA``, with or without the prefix ``released:``, and becomes the
+    canonical one: ``mst:2.0`` is ``mst:2``. The layout `coordinates` (n, d) is in millimetres; the hand-drawn graph
+    exists for `NEUTOUCH` only. OptionError if the name, K or SIGMA is not one of the choices, or does not suit it.
 
-    Returns
-    -------
-    Graph
-        Its name is the canonical one: ``mst:2.0`` becomes ``mst:2``.
-
-    Raises
-    ------
-    OptionError
-        If the name, K or SIGMA is not one of the choices, or does not suit the layout.
-    ModelError
-        If the coordinates are malformed.
-
-    Notes
-    -----
     ``released:knn:K`` lists a mutual pair twice in each direction, ``released:mst:SIGMA`` repeats the tree edges
     shorter than sigma; the plain names keep the first of equal rows. Distances are compared after rounding to
     1e-9 mm, because positions are typed in decimals and equal distances differ in their last bits.
@@ -155,10 +138,7 @@ def normalised_adjacency(edges: ArrayLike, n: int) -> FloatArray:
     ``A[target, source]`` counts the edges, so repeats add up; D is the in-degree, as in torch_geometric's
     ``gcn_norm``. A taxel that no edge enters has a zero row and a zero column, never NaN.
 
-    Raises
-    ------
-    ModelError
-        If the edges are malformed (see `check_edges`).
+    ModelError if the edges are malformed (see `check_edges`).
 
     Examples
     --------

@@ -25,10 +25,7 @@ _SHOWN = 8  # numbers that a warning lists
 def read_taxels(path: str | os.PathLike[str]) -> FloatArray:
     """Read the positions of the taxels, (n, 2) or (n, 3): lines ``x,y`` or ``x,y,z`` in millimetres, taxel 0 first.
 
-    Raises
-    ------
-    DataError
-        If the file is not such a table, a position is not finite, or two taxels share one.
+    DataError if the file is not such a table, a position is not finite, or two taxels share one.
     """
     table = read_table(path, ("x", "y"), ("z",))
     places = np.stack([table.columns[name] for name in ("x", "y", "z") if name in table.columns], axis=1)
@@ -71,10 +68,7 @@ def read_edges(
     Unless `directed`, each counts in both directions, listed once or twice. Edges that the file lists again make a
     warning.
 
-    Raises
-    ------
-    DataError
-        If the file is not such a table, or an edge names a taxel that does not exist or joins one to itself.
+    DataError if the file is not such a table, or an edge names a taxel that does not exist or joins one to itself.
     """
     table = read_table(path, ("source", "target"))
     ends = np.stack([table.columns["source"], table.columns["target"]], axis=1)
@@ -113,10 +107,8 @@ def sensor_graph(
     It is named as in `graph`, or ``edges:FILE``. A sensor given by edges alone has no positions; its taxels then stand
     on a line in their order, which nothing that is computed from edges uses.
 
-    Raises
-    ------
-    OptionError, DataError
-        If the options exclude each other, the graph does not suit the sensor, or a file cannot be used.
+    OptionError, DataError if the options exclude each other, the graph does not suit the sensor, or a file cannot be
+    used.
     """
     if (graph is None) == (edges is None):
         found = "neither was given" if graph is None else "both were given"

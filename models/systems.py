@@ -30,10 +30,7 @@ def grid_cells(coordinates: FloatArray = NEUTOUCH) -> IntArray:
 
     Halves round to the even number, as the released code's ``rint`` does.
 
-    Raises
-    ------
-    DataError
-        If the sensor has three dimensions or is too large.
+    DataError if the sensor has three dimensions or is too large.
 
     Examples
     --------

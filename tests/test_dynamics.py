@@ -16,8 +16,7 @@ from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, cloc
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.graphs import normalised_adjacency
-from spikeloom.models.networks.currents import accumulate, accumulate_steps, lasting_current
-from spikeloom.models.networks.layers import LifSteps, lif
+from spikeloom.models.networks.layers import accumulate, accumulate_steps, lasting_current, lif, lif_steps
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
@@ -83,7 +82,7 @@ def test_gradients_equal_plain_autograd(surrogate, seed, steps, alpha):
         return lif(lasting_current(drive, alpha) + bias, beta, theta, surrogate)[0]
 
     def torch_steps(drive, bias):
-        return LifSteps.apply(lasting_current(drive, alpha) + bias, beta, theta, surrogate)[0]
+        return lif_steps(lasting_current(drive, alpha) + bias, beta, theta, surrogate)[0]
 
     def plain(drive, bias):
         return neurons_step_by_step(drive, bias, alpha, beta, theta, surrogate)

@@ -222,12 +222,10 @@ def test_origin(lively, lively_file, lines, objects):
 def test_real_time_decides_alike(lively, lively_file, lines, objects):
     events = random_events(2, 15)
     path = lines(as_lines(events, inside=19_999) + "\n" + as_lines(events))
-    found = objects(lively_file, path, "--speed", "real", "--timing")
+    found = objects(lively_file, path, "--speed", "real")
     assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(lively, events)] * 2
     (end,) = found["end"]
     assert end["late"] == 0
-    assert 0 < end["step"]["median_ms"] <= end["step"]["p99_ms"]
-    assert end["step"]["p99_share_of_bin"] == pytest.approx(end["step"]["p99_ms"] / 20)
 
 
 def feed(descriptor: int, *parts: tuple[str, float]) -> threading.Thread:

@@ -40,25 +40,10 @@ def save_checkpoint(
 ) -> None:
     """Write a checkpoint, whole or not at all; equal input gives equal bytes.
 
-    Parameters
-    ----------
-    weights : mapping of ``last``, ``best`` or ``clean`` (at least one) to tensors
-        ``conv1.hops`` (filters, features, channels), ``conv1.bias``, ``fc1.weight``, ``fc1.bias`` … float32.
-    graph : Graph
-        What it was trained on.
-    training : mapping
-        JSON values: how it was made and what it reached.
-    forms : sequence of Form, optional
-        How the chip stores each layer, conv1 first, where the network was fine-tuned for it.
-    towers : int
-        Networks that lie side by side in the tensors, see :mod:`formats.towers`.
-    bins : int
-        Bins of the recordings that a step joins.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written; an older file is left as it was.
+    `weights` has the tensors of at least one of ``last``, ``best`` and ``clean``: ``conv1.hops`` (filters, features,
+    channels), ``conv1.bias``, ``fc1.weight``, ``fc1.bias`` … float32. `training` are JSON values: how it was made and
+    what it reached. `forms` say how the chip stores each layer, conv1 first, where the network was fine-tuned for it.
+    `towers` lie side by side in the tensors, see :mod:`formats.towers`; a step joins so many `bins` of the recordings.
     """
     tensors_of_one = next(iter(weights.values()))
     stages = sum(name.startswith("fc") and name.endswith(".weight") for name in tensors_of_one)

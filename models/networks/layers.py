@@ -86,8 +86,9 @@ def lif(current: Tensor, beta: float, theta: float, surrogate: Surrogate = RECTA
     derivative of the spike. Returns zeros and ones, and the membrane that was compared with `theta`, both (steps, ...);
     no gradient flows from the membrane.
     """
-    function = _Lif if current.device.type == "cpu" else LifSteps
-    spikes, membrane = function.apply(current, beta, theta, surrogate)  # type: ignore[no-untyped-call]
+    if current.device.type != "cpu":
+        return lif_steps(current, beta, theta, surrogate)
+    spikes, membrane = _Lif.apply(current, beta, theta, surrogate)  # type: ignore[no-untyped-call]
     return spikes, membrane
 
 
@@ -113,46 +114,77 @@ class _Lif(torch.autograd.Function):
         return out, None, None, None
 
 
-class LifSteps(torch.autograd.Function):
-    """The same recurrence and gradient in torch operations, one step at a time: for devices without the kernels."""
+class Spike(torch.autograd.Function):
+    """``u > theta``, with a surrogate for its derivative."""
 
     @staticmethod
-    def forward(
-        ctx: Any, current: Tensor, beta: float, theta: float, surrogate: Surrogate = RECTANGLE
-    ) -> tuple[Tensor, Tensor]:
-        """See :func:`lif`."""
-        ctx.beta, ctx.theta, ctx.surrogate = beta, theta, surrogate
-        spikes, membrane = torch.empty_like(current), torch.empty_like(current)
-        u = torch.zeros_like(current[0])
-        for t in range(len(current)):
-            u = torch.where(u > theta, 0.0, u * beta) + current[t]
-            membrane[t] = u
-            spikes[t] = u > theta
+    def forward(ctx: Any, membrane: Tensor, theta: float, surrogate: Surrogate) -> Tensor:
+        """Zeros and ones."""
         ctx.save_for_backward(membrane)
-        ctx.mark_non_differentiable(membrane)
-        ctx.set_materialize_grads(False)
-        return spikes, membrane
+        ctx.theta, ctx.surrogate = theta, surrogate
+        return (membrane > theta).to(membrane.dtype)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None, None]:
-        """Gradient of the spikes through decay and reset."""
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        """The surrogate at the distance from the threshold."""
         (membrane,) = ctx.saved_tensors
         surrogate: Surrogate = ctx.surrogate
-        out = torch.empty_like(membrane)
-        later = torch.zeros_like(membrane[0])
-        for t in range(len(membrane) - 1, -1, -1):
-            u = membrane[t]
-            through_spike = gradients[0][t]
-            if surrogate.reset:
-                through_spike = through_spike - later * (u * ctx.beta)
-            distance = (u - ctx.theta).abs()
-            if surrogate.shape == FAST_SIGMOID:
-                spike_part = through_spike / (1 + distance / surrogate.width) ** 2
-            else:
-                spike_part = torch.where(distance < surrogate.width, through_spike, 0.0)
-            later = torch.where(u > ctx.theta, 0.0, later * ctx.beta) + spike_part
-            out[t] = later
-        return out, None, None, None
+        distance = (membrane - ctx.theta).abs()
+        if surrogate.shape == FAST_SIGMOID:
+            return gradients[0] / (1 + distance / surrogate.width) ** 2, None, None
+        return gradients[0] * (distance < surrogate.width), None, None
+
+
+def lif_steps(current: Tensor, beta: float, theta: float, surrogate: Surrogate = RECTANGLE) -> tuple[Tensor, Tensor]:
+    """As :func:`lif` in torch operations, one step at a time: for devices without the kernels."""
+    spike: Tensor = torch.zeros_like(current[0])
+    u, spikes, membranes = spike, list[Tensor](), list[Tensor]()
+    for drive in current:
+        u = beta * u * (1 - (spike if surrogate.reset else spike.detach())) + drive
+        spike = Spike.apply(u, theta, surrogate)  # type: ignore[no-untyped-call]
+        spikes.append(spike)
+        membranes.append(u.detach())
+    return torch.stack(spikes), torch.stack(membranes)
+
+
+def lasting_current(drive: Tensor, alpha: float) -> Tensor:
+    """Synaptic currents along the first axis, from rest: ``i_t = alpha * i_{t-1} + drive_t``.
+
+    Examples
+    --------
+    >>> lasting_current(torch.tensor([1.0, 0.0, 2.0]), 0.5).tolist()
+    [1.0, 0.5, 2.25]
+    """
+    current: Tensor = _LastingCurrent.apply(drive, alpha)  # type: ignore[no-untyped-call]
+    return current
+
+
+class _LastingCurrent(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, drive: Tensor, alpha: float) -> Tensor:
+        ctx.alpha = alpha
+        return _accumulated(drive, alpha, backwards=False)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        return _accumulated(gradients[0], ctx.alpha, backwards=True), None
+
+
+def _accumulated(steps: Tensor, alpha: float, *, backwards: bool) -> Tensor:
+    found = steps.clone(memory_format=torch.contiguous_format)
+    if found.device.type == "cpu":
+        accumulate(rows_of(found), kind_of(found)(alpha), backwards)
+    else:
+        accumulate_steps(found, alpha, backwards=backwards)
+    return found
+
+
+def accumulate_steps(current: Tensor, alpha: float, *, backwards: bool) -> None:
+    """What :func:`accumulate` does, in torch operations: for devices without the kernels."""
+    steps = range(len(current) - 2, -1, -1) if backwards else range(1, len(current))
+    before = 1 if backwards else -1
+    for t in steps:
+        current[t] += alpha * current[t + before]
 
 
 def spike_linear(spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -281,6 +313,23 @@ def _differentiate(
         else:
             _differentiate_step(spikes_gradient[t], membrane[t], later, beta, theta, width, reset, out[t])
         later = out[t]
+
+
+@numba.njit(cache=True)
+def _accumulate_step(current: Any, before: Any, alpha: Any) -> None:
+    for i in range(len(current)):
+        current[i] += alpha * before[i]
+
+
+@numba.njit(cache=True)
+def accumulate(current: Any, alpha: Any, backwards: bool) -> None:
+    """Add to each row (steps, neurons) the share `alpha` of the one before, in place; from the end if backwards."""
+    steps = len(current)
+    for t in range(1, steps):
+        if backwards:
+            _accumulate_step(current[steps - 1 - t], current[steps - t], alpha)
+        else:
+            _accumulate_step(current[t], current[t - 1], alpha)
 
 
 @numba.njit(cache=True)

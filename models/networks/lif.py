@@ -6,27 +6,11 @@ compiled (:func:`module.compile_module`). How it is trained is its own affair.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
+from spikeloom.models.networks.layers import Spike
 from spikeloom.models.networks.surrogate import RECTANGLE
-
-
-class _Spike(torch.autograd.Function):
-    """``u > theta``, with the rectangular surrogate for its derivative."""
-
-    @staticmethod
-    def forward(ctx: Any, membrane: Tensor, theta: float) -> Tensor:
-        ctx.save_for_backward(membrane)
-        ctx.theta = theta
-        return (membrane > theta).to(membrane.dtype)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        (membrane,) = ctx.saved_tensors
-        return gradients[0] * ((membrane - ctx.theta).abs() < RECTANGLE.width), None
 
 
 class LIF(nn.Module):
@@ -58,7 +42,7 @@ class LIF(nn.Module):
             membrane = current
         else:
             membrane = self.membrane * self.beta * (1.0 - self.spikes) + current
-        spikes: Tensor = _Spike.apply(membrane, self.theta)  # type: ignore[no-untyped-call]
+        spikes: Tensor = Spike.apply(membrane, self.theta, RECTANGLE)  # type: ignore[no-untyped-call]
         self.membrane, self.spikes = membrane, spikes
         return spikes
 

@@ -181,20 +181,12 @@ def module_network(
 ) -> Network:
     """Lower a module to a network of populations and synapses, in float64.
 
-    Parameters
-    ----------
-    net : Module
-        Any module whose ``forward`` takes the input of one step and calls :class:`lif.LIF` layers; it returns
-        the spikes of the last one, or a sum of them for each class. It is copied and brought to rest.
-    example : Tensor
-        Input of one step. Its first axis may be a batch; else the module is probed one input at a time.
-    polarities, polarities_first : optional
-        See :func:`sensor_layout.sensor_layout`.
+    The ``forward`` of `net` takes the input of one step and calls :class:`lif.LIF` layers; it returns the spikes of the
+    last one, or a sum of them for each class. It is copied and brought to rest. The `example` is an input of one step;
+    its first axis may be a batch, else the module is probed one input at a time. For `polarities` and
+    `polarities_first` see :func:`sensor_layout.sensor_layout`.
 
-    Raises
-    ------
-    ModelError
-        If a stage is not affine, or the chip cannot have the network.
+    ModelError if a stage is not affine, or the chip cannot have the network.
 
     Examples
     --------

@@ -20,8 +20,14 @@ from torch import Tensor, nn
 
 from spikeloom.compiler.dynamics import PLAIN, RELAY_WEIGHT, Clocks, Dynamics
 from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, feature_major, in_order
-from spikeloom.models.networks.currents import lasting_current
-from spikeloom.models.networks.layers import filter_places, lif, rates_of, spike_linear, tag_convolution
+from spikeloom.models.networks.layers import (
+    filter_places,
+    lasting_current,
+    lif,
+    rates_of,
+    spike_linear,
+    tag_convolution,
+)
 from spikeloom.models.networks.surrogate import RECTANGLE, Surrogate
 from spikeloom.models.systems import HOPS, filters_of
 
@@ -112,20 +118,10 @@ class Sizes(Protocol):
 class SpikingNet(TrainedModule):
     """A first layer, dense layers and a spike-count vote; every layer is one of LIF neurons [1]_.
 
-    Parameters
-    ----------
-    architecture : Architecture
-        Sizes.
-    propagation : (taxels, taxels) or (filters, places, taxels) float64
-        What the first layer sees, see :func:`systems.propagation_of`.
-    seed : int
-        Of the initial weights: uniform within 1/sqrt(fan-in), as torch and torch_geometric draw them; the bias of
-        a graph convolution starts at zero. The global random state is neither used nor moved.
-    surrogate : Surrogate
-        Derivative of a spike.
+    `propagation` is what the first layer sees, see :func:`systems.propagation_of`. The `seed` is that of the initial
+    weights: uniform within 1/sqrt(fan-in), as torch and torch_geometric draw them; the bias of a graph convolution
+    starts at zero. The global random state is neither used nor moved. The `surrogate` is the derivative of a spike.
 
-    Notes
-    -----
     Neurons of the first layer lie place by place here; exported weights are in the order of the system. The relays of
     clocks come last.
 

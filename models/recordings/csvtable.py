@@ -49,10 +49,7 @@ def read_table(
 
     The table has at least one row; values may be infinite or NaN.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be read or is not such a table; the message names the line.
+    DataError if the file cannot be read or is not such a table; the message names the line.
     """
     where = where or Path(path).name
     known = (*required, *optional)

@@ -47,11 +47,8 @@ class EventStream:
 def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, where: str | None = None) -> EventStream:
     """Read a ``.csv`` or a ``.npz`` of one-dimensional arrays, whose ``label`` may be one number.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be read, holds no events, or one that a sensor of so many `taxels` does not send; the
-        message names the event.
+    DataError if the file cannot be read, holds no events, or one that a sensor of so many `taxels` does not send; the
+    message names the event.
     """
     path = Path(path)
     where = where or path.name

@@ -67,29 +67,15 @@ def load_data(
 ) -> Recordings:
     """Read the first `limit` recordings of a split, files in plain string order.
 
-    Parameters
-    ----------
-    path : path or str
-        A folder or zip in the released layout; a folder of ``.csv``, ``.npz`` and ``.npy`` recordings, flat (it
-        stands for any split) or with ``train/`` and ``test/``; one such file; or the name of a data set that was
-        fetched.
-    bin_s : float
-        Width of a time bin, seconds. The released layout and ``.npy`` files have bins already: see `require_events`.
-    taxels, classes : int, optional
-        What the network expects. Without `taxels` the highest taxel with an event decides.
+    The path is a folder or zip in the released layout; a folder of ``.csv``, ``.npz`` and ``.npy`` recordings, flat (it
+    stands for any split) or with ``train/`` and ``test/``; one such file; or the name of a data set that was fetched.
+    `bin_s` is the width of a time bin in seconds; the released layout and ``.npy`` files have bins already, see
+    `require_events`. The network expects so many `taxels` and `classes`; without `taxels` the highest taxel with an
+    event decides. Labels are `UNLABELLED` where nothing says them, see `need_labels`. In the released layout all
+    recordings have labels, the same steps and taxels, and no counts.
 
-    Returns
-    -------
-    Recordings
-        Labels are `UNLABELLED` where nothing says them; see `need_labels`. In the released layout all have labels, the
-        same steps and taxels, and no counts.
-
-    Raises
-    ------
-    DataError
-        If a recording cannot be used; the message names file and place.
-    OptionError
-        If `bin_s` is not a duration, or given for what has bins already; if `limit` is below 1.
+    DataError if a recording cannot be used, with file and place; OptionError if `bin_s` is not a duration or given for
+    what has bins already, or `limit` is below 1.
     """
     if not (math.isfinite(bin_s) and bin_s > 0):
         raise OptionError(f"--bin {bin_s:g}: not a duration; give seconds above 0, for example {BIN_S:g}")
@@ -194,10 +180,7 @@ def bin_events(
     counts : EventCounts
         For this recording.
 
-    Raises
-    ------
-    DataError
-        If an event is later than `MAX_STEPS` bins.
+    DataError if an event is later than `MAX_STEPS` bins.
     """
     latest = int(np.argmax(stream.time_s))
     unit = likely_unit(stream.time_s)

@@ -105,10 +105,7 @@ class Recordings:
 def opened(path: Path) -> Iterator[Members]:
     """What opens each recording of a folder, or npy file of a zip, by its name with slashes; folders two levels deep.
 
-    Raises
-    ------
-    DataError
-        If there is no such folder or zip, or the zip announces more than `MAX_TOTAL_BYTES`.
+    DataError if there is no such folder or zip, or the zip announces more than `MAX_TOTAL_BYTES`.
     """
     if path.is_dir():
         files = [file for depth in ("*", "*/*", "*/*/*") for file in path.glob(depth) if file.is_file()]

@@ -80,10 +80,8 @@ def fetch_data(name: str, *, url: str | None = None, folder: str | os.PathLike[s
 
     `url` is another address of the same file; the `folder`, `data_folder` by default, is made if needed.
 
-    Raises
-    ------
-    OptionError, DataError
-        If there is no such data set, or the address does not serve the released file, after `RETRIES` more attempts.
+    OptionError, DataError if there is no such data set, or the address does not serve the released file, after
+    `RETRIES` more attempts.
     """
     data = _known(name)
     url = url or data.url

@@ -74,24 +74,10 @@ def synthetic_grasps(
 ) -> Recordings:
     """Draw grasps with random place, orientation, size, depth and speed.
 
-    Parameters
-    ----------
-    coordinates : (taxels, 2) array
-        The layout; only its proportions matter. Further dimensions are ignored.
-    per_class : int
-        Grasps of each class.
-    steps : int
-        Length of a recording, at least `MIN_STEPS`.
-    seed : int
-        Not negative. Each grasp has a stream of its own: those of a smaller `per_class` come first in a larger
-        one, and the choice of classes does not change them.
-    classes : tuple of str
-        Which of `SHAPES`; labels count along it.
-
-    Returns
-    -------
-    Recordings
-        Classes in turn, so that the first recordings hold all of them.
+    Of the layout `coordinates` (taxels, 2) in any unit only the proportions matter. A recording has `steps`, at least
+    `MIN_STEPS`. Each grasp has a stream of its own: those of a smaller `per_class` come first in a larger one, and the
+    choice of `classes` among `SHAPES`, along which labels count, does not change them. Classes come in turn, so that
+    the first recordings hold all of them.
 
     Examples
     --------

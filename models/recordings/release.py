@@ -31,10 +31,7 @@ def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings]) -
     A zip that exists is replaced, a folder must not exist. Numbers have leading zeros, so that the plain order of the
     files is the order of the recordings.
 
-    Raises
-    ------
-    OptionError, DataError
-        If there is no place for it, or a recording has no label.
+    OptionError, DataError if there is no place for it, or a recording has no label.
     """
     path = Path(path)
     for recordings in splits:
@@ -85,10 +82,7 @@ def _name(recordings: Recordings, index: int) -> str:
 def write_event_lines(path: str | os.PathLike[str], splits: Sequence[Recordings], bin_s: float) -> None:
     """Write one recording as lines ``time_s,taxel,polarity``, each event at the middle of its bin.
 
-    Raises
-    ------
-    DataError
-        If there are several recordings.
+    DataError if there are several recordings.
     """
     count = sum(len(recordings) for recordings in splits)
     if count != 1:

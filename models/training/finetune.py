@@ -99,29 +99,14 @@ def finetune(
     resume: bool = False,
     after_epoch: Callable[[TunedEpoch], None] | None = None,
 ) -> Tuned:
-    """Train a network on chip integers.
+    """Train a network on chip integers: storage of `bits`, one or one a layer, with at most so many `groups` of scales.
 
-    Parameters
-    ----------
-    training, test : Recordings
-        Both splits; nothing is chosen on `test`, it is read before the first epoch and after the last.
-    bits : sequence of int
-        Storage width, one or one for each layer.
-    groups : int
-        Scales of a layer, at most.
-    epochs, seed : int
-        Passes over the training recordings; order of the recordings.
-    state : path, optional
-        File that holds the state after each epoch; the caller removes it when the result is safe.
-    resume : bool
-        Continue from `state`; the result is that of an uninterrupted fine-tuning, bit for bit.
-    after_epoch : callable, optional
-        Called with the figures of each epoch.
+    Nothing is chosen on `test`, it is read before the first epoch and after the last. The `seed` is that of the order
+    of recordings. The file `state` holds the state after each epoch, which the caller removes when the result is safe;
+    `resume` goes on from it, to the same weights as without interruption.
 
-    Raises
-    ------
-    OptionError, ModelError, DataError
-        If options, network or recordings cannot be used, or the loss is no longer a number.
+    OptionError, ModelError or DataError if options, network or recordings cannot be used, or the loss is no longer a
+    number.
     """
     widths = check_bits(bits, 1 + len(checkpoint.dense), target)
     for name, value, least in (("--epochs", epochs, 1), ("--seed", seed, 0)):

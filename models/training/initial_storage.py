@@ -44,10 +44,7 @@ def initial_forms(
 
     `calibration` gives the rate of each input; every layer has its width in `bits` and so many scales at most.
 
-    Raises
-    ------
-    ModelError
-        If no exponent gives a threshold and biases that the registers hold.
+    ModelError if no exponent gives a threshold and biases that the registers hold.
     """
     forms = []
     for post, (population, width) in enumerate(zip(network.populations, bits, strict=True)):

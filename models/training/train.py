@@ -87,36 +87,16 @@ def train(
     position: int = 0,
     after_epoch: Callable[[Epoch], None] | None = None,
 ) -> Trained:
-    """Train a network from scratch, or go on with an interrupted training.
+    """Train a network from scratch, or go on with an interrupted training; `test` is only looked at.
 
-    Parameters
-    ----------
-    training, test : Recordings
-        Both splits; `test` is only looked at.
-    propagation : (taxels, taxels) or (filters, places, taxels) float64
-        What the first layer sees, see :func:`systems.propagation_of`.
-    seed : int
-        Of the initial weights and of the order of recordings.
-    recipe : Recipe
-        Batch, loss, surrogate, optimizer and schedule; its sizes and dynamics are already in the architecture.
-    keep_epoch : int, optional
-        Epoch, counted from 1, whose weights are kept too.
-    state : path, optional
-        File that holds the state after each epoch; the caller removes it when the result is safe.
-    resume : bool
-        Continue from `state` if it exists. On the CPU the final weights equal those of an uninterrupted training.
-    label, position : str, int
-        Name and row of the progress bar, where several trainings run side by side.
-    after_epoch : callable, optional
-        Called with the figures of each epoch.
+    `propagation` is what the first layer sees, see :func:`systems.propagation_of`; the sizes and dynamics of the
+    `recipe` are already in the architecture. The `seed` is that of the initial weights and of the order of recordings.
+    The weights after epoch `keep_epoch`, counted from 1, are kept too. The file `state` holds the state after each
+    epoch, which the caller removes when the result is safe; `resume` goes on from it, on the CPU to the same weights as
+    without interruption. `label` and `position` are name and row of the progress bar.
 
-    Raises
-    ------
-    OptionError
-        If `epochs`, the recipe's `decay_epochs` or `seed` is too small, there is no such device, or `state` belongs to
-        another training.
-    DataError
-        If recordings and architecture disagree, or the loss is no longer a number.
+    OptionError if a number is too small, there is no such device, or `state` is another training's. DataError if
+    recordings and architecture disagree, or the loss is no longer a number.
     """
     _require_options(epochs, recipe.decay_epochs, seed, device)
     for recordings in (training, test):

@@ -24,14 +24,13 @@ from spikeloom.models.training.recipes import LAYERS, RECIPES, Recipe
 SYSTEMS = systems.SYSTEMS
 COPIES: tuple[int, ...] = ()
 
+read = read_checkpoint
+
 
 def recipe_for(name: str, given: Mapping[str, Any]) -> Recipe:
     """The recipe of that name.
 
-    Raises
-    ------
-    OptionError
-        If copies of inputs are wanted.
+    OptionError if copies of inputs are wanted.
     """
     if "--copies" in given:
         raise OptionError(f"--copies {given['--copies']}: is for chips whose inputs have copies; omit it")
@@ -65,11 +64,6 @@ def save(path: Path, kept: Mapping[str, Any], plan: Plan, record: Mapping[str, A
         dynamics=sizes.dynamics,
         bins=plan.bins,
     )
-
-
-def read(path: Path) -> Checkpoint:
-    """Read a checkpoint."""
-    return read_checkpoint(path)
 
 
 def differing(found: Checkpoint, plan: Plan) -> list[str]:

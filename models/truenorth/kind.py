@@ -20,6 +20,8 @@ from spikeloom.models.truenorth import network
 SYSTEMS = (SYSTEM,)
 COPIES = tuple(BASES)
 
+read = read_trained
+
 CROSSBARS = Recipe(
     name="truenorth",
     epochs=30,
@@ -71,11 +73,6 @@ def save(path: Path, kept: Mapping[str, Any], plan: Plan, record: Mapping[str, A
     sizes = architecture(plan)
     networks = {which: network.native_network(sizes, arrays) for which, arrays in kept.items()}
     write_trained(path, networks, graph=plan.graph.name, edges=plan.graph.edges, training=record)
-
-
-def read(path: Path) -> Trained:
-    """Read a file."""
-    return read_trained(path)
 
 
 def differing(found: Trained, plan: Plan) -> list[str]:

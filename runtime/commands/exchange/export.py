@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.formats.onnx import writer_float
 from spikeloom.compiler.formats.onnx.builder import port_words
@@ -32,17 +31,8 @@ TITLES = {each.name: each.title for each in FORMATS} | {
 }
 """Values of ``--to``."""
 
-ABSENT: dict[str, Any] = {
-    "form": None,
-    "data": None,
-    "split": None,
-    "bin": BIN_S,
-    "recording": None,
-    "limit": None,
-    "dt": None,
-    "strict": False,
-}
-"""Options of single formats, and what they are where they are not given."""
+OPTIONS = ("form", "data", "split", "bin", "recording", "limit", "dt", "strict")
+"""Of single formats."""
 
 OF_RECORDINGS = ("split", "bin", "recording", "limit")
 
@@ -125,14 +115,12 @@ def _request(arguments: argparse.Namespace) -> Request:
 def _require_fit(arguments: argparse.Namespace, chosen: Format | None) -> None:
     """Refuse options that the format would ignore."""
     users = {each.name: each.options for each in FORMATS} | {FLOAT: ("form",)}
-    given = {name: getattr(arguments, name) for name, absent in ABSENT.items() if getattr(arguments, name) != absent}
-    for name, value in given.items():
-        shown = f"--{name}" if value is True else f"--{name} {value}"
+    for name in OPTIONS:
         if name not in users[arguments.to]:
-            formats = [to for to, options in users.items() if name in options]
-            raise OptionError(f"{shown}: is for {' and '.join(formats)}, --to says {arguments.to}; omit it")
-        if name in OF_RECORDINGS and arguments.data is None:
-            raise OptionError(f"{shown}: says which recording of --data, which is not given; add it")
+            formats = " and ".join(to for to, options in users.items() if name in options)
+            refuse(arguments, (name,), f"is for {formats}, --to says {arguments.to}")
+        elif name in OF_RECORDINGS and arguments.data is None:
+            refuse(arguments, (name,), "says which recording of --data, which is not given")
     if chosen is not None:
         refuse(arguments, NETWORK, f"is for checkpoints, --to {arguments.to} takes a netlist")
 

@@ -136,7 +136,6 @@ class Watch:
     repeated: int = 0
     late: int = 0
     early: int = 0
-    step_s: list[float] = field(default_factory=list)
 
     def run(self) -> bool:
         """Follow the lines to their end; return whether the user, or the reader of our output, ended it before."""
@@ -193,10 +192,8 @@ class Watch:
         """Step the open bin, not before its end by the wall clock if that counts."""
         if self.real and wait:
             time.sleep(max(0.0, self._wall(self.stream.index + 1) - time.monotonic()))
-        begun = time.perf_counter()
         step = self.stream.step(self.column)
         self.last = (step,)
-        self.step_s.append(time.perf_counter() - begun)
         self.column[:] = 0
         self.display.bin(self.grasps + 1, step)
         if step.index + 1 == self.bins:
@@ -225,15 +222,6 @@ class Watch:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StepTime:
-    """Median and 99th percentile of the time of a step, also as a share of a bin."""
-
-    median_ms: float
-    p99_ms: float
-    p99_share_of_bin: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
     """All grasps together; `early` counts those that ended before their length, where they may."""
 
@@ -245,7 +233,6 @@ class Summary:
     late: int
     interrupted: bool
     early: int | None = field(default=None, metadata=OPTIONAL)
-    step: StepTime | None = field(default=None, metadata=OPTIONAL)
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
@@ -299,7 +286,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
         late=session.late,
         interrupted=interrupted,
         early=None if factor is None else session.early,
-        step=_timing(session.step_s, float(bin_s)) if arguments.timing else None,
     )
     return Outcome(summary, sections)
 
@@ -334,7 +320,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="A",
         help="end a grasp of --bins once nothing can change the vote, or it leads by A*sqrt(bins left) (see anytime)",
     )
-    parser.add_argument("--timing", action="store_true", help="add the time that steps took to the summary")
     parser.epilog = NOTES
 
 
@@ -367,18 +352,9 @@ def _standing(step: Step) -> str:
     return f"class {step.decision}, {number(int(step.counts.max()), 'vote')}, {ahead}"
 
 
-def _timing(step_s: list[float], bin_s: float) -> StepTime:
-    median, late = np.percentile(step_s or [0.0], [50, 99]).tolist()
-    return StepTime(median_ms=1e3 * median, p99_ms=1e3 * late, p99_share_of_bin=late / bin_s)
-
-
 def sections(found: Summary) -> list[Section]:
     """The summary for people."""
     parts = [number(found.grasps, "grasp"), number(found.bins, "bin"), number(found.events, "event")]
     parts += [f"{found.repeated} repeated within a bin", f"{found.late} late"]
     text = ", ".join([*parts, *([] if found.early is None else [f"{found.early} ended early"])])
-    if found.step is not None:
-        step = found.step
-        share = f"{100 * step.p99_share_of_bin:.2g} % of a bin"
-        text += f"\nstep: median {step.median_ms:.3f} ms, 99th percentile {step.p99_ms:.3f} ms ({share})"
     return [Section("Watched", [Text(text + ("\ninterrupted" if found.interrupted else ""))])]

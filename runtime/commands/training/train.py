@@ -149,18 +149,10 @@ def plan_jobs(arguments: argparse.Namespace, training: Recordings, test: Recordi
     """One job for each seed that the options ask for, on recordings of their data."""
     graph, grid = _sensor(arguments)
     system = arguments.system or TACTILESGNET
-    data = arguments.data if arguments.data == SYNTHETIC else training.source
-    words = [
-        f"spikeloom train --data {data}",
-        *repeat.words({"bin": arguments.bin}),
-        f"--join {arguments.join}" if arguments.join > 1 else "",
-    ]
-    sensor = repeat.given(arguments, ("graph", "taxels", "edges", "directed"))
-    sensor |= {name: Path(sensor[name]).name for name in ("taxels", "edges") if sensor[name]}
-    words += [_system_words(arguments, system), *repeat.words(sensor)]
     recipe = _recipe(arguments)
     epochs = recipe.epochs if arguments.epochs is None else arguments.epochs
-    command = " ".join(filter(None, [*words, _recipe_words(arguments), f"--epochs {epochs}"]))
+    data = SYNTHETIC if arguments.data == SYNTHETIC else training.source
+    command = " ".join(_words(arguments, {"data": data}, {"epochs": epochs}))
     plan = Plan(
         system=system,
         graph=graph,
@@ -232,17 +224,16 @@ def _named_recipe(arguments: argparse.Namespace) -> Recipe:
     return kind_of(arguments.system or TACTILESGNET).recipe_for(arguments.recipe, options)
 
 
-def _recipe_words(arguments: argparse.Namespace) -> str:
-    """Options that name the recipe, as they would be typed; none for the released one."""
-    words = [] if arguments.recipe == RELEASED.name else [f"--recipe {arguments.recipe}"]
-    given = {name: getattr(arguments, name) for name in OVERRIDES}
-    usual = _named_recipe(arguments)
-    words += [
-        f"--{name.replace('_', '-')} {value}"
-        for name, value in given.items()
-        if value is not None and value != getattr(usual, name, None)
-    ]
-    return " ".join(words)
+def _words(arguments: argparse.Namespace, first: dict[str, Any], last: dict[str, Any]) -> list[str]:
+    """The words that ask for the same training, without the seed and the output."""
+    names = ("bin", "join", "system", "padding", "copies", "graph", "taxels", "edges", "directed", "recipe")
+    usual = {"join": 1, "system": TACTILESGNET, "copies": USUAL_COPIES, "recipe": RELEASED.name}
+    recipe = _named_recipe(arguments)
+    usual |= {name: getattr(recipe, name, None) for name in OVERRIDES}
+    options = repeat.given(arguments, (*names, *OVERRIDES))
+    options = {name: None if value == usual.get(name) else value for name, value in options.items()}
+    files = {name: Path(options[name]).name for name in ("taxels", "edges") if options[name]}
+    return ["spikeloom", "train", *repeat.words(first | options | files | last)]
 
 
 def _sensor(arguments: argparse.Namespace) -> tuple[Graph, Grid | None]:
@@ -260,11 +251,3 @@ def _sensor(arguments: argparse.Namespace) -> tuple[Graph, Grid | None]:
     if graph is None:
         raise OptionError(f"train: no graph; name it with --graph: {CHOICES}, or give --edges")
     return graph, None
-
-
-def _system_words(arguments: argparse.Namespace, system: str) -> str:
-    """Options that name the system, as they would be typed; none for the usual one."""
-    words = [] if system == TACTILESGNET else [f"--system {system}"]
-    words += [f"--padding {arguments.padding}"] if arguments.padding else []
-    words += [f"--copies {arguments.copies}"] if arguments.copies not in (None, USUAL_COPIES) else []
-    return " ".join(words)

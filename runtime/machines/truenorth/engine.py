@@ -59,12 +59,9 @@ def prepare(netlist: CrossbarNetlist, *, careful: bool = False) -> Engine:
     axon, neuron, halves = (column[near] for column in synapses)
     bounds, segments, row = _segments(axon, neuron, halves, axons)
     axon, neuron, halves = (column[~near] for column in synapses)
-    # of each neuron: the axon that its spikes reach and their delay, and whether they need not be queued
+    # of each neuron: the axon that its spikes reach, and their delay
     target, delay = np.full(netlist.n_neurons, -1), np.zeros(netlist.n_neurons, np.int64)
-    direct = np.zeros(netlist.n_neurons, np.bool_)
     target[netlist.wire_neuron], delay[netlist.wire_neuron] = twins.axon[wires], netlist.wire_delay
-    far = np.bincount(axon, minlength=axons) > 0
-    direct[netlist.wire_neuron] = twins.single[wires] & ~far[twins.axon[wires]] & (netlist.wire_delay == 1)
     votes = np.where(netlist.readout_class >= 0, netlist.readout_first, -1)
     columns = [*(getattr(netlist, name) for name in kernel.PARAMETERS), target, delay, votes]
     wiring = kernel.Wiring(
@@ -81,7 +78,6 @@ def prepare(netlist: CrossbarNetlist, *, careful: bool = False) -> Engine:
         synapse_weight=halves,
         number=first.astype(np.int64),
         parameters=np.stack(columns, axis=1)[first].astype(np.int32),
-        direct=direct[first],
         initial=netlist.initial[first].astype(np.int32),
     )
     return Engine(
@@ -179,12 +175,8 @@ def simulate(
     none depends on its neighbours. Spikes and membranes are kept where they are wanted, at one and four bytes a neuron
     and tick.
 
-    Raises
-    ------
-    DataError
-        If the recordings have another number of input channels than the network.
-    NumericRangeError
-        If they would take more ticks than a run can count.
+    DataError if the recordings have another number of input channels than the network. NumericRangeError if they would
+    take more ticks than a run can count.
     """
     engine = network if isinstance(network, Engine) else prepare(network)
     netlist = engine.netlist

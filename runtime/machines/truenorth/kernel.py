@@ -60,9 +60,6 @@ class Wiring(NamedTuple):
     synapse_weight: IntArray  # (synapses,) int64; in halves
     number: IntArray  # (neurons,) int64; which neuron of the network it is, whose random numbers it draws
     parameters: Int32  # (neurons, 11) int32
-    # (neurons,) bool; whether a spike reaches steady neurons alone, in the next tick, on an axon that nothing else
-    # leads to
-    direct: npt.NDArray[np.bool_]
     initial: Int32  # (neurons,) int32
 
 
@@ -234,31 +231,12 @@ def _send_steady(
     steady: Any, tick: Any, ticks: Any, window: Any, slots: Any, wiring: Any, state: Any, tallies: Any
 ) -> Any:
     """Lead on all spikes of steady neurons; returns those that merge."""
-    merged, last, traced = 0, tick + 1 >= ticks, len(tallies.raster) > 0
-    direct, axon_of, sums, row = wiring.direct, wiring.parameters[:, AXON], state.steady_sum, wiring.row
-    bounds, segments, spikes, axons = wiring.segment_bounds, wiring.segments, tallies.spikes, tallies.axons
-    words = state.steady_spike.view(np.uint64)
+    merged, words = 0, state.steady_spike.view(np.uint64)
     for word in range(len(words)):
         if words[word]:
             for n in range(WORD * word, min(WORD * word + WORD, steady)):
-                if not state.steady_spike[n]:
-                    continue
-                if not direct[n]:
+                if state.steady_spike[n]:
                     merged += _send(n, tick, ticks, window, slots, wiring, state, tallies)
-                    continue
-                spikes[n] += 1
-                if traced:
-                    tallies.raster[tick, n] = True
-                if last:
-                    continue
-                axon = axon_of[n]
-                axons[axon] += 1
-                for s in range(bounds[axon], bounds[axon + 1]):  # the sums of this tick are taken already
-                    first, end, at = segments[s, 0], segments[s, 1], segments[s, 2]
-                    if end - first == 1:
-                        sums[first] += row[at]
-                    else:
-                        _add(sums[first:end], row[at : at + end - first])
     return merged
 
 

@@ -27,7 +27,6 @@ _REGISTERS = (
 class Twins:
     """Which neurons and axons are of a kind."""
 
-    single: BoolArray  # (axons,); whether only one thing leads to an axon
     # neuron, axon: (neurons,), (axons,) int64; kind of each
     neuron: IntArray
     axon: IntArray
@@ -68,7 +67,6 @@ def find_twins(netlist: CrossbarNetlist, half: int) -> Twins:
     ends, starts, sums = kind[pairs[0][kept]], pairs[1][kept], weights[kept]
     order = np.lexsort((ends, starts))
     return Twins(
-        single=single,
         neuron=kind,
         axon=axon_kind,
         first_neuron=first_neuron,
