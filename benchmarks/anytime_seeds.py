@@ -13,14 +13,12 @@ import argparse
 import numpy as np
 
 from spikeloom.compiler import compile_network
-from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.commands.choose.anytime import ALLOWED
 from spikeloom.runtime.inputs.network import propagation
 from spikeloom.runtime.machines.integer import integer_machine_of
-from spikeloom.runtime.machines.loihi1.costs import cumulative
 from spikeloom.runtime.report.sections import Table
 from spikeloom.runtime.studies.anytime import exits
 
@@ -37,7 +35,7 @@ def main() -> None:
         checkpoint = read_checkpoint(path)
         netlist = compile_network(expand(checkpoint, propagation(checkpoint, None, path)[1])).netlist
         seen, reported = (
-            cumulative.votes_of(netlist, with_clocks(data.events, netlist.clocks), own)
+            integer_machine_of(netlist).cumulative(data.events, own).votes
             for data, own in zip(splits, lengths, strict=True)
         )
         at = exits.standing(reported, lengths[1])

@@ -44,7 +44,7 @@ def counts(netlist: Netlist) -> Run:
         assert trace.charged is not None
         steps = np.full(len(events), events.shape[2])
         timing.simple_times(latencies, trace.charged, steps + engine.drain)
-        cost.estimate(meter, trace.counts, steps)
+        cost.estimate(meter, trace.counts, steps + engine.drain)
         return trace
 
     return run
@@ -64,7 +64,7 @@ def cycle(netlist: Netlist) -> Run:
         steps = np.full(len(events), events.shape[2])
         timing.simple_times(latencies, trace.charged, steps + engine.drain)
         timing.detailed(latencies, trace.spikes, trace.updated, events)
-        cost.estimate(meter, trace.counts, events.shape[2])
+        cost.estimate(meter, trace.counts, steps + engine.drain)
         return trace
 
     return run

@@ -63,7 +63,8 @@ def measure(
     ).netlist
     trace = engine.simulate(netlist, test.events.reshape(len(test), -1, test.steps), spikes=True)
     assert trace.spikes is not None
-    costs = cost.estimate(cost.prepare(netlist, load_target(netlist.target)), trace.counts, test.steps)
+    meter = cost.prepare(netlist, load_target(netlist.target))
+    costs = cost.estimate(meter, trace.counts, test.steps + netlist.max_depth)
     kept = integer_machine_of(netlist).compared()
     different = {
         layer.name: int(np.count_nonzero((aligned(netlist, trace.spikes, i) != reference[layer.name])[..., kept[i]]))

@@ -27,7 +27,7 @@ from spikeloom.runtime import cli
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.machines.integer import LONGEST, integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine, kernel
-from spikeloom.runtime.machines.loihi1.costs import cost, cumulative, estimate
+from spikeloom.runtime.machines.loihi1.costs import cost, estimate
 from spikeloom.runtime.machines.loihi1.trace import Counts
 from spikeloom.runtime.machines.votes import class_counts, predictions
 from spikeloom.runtime.studies.anytime import exits
@@ -84,7 +84,7 @@ def test_all_figures_of_a_stopped_chip(report, place, monkeypatch):
                 inputs=state.inputs[None], spikes=state.spikes[None], updates=updates, saturations=0 * updates
             )
             assert rule["samples"]["decisions"][i] == predictions(netlist, counts.spikes)[0]
-            found = cost.estimate(meter, counts, ends - netlist.max_depth)
+            found = cost.estimate(meter, counts, ends)
             left = whole.costs.synaptic_operations[i].sum() - found.synaptic_operations.sum()
             assert rule["samples"]["saved_operations"][i] == left
             for name, each in found.energy.items():
@@ -120,7 +120,7 @@ def test_recordings_of_different_length_end_on_their_own(place, monkeypatch):
     monkeypatch.chdir(place)
     netlist, data = read_netlist("net.loom"), load_data("data", "test")
     lengths = np.array([60, 1, 7, 24, 33, 2, 50, 59, 60, 60, 3, 40])
-    ran = cumulative.run(netlist, load_target("loihi1"), with_clocks(data.events, netlist.clocks), lengths)
+    ran = integer_machine_of(netlist).cumulative(data.events, lengths)
     at = exits.standing(ran.votes, lengths)
     sure = exits.proven(ran.votes, at, exits.most_votes(integer_machine_of(netlist), STEPS))
     ends = exits.exits(sure, at)

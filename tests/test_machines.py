@@ -84,11 +84,8 @@ def test_what_is_compared_with_a_float_model():
     found, events = integer_machine(made.machine), made.events
     sizes = [layer.neurons for layer in found.netlist.layers]
     assert [len(out) for out in found.absent] == [len(out) for out in found.unread] == sizes
-    assert len(found.lags) == len(sizes)
-    votes = found.votes_by_step(events, LENGTHS)
     ran = found.cumulative(events, LENGTHS)
-    np.testing.assert_array_equal(ran.votes, votes)
-    np.testing.assert_array_equal(votes[:, -1], found.run(events, lengths=LENGTHS).votes)
+    np.testing.assert_array_equal(ran.votes[:, -1], found.run(events, lengths=LENGTHS).votes)
     price = found.price(events, lengths=LENGTHS, bin_s=0.02)[1]
     np.testing.assert_array_equal(ran.operations[:, -1], price.synaptic_operations)
 

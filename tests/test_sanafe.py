@@ -23,8 +23,6 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost
 
-FIT = next(table for table in LOIHI.energy if table.name == "sanafe")
-
 PROGRAM = """
 import json, sys
 import numpy as np
@@ -99,8 +97,9 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
     latencies = timing.prepare(netlist, LOIHI, SANAFE, **as_priced)
     batch = trace.spikes, updated, shifted
     simple, detailed = timing_oracle.simple(latencies, *batch), timing.detailed(latencies, *batch)
-    updates = cost.updates_by_core(netlist, updated)
-    parts = cost.by_part(FIT, cost.count_by_core(netlist, LOIHI, trace.counts, updates, steps, **as_priced))
+    counts = replace(trace.counts, updates=cost.updates_by_core(netlist, updated))
+    meter = cost.prepare(netlist, LOIHI, "core", **as_priced)
+    parts = cost.by_part(LOIHI, cost.count(meter, counts, steps))["sanafe"]
 
     names, number = sanafe.group_names(netlist), sanafe.members(netlist)
     compartment = {(names[netlist.layer[c]], int(number[c])): c for c in range(netlist.n_compartments)}

@@ -111,10 +111,9 @@ def test_the_published_energies_to_the_decimal():
     updated = timing_oracle.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
     # o fired in step 2 on what arrived; its current still holds that in step 3, and nothing else happens to it
     assert np.argwhere(trace.updated & ~updated).tolist() == [[3, 2]]
-    updates = cost.updates_by_core(netlist, updated[:, None])
-    amounts = cost.count_by_core(netlist, LOIHI, counts, updates, 1, input_tiles=(0,))
-    (fit,) = (entry for entry in LOIHI.energy if entry.name == "sanafe")
-    parts = cost.by_part(fit, amounts)
+    counts = replace(counts, updates=cost.updates_by_core(netlist, updated[:, None]))
+    amounts = cost.count(cost.prepare(netlist, LOIHI, "core", input_tiles=(0,)), counts, 1)
+    parts = cost.by_part(LOIHI, amounts)["sanafe"]
     assert {part: (1e12 * joules.sum(axis=1)).round(1).tolist() for part, joules in parts.items()} == ENERGY_PJ
 
 
@@ -277,24 +276,28 @@ def test_parts_and_cores_add_up_to_the_estimate():
     events = (np.random.default_rng(4).random((3, netlist.n_inputs, 12)) < 0.3).astype(np.uint8)
     lengths = np.array([12, 5, 0])
     trace = engine.simulate(netlist, events, lengths=lengths, spikes=True, updated=True)
-    estimate = cost.estimate(cost.prepare(netlist, LOIHI), trace.counts, lengths)
-    updates = cost.updates_by_core(netlist, trace.updated)
-    amounts = cost.count_by_core(netlist, LOIHI, trace.counts, updates, lengths + netlist.max_depth)
+    estimate = cost.estimate(cost.prepare(netlist, LOIHI), trace.counts, lengths + netlist.max_depth)
+    counts = replace(trace.counts, updates=cost.updates_by_core(netlist, trace.updated))
+    amounts = cost.estimate(cost.prepare(netlist, LOIHI, "core"), counts, lengths + netlist.max_depth).events
     assert all(amount.shape == (3, netlist.n_cores) for amount in amounts.values())
     for event, amount in amounts.items():
         np.testing.assert_allclose(amount.sum(axis=1), estimate.events[event].sum(axis=1), err_msg=event)
         assert amount.any(), event
     for priced in LOIHI.energy:
         for found in (amounts, estimate.events):
-            whole = sum(joules.sum(axis=1) for joules in cost.by_part(priced, found).values())
+            whole = sum(joules.sum(axis=1) for joules in cost.by_part(LOIHI, found)[priced.name].values())
             np.testing.assert_allclose(whole, estimate.energy[priced.name].sum(axis=1), rtol=1e-12)
 
 
 def test_amounts_of_a_core_are_its_own():
     netlist, _, trace = six_steps()
-    counts = replace(trace.counts, inputs=trace.counts.inputs[None], spikes=trace.counts.spikes[None])
     updates = cost.updates_by_core(netlist, trace.updated[None])
-    amounts = cost.count_by_core(netlist, LOIHI, counts, updates, 6)
+    counts = replace(trace.counts, inputs=trace.counts.inputs[None], spikes=trace.counts.spikes[None], updates=updates)
+
+    def amounts_of(**options):
+        return cost.count(cost.prepare(netlist, LOIHI, "core", **options), counts, 6)
+
+    amounts = amounts_of()
     # h0 fires twice and h1 once, all to o; o fires twice, to nobody; six events reach two neurons each
     assert amounts["spike"].tolist() == [[3, 2]]
     assert amounts["packet"].tolist() == amounts["hop_east_west"].tolist() == [[3, 0]]
@@ -302,11 +305,11 @@ def test_amounts_of_a_core_are_its_own():
     assert amounts["synaptic_operation_dense"].tolist() == [[12, 3]]
     assert amounts["neuron_active"].tolist() == updates.tolist()
     assert amounts["neuron_idle"].tolist() == [[12 - updates[0, 0], 6 - updates[0, 1]]]
-    fed = cost.count_by_core(netlist, LOIHI, counts, updates, 6, input_tiles=(0,))
+    fed = amounts_of(input_tiles=(0,))
     assert fed["packet"].tolist() == [[3, 0, 6]]
     assert fed["hop_north_south"].tolist() == [[0, 0, 6]]
     assert fed["neuron_idle"][:, 2:].tolist() == [[0]]
-    sparse = cost.count_by_core(netlist, LOIHI, counts, updates, 6, dense=np.zeros(netlist.n_synapses, np.bool_))
+    sparse = amounts_of(dense=np.zeros(netlist.n_synapses, np.bool_))
     assert sparse["synaptic_operation_sparse"].tolist() == [[12, 3]]
     assert not sparse["synaptic_operation_dense"].any()
 

@@ -26,7 +26,6 @@ from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.commands.exchange import watch
 from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.costs import cumulative
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import terminal
@@ -354,7 +353,7 @@ def test_a_grasp_ends_as_soon_as_it_is_sure(lively, lively_file, lines, objects,
         events = random_events(seed)
         given = () if factor is None else (factor,)
         found = objects(lively_file, lines(as_lines(events, seed)), "--bins", 40, "--until-sure", *given)
-        votes = cumulative.votes_of(lively, events.reshape(1, 20, 40), np.array([40]))
+        votes = integer_machine_of(lively).cumulative(events.reshape(1, 20, 1, 40), np.array([40])).votes
         at = exits.standing(votes, np.array([40]))
         sure = exits.proven(votes, at, exits.most_votes(integer_machine_of(lively), 40))
         end = int(exits.exits(sure, at, np.inf if factor is None else factor)[0])

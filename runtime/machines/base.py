@@ -2,7 +2,7 @@
 
 A machine is found by the target that its netlist names: the module ``machines/NAME/machine.py`` of the target
 ``compiler/targets/NAME``. What only some chips do in their own way stands in modules beside it, see
-:func:`chip_commands` and :func:`chip_chart`; formats of other programs are listed in ``machines/exports.py``.
+:func:`chip_commands`, :func:`chip_chart` and :func:`export_formats`.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime import machines
+from spikeloom.runtime.machines.export_format import Format
 from spikeloom.runtime.report.sections import Outcome
 
 EventArray = npt.NDArray[np.uint8 | np.bool_]
@@ -41,9 +42,13 @@ ENGINES = ("spikeloom", "onnx")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Run:
-    """Votes (samples, classes) int64 and, by layer, spikes and membranes (samples, steps, neurons) where kept."""
+    """Votes (samples, classes) int64 and, by layer, spikes and membranes (samples, steps, neurons) where kept.
+
+    `counts` are spikes of each neuron that the chip holds, in the order of the netlist; (samples, neurons).
+    """
 
     votes: IntArray
+    counts: IntArray
     spikes: Mapping[str, BoolArray] | None = None
     membranes: Mapping[str, npt.NDArray[np.int32]] | None = None
 
@@ -270,8 +275,18 @@ def trained_for(path: object) -> Any | None:
     """Commands of the chip that a checkpoint was trained for; None for any other network."""
     if not isinstance(path, str):
         return None
-    chips = (chip_commands(each.name) for each in iter_modules(machines.__path__) if each.ispkg)
+    chips = map(chip_commands, _chips())
     return next((chip for chip in chips if chip is not None and chip.takes(path)), None)
+
+
+def export_formats() -> list[Format]:
+    """Formats of other programs that the machines can write: ``FORMATS`` of each chip's module ``exports``."""
+    modules = [_own_module(name, "exports") for name in _chips()]
+    return [each for module in modules if module is not None for each in module.FORMATS]
+
+
+def _chips() -> list[str]:
+    return [each.name for each in iter_modules(machines.__path__) if each.ispkg]
 
 
 def compiled(compilation: Any, sha256: str, facts: Sequence[str]) -> Outcome:

@@ -50,38 +50,9 @@ class IntegerMachine(Machine):
     def integer(self) -> IntegerNetwork:
         """The netlist, cores forgotten; raises FormatError where it is no such network."""
 
-    @property
-    @abstractmethod
-    def lags(self) -> tuple[int, ...]:
-        """Chip steps by which each layer is behind the data."""
-
-    @property
-    @abstractmethod
-    def absent(self) -> tuple[BoolArray, ...]:
-        """Neurons of each layer, (neurons,) bool, that the chip does not hold."""
-
-    @property
-    @abstractmethod
-    def unread(self) -> tuple[BoolArray, ...]:
-        """Those of them that were left out because their spikes reach no neuron: their spikes cannot be compared."""
-
-    @property
-    @abstractmethod
-    def received(self) -> BoolArray:
-        """Input channels, (channels,) bool, that some core takes in."""
-
     @abstractmethod
     def cumulative(self, events: EventArray, lengths: IntArray) -> Cumulative:
         """Votes and costs step by step, from one run; `lengths` (samples,) are the data steps of each recording."""
-
-    @abstractmethod
-    def votes_by_step(self, events: EventArray, lengths: IntArray) -> IntArray:
-        """Votes of :meth:`cumulative` alone."""
-
-    @property
-    @abstractmethod
-    def read_out_lag(self) -> int:
-        """Chip steps by which the votes are behind the data."""
 
     @property
     @abstractmethod
@@ -90,10 +61,6 @@ class IntegerMachine(Machine):
 
         In the order of ``readout_class``; after :data:`LONGEST` steps nothing is looked for any more.
         """
-
-    @abstractmethod
-    def spike_counts(self, events: EventArray, lengths: IntArray | None) -> IntArray:
-        """Spikes of each neuron that the chip holds, in the order of the netlist; (samples, neurons)."""
 
     @abstractmethod
     def packed(self, channels: EventArray, lengths: IntArray) -> tuple[npt.NDArray[np.uint64], IntArray]:
@@ -106,6 +73,31 @@ class IntegerMachine(Machine):
     @abstractmethod
     def page_parts(self, events: EventArray, *, lengths: IntArray | None, bin_s: float) -> BatchParts:
         """Run recordings for the page of the netlist; events, lengths and `bin_s` as for `price`."""
+
+    @property
+    def absent(self) -> tuple[BoolArray, ...]:
+        """Neurons of each layer, (neurons,) bool, that the chip does not hold."""
+        return tuple(
+            ~np.isin(np.arange(layer.neurons), self.netlist.neuron[self.netlist.compartments_of(index)])
+            for index, layer in enumerate(self.netlist.layers)
+        )
+
+    @property
+    def unread(self) -> tuple[BoolArray, ...]:
+        """Those of them that were left out because their spikes reach no neuron: their spikes cannot be compared."""
+        return tuple(np.isin(np.arange(layer.neurons), layer.unread) for layer in self.netlist.layers)
+
+    @property
+    def received(self) -> BoolArray:
+        """Input channels, (channels,) bool, that some core takes in."""
+        received: BoolArray = np.isin(np.arange(self.netlist.n_inputs), self.netlist.axon_source)
+        return received
+
+    @property
+    def read_out_lag(self) -> int:
+        """Chip steps by which the votes are behind the data: the depth of the latest layer that votes."""
+        voting = np.unique(self.netlist.layer[self.netlist.readout_class >= 0])
+        return max(int(self.netlist.layers[layer].depth) for layer in voting.tolist())
 
     def compared(self) -> list[slice | IntArray]:
         """Neurons of each layer whose spikes can be compared."""

@@ -106,7 +106,7 @@ def _races(arguments: argparse.Namespace, machine: IntegerMachine) -> FloatArray
     machine.require_sensor(training.events)
     progress("calibrating")
     lengths = training.step_counts
-    return exits.turning_points(exits.races(machine.votes_by_step(training.events, lengths), lengths))
+    return exits.turning_points(exits.races(machine.cumulative(training.events, lengths).votes, lengths))
 
 
 def _float_votes(arguments: argparse.Namespace, machine: IntegerMachine, data: Recordings) -> IntArray | None:

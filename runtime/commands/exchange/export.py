@@ -19,13 +19,14 @@ from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.inputs.repeat import NETWORK, refuse
+from spikeloom.runtime.machines.base import export_formats
 from spikeloom.runtime.machines.export_format import Export, Format, Request, port_lines
-from spikeloom.runtime.machines.exports import FORMATS
 from spikeloom.runtime.report.encode import INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 
 FLOAT = "onnx-float"
 
+FORMATS = export_formats()
 TITLES = {each.name: each.title for each in FORMATS} | {
     FLOAT: "the float network of a checkpoint as a static ONNX graph"
 }

@@ -45,9 +45,6 @@ Function = Callable[..., Any]
 LANES = 64
 """Compartments of a block."""
 
-CHARGES = 16
-"""Charges of a source are padded to a multiple of this."""
-
 LISTED = 4
 """Bits of a word that are listed at a time."""
 
@@ -90,22 +87,6 @@ class Blocks(NamedTuple):
     compartment: IntArray  # (blocks * 64,) int64; compartment of each position, -1 for none
     # (blocks,) int64; compartment of the first position where the block holds 64 consecutive ones, else -1
     whole: IntArray
-
-
-class ChargeRows(NamedTuple):
-    """What events add to sums of each chip step; see :class:`trace.Charges`."""
-
-    width: int  # Sums, padded to a multiple of `CHARGES`; 0 if there are none
-    narrow: bool  # Whether all events that a stage can receive in a step add up to less than 2**31 in each sum
-    # ((words of the inputs + blocks) * 64 * width,) int32; what an event of each channel, then a spike of each position
-    # adds
-    source: AnyArray
-    everyone: IntArray  # (stages * width,) int64; what an update of all compartments of each stage adds
-    update: IntArray  # (kinds * width,) int64; what an update adds; few compartments differ in that
-    first: IntArray  # (blocks + 1,) int64; bounds of each block in the groups
-    # group, member: (groups,) int64, uint64; kind of each group, and which positions of the block are of it
-    group: IntArray
-    member: AnyArray
 
 
 class Scratch(NamedTuple):
@@ -360,42 +341,6 @@ def _block_step(*, listed: bool, rests: bool, lasts: bool) -> Function:
     return step
 
 
-def _charging(*, narrow: bool) -> Function:
-    """Make the sum of charges; `narrow` where it fits the 32 bits of a charge."""
-    each, wide = ir.VectorType(_STATE, CHARGES), ir.VectorType(_WORD, CHARGES)
-    held = each if narrow else wide
-
-    @_intrinsic
-    def charge(
-        typing: Any, listed: Any, begin: Any, end: Any, charges: Any, at: Any, width: Any, out: Any, to: Any
-    ) -> Any:
-        """Add up some charges of all sources that are listed from `begin` to `end`; `at` is that of source 0."""
-        signature = types.void(listed, types.int64, types.int64, charges, *[types.int64] * 2, out, types.int64)
-
-        def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
-            sources, rows, sums = (
-                context.make_array(kind)(context, builder, value).data
-                for kind, value in ((listed, values[0]), (charges, values[3]), (out, values[6]))
-            )
-
-            def add(source: Any, totals: Any) -> Any:
-                row = builder.add(values[4], builder.mul(source, values[5]))
-                charged = _vector(builder, rows, row, each)[0]
-                return (builder.add(totals[0], charged if narrow else builder.sext(charged, wide)),)
-
-            (total,) = _each_listed(builder, sources, values[1:3], (ir.Constant(held, [0] * CHARGES),), add)
-            before, place = _vector(builder, sums, values[7], wide)
-            _store(builder, builder.add(before, builder.sext(total, wide) if narrow else total), place)
-            return context.get_dummy_value()
-
-        return signature, emit
-
-    return charge
-
-
-_charge, _charge_narrow = (_charging(narrow=narrow) for narrow in (False, True))
-
-
 @_intrinsic
 def _lowest(typing: Any, word: Any) -> Any:
     """Index of the lowest bit of a word, 64 of zero."""
@@ -540,67 +485,16 @@ def _run_stage(
 
 
 @compiled
-def _charge_all(
-    listed: AnyArray, bounds: IntArray, steps: int, charges: ChargeRows, at: int, delay: int, sums: IntArray
-) -> None:
-    """Add what listed sources, the first of them with its charges at `at`, bring to the sums of each chip step."""
-    for t in range(steps):
-        for part in range(0, charges.width, CHARGES):
-            to = (t + delay) * charges.width + part
-            if charges.narrow:
-                _charge_narrow(listed, bounds[t], bounds[t + 1], charges.source, at + part, charges.width, sums, to)
-            else:
-                _charge(listed, bounds[t], bounds[t + 1], charges.source, at + part, charges.width, sums, to)
-
-
-@compiled
-def _charge_updates(blocks: Blocks, steps: int, idle: AnyArray, charges: ChargeRows, sums: IntArray) -> None:
-    """Add what updates bring: those of all compartments, less those that are idle."""
-    width = charges.width
-    resting = np.empty(charges.update.size // width, np.int64)
-    for s in range(blocks.stage.size - 1):
-        begin, end = blocks.stage[s], blocks.stage[s + 1]
-        for t in range(steps):
-            at = (t + s) * width
-            for i in range(width):
-                sums[at + i] += charges.everyone[s * width + i]
-            resting[:] = 0
-            for block in range(begin, end):
-                if blocks.restful[block]:
-                    word = idle[steps * begin + t * (end - begin) + block - begin]
-                    for g in range(charges.first[block], charges.first[block + 1]):
-                        resting[charges.group[g]] += _bits(word & charges.member[g])
-            for kind in range(resting.size):
-                if resting[kind]:
-                    for i in range(width):
-                        sums[at + i] -= resting[kind] * charges.update[kind * width + i]
-
-
-@compiled
-def _run_stages(
-    blocks: Blocks,
-    n_words: int,
-    steps: int,
-    scratch: Scratch,
-    charges: ChargeRows,
-    sums: IntArray,
-    lasting: Lasting | None,
-) -> None:
+def _run_stages(blocks: Blocks, n_words: int, steps: int, scratch: Scratch, lasting: Lasting | None) -> None:
     """Let all stages integrate, one after the other, and count spikes and events."""
     bounds = np.empty(steps + 1, np.int64)
     active, start, width, count = scratch.words, 0, n_words, scratch.inputs
-    at, delay = 0, 0  # of the charges of the sources; of their steps
     for s in range(blocks.stage.size - 1):
         listed = _list(active, start, width, steps, bounds, count)
-        _charge_all(listed, bounds, steps, charges, at * LANES * charges.width, delay, sums)
         _run_stage(blocks, s, steps, active, start, width, listed, bounds, scratch, lasting)
         begin, end = blocks.stage[s], blocks.stage[s + 1]
         active, start, width, count = scratch.raster, steps * begin, end - begin, scratch.spikes[begin * LANES :]
-        at, delay = n_words + begin, s
-    listed = _list(active, start, width, steps, bounds, count)
-    _charge_all(listed, bounds, steps, charges, at * LANES * charges.width, delay, sums)
-    if charges.width:
-        _charge_updates(blocks, steps, scratch.idle, charges, sums)
+    _list(active, start, width, steps, bounds, count)
 
 
 @compiled
@@ -665,16 +559,13 @@ def run_recordings(
     fired: AnyArray,
     membranes: AnyArray,
     updated: AnyArray,
-    charges: ChargeRows,
-    charged: IntArray,
     keep_u: AnyArray | None,
 ) -> None:
     """Run some recordings: `events` (recordings, channels, columns) uint8, not zero where there is one.
 
     Filled, from zeros, are the counts `inputs`, `spikes`, `updates`; `fired` and `updated` (recordings, chip steps,
-    words) uint64 and `membranes` (recordings, chip steps, compartments) int32, or no recordings of what is not wanted;
-    and `charged` (recordings, chip steps * sums). `keep_u` is that of the blocks where some current outlasts its step:
-    other networks do without the code for it.
+    words) uint64 and `membranes` (recordings, chip steps, compartments) int32, or no recordings of what is not wanted.
+    `keep_u` is that of the blocks where some current outlasts its step: other networks do without the code for it.
     """
     n_words, n_blocks = (events.shape[1] + LANES - 1) // LANES, blocks.keep.size
     for r in range(events.shape[0]):
@@ -691,10 +582,10 @@ def run_recordings(
         )
         _pack(events[r], steps, scratch.words)
         if keep_u is None:
-            _run_stages(blocks, n_words, steps, scratch, charges, charged[r], None)
+            _run_stages(blocks, n_words, steps, scratch, None)
         else:
             lasting = Lasting(keep_u, np.zeros(n_blocks * LANES, np.int32))
-            _run_stages(blocks, n_words, steps, scratch, charges, charged[r], lasting)
+            _run_stages(blocks, n_words, steps, scratch, lasting)
 
         inputs[r] = scratch.inputs[: events.shape[1]]
         for position in range(n_blocks * LANES):
@@ -712,3 +603,45 @@ def run_recordings(
             _pack_compartments(blocks, steps, scratch.idle, updated[r], True)
         if membranes.shape[0]:
             _copy_membranes(blocks, steps, scratch.membranes, membranes[r])
+
+
+@compiled_and_cached
+def add_charges(
+    events: AnyArray,
+    lengths: IntArray,
+    fired: AnyArray,
+    updated: AnyArray,
+    channels: IntArray,
+    spikes: IntArray,
+    kinds: IntArray,
+    members: AnyArray,
+    charged: IntArray,
+) -> None:
+    """Add what happened in some recordings to the sums of each chip step, `charged` (recordings, chip steps, sums).
+
+    `events`, `fired` and `updated` are as in :func:`run_recordings`; `channels` and `spikes` have the sums of each
+    source. An update adds one of few `kinds` (kinds, sums); bits of `members` (kinds, words) are compartments of each.
+    """
+    sums = kinds.shape[1]
+    for r in range(events.shape[0]):
+        for channel in range(events.shape[1]):
+            for t in range(lengths[r]):
+                if events[r, channel, t]:
+                    charged[r, t] += channels[channel]
+        totals = np.empty(sums, np.int64)
+        for t in range(fired.shape[1]):
+            totals[:] = 0
+            for w in range(fired.shape[2]):
+                left = fired[r, t, w]
+                while left:
+                    source = w * LANES + _lowest(left)
+                    for i in range(sums):
+                        totals[i] += spikes[source, i]
+                    left &= left - np.uint64(1)
+            for kind in range(kinds.shape[0]):
+                count = 0
+                for w in range(updated.shape[2]):
+                    count += _bits(updated[r, t, w] & members[kind, w])
+                for i in range(sums):
+                    totals[i] += count * kinds[kind, i]
+            charged[r, t] += totals

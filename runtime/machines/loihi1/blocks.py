@@ -10,8 +10,7 @@ import numpy.typing as npt
 from spikeloom.compiler.fixedpoint import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, largest_current
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
 from spikeloom.compiler.types import BoolArray, IntArray
-from spikeloom.runtime.machines.loihi1.block_kernel import CHARGES, LANES, Blocks, ChargeRows
-from spikeloom.runtime.machines.loihi1.trace import Charges
+from spikeloom.runtime.machines.loihi1.block_kernel import LANES, Blocks
 
 SUM_MAX = 2**15 - 1
 """Largest sum that the kernel holds."""
@@ -141,46 +140,6 @@ def obstacle(netlist: Netlist) -> str | None:
     if lay_out_blocks(netlist) is None:
         return "synapses too scattered for rows of 64"
     return None
-
-
-def charge_rows(netlist: Netlist, blocks: Blocks, charges: Charges | None) -> ChargeRows:
-    """Lay charges out for the kernel: padded, by channel and position."""
-    if charges is None:
-        none = np.zeros(0, np.int64)
-        return ChargeRows(0, False, none.astype(np.int32), none, none, none, none, none.astype(np.uint64))
-    sums = charges.spikes.shape[1]
-    width = -(-sums // CHARGES) * CHARGES
-    channels = -(-netlist.n_inputs // LANES) * LANES
-    seated = np.flatnonzero(blocks.compartment >= 0)
-    source = np.zeros((channels + len(blocks.compartment), width), np.int32)
-    update = np.zeros((len(blocks.compartment), width), np.int64)
-    source[: netlist.n_inputs, :sums] = charges.channels
-    source[channels + seated, :sums] = charges.spikes[blocks.compartment[seated]]
-    update[seated, :sums] = charges.updates[blocks.compartment[seated]]
-    begins = np.append(0, channels + blocks.stage * LANES)  # of the channels, then of the positions of each stage
-    most = _sums_between(np.abs(source.astype(np.int64)), begins).max(initial=0)
-    kinds, kind = np.unique(update, axis=0, return_inverse=True)
-    groups, member = np.unique(np.arange(len(update)) // LANES * len(kinds) + kind.reshape(-1), return_inverse=True)
-    words = np.zeros(len(groups), np.uint64)
-    np.bitwise_or.at(words, member.reshape(-1), _bit(np.arange(len(update)) % LANES))
-    block, group = np.divmod(groups, len(kinds))
-    return ChargeRows(
-        width=width,
-        narrow=bool(most < 2**31),
-        source=source.reshape(-1),
-        everyone=_sums_between(update, blocks.stage * LANES).reshape(-1),
-        update=kinds.reshape(-1),
-        first=np.searchsorted(block, np.arange(len(blocks.layer) + 1)),
-        group=group,
-        member=words,
-    )
-
-
-def _sums_between(rows: IntArray, bounds: IntArray) -> IntArray:
-    """Sums of the rows from each bound to the next, zero where there are none; ``np.add.reduceat`` has one there."""
-    below = np.concatenate([np.zeros((1, rows.shape[1]), np.int64), np.cumsum(rows, axis=0)])
-    sums: IntArray = below[bounds[1:]] - below[bounds[:-1]]
-    return sums
 
 
 class _Seats(NamedTuple):

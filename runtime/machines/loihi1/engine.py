@@ -21,8 +21,8 @@ import numpy.typing as npt
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, IntArray
-from spikeloom.runtime.machines.loihi1.block_kernel import Blocks, ChargeRows, run_recordings
-from spikeloom.runtime.machines.loihi1.blocks import charge_rows, lay_out_blocks
+from spikeloom.runtime.machines.loihi1.block_kernel import Blocks, add_charges, run_recordings
+from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.kernel import State, Tables, chip_steps, state_of, tables_of
 from spikeloom.runtime.machines.loihi1.trace import (
     REGISTER_LIMITS,
@@ -37,6 +37,7 @@ from spikeloom.runtime.machines.loihi1.trace import (
 )
 
 EventArray = npt.NDArray[np.uint8 | np.bool_]
+WordArray = npt.NDArray[np.uint64]
 
 PART = 4
 """Recordings that a thread takes at a time."""
@@ -46,13 +47,12 @@ PART = 4
 class Engine:
     """A netlist prepared for a kernel by :func:`prepare`; holds no state and can be shared by threads.
 
-    The kernel of layers reads `blocks` and `rows`, that of steps `tables` and `charges`, what events add to the
-    sums of each chip step. A recording takes `drain` chip steps beyond its data steps.
+    The kernel of layers reads `blocks`, that of steps `tables`; `charges` are what events add to the sums of each chip
+    step. A recording takes `drain` chip steps beyond its data steps.
     """
 
     netlist: Netlist
     blocks: Blocks | None
-    rows: ChargeRows | None
     tables: Tables | None
     drain: int
     charges: Charges | None
@@ -68,7 +68,6 @@ def prepare(netlist: Netlist, *, stepwise: bool = False, gated: bool = True, cha
     return Engine(
         netlist=netlist,
         blocks=blocks,
-        rows=None if blocks is None else charge_rows(netlist, blocks, charges),
         tables=tables_of(netlist, gated=gated) if blocks is None else None,
         drain=netlist.max_depth if gated else 0,
         charges=charges,
@@ -134,12 +133,10 @@ def simulate(
     recording that overflows; a note on the exception says which.
     """
     engine = netlist if isinstance(netlist, Engine) else prepare(netlist)
-    netlist = engine.netlist
+    netlist, charges = engine.netlist, engine.charges
     check_channels(netlist, events.shape[1])
     recordings, _, length = events.shape
     shape = (recordings, length + engine.drain, netlist.n_compartments)
-    sums = 0 if engine.charges is None else engine.charges.spikes.shape[1]
-    charged = np.zeros((*shape[:2], sums if engine.rows is None else engine.rows.width), np.int64)
     trace = Trace(
         counts=Counts(
             inputs=np.zeros((recordings, netlist.n_inputs), np.int64),
@@ -150,21 +147,22 @@ def simulate(
         spikes=np.zeros(shape, np.bool_) if spikes else None,
         membranes=np.zeros(shape, np.int32) if membranes else None,
         updated=np.zeros(shape, np.bool_) if updated else None,
-        charged=None if engine.charges is None else charged[..., :sums],
+        charged=None if charges is None else np.zeros((*shape[:2], charges.spikes.shape[1]), np.int64),
         packed=np.zeros((*shape[:2], -(-shape[2] // 64)), np.uint64) if packed else None,
     )
     ends = np.full(recordings, length) if lengths is None else np.asarray(lengths, np.int64)
-    size = PART
-    if engine.blocks is None:
-        size = 1
-    else:
-        events = np.ascontiguousarray(events)
+    run_part, size = (_run_steps, 1) if engine.blocks is None else (_run_layers, PART)
+    given = np.ascontiguousarray(events).view(np.uint8)
+    given.flags.writeable = False  # or the kernels would be compiled twice, for either
+    if charges is not None:
+        kinds, kind = np.unique(charges.updates, axis=0, return_inverse=True)
+        members = pack(kind.reshape(-1) == np.arange(len(kinds))[:, None])
 
     def run(part: slice) -> None:
-        if engine.blocks is None:
-            _run_steps(engine, events[part.start], int(ends[part.start]), trace, part.start)
-        else:
-            _run_layers(engine, events[part], ends[part], trace, charged, part)
+        fired, worked = run_part(engine, given[part], ends[part], trace, part)
+        if charges is not None and trace.charged is not None:
+            source = charges.channels, charges.spikes
+            add_charges(given[part], ends[part], fired, worked, *source, kinds, members, trace.charged[part])
 
     parts = [slice(i, min(i + size, recordings)) for i in range(0, recordings, size)]
     workers = min(threads or os.cpu_count() or 1, len(parts))
@@ -176,54 +174,57 @@ def simulate(
 
 
 def _run_layers(
-    engine: Engine, events: EventArray, ends: IntArray, trace: Trace, charged: IntArray, part: slice
-) -> None:
-    """Run some recordings layer after layer; `part` is where they belong in the trace."""
-    blocks, rows, nothing = engine.blocks, engine.rows, (0, 0, 0)
+    engine: Engine, events: EventArray, ends: IntArray, trace: Trace, part: slice
+) -> tuple[WordArray, WordArray]:
+    """Run some recordings layer after layer, `part` of the trace; spikes and updates at a bit each where wanted."""
+    blocks, nothing = engine.blocks, (0, 0, 0)
     assert blocks is not None, "laid out for the kernel of steps"
-    assert rows is not None, "laid out with the blocks"
-    steps, n = len(charged[0]) if len(charged) else 0, engine.netlist.n_compartments
-    words = len(events), steps, -(-n // 64)
-    spikes = np.zeros(words, np.uint64) if trace.packed is None else trace.packed[part]
-    updated = np.zeros(words if trace.updated is not None else nothing, np.uint64)
-    given = events.view(np.uint8)
-    given.flags.writeable = False  # or the kernel would be compiled twice, for either
+    n = engine.netlist.n_compartments
+    words = len(events), events.shape[2] + engine.drain, -(-n // 64)
+    spikes, updated = (
+        np.zeros(words if engine.charges is not None or kept is not None else nothing, np.uint64)
+        for kept in (trace.spikes, trace.updated)
+    )
+    if trace.packed is not None:
+        spikes = trace.packed[part]
     run_recordings(
         blocks,
-        given,
+        events,
         ends,
         trace.counts.inputs[part],
         trace.counts.spikes[part],
         trace.counts.updates[part],
-        spikes if trace.spikes is not None or trace.packed is not None else spikes[:0],
+        spikes,
         np.zeros(nothing, np.int32) if trace.membranes is None else trace.membranes[part],
         updated,
-        rows,
-        charged[part].reshape(len(events), -1),
         blocks.keep_u if blocks.keep_u.any() else None,
     )
     if trace.spikes is not None:
         trace.spikes[part] = unpack(spikes, n)
     if trace.updated is not None:
         trace.updated[part] = unpack(updated, n)
+    return spikes, updated
 
 
-def _run_steps(engine: Engine, events: EventArray, length: int, trace: Trace, index: int) -> None:
-    """Run one recording step after step; `index` is its place in the trace."""
-    netlist, charges, window = engine.netlist, engine.charges, length + engine.drain
-    state, size = state_of(netlist), (window, netlist.n_compartments)
-    fired = np.zeros(size, np.bool_) if trace.spikes is None else trace.spikes[index, :window]
-    worked = np.zeros(size, np.bool_) if trace.updated is None else trace.updated[index, :window]
+def _run_steps(
+    engine: Engine, events: EventArray, ends: IntArray, trace: Trace, part: slice
+) -> tuple[WordArray, WordArray]:
+    """Run the one recording of a part step after step; its spikes and updates at a bit each."""
+    netlist, index, length = engine.netlist, part.start, int(ends[0])
+    state, window = state_of(netlist), length + engine.drain
+    size = events.shape[2] + engine.drain, netlist.n_compartments
+    fired = np.zeros(size, np.bool_) if trace.spikes is None else trace.spikes[index]
+    worked = np.zeros(size, np.bool_) if trace.updated is None else trace.updated[index]
     try:
         advance(
             engine,
             state,
-            events[:, :length],
+            events[0, :, :length],
             length=length,
             steps=window,
-            spikes=fired,
+            spikes=fired[:window],
             membranes=None if trace.membranes is None else trace.membranes[index, :window],
-            updated=worked,
+            updated=worked[:window],
         )
     except NumericRangeError as error:
         error.add_note(f"recording {index} of {len(trace.counts.inputs)}, counted from 0")
@@ -232,10 +233,7 @@ def _run_steps(engine: Engine, events: EventArray, length: int, trace: Trace, in
     trace.counts.spikes[index] = state.spikes
     np.add.at(trace.counts.updates[index], netlist.layer, state.updates)
     np.add.at(trace.counts.saturations[index], netlist.layer, state.saturations)
+    spikes = pack(fired)
     if trace.packed is not None:
-        trace.packed[index, :window] = pack(fired)
-    if charges is not None and trace.charged is not None:
-        # float64 products of integers below 2**53 are exact
-        found = fired.astype(np.float64) @ charges.spikes + worked.astype(np.float64) @ charges.updates
-        found[:length] += (events[:, :length] != 0).T.astype(np.float64) @ charges.channels
-        trace.charged[index, :window] = np.rint(found).astype(np.int64)
+        trace.packed[index] = spikes
+    return spikes[None], pack(worked)[None]

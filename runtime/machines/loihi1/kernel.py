@@ -55,10 +55,9 @@ class State(NamedTuple):
     # current, membrane: (compartments,) int32; the two registers, after any reset
     current: AnyArray
     membrane: AnyArray
-    # active, sums, integrates, worked, flags: Scratch of one step
+    # active, sums, worked, flags: Scratch of one step
     active: IntArray
     sums: IntArray
-    integrates: AnyArray
     worked: AnyArray
     flags: AnyArray
     inputs: IntArray  # (channels,) int64; events so far
@@ -91,7 +90,7 @@ def state_of(netlist: Netlist) -> State:
     n, channels = netlist.n_compartments, netlist.n_inputs
     current, membrane = np.zeros((2, n), np.int32)
     spikes, updates, saturations = np.zeros((3, n), np.int64)
-    integrates, worked, flags = np.zeros((3, n), np.bool_)
+    worked, flags = np.zeros((2, n), np.bool_)
     return State(
         counter=np.zeros(2, np.int64),
         fired=np.zeros(n + 1, np.int64),
@@ -99,7 +98,6 @@ def state_of(netlist: Netlist) -> State:
         membrane=membrane,
         active=np.zeros(channels + n + 1, np.int64),
         sums=np.zeros(2 * n, np.int64),
-        integrates=integrates,
         worked=worked,
         flags=flags,
         inputs=np.zeros(channels, np.int64),
@@ -158,68 +156,44 @@ def _deliver(tables: Tables, state: State, sources: IntArray) -> None:
 
 
 @compiled
-def _find_work(
-    depth: AnyArray,
-    step: int,
-    length: int,
-    current: AnyArray,
-    membrane: AnyArray,
-    bias: AnyArray,
-    sums: IntArray,
-    integrates: AnyArray,
-    worked: AnyArray,
-) -> None:
-    """Tell which windows are open, and who has work to do."""
+def _integrate(tables: Tables, state: State, step: int, length: int) -> bool:
+    """Let all compartments whose window is open integrate, and say whether a register overflows.
+
+    `flags` become those that spike; membranes are left before a reset.
+    """
+    depth, keep_u, keep_v, bias, threshold = tables.depth, tables.keep_u, tables.keep_v, tables.bias, tables.threshold
+    current, membrane, sums, flags, worked = state.current, state.membrane, state.sums, state.flags, state.worked
+    saturations, any_overflow = state.saturations, False
     for c in range(depth.size):
-        integrates[c] = (depth[c] <= step) & (step - depth[c] < length)
-        holds = (current[c] | membrane[c] | bias[c]) != 0
-        worked[c] = integrates[c] & (holds | ((sums[2 * c] | sums[2 * c + 1]) != 0))
-
-
-@compiled
-def _add_input(integrates: AnyArray, current: AnyArray, keep_u: AnyArray, sums: IntArray, overflows: AnyArray) -> bool:
-    """Let currents decay and add the sums; tell who overflows, and whether anybody does."""
-    any_overflow = False
-    for c in range(current.size):
+        is_open = (depth[c] <= step) & (step - depth[c] < length)
+        arrived = (sums[2 * c] | sums[2 * c + 1]) != 0
+        worked[c] = is_open & (arrived | ((current[c] | membrane[c] | bias[c]) != 0))
+        # the current decays, and the sums are added
         positive, negative = sums[2 * c] >> ARRIVAL_BITS, sums[2 * c + 1] >> ARRIVAL_BITS
         u = np.int32(_kept(current[c], keep_u[c]) + np.int32(np.int32(positive - negative) << MEMBRANE_SHIFT))
-        beyond = (max(positive, negative) > SUM_MAX) | (abs(u) > CURRENT_MAX)
-        overflows[c] = integrates[c] & beyond
-        any_overflow |= overflows[c]
-        current[c] = u if integrates[c] else np.int32(0)
+        any_overflow |= is_open & ((max(positive, negative) > SUM_MAX) | (abs(u) > CURRENT_MAX))
+        # the membrane decays, current and bias are added, it saturates and is compared
+        v = np.int32(np.int32(_kept(membrane[c], keep_v[c]) + u) + bias[c])
+        compared = np.int32(min(max(v, np.int32(-MEMBRANE_MAX)), np.int32(MEMBRANE_MAX)))
+        saturations[c] += is_open & (compared != v)
+        flags[c] = is_open & (compared > threshold[c])
+        current[c], membrane[c] = (u, compared) if is_open else (np.int32(0), np.int32(0))
     return any_overflow
 
 
 @compiled
-def _fire(
-    integrates: AnyArray,
-    current: AnyArray,
-    membrane: AnyArray,
-    keep_v: AnyArray,
-    bias: AnyArray,
-    threshold: AnyArray,
-    fires: AnyArray,
-    saturations: AnyArray,
-) -> None:
-    """Let membranes decay, add currents and biases, saturate, compare; they are left before a reset."""
-    for c in range(membrane.size):
-        v = np.int32(np.int32(_kept(membrane[c], keep_v[c]) + current[c]) + bias[c])
-        compared = np.int32(min(max(v, np.int32(-MEMBRANE_MAX)), np.int32(MEMBRANE_MAX)))
-        saturations[c] += integrates[c] & (compared != v)
-        fires[c] = integrates[c] & (compared > threshold[c])
-        membrane[c] = compared if integrates[c] else np.int32(0)
-
-
-@compiled
-def _first_overflow(state: State) -> tuple[Any, int, Any]:
+def _first_overflow(state: State, depth: AnyArray, step: int, length: int) -> tuple[Any, int, Any]:
     """Lowest compartment that overflows: its id, its register (0 sum, 1 current) and the value."""
-    c = np.argmax(state.flags)
-    positive, negative = state.sums[2 * c] >> ARRIVAL_BITS, state.sums[2 * c + 1] >> ARRIVAL_BITS
-    if positive > SUM_MAX:
-        return c, 0, positive << MEMBRANE_SHIFT
-    if negative > SUM_MAX:
-        return c, 0, -(negative << MEMBRANE_SHIFT)
-    return c, 1, np.int64(state.current[c])
+    for c in range(state.current.size):
+        if depth[c] <= step and step - depth[c] < length:
+            positive, negative = state.sums[2 * c] >> ARRIVAL_BITS, state.sums[2 * c + 1] >> ARRIVAL_BITS
+            if positive > SUM_MAX:
+                return c, 0, positive << MEMBRANE_SHIFT
+            if negative > SUM_MAX:
+                return c, 0, -(negative << MEMBRANE_SHIFT)
+            if abs(state.current[c]) > CURRENT_MAX:
+                return c, 1, np.int64(state.current[c])
+    return -1, 0, np.int64(0)
 
 
 @compiled
@@ -254,20 +228,16 @@ def chip_steps(
     compartment, register and value of the first overflow; the chip step is -1 if there is none.
     """
     for t in range(steps):
-        step, current, membrane, integrates = state.counter[0], state.current, state.membrane, state.integrates
+        step = state.counter[0]
         n = _list_sources(state, events, t, length)
         _deliver(tables, state, state.active[:n])
-        _find_work(tables.depth, step, length, current, membrane, tables.bias, state.sums, integrates, state.worked)
-        if _add_input(integrates, current, tables.keep_u, state.sums, state.flags):
-            compartment, register, value = _first_overflow(state)
+        if _integrate(tables, state, step, length):
+            compartment, register, value = _first_overflow(state, tables.depth, step, length)
             return step, compartment, register, value
-        _fire(
-            integrates, current, membrane, tables.keep_v, tables.bias, tables.threshold, state.flags, state.saturations
-        )
         if spikes.shape[0]:
             spikes[t] = state.flags
         if membranes.shape[0]:
-            membranes[t] = membrane
+            membranes[t] = state.membrane
         if updated.shape[0]:
             updated[t] = state.worked
         _reset_and_count(state)

@@ -125,52 +125,15 @@ class Loihi(IntegerMachine):
         """Compartments as populations, axons as projections."""
         return lift(self.netlist)
 
-    @property
-    def lags(self) -> tuple[int, ...]:
-        """Depths of the layers."""
-        return tuple(layer.depth for layer in self.netlist.layers)
-
-    @property
-    def absent(self) -> tuple[BoolArray, ...]:
-        """Neurons without a compartment."""
-        return tuple(
-            ~np.isin(np.arange(layer.neurons), self.netlist.neuron[self.netlist.compartments_of(index)])
-            for index, layer in enumerate(self.netlist.layers)
-        )
-
-    @property
-    def unread(self) -> tuple[BoolArray, ...]:
-        """As the netlist lists them."""
-        return tuple(np.isin(np.arange(layer.neurons), layer.unread) for layer in self.netlist.layers)
-
-    @property
-    def received(self) -> BoolArray:
-        """Channels with an axon."""
-        sources = self.netlist.axon_source
-        return np.isin(np.arange(self.netlist.n_inputs), sources[sources < self.netlist.n_inputs])
-
     def cumulative(self, events: EventArray, lengths: IntArray) -> Cumulative:
         """Sums that the engine adds up itself: no spike is kept."""
-        return cumulative.run(self.netlist, self.target, with_clocks(events, self.netlist.clocks), lengths)
-
-    def votes_by_step(self, events: EventArray, lengths: IntArray) -> IntArray:
-        """The same of votes."""
-        return cumulative.votes_of(self.netlist, with_clocks(events, self.netlist.clocks), lengths)
-
-    @property
-    def read_out_lag(self) -> int:
-        """Depth of the latest layer that votes."""
-        return cumulative.read_out_depth(self.netlist)
+        channels = with_clocks(events, self.netlist.clocks)
+        return cumulative.run(self.netlist, self.target, channels, lengths, lag=self.read_out_lag)
 
     @property
     def least_intervals(self) -> IntArray:
         """From the largest sums of each compartment that votes."""
         return cumulative.least_intervals(self.netlist)
-
-    def spike_counts(self, events: EventArray, lengths: IntArray | None) -> IntArray:
-        """Those of compartments."""
-        channels = with_clocks(events, self.netlist.clocks)
-        return engine.simulate(self._engine, channels, lengths=lengths).counts.spikes
 
     def packed(self, channels: EventArray, lengths: IntArray) -> tuple[npt.NDArray[np.uint64], IntArray]:
         """Bits by compartment, as the engine packs them."""
@@ -237,7 +200,7 @@ class Loihi(IntegerMachine):
 
     def _run(self, counts: IntArray, spikes: BoolArray | None, membranes: MembraneArray | None = None) -> Run:
         votes = class_counts(self.netlist, counts)
-        return Run(votes=votes, spikes=self._by_layer(spikes), membranes=self._by_layer(membranes))
+        return Run(votes=votes, counts=counts, spikes=self._by_layer(spikes), membranes=self._by_layer(membranes))
 
     def _by_layer(self, array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]] | None:
         if array is None:

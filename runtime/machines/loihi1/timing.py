@@ -55,33 +55,37 @@ class Latencies:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SimpleTimes:
-    """What the simple model says of a batch of recordings; nothing happens after a recording's own steps."""
+class StepTimes:
+    """What a model says of a batch of recordings; nothing happens after a recording's own steps."""
 
     duration_ns: FloatArray  # (samples, steps) float64; of each chip step, barrier included
-    # generation_ns, processing_ns: (samples, cores) float64; time that each core spends on its sweep and on sending,
-    # and on receiving, over all steps
-    generation_ns: FloatArray
-    processing_ns: FloatArray
     critical_core: IntArray  # (samples, steps) int64; core that took longest; the lowest of several, -1 after the end
     receiving: BoolArray  # (samples, steps) bool; whether it took longest to receive
 
+    @property
+    def seconds(self) -> FloatArray:
+        """Of each recording; shape (samples,)."""
+        seconds: FloatArray = self.duration_ns.sum(axis=1) * 1e-9
+        return seconds
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DetailedTimes:
-    """What the detailed model says of a batch of recordings; nothing happens after a recording's own steps."""
+class SimpleTimes(StepTimes):
+    """Also (samples, cores) float64: how long each core sweeps and sends, and how long it receives, in all steps."""
 
-    duration_ns: FloatArray  # (samples, steps) float64; of each chip step, barrier included
-    # sent_ns, processed_ns: (samples, steps) float64; when the last core ended its sweep and sending, and when the last
-    # message was processed
+    generation_ns: FloatArray
+    processing_ns: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DetailedTimes(StepTimes):
+    """Also, each (samples, steps) float64, what queues and the mesh do."""
+
+    # when the last core ended its sweep and sending, and when the last message was processed
     sent_ns: FloatArray
     processed_ns: FloatArray
-    # (samples, steps) float64; time for which cores could not send because the links were full, summed over the cores
-    blocked_ns: FloatArray
-    critical_core: IntArray  # (samples, steps) int64; core that was last; the lowest of several, -1 after the end
-    receiving: BoolArray  # (samples, steps) bool; whether it was last in receiving
-    # (samples, steps) float64; most messages on any link at any time; one on its way counts as one spread evenly over
-    # its links and its end
+    blocked_ns: FloatArray  # for which cores could not send because the links were full, summed over the cores
+    # most messages on any link at any time; one on its way counts as one spread evenly over its links and its end
     peak_load: FloatArray
 
 
@@ -107,16 +111,6 @@ def _way(start: int, end: int, port: int, width: int, tile_links: int) -> list[i
     return links
 
 
-def entries_by_form(netlist: Netlist, dense: BoolArray | None = None) -> tuple[IntArray, IntArray]:
-    """Synapses of each axon in dense and in sparse lists, as stored or as `dense` (synapses,) says."""
-    entries = np.diff(netlist.axon_synapses)
-    if dense is None:
-        in_dense = np.where(netlist.format_index_bits[netlist.axon_format] == 0, entries, 0)
-    else:
-        in_dense = np.bincount(netlist.axon_of_synapse()[dense], minlength=netlist.n_axons)
-    return in_dense, entries - in_dense
-
-
 def prepare(
     netlist: Netlist,
     target: Target,
@@ -138,7 +132,10 @@ def prepare(
     inner = np.arange(len(core_tile)) < netlist.n_cores
     latency = {event: table.picoseconds(event) for event in table.latencies}
 
-    in_dense, in_sparse = entries_by_form(netlist, dense)
+    axon = netlist.axon_of_synapse()
+    if dense is None:
+        dense = netlist.format_index_bits[netlist.axon_format[axon]] == 0
+    in_dense, in_sparse = (np.bincount(axon[form], minlength=netlist.n_axons) for form in (dense, ~dense))
     processing = latency["axon_in"] + in_dense * latency["synaptic_operation_dense"]
     processing += in_sparse * latency["synaptic_operation_sparse"]
     destination = netlist.core_of_axon()

@@ -43,8 +43,7 @@ class Charges:
 
     channels: IntArray  # (n_inputs, sums) int64; by an input event of each channel
     spikes: IntArray  # (compartments, sums) int64; by a spike of each compartment
-    # (compartments, sums) int64; by an update of each compartment. All three are below 2**31 in magnitude.
-    updates: IntArray
+    updates: IntArray  # (compartments, sums) int64; by an update of each compartment
 
 
 def side_by_side(parts: Sequence[Charges]) -> Charges:

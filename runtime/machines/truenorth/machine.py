@@ -109,7 +109,8 @@ class TrueNorth(Machine):
 
     def _run(self, trace: Trace) -> Run:
         votes = class_counts(self.netlist, trace.counts.votes)
-        return Run(votes=votes, spikes=self._by_layer(trace.spikes), membranes=self._by_layer(trace.membranes))
+        spikes, membranes = self._by_layer(trace.spikes), self._by_layer(trace.membranes)
+        return Run(votes=votes, counts=trace.counts.spikes, spikes=spikes, membranes=membranes)
 
     def _by_layer(self, array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]] | None:
         if array is None:

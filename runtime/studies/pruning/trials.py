@@ -21,13 +21,12 @@ from spikeloom.compiler.passes.prune import without_channels
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import machine_of
-from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.studies.pruning.results import Costs
 
 
 def spikes_of(netlist: Netlist, of: Recordings) -> IntArray:
     """Spikes of each compartment in all recordings; (compartments,)."""
-    spikes: IntArray = integer_machine_of(netlist).spike_counts(of.events, of.lengths).sum(axis=0)
+    spikes: IntArray = machine_of(netlist).run(of.events, lengths=of.lengths).counts.sum(axis=0)
     return spikes
 
 

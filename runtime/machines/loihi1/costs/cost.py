@@ -13,19 +13,18 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from spikeloom.compiler.targets.base import EnergyTable, Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_of_core
 from spikeloom.compiler.targets.loihi1.layout.place import hops
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.machines.loihi1.timing import entries_by_form
 from spikeloom.runtime.machines.loihi1.trace import Counts
 
 EVENTS = (
@@ -62,9 +61,9 @@ BETWEEN_CHIPS = "packet_between_chips"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Costs:
-    """Counts per recording and layer, (samples, layers), and energies.
+    """Counts per recording and group of neurons, (samples, groups), and energies; groups are those of a meter.
 
-    Synaptic operations belong to the layer that receives them, packets and hops to the layer that sends them; `zeros`
+    Synaptic operations belong to the group that receives them, packets and hops to the group that sends them; `zeros`
     are operations on stored zeros, `between_chips` packets that leave their chip. `steps` are the chip steps of the
     longest recording; joules are by table, and `unpriced` are the tables that lack events which happened.
     """
@@ -78,211 +77,148 @@ class Costs:
 
     @property
     def synaptic_operations(self) -> FloatArray:
-        """Visited entries, dense and sparse; shape (samples, layers)."""
+        """Visited entries, dense and sparse; shape (samples, groups)."""
         return self.events["synaptic_operation_dense"] + self.events["synaptic_operation_sparse"]
-
-
-def _visits(netlist: Netlist) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Entries that one spike of each source visits in each layer; each (sources, layers).
-
-    Those of dense lists, those of sparse lists, and zeros among both.
-    """
-    size, layers = netlist.n_inputs + netlist.n_compartments, len(netlist.layers)
-    dense, sparse, zeros = (np.zeros(size * layers) for _ in range(3))
-    in_dense = netlist.format_index_bits[netlist.axon_format] == 0
-    length = np.diff(netlist.axon_synapses)
-    for core in range(netlist.n_cores):
-        source, compartment, weight = netlist.synapses_of(core)
-        axons = slice(*netlist.core_axons[core : core + 2])
-        listed = np.repeat(in_dense[axons], length[axons])
-        entry = source * layers + netlist.layer[compartment]
-        for total, kept in ((dense, listed), (sparse, ~listed), (zeros, weight == 0)):
-            place, amount = np.unique(entry[kept], return_counts=True)
-            total[place] += amount
-    shape = size, layers
-    return dense.reshape(shape), sparse.reshape(shape), zeros.reshape(shape)
-
-
-def _routes(netlist: Netlist, target: Target) -> FloatArray:
-    """What one spike of each compartment sends; shape (compartments, 4).
-
-    Packets, east-west and north-south hops of those that stay on their chip, and packets that do not.
-    """
-    width = target.limit("mesh.width")
-    inner = netlist.axon_source >= netlist.n_inputs
-    source = netlist.axon_source[inner] - netlist.n_inputs
-    start, end = netlist.core_of_compartment()[source], netlist.core_of_axon()[inner]
-    chip = chip_of_core(netlist.core_tile, target)
-    leaves = chip[start] != chip[end]
-    moves = np.where(leaves, 0, hops(netlist.core_tile[start], netlist.core_tile[end], width))
-    each = [np.ones(len(source)), *moves, leaves]
-    return np.stack([np.bincount(source, amount, netlist.n_compartments) for amount in each], axis=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Meter:
     """What one event of each source causes, prepared by :func:`prepare` for any number of runs.
 
-    `caused` is (sources, names * layers): amount of each event of `names` for each layer by a spike of each source,
-    input channels first; `neurons` are the compartments of each layer.
+    `caused` is (sources, names * groups): amount of each event of `names` for each group by a spike of each source,
+    input channels first; `neurons` are the compartments of each group.
     """
 
-    netlist: Netlist
     target: Target
     names: tuple[str, ...]
     caused: FloatArray
-    neurons: FloatArray
+    neurons: IntArray
 
 
-def prepare(netlist: Netlist, target: Target) -> Meter:
-    """Look up what spikes cause on a target with energy tables."""
-    dense, sparse, zeros = _visits(netlist)
-    of_layer = np.eye(len(netlist.layers))[netlist.layer]
-    silent = np.zeros((netlist.n_inputs, len(netlist.layers)))
-    sent = {
-        event: np.concatenate([silent, route[:, None] * of_layer])
-        for event, route in zip(
-            ("packet", "hop_east_west", "hop_north_south", BETWEEN_CHIPS), _routes(netlist, target).T, strict=True
-        )
-    }
-    caused = {
-        "synaptic_operation_dense": dense,
-        "synaptic_operation_sparse": sparse,
-        "spike": np.concatenate([silent, of_layer]),
-        **sent,
-        "zeros": zeros,
+def prepare(
+    netlist: Netlist,
+    target: Target,
+    by: Literal["layer", "core", "whole"] = "layer",
+    *,
+    input_tiles: tuple[int, ...] = (),
+    dense: BoolArray | None = None,
+) -> Meter:
+    """Look up what spikes cause on a target with energy tables, by layer, by core or all in one group.
+
+    `input_tiles` and `dense` are as for :func:`timing.prepare`: the groups of cores that hold inputs come after the
+    others, and cost only their packets and hops.
+    """
+    n_inputs, size = netlist.n_inputs, netlist.n_inputs + netlist.n_compartments
+    core_of = netlist.core_of_compartment()
+    group, groups = {
+        "layer": (netlist.layer, len(netlist.layers)),
+        "core": (core_of, netlist.n_cores),
+        "whole": (np.zeros_like(netlist.layer), 1),
+    }[by]
+    extra = np.arange(n_inputs) // target.limit("core.compartments")  # of the cores that hold inputs, if any do
+    home, core = np.append(groups + extra, group), np.append(netlist.n_cores + extra, core_of)
+    neurons = np.bincount(group, minlength=groups + len(input_tiles))
+
+    def caused(amount: IntArray | BoolArray, source: IntArray, receiver: IntArray) -> FloatArray:
+        """Sums over synapses, axons or neurons; (sources, groups)."""
+        sums = np.bincount(source * len(neurons) + receiver, amount.astype(np.float64), size * len(neurons))
+        return sums.reshape(size, len(neurons))
+
+    axon = netlist.axon_of_synapse()
+    if dense is None:
+        dense = netlist.format_index_bits[netlist.axon_format[axon]] == 0
+    entries = netlist.axon_source[axon], group[netlist.synapse_compartment()]
+    tile = np.append(netlist.core_tile, np.array(input_tiles, np.int64))
+    sent = np.flatnonzero(core[netlist.axon_source] < len(tile))  # a channel that is on no core sends nothing
+    source = netlist.axon_source[sent]
+    start, end = tile[core[source]], netlist.core_tile[netlist.core_of_axon()[sent]]
+    leaves = chip_of_core(start, target) != chip_of_core(end, target)
+    east_west, north_south = np.where(leaves, 0, hops(start, end, target.limit("mesh.width")))
+    compartments = np.arange(n_inputs, size)
+    amounts = {
+        "synaptic_operation_dense": caused(dense, *entries),
+        "synaptic_operation_sparse": caused(~dense, *entries),
+        "spike": caused(np.ones_like(group), compartments, group),
+        "packet": caused(np.ones_like(source), source, home[source]),
+        "hop_east_west": caused(east_west, source, home[source]),
+        "hop_north_south": caused(north_south, source, home[source]),
+        BETWEEN_CHIPS: caused(leaves, source, home[source]),
+        "zeros": caused(netlist.synapse_weight == 0, *entries),
     }
     return Meter(
-        netlist=netlist,
         target=target,
-        names=tuple(caused),
-        caused=np.concatenate(list(caused.values()), axis=1),
-        neurons=np.bincount(netlist.layer, minlength=len(netlist.layers)).astype(np.float64),
+        names=tuple(amounts),
+        caused=np.concatenate(list(amounts.values()), axis=1),
+        neurons=neurons,
     )
 
 
-def count(meter: Meter, counts: Counts, steps: int | IntArray) -> dict[str, FloatArray]:
-    """Amount per recording and layer of everything that a meter knows and of neuron updates.
+def count(meter: Meter, counts: Counts, chip_steps: int | IntArray) -> dict[str, FloatArray]:
+    """Amount per recording and group of everything that a meter knows and of neuron updates.
 
-    `counts` are those of a batch, with one leading axis of recordings; `steps` the data steps T of all of them, or of
-    each (samples,).
+    `counts` are those of a batch, with one leading axis of recordings and updates by group; `chip_steps` those of all
+    recordings, or of each (samples,).
     """
     sources = np.concatenate([counts.inputs, counts.spikes], axis=1).astype(np.float64)
     amounts = dict(zip(meter.names, np.split(sources @ meter.caused, len(meter.names), axis=1), strict=True))
-    active = counts.updates.astype(np.float64)
+    active = np.zeros((len(sources), len(meter.neurons)))  # cores of inputs have no neuron
+    active[:, : counts.updates.shape[1]] = counts.updates
     amounts["neuron_active"] = active
-    amounts["neuron_idle"] = meter.neurons * (np.reshape(steps, (-1, 1)) + meter.netlist.max_depth) - active
+    amounts["neuron_idle"] = meter.neurons * np.reshape(chip_steps, (-1, 1)) - active
     return amounts
 
 
-def price(table: EnergyTable, events: Mapping[str, FloatArray]) -> FloatArray | tuple[str, ...]:
-    """Energy in joules, or the events that happened and that the table has no price for."""
-    names = {
-        event: "synaptic_operation" if "synaptic_operation" in table.prices and event.startswith("syn") else event
-        for event in EVENTS
-    }
-    lacking = tuple(
+def _named(table: EnergyTable, event: str) -> str:
+    """The name under which a table prices an event."""
+    return "synaptic_operation" if "synaptic_operation" in table.prices and event.startswith("syn") else event
+
+
+def lacking(table: EnergyTable, events: Mapping[str, FloatArray]) -> tuple[str, ...]:
+    """Events that happened and that a table has no price for."""
+    return tuple(
         event
-        for event, name in names.items()
-        if name not in table.prices and event not in OPTIONAL and np.any(events[event])
+        for event in EVENTS
+        if _named(table, event) not in table.prices and event not in OPTIONAL and np.any(events[event])
     )
-    if lacking:
-        return lacking
+
+
+def joules(table: EnergyTable, events: Mapping[str, FloatArray], of: Iterable[str] = EVENTS) -> FloatArray:
+    """Energy of some events; what the table has no price for is left out."""
     energy = np.zeros_like(events["packet"])
-    for event, name in names.items():
+    for event in of:
+        name = _named(table, event)
         if name in table.prices:
             energy = energy + events[event] * table.joule(name)
     return energy
 
 
-def estimate(meter: Meter, counts: Counts, steps: int | IntArray) -> Costs:
-    """Price a run with every table of its chip; `counts` and `steps` as for :func:`count`."""
-    amounts = count(meter, counts, steps)
+def by_table(target: Target, events: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Energy by each table that has a price for all that happened."""
+    return {table.name: joules(table, events) for table in target.energy if not lacking(table, events)}
+
+
+def by_part(target: Target, events: Mapping[str, FloatArray]) -> dict[str, dict[str, FloatArray]]:
+    """The same for each part of the chip."""
+    return {
+        table.name: {part: joules(table, events, of) for part, of in PARTS.items()}
+        for table in target.energy
+        if not lacking(table, events)
+    }
+
+
+def estimate(meter: Meter, counts: Counts, chip_steps: int | IntArray) -> Costs:
+    """Price a run with every table of its chip; `counts` and `chip_steps` as for :func:`count`."""
+    amounts = count(meter, counts, chip_steps)
     events = {event: amounts[event] for event in EVENTS}
-    priced = {table.name: price(table, events) for table in meter.target.energy}
+    energy = by_table(meter.target, events)
     return Costs(
         events=events,
         zeros=amounts["zeros"],
         between_chips=amounts[BETWEEN_CHIPS],
-        steps=int(np.max(steps)) + meter.netlist.max_depth,
-        energy={name: result for name, result in priced.items() if not isinstance(result, tuple)},
-        unpriced={name: result for name, result in priced.items() if isinstance(result, tuple)},
+        steps=int(np.max(chip_steps)),
+        energy=energy,
+        unpriced={table.name: lacking(table, events) for table in meter.target.energy if table.name not in energy},
     )
-
-
-def by_part(table: EnergyTable, events: Mapping[str, FloatArray]) -> dict[str, FloatArray] | tuple[str, ...]:
-    """Energy of each part in joules, or the events that happened and that the table has no price for.
-
-    `events` are amounts by layer, as :func:`count` gives them, or by core, as :func:`count_by_core` does; the
-    parts add up to :func:`price` of the same amounts.
-    """
-    whole = price(table, events)
-    if isinstance(whole, tuple):
-        return whole
-    found = {}
-    for part, own in PARTS.items():
-        energy = price(table, {event: amount if event in own else 0 * amount for event, amount in events.items()})
-        assert not isinstance(energy, tuple)
-        found[part] = energy
-    return found
-
-
-def count_by_core(
-    netlist: Netlist,
-    target: Target,
-    counts: Counts,
-    updates: IntArray,
-    chip_steps: int | IntArray,
-    *,
-    input_tiles: tuple[int, ...] = (),
-    dense: BoolArray | None = None,
-) -> dict[str, FloatArray]:
-    """Amount of every event of `EVENTS` per recording and core, (samples, cores) float64 each.
-
-    Synaptic operations belong to the core that receives them, packets and hops to the core that sends them. `updates`
-    (samples, cores) are :func:`updates_by_core` of a trace, `chip_steps` those of all recordings or of each;
-    `input_tiles` and `dense` are as for :func:`timing.prepare`: cores of inputs come after the others and cost only
-    their packets and hops.
-    """
-    cores = netlist.n_cores + len(input_tiles)
-    tile = np.append(netlist.core_tile, np.array(input_tiles, np.int64))
-    channels = np.arange(netlist.n_inputs) // target.limit("core.compartments")
-    home = np.append(netlist.n_cores + channels, netlist.core_of_compartment())
-    fired = np.concatenate([counts.inputs, counts.spikes], axis=1).astype(np.float64)
-    source, receiver = netlist.axon_source, netlist.core_of_axon()
-
-    in_dense, in_sparse = entries_by_form(netlist, dense)
-
-    def sums(amount: IntArray, axons: IntArray, at: IntArray) -> FloatArray:
-        """What the spikes of the axons' sources cause on the cores `at`; (samples, cores)."""
-        each = csr_array((amount[axons].astype(np.float64), (at[axons], source[axons])), (cores, fired.shape[1]))
-        caused: FloatArray = (each @ fired.T).T
-        return caused
-
-    every = np.arange(netlist.n_axons)
-    sent = every if input_tiles else np.flatnonzero(source >= netlist.n_inputs)
-    sender = np.minimum(home[source], cores)  # a channel that is on no core sends nothing
-    y, x = np.divmod(np.append(tile, 0), target.limit("mesh.width"))
-
-    def on_cores(amount: IntArray) -> FloatArray:
-        """Pad amounts of the netlist's cores with nothing on those of the inputs."""
-        padded = np.zeros((len(fired), cores))
-        padded[:, : netlist.n_cores] = amount
-        return padded
-
-    neurons = np.diff(netlist.core_compartments)
-    spikes = [np.bincount(home[netlist.n_inputs :], row, netlist.n_cores) for row in counts.spikes]
-    amounts = {
-        "synaptic_operation_dense": sums(in_dense, every, receiver),
-        "synaptic_operation_sparse": sums(in_sparse, every, receiver),
-        "neuron_idle": on_cores(neurons * np.reshape(chip_steps, (-1, 1)) - updates),
-        "neuron_active": on_cores(updates),
-        "spike": on_cores(np.array(spikes).reshape(-1, netlist.n_cores)),
-        "packet": sums(np.ones(netlist.n_axons, np.int64), sent, sender),
-        "hop_east_west": sums(np.abs(x[sender] - x[receiver]), sent, sender),
-        "hop_north_south": sums(np.abs(y[sender] - y[receiver]), sent, sender),
-    }
-    return {event: amounts[event] for event in EVENTS}
 
 
 def updates_by_core(netlist: Netlist, updated: BoolArray) -> IntArray:

@@ -19,11 +19,6 @@ from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.trace import Charges, side_by_side
 
 
-def read_out_depth(netlist: Netlist) -> int:
-    """Chip steps by which the votes lag behind the data: the depth of the latest layer that votes."""
-    return max(netlist.layers[int(layer)].depth for layer in np.unique(netlist.layer[netlist.readout_class >= 0]))
-
-
 def least_intervals(netlist: Netlist) -> IntArray:
     """See :attr:`IntegerMachine.least_intervals`; in the order of compartments."""
     voters = np.flatnonzero(netlist.readout_class >= 0)
@@ -55,26 +50,15 @@ def vote_charges(netlist: Netlist) -> Charges:
     )
 
 
-def votes_of(netlist: Netlist, events: engine.EventArray, lengths: IntArray) -> IntArray:
-    """Votes so far after each step of the read-out, ``Cumulative.votes`` alone; arguments as for :func:`run`."""
-    prepared = engine.prepare(netlist, charges=vote_charges(netlist))
-    trace = engine.simulate(prepared, events, lengths=lengths)
-    assert trace.charged is not None, "votes were wanted"
-    return _by_step(netlist, trace.charged, events.shape[2])
+def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: IntArray, *, lag: int) -> Cumulative:
+    """Run recordings (samples, n_inputs, T), each for its own length in data steps (samples,), once.
 
-
-def _by_step(netlist: Netlist, votes: IntArray, steps: int) -> IntArray:
-    """Votes so far after each step of the read-out, from those of each chip step."""
-    depth = read_out_depth(netlist)
-    return np.cumsum(votes, axis=1)[:, depth : depth + steps]
-
-
-def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: IntArray) -> Cumulative:
-    """Run recordings (samples, n_inputs, T), each for its own length in data steps (samples,), once."""
+    `lag` are the chip steps by which the votes are behind the data.
+    """
     timed = target.time if chip_count(netlist.core_tile, target) == 1 else ()
     latencies = [timing.prepare(netlist, target, table) for table in timed]
-    meter = cost.prepare(netlist, target)
-    parts = [vote_charges(netlist), _event_charges(meter), *map(timing.charges, latencies)]
+    meter = cost.prepare(netlist, target, "whole")
+    parts = [vote_charges(netlist), _event_charges(netlist, meter), *map(timing.charges, latencies)]
     prepared = engine.prepare(netlist, charges=side_by_side(parts))
     trace = engine.simulate(prepared, events, lengths=lengths)
     assert trace.charged is not None, "sums were wanted"
@@ -83,15 +67,15 @@ def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: In
     chip_steps = lengths + netlist.max_depth
     runs = np.arange(trace.charged.shape[1]) < chip_steps[:, None]
     events_by_step = _events(meter, happened, runs)
-    found = {table.name: cost.price(table, events_by_step) for table in target.energy}
+    energy = cost.by_table(target, events_by_step)
     operations = events_by_step["synaptic_operation_dense"] + events_by_step["synaptic_operation_sparse"]
     return Cumulative(
-        votes=_by_step(netlist, votes, events.shape[2]),
-        depth=read_out_depth(netlist),
+        votes=np.cumsum(votes, axis=1)[:, lag : lag + events.shape[2]],
+        depth=lag,
         lengths=lengths,
         chip_steps=chip_steps,
         operations=np.cumsum(operations, axis=1),
-        energy={name: np.cumsum(each, axis=1) for name, each in found.items() if not isinstance(each, tuple)},
+        energy={name: np.cumsum(each, axis=1) for name, each in energy.items()},
         time={
             table.name: np.cumsum(timing.simple_times(each, own, chip_steps).duration_ns, axis=1) * 1e-9
             for table, each, own in zip(timed, latencies, times, strict=True)
@@ -99,11 +83,9 @@ def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: In
     )
 
 
-def _event_charges(meter: cost.Meter) -> Charges:
-    """What events add to the amounts that a meter knows, layers taken together, and to neuron updates."""
-    netlist = meter.netlist
-    caused = meter.caused.reshape(len(meter.caused), len(meter.names), -1).sum(axis=2).astype(np.int64)
-    caused = np.concatenate([caused, np.zeros((len(caused), 1), np.int64)], axis=1)
+def _event_charges(netlist: Netlist, meter: cost.Meter) -> Charges:
+    """What events add to the amounts that a meter knows, and to neuron updates."""
+    caused = np.pad(meter.caused.astype(np.int64), ((0, 0), (0, 1)))
     updates = np.zeros((netlist.n_compartments, caused.shape[1]), np.int64)
     updates[:, -1] = 1
     return Charges(channels=caused[: netlist.n_inputs], spikes=caused[netlist.n_inputs :], updates=updates)
@@ -112,5 +94,5 @@ def _event_charges(meter: cost.Meter) -> Charges:
 def _events(meter: cost.Meter, happened: IntArray, runs: BoolArray) -> dict[str, FloatArray]:
     """Amount of each priced event in each chip step; (samples, chip steps)."""
     amounts = dict(zip((*meter.names, "neuron_active"), np.moveaxis(happened.astype(np.float64), 2, 0), strict=True))
-    amounts["neuron_idle"] = runs * meter.neurons.sum() - amounts["neuron_active"]
+    amounts["neuron_idle"] = runs * meter.neurons - amounts["neuron_active"]
     return {event: amounts[event] for event in cost.EVENTS}

@@ -6,7 +6,7 @@ Every message is scheduled for these, and energy is told by core. Spikes are the
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -28,12 +28,11 @@ PART = 16
 class Estimate:
     """Costs of a batch of recordings.
 
-    Events and energies by layer; joules by table and part, (samples, layers); data steps; times by table; and, in
-    detail ``cycle`` only, detailed times and joules by table and core.
+    Events and energies by layer; data steps; times by table; and, in detail ``cycle`` only, detailed times and joules
+    by table and core.
     """
 
     costs: Costs
-    parts: Mapping[str, Mapping[str, FloatArray]]
     steps: IntArray
     simple: Mapping[str, SimpleTimes]
     detailed: Mapping[str, DetailedTimes]
@@ -78,30 +77,18 @@ def estimate(
         counts, charged = trace.counts, trace.charged
         if spikes is not None:
             spikes[:] = trace.spikes
-    simple = {}
-    if charged is not None:
-        sums = np.split(charged, len(latencies), axis=2)
-        simple = {
-            name: timing.simple_times(each, own, steps + prepared.drain)
-            for (name, each), own in zip(latencies.items(), sums, strict=True)
-        }
-    costs = cost.estimate(cost.prepare(netlist, target), counts, steps)
-    parts = {prices.name: cost.by_part(prices, costs.events) for prices in target.energy}
-    cores: dict[str, FloatArray] = {}
+    chip_steps = steps + netlist.max_depth
+    sums = [] if charged is None else np.split(charged, len(latencies), axis=2)
+    simple = {
+        name: timing.simple_times(each, own, chip_steps)
+        for (name, each), own in zip(latencies.items(), sums, strict=True)
+    }
+    cores: Mapping[str, FloatArray] = {}
     if detail == "cycle":
-        by_core = cost.count_by_core(netlist, target, counts, updates, steps + netlist.max_depth)
-        for prices in target.energy:
-            found = cost.price(prices, by_core)
-            if not isinstance(found, tuple):
-                cores[prices.name] = found
-    return counts, Estimate(
-        costs=costs,
-        parts={name: found for name, found in parts.items() if not isinstance(found, tuple)},
-        steps=steps,
-        simple=simple,
-        detailed=detailed,
-        cores=cores,
-    )
+        by_core = replace(counts, updates=updates)
+        cores = cost.estimate(cost.prepare(netlist, target, "core"), by_core, chip_steps).energy
+    costs = cost.estimate(cost.prepare(netlist, target), counts, chip_steps)
+    return counts, Estimate(costs=costs, steps=steps, simple=simple, detailed=detailed, cores=cores)
 
 
 def _deep(

@@ -12,9 +12,9 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import FloatArray
-from spikeloom.runtime.machines.loihi1.costs.cost import NOT_PRICED, Costs
+from spikeloom.runtime.machines.loihi1.costs.cost import NOT_PRICED, Costs, by_part
 from spikeloom.runtime.machines.loihi1.costs.estimate import Estimate
-from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
+from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, StepTimes
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 
 
@@ -59,14 +59,6 @@ class End:
 
     table: str
     energy_j: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EnergyRange:
-    """How far tables disagree."""
-
-    low: End
-    high: End
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,7 +138,7 @@ class CostReport:
     min: Amounts
     max: Amounts
     energy_by_part_j: Mapping[str, Mapping[str, float]]
-    energy_range_j: EnergyRange | None
+    energy_range_j: Mapping[str, End] | None
     layers: tuple[LayerCosts, ...]
     cores: tuple[CoreCosts, ...]
     time: tuple[Times, ...]
@@ -172,7 +164,7 @@ def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: flo
         max=whole(np.max),
         energy_by_part_j={
             name: {part: float(each.sum(axis=1).mean()) for part, each in parts.items()}
-            for name, parts in found.parts.items()
+            for name, parts in by_part(target, costs.events).items()
         },
         energy_range_j=_energy_range(costs),
         layers=tuple(
@@ -226,12 +218,12 @@ def _mean_of(layer: int) -> Callable[[FloatArray], float]:
     return lambda amount: float(amount[:, layer].mean())
 
 
-def _energy_range(costs: Costs) -> EnergyRange | None:
-    means = {name: float(each.sum(axis=1).mean()) for name, each in costs.energy.items()}
+def _energy_range(costs: Costs) -> dict[str, End] | None:
+    """How far tables disagree."""
+    means = [End(table=name, energy_j=float(each.sum(axis=1).mean())) for name, each in costs.energy.items()]
     if len(means) < 2:
         return None
-    low, high = (end(means, key=lambda name: means[name]) for end in (min, max))
-    return EnergyRange(low=End(table=low, energy_j=means[low]), high=End(table=high, energy_j=means[high]))
+    return {name: end(means, key=lambda mean: mean.energy_j) for name, end in (("low", min), ("high", max))}
 
 
 def _links(chips: int, costs: Costs) -> list[str]:
@@ -245,7 +237,7 @@ def _links(chips: int, costs: Costs) -> list[str]:
     ]
 
 
-def _models(found: Estimate) -> Iterator[tuple[str, str, SimpleTimes | DetailedTimes]]:
+def _models(found: Estimate) -> Iterator[tuple[str, str, StepTimes]]:
     """Table, model and times."""
     for table, simple in found.simple.items():
         yield table, "simple", simple
@@ -253,8 +245,8 @@ def _models(found: Estimate) -> Iterator[tuple[str, str, SimpleTimes | DetailedT
         yield table, "detailed", detailed
 
 
-def _times(table: str, model: str, times: SimpleTimes | DetailedTimes) -> Times:
-    seconds = times.duration_ns.sum(axis=1) * 1e-9
+def _times(table: str, model: str, times: StepTimes) -> Times:
+    seconds = times.seconds
     ran = times.critical_core >= 0
     cores, steps = np.unique(times.critical_core[ran], return_counts=True)
     detailed = times if isinstance(times, DetailedTimes) else None
@@ -289,7 +281,7 @@ def _pace(found: Estimate, bin_s: float) -> Pace:
                 energy_table=name,
                 time_table=table,
                 model=model,
-                power_w=float((each / (times.duration_ns.sum(axis=1) * 1e-9)).mean()),
+                power_w=float((each / times.seconds).mean()),
                 energy_delay_js=float((each * times.duration_ns.sum(axis=1) * 1e-9).mean()),
             )
             for table, model, times in _models(found)

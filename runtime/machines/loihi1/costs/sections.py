@@ -86,7 +86,7 @@ def _lines(report: CostReport) -> list[str]:
     pace, ends = report.pace, report.energy_range_j
     lines = []
     if ends is not None:
-        low, high = (f"{si(end.energy_j, 'J')} ({end.table})" for end in (ends.low, ends.high))
+        low, high = (f"{si(ends[end].energy_j, 'J')} ({ends[end].table})" for end in ("low", "high"))
         lines.append(f"sources differ: a mean inference takes {low} to {high}")
     real_time = ", ".join(f"{si(value, 'W')} ({name})" for name, value in pace.real_time_w.items())
     lines.append(f"dynamic power at the sensor's pace, {1000 * pace.bin_s:g} ms a step: {real_time}")
