@@ -43,8 +43,8 @@ def counts(netlist: Netlist) -> Run:
         trace = simulate(engine, events, threads=1)
         assert trace.charged is not None
         steps = np.full(len(events), events.shape[2])
-        timing.simple_times(latencies, trace.charged, steps + engine.drain)
-        cost.estimate(meter, trace.counts, steps + engine.drain)
+        timing.simple_times(latencies, trace.charged, steps + netlist.max_depth)
+        cost.estimate(meter, trace.counts, steps + netlist.max_depth)
         return trace
 
     return run
@@ -62,9 +62,9 @@ def cycle(netlist: Netlist) -> Run:
         assert trace.updated is not None
         assert trace.charged is not None
         steps = np.full(len(events), events.shape[2])
-        timing.simple_times(latencies, trace.charged, steps + engine.drain)
+        timing.simple_times(latencies, trace.charged, steps + netlist.max_depth)
         timing.detailed(latencies, trace.spikes, trace.updated, events)
-        cost.estimate(meter, trace.counts, steps + engine.drain)
+        cost.estimate(meter, trace.counts, steps + netlist.max_depth)
         return trace
 
     return run

@@ -199,6 +199,11 @@ def recording_of(batch: Trace, index: int) -> Trace:
     return Trace(counts=counts, **{name: getattr(batch, name)[index] for name in KEPT})
 
 
+def ungated(netlist: Netlist) -> Netlist:
+    """The netlist without windows: all layers integrate in each data step, biases included."""
+    return replace(netlist, layers=tuple(replace(layer, depth=0) for layer in netlist.layers))
+
+
 def by_engine(netlist: Netlist, events: np.ndarray, **options: bool) -> Trace:
     """Run one recording through the fast simulator."""
     prepared = engine.prepare(netlist, **options)

@@ -287,15 +287,16 @@ def test_no_output_neuron_spikes_more_often(data):
     except NumericRangeError:
         return
     voters = np.flatnonzero(netlist.readout_class >= 0)
-    for voter, interval in zip(voters, integer_machine_of(netlist).least_intervals, strict=True):
+    machine = integer_machine_of(netlist)
+    for voter, interval in zip(voters, machine.least_intervals, strict=True):
         times = np.flatnonzero(spikes[:, voter])
         assert interval or not len(times)
         assert np.all(np.diff(times) >= interval)
     length = events.shape[1]
     if length:
-        counted = cumulative.votes_of(netlist, events[None], np.array([length]))
+        counted = machine.cumulative(events[None, :, None], np.array([length])).votes
         at = exits.standing(counted, np.array([length]))
-        sure = exits.proven(counted, at, exits.most_votes(integer_machine_of(netlist), length))
+        sure = exits.proven(counted, at, exits.most_votes(machine, length))
         assert np.all(at.leader[sure] == at.decision[0])
 
 
@@ -305,7 +306,7 @@ def test_live_and_recorded_votes_end_alike():
     events = (np.random.default_rng(1).random((6, netlist.n_inputs, 40)) < 0.3).astype(np.uint8)
     lengths = np.full(6, 40)
     machine = integer_machine_of(netlist)
-    votes, depth = cumulative.votes_of(netlist, events, lengths), machine.read_out_lag
+    votes, depth = machine.cumulative(events[:, :, None], lengths).votes, machine.read_out_lag
     at = exits.standing(votes, lengths)
     sure = exits.proven(votes, at, exits.most_votes(machine, 40))
     assert depth == 3
@@ -326,7 +327,7 @@ def test_no_recording_is_decided_otherwise_by_proof(which, request):
     for split in ("train", "test"):
         data = load_data(request.getfixturevalue(f"{which}_zip"), split)
         lengths = np.full(len(data), data.steps)
-        votes = cumulative.votes_of(netlist, with_clocks(data.events, netlist.clocks), lengths)
+        votes = integer_machine_of(netlist).cumulative(data.events, lengths).votes
         at = exits.standing(votes, lengths)
         ends = exits.exits(exits.proven(votes, at, exits.most_votes(integer_machine_of(netlist), data.steps)), at)
         assert_array_equal(at.leader[np.arange(len(data)), ends], at.decision)

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from random_netlists import ungated
 
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
-from spikeloom.runtime.machines.loihi1.engine import prepare, simulate
+from spikeloom.runtime.machines.loihi1.engine import simulate
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -58,7 +59,7 @@ def test_our_spikes_are_those_of_the_reference(workload, busy):
 def test_our_spikes_without_windows_are_those_of_the_pipelined_reference(workload, busy):
     events, _, netlist = busy
     events = np.concatenate([events, np.zeros_like(events[:, :4])], axis=1)
-    trace = simulate(prepare(netlist, gated=False), channels_first(events), threads=1, spikes=True)
+    trace = simulate(ungated(netlist), channels_first(events), threads=1, spikes=True)
     for layer, expected in enumerate(workload.reference(workload.chain_of(netlist), events, delay=1)):
         assert np.array_equal(trace.spikes[:, :, netlist.compartments_of(layer)], expected)
 

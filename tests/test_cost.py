@@ -290,11 +290,12 @@ def test_all_details_have_the_same_spikes_and_events(small, found):
 
 
 def test_parts_and_cores_add_up_to_the_whole(found):
-    _, cost = found["cycle"]
-    for name, whole in cost.costs.energy.items():
-        assert set(cost.parts[name]) == {"synapse", "soma", "network"}
-        np.testing.assert_allclose(sum(cost.parts[name].values()), whole, rtol=1e-12)
-        np.testing.assert_allclose(cost.cores[name].sum(axis=1), whole.sum(axis=1), rtol=1e-12)
+    _, priced = found["cycle"]
+    for name, whole in priced.costs.energy.items():
+        parts = cost.by_part(LOIHI, priced.costs.events)[name]
+        assert set(parts) == {"synapse", "soma", "network"}
+        np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-12)
+        np.testing.assert_allclose(priced.cores[name].sum(axis=1), whole.sum(axis=1), rtol=1e-12)
 
 
 def test_a_batch_is_its_recordings_one_by_one(small, found):

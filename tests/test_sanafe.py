@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import timing_oracle
-from random_netlists import large_netlist
+from random_netlists import large_netlist, ungated
 from test_timing import DETAILED, ENERGY_PJ, LOIHI, SANAFE, SIMPLE, six_steps
 
 from spikeloom.compiler.fixedpoint import read_only
@@ -91,7 +91,7 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
 
     shifted = np.zeros((*events.shape[:2], steps), np.uint8)
     shifted[:, :, 1 : events.shape[2] + 1] = events
-    trace = engine.simulate(engine.prepare(netlist, gated=False), shifted, spikes=True, membranes=True)
+    trace = engine.simulate(ungated(netlist), shifted, spikes=True, membranes=True)
     updated = timing_oracle.updates(netlist, shifted, trace.spikes, trace.membranes)
     as_priced = {"input_tiles": sanafe.input_tiles(netlist, LOIHI), "dense": timing_oracle.dense_synapses(netlist)}
     latencies = timing.prepare(netlist, LOIHI, SANAFE, **as_priced)

@@ -7,7 +7,7 @@ import pytest
 import timing_oracle
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_netlists import Axon, Neuron, build, by_engine, large_netlist, netlists, recordings
+from random_netlists import Axon, Neuron, build, by_engine, large_netlist, netlists, recordings, ungated
 
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import sanafe
@@ -79,7 +79,7 @@ def six_steps():
     netlist = replace(netlist, core_tile=read_only([8, 9]), format_index_bits=read_only([0]))
     # an event acts in the step after the one in which its channel fires there
     events = np.array([[0, 1, 1, 0, 1, 0], [0, 1, 0, 0, 1, 1]], np.uint8)
-    return netlist, events, by_engine(netlist, events, gated=False)
+    return netlist, events, by_engine(ungated(netlist), events)
 
 
 DETAILED = [1058.8, 1068.7, 1039.7, 1058.8, 1068.7, 1078.4]

@@ -2,8 +2,7 @@
 
 What the file says and what the chip does differ in a few points:
 
-* SANA-FE knows no windows: biases act from its first step on. :func:`engine.prepare` runs the same with
-  ``gated=False``.
+* SANA-FE knows no windows: biases act from its first step on. The engine runs the same if all layers have depth 0.
 * Input channels are neurons: they fire in one step and act in the next. They sit on cores of their own, cost nothing
   but their messages, and are silent until they are given ``spikes``.
 * A neuron names one unit for all of its synapses. A neuron that both dense and sparse lists reach names the one with

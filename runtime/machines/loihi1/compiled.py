@@ -58,9 +58,9 @@ class CompilationFacts:
     facts: Sequence[str] | None = field(default=None, metadata=OPTIONAL)
 
 
-def facts_of(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> CompilationFacts:
-    """Facts of a compilation whose netlist was written to a file with a hash."""
-    return CompilationFacts(
+def outcome(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> Outcome:
+    """Facts of a compilation, whose netlist was written to a file with a hash, with their layout."""
+    result = CompilationFacts(
         netlist=description.describe(done.netlist, done.uses, sha256),
         calibration=done.choices,
         proofs=done.proofs,
@@ -71,11 +71,7 @@ def facts_of(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> Compi
         layout=LayoutChoice(optimize=done.options.optimize, expected=_layout(done.layout), usual=_layout(done.usual)),
         facts=facts or None,
     )
-
-
-def outcome(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> Outcome:
-    """Facts of a compilation with their layout."""
-    return Outcome(facts_of(done, sha256, facts), sections)
+    return Outcome(result, sections)
 
 
 def _layout(layout: choose.Layout) -> LayoutFacts:

@@ -134,9 +134,12 @@ def sections(facts: NetlistFacts) -> Iterator[Section]:
     lines = [
         f"{facts.target}: {facts.neurons:,} neurons{left}, {facts.synapses:,} synapses "
         f"({facts.synapses_stored:,} stored, {facts.synapses_nonzero:,} non-zero), {facts.cores} cores on {where}",
-        *clock_lines(facts.clocks),
-        *bin_lines(facts.bins or 1),
     ]
+    if facts.clocks is not None:
+        channels, steps = facts.clocks.channels, facts.clocks.steps
+        lines.append(f"  {channels} clocks of {steps} steps each, {channels * steps} in all, beside the sensor")
+    if facts.bins is not None:
+        lines.append(f"  a step joins {facts.bins} bins of the recordings")
     yield Section("", [*map(Text, lines), _layer_table(facts.layers)])
     fullest: dict[str, LimitUse] = {}
     for use in facts.limits:
@@ -190,16 +193,3 @@ def _span(values: OneOrMany) -> str:
         return f"{values:.6g}"
     ends = f"{min(values):.6g}", f"{max(values):.6g}"
     return "…".join(ends) if ends[0] != ends[1] else ends[0]
-
-
-def clock_lines(clocks: Clocks | None) -> list[str]:
-    """What the clocks of a network are; none for most."""
-    if clocks is None or not clocks.channels:
-        return []
-    channels, steps = clocks.channels, clocks.steps
-    return [f"  {channels} clocks of {steps} steps each, {channels * steps} in all, beside the sensor"]
-
-
-def bin_lines(bins: int) -> list[str]:
-    """How long the steps of a network are, where they join bins of the recordings."""
-    return [f"  a step joins {bins} bins of the recordings"] if bins > 1 else []

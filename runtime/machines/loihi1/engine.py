@@ -48,28 +48,26 @@ class Engine:
     """A netlist prepared for a kernel by :func:`prepare`; holds no state and can be shared by threads.
 
     The kernel of layers reads `blocks`, that of steps `tables`; `charges` are what events add to the sums of each chip
-    step. A recording takes `drain` chip steps beyond its data steps.
+    step.
     """
 
     netlist: Netlist
     blocks: Blocks | None
     tables: Tables | None
-    drain: int
     charges: Charges | None
 
 
-def prepare(netlist: Netlist, *, stepwise: bool = False, gated: bool = True, charges: Charges | None = None) -> Engine:
+def prepare(netlist: Netlist, *, stepwise: bool = False, charges: Charges | None = None) -> Engine:
     """Lay a netlist out for a kernel.
 
-    `stepwise` is for :func:`advance`: the kernel of steps even where that of layers would do; it is also taken if not
-    `gated`, see :func:`spec.simulate`. `charges` are what events add to the sums of each chip step in a trace.
+    `stepwise` is for :func:`advance`: the kernel of steps even where that of layers would do. `charges` are what events
+    add to the sums of each chip step in a trace.
     """
-    blocks = lay_out_blocks(netlist) if gated and not stepwise else None
+    blocks = None if stepwise else lay_out_blocks(netlist)
     return Engine(
         netlist=netlist,
         blocks=blocks,
-        tables=tables_of(netlist, gated=gated) if blocks is None else None,
-        drain=netlist.max_depth if gated else 0,
+        tables=tables_of(netlist) if blocks is None else None,
         charges=charges,
     )
 
@@ -136,7 +134,7 @@ def simulate(
     netlist, charges = engine.netlist, engine.charges
     check_channels(netlist, events.shape[1])
     recordings, _, length = events.shape
-    shape = (recordings, length + engine.drain, netlist.n_compartments)
+    shape = (recordings, length + netlist.max_depth, netlist.n_compartments)
     trace = Trace(
         counts=Counts(
             inputs=np.zeros((recordings, netlist.n_inputs), np.int64),
@@ -180,7 +178,7 @@ def _run_layers(
     blocks, nothing = engine.blocks, (0, 0, 0)
     assert blocks is not None, "laid out for the kernel of steps"
     n = engine.netlist.n_compartments
-    words = len(events), events.shape[2] + engine.drain, -(-n // 64)
+    words = len(events), events.shape[2] + engine.netlist.max_depth, -(-n // 64)
     spikes, updated = (
         np.zeros(words if engine.charges is not None or kept is not None else nothing, np.uint64)
         for kept in (trace.spikes, trace.updated)
@@ -211,8 +209,8 @@ def _run_steps(
 ) -> tuple[WordArray, WordArray]:
     """Run the one recording of a part step after step; its spikes and updates at a bit each."""
     netlist, index, length = engine.netlist, part.start, int(ends[0])
-    state, window = state_of(netlist), length + engine.drain
-    size = events.shape[2] + engine.drain, netlist.n_compartments
+    state, window = state_of(netlist), length + engine.netlist.max_depth
+    size = events.shape[2] + engine.netlist.max_depth, netlist.n_compartments
     fired = np.zeros(size, np.bool_) if trace.spikes is None else trace.spikes[index]
     worked = np.zeros(size, np.bool_) if trace.updated is None else trace.updated[index]
     try:

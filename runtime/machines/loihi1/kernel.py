@@ -39,7 +39,7 @@ class Tables(NamedTuple):
     # weights of compartment c is 2 * c, that of the negative ones follows
     sum_of: AnyArray
     magnitude: AnyArray
-    depth: AnyArray  # (compartments,) int32; of the layer of each, or zero where no window holds it at rest
+    depth: AnyArray  # (compartments,) int32; of the layer of each
     # keep_u, keep_v, threshold, bias: (compartments,) int32; decays in 1/4096, the others in membrane units
     keep_u: AnyArray
     keep_v: AnyArray
@@ -67,12 +67,12 @@ class State(NamedTuple):
     saturations: IntArray
 
 
-def tables_of(netlist: Netlist, *, gated: bool) -> Tables:
+def tables_of(netlist: Netlist) -> Tables:
     """Lay a netlist out for the kernel."""
     source = netlist.axon_source[netlist.axon_of_synapse()]
     order = np.argsort(source, kind="stable")
     weight = netlist.effective_weight()[order]
-    depth = np.array([layer.depth if gated else 0 for layer in netlist.layers], np.int32)
+    depth = np.array([layer.depth for layer in netlist.layers], np.int32)
     return Tables(
         first=np.searchsorted(source[order], np.arange(netlist.n_inputs + netlist.n_compartments + 1)),
         sum_of=(2 * netlist.synapse_compartment()[order] + (weight < 0)).astype(np.uint32),

@@ -146,13 +146,12 @@ def read_synapses(netlist: Netlist) -> list[list[tuple[int, int]]]:
     return lists
 
 
-def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_], *, gated: bool = True) -> Trace:
+def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trace:
     """Run one recording (n_inputs, T) through the chip; the trace has spikes, membranes and updates, no leading axis.
 
-    Unless `gated`, layers know no windows: all integrate in each of ``T`` chip steps, biases included, as simulators do
-    that know none. Raises DataError if the recording has another number of input channels than the network, and
-    NumericRangeError at the first register that would overflow: the lowest chip step, then the lowest compartment id,
-    the synaptic sum before the current.
+    Raises DataError if the recording has another number of input channels than the network, and NumericRangeError at
+    the first register that would overflow: the lowest chip step, then the lowest compartment id, the synaptic sum
+    before the current.
     """
     check_channels(netlist, events.shape[0])
     n_inputs, length = events.shape
@@ -162,7 +161,7 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_], *, gate
     for axon, source in enumerate(netlist.axon_source.tolist()):
         axons_of[source].append(axon)
 
-    chip_steps = length + netlist.max_depth if gated else length
+    chip_steps = length + netlist.max_depth
     spikes = np.zeros((chip_steps, len(compartments)), np.bool_)
     membranes = np.zeros((chip_steps, len(compartments)), np.int32)
     updated = np.zeros((chip_steps, len(compartments)), np.bool_)
@@ -195,7 +194,7 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_], *, gate
         # let every neuron whose window is open integrate
         spiked_now = []
         for c, neuron in enumerate(compartments):
-            if gated and not neuron.depth <= t < neuron.depth + length:
+            if not neuron.depth <= t < neuron.depth + length:
                 neuron.current = neuron.membrane = 0
                 continue
             worked = neuron.membrane != 0 or neuron.current != 0 or reached[c] or neuron.bias != 0

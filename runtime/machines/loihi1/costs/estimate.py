@@ -110,7 +110,7 @@ def _deep(
         counts.append(trace.counts)
         charged += [] if trace.charged is None else [trace.charged]
         updates.append(cost.updates_by_core(prepared.netlist, trace.updated))
-        own = steps[part] + prepared.drain
+        own = steps[part] + prepared.netlist.max_depth
         given = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after a recording's end
         for name, each in latencies.items():
             found[name].append(timing.detailed(each, trace.spikes, trace.updated, given, steps=own))
