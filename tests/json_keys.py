@@ -7,7 +7,7 @@ bits:
     combinations command float_accuracy front layers netlist of recommended recordings scale_groups wanted
     widths
 chart:
-    budget chosen_by command data digest expected format grid measured networks points recommended refused saving
+    budget chosen_by command data expected format grid networks points recommended refused saving
     spikeloom tables target
 compile:
     chips classes compartments cores layers limits neurons provenance sha256 synapses synapses_nonzero
@@ -52,7 +52,7 @@ inspect netlist, crossbars:
 join:
     classes command file graph layers sha256 system towers
 lean:
-    candidates chosen differ layers output overflowing rows samples source split taken taxels
+    differ layers output overflowing rows samples source split taken taxels
 report:
     cores costs decisions netlist output provenance recording taxels verify
 run:

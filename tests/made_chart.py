@@ -12,10 +12,8 @@ from spikeloom.runtime.studies.chart.results import (
     ChartedNetwork,
     ChosenBy,
     Figures,
-    Measured,
     Point,
     Refused,
-    Tables,
     share,
 )
 
@@ -73,7 +71,6 @@ def made_network(name: str = "grasps", **about: Any) -> ChartedNetwork:
         "sha256": "ab" * 32,
         "system": "tactilesgnet",
         "graph": "manual",
-        "has_graph": True,
         "weights": "last",
         "fine_tuned": False,
         "trained_by": "spikeloom train",
@@ -120,7 +117,7 @@ def made_chart(*budgets: str) -> Chart:
         target="loihi1",
         command="spikeloom chart grasps.pt grasps-knn1.pt --data 'a <b>' -o out",
         data=ChartedData(path="a <b>", bin_s=0.02, sha256="cd" * 32, steps=250, **SAMPLES),
-        tables=Tables(energy={"one": "prices <one>", "two": "prices two"}, time={"clock": "times"}),
+        tables={"energy": {"one": "prices <one>", "two": "prices two"}, "time": {"clock": "times"}},
         chosen_by=BY,
         grid=Grid(bits=((2,), (4,), (8,)), window=(50, 100)),
         networks=tuple(networks),
@@ -130,6 +127,4 @@ def made_chart(*budgets: str) -> Chart:
         recommended=choices.recommended(points, networks, BY, bin_s=0.02),
         saving=choices.saving(points, BY),
         budget=choices.pick(points, choices.parse_budgets(budgets), BY),
-        measured=Measured(recordings_per_s={str(point.number): 1000.0 for point in points}),
-        digest="ef" * 32,
     )

@@ -13,8 +13,6 @@ from typing import Any
 from spikeloom.compiler.errors import DataError
 from spikeloom.runtime.studies.jobs import Job, content_key, sweep
 
-KIND = "test"
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Square(Job):
@@ -63,4 +61,4 @@ def points(log: Path, count: int, **trouble: dict[int, Any]) -> list[Square]:
 if __name__ == "__main__":
     store, log, count, jobs = sys.argv[1:]
     made = points(Path(log), int(count), seconds=dict.fromkeys(range(int(count)), 0.1))
-    sweep(made, square, Path(store), kind=KIND, version=1, jobs=int(jobs), label="squares")
+    sweep(made, square, Path(store), jobs=int(jobs), label="squares")

@@ -218,11 +218,6 @@ def report_lines(place, *words):
     return [json.loads(line) for line in out.getvalue().splitlines()]
 
 
-def test_lean_takes_networks_of_one_timing(refusal):
-    line = refusal("lean", "plain.pt", "x.pt", "--data", "fine")
-    assert line == "spikeloom: x.pt: a step joins 3 bins, of plain.pt 1; spikeloom chart compares such networks"
-
-
 # --- what else is made of them ----------------------------------------------------------------------------------------
 
 

@@ -9,9 +9,8 @@ from made_chart import made_chart
 
 from spikeloom.runtime.report.encode import decode, encode
 from spikeloom.runtime.report.sections import terminal
-from spikeloom.runtime.studies.chart.files import page
 from spikeloom.runtime.studies.chart.results import Chart
-from spikeloom.runtime.studies.chart.sections import panels, printed, series_of
+from spikeloom.runtime.studies.chart.sections import page, panels, printed, series_of
 
 PARTS = ["Networks", "Which one to deploy", "Accuracy against cost", "Every point", "Provenance"]
 

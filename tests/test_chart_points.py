@@ -198,7 +198,7 @@ def test_the_nearest_point_of_a_budget_that_nothing_fits(points):
     found = picked(points, "energy=20uJ")
     assert (found.fits, found.fitting, found.point) == (False, 0, 4)
     (miss,) = found.misses.values()
-    assert (miss.limit, miss.found) == (pytest.approx(20 * UJ), pytest.approx(40 * UJ))
+    assert (miss["limit"], miss["found"]) == (pytest.approx(20 * UJ), pytest.approx(40 * UJ))
     both = picked(points, "energy=50uJ", "latency=2ms")
     assert (both.point, list(both.misses)) == (3, ["energy"])
 

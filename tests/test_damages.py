@@ -74,7 +74,7 @@ def moved(before, after):
 @pytest.mark.parametrize("packing", [None, (Packing(bits=4),), (Packing(planes=2),)])
 def test_float_weights_move_as_the_stored_ones_do(packing):
     pair = made(packing=packing)
-    after = damages.flip_bits(pair, 0.02, drawn(1))
+    after = damages.weight_bit_flips(pair, 0.02, drawn(1))
     assert any(m.any() for m in moved(pair, after))
     for old, new in zip(pair.network.projections, after.network.projections, strict=True):
         same = old.weight.toarray() == new.weight.toarray()
@@ -84,15 +84,15 @@ def test_float_weights_move_as_the_stored_ones_do(packing):
 def test_flipped_bits_are_as_many_as_asked_and_two_flips_undo_each_other():
     pair = made()
     bits = 8 * pair.netlist.n_synapses
-    after = damages.flip_bits(pair, 0.1, drawn(2))
+    after = damages.weight_bit_flips(pair, 0.1, drawn(2))
     codes = [(p.netlist.synapse_weight.astype(int) // 2) & 255 for p in (pair, after)]
     flipped = sum(int(x).bit_count() for x in codes[0] ^ codes[1])
     assert abs(flipped - 0.1 * bits) < 5 * np.sqrt(0.09 * bits)
     assert np.all(after.netlist.synapse_weight % 2 == 0)
     assert after.netlist.synapse_weight.min() >= -256
     assert after.netlist.synapse_weight.max() <= 254
-    none = damages.flip_bits(pair, 0.0, drawn())
-    for same in (damages.flip_bits(after, 0.1, drawn(2)), none):
+    none = damages.weight_bit_flips(pair, 0.0, drawn())
+    for same in (damages.weight_bit_flips(after, 0.1, drawn(2)), none):
         assert_array_equal(same.netlist.synapse_weight, pair.netlist.synapse_weight)
     pairs = zip(none.network.projections, pair.network.projections, strict=True)
     assert all(ours.weight is theirs.weight for ours, theirs in pairs)
@@ -190,7 +190,7 @@ def test_a_tie_does_not_fire_and_does_with_the_threshold_one_unit_lower():
 def test_shorter_decay_on_both_sides(tmp_path):
     pair = timed(tmp_path)
     network = pair.network
-    after = damages.shorten_decay(pair, 0.5)
+    after = damages.shorter_decay(pair, 0.5)
     for post, (old, new) in enumerate(zip(network.populations, after.network.populations, strict=True)):
         u, v = decay_registers(0.5 * old.beta, 0.5 * old.alpha)
         ids = pair.netlist.compartments_of(post)
@@ -201,7 +201,7 @@ def test_shorter_decay_on_both_sides(tmp_path):
 
 
 def test_windows_that_open_late_are_those_of_the_specification():
-    pair = damages.open_late(made(), 2)
+    pair = damages.layers_late(made(), 2)
     assert [layer.depth for layer in pair.netlist.layers] == [0, 3, 4, 5]
     assert lay_out_blocks(pair.netlist) is None
     events = inputs(pair, samples=1)
@@ -243,7 +243,7 @@ def test_the_same_network_is_stored_alike_and_none_can_overflow():
 
 def test_outliers_leave_the_float_network_but_for_one_weight_a_layer_and_coarsen_the_chip():
     pair = made()
-    after = damages.add_outliers(pair, 8, drawn(5))
+    after = damages.outlier_weight(pair, 8, drawn(5))
     for old, new in zip(weights(pair.network), weights(after.network), strict=True):
         place = np.argwhere(old != new)
         assert len(place) == 1

@@ -61,8 +61,8 @@ def test_neighbours_are_the_nearest_ones_the_lower_number_first():
 @given(recordings(), SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_a_higher_rate_loses_and_invents_what_a_lower_one_does_and_more(events, seed, share, other):
     rates = (0.0, *sorted((share, other)), 1.0)
-    kept = [d.lose(events, rate, drawn(seed)) for rate in rates]
-    made = [d.invent(events, rate, drawn(seed)) for rate in rates]
+    kept = [d.events_lost(events, rate, drawn(seed)) for rate in rates]
+    made = [d.events_spurious(events, rate, drawn(seed)) for rate in rates]
     assert_array_equal(kept[0], events)
     assert_array_equal(made[0], events)
     assert not kept[3].any()
@@ -76,25 +76,25 @@ def test_a_higher_rate_loses_and_invents_what_a_lower_one_does_and_more(events, 
 def test_rates_are_those_that_were_asked_for(share):
     full, none = np.ones((4, 39, 2, 250), np.uint8), np.zeros((4, 39, 2, 250), np.uint8)
     spread = 5 * np.sqrt(share * (1 - share) * full.size)  # five standard deviations of a binomial number
-    assert abs(full.sum() - d.lose(full, share, drawn(1)).sum(dtype=int) - share * full.size) < spread
-    assert abs(d.invent(none, share, drawn(1)).sum(dtype=int) - share * full.size) < spread
+    assert abs(full.sum() - d.events_lost(full, share, drawn(1)).sum(dtype=int) - share * full.size) < spread
+    assert abs(d.events_spurious(none, share, drawn(1)).sum(dtype=int) - share * full.size) < spread
 
 
 @REPEATABLE
 @given(recordings(), SEEDS, st.floats(0, 8))
 def test_jitter_moves_events_along_their_channel_and_makes_none(events, seed, sigma):
-    found = d.jitter(events, sigma, drawn(seed))
+    found = d.time_jitter(events, sigma, drawn(seed))
     before, after = events.sum(axis=3, dtype=int), found.sum(axis=3, dtype=int)
     assert np.all(after <= before)  # less by what meets
     assert_array_equal(after > 0, before > 0)
     assert found.max(initial=0) <= 1
-    assert_array_equal(d.jitter(events, 0.0, drawn(seed)), events)
+    assert_array_equal(d.time_jitter(events, 0.0, drawn(seed)), events)
 
 
 def test_jitter_keeps_the_number_of_events_that_do_not_meet():
     events = np.zeros((1, 200, 2, 101), np.uint8)
     events[..., 50] = 1
-    found = d.jitter(events, 5.0, drawn(3))
+    found = d.time_jitter(events, 5.0, drawn(3))
     assert_array_equal(found.sum(axis=3), events.sum(axis=3))
     moved = np.nonzero(found)[3] - 50
     assert abs(moved.mean()) < 1.5
@@ -141,17 +141,17 @@ def test_swapped_polarity_is_undone_by_doing_it_again(events, seed, count):
 @given(recordings(), SEEDS, st.floats(0, 1), st.floats(0, 1))
 def test_densities_are_reached_from_their_side_alone(events, seed, density, other):
     room = events[0].size
-    thin, full = d.thin(events, density, drawn(seed)), d.fill(events, density, drawn(seed))
+    thin, full = d.near_empty(events, density, drawn(seed)), d.saturated(events, density, drawn(seed))
     assert np.all(thin <= events)
     assert np.all(full >= events)
     for i, own in enumerate(events.sum(axis=(1, 2, 3), dtype=int).tolist()):
         assert thin[i].sum(dtype=int) == min(own, int(np.floor(density * room)))
         assert full[i].sum(dtype=int) == max(own, int(np.ceil(density * room)))
     low, high = sorted((density, other))
-    assert np.all(d.thin(events, low, drawn(seed)) <= d.thin(events, high, drawn(seed)))
-    assert np.all(d.fill(events, low, drawn(seed)) <= d.fill(events, high, drawn(seed)))
-    assert d.fill(events, 1.0, drawn(seed)).all()
-    assert not d.thin(events, 0.0, drawn(seed)).any()
+    assert np.all(d.near_empty(events, low, drawn(seed)) <= d.near_empty(events, high, drawn(seed)))
+    assert np.all(d.saturated(events, low, drawn(seed)) <= d.saturated(events, high, drawn(seed)))
+    assert d.saturated(events, 1.0, drawn(seed)).all()
+    assert not d.near_empty(events, 0.0, drawn(seed)).any()
 
 
 @REPEATABLE
@@ -162,15 +162,15 @@ def test_recordings_that_were_given_stay_as_they_are(events, seed):
     for change in (
         lambda: d.silence(events, taxels),
         lambda: d.stick(events, taxels),
-        lambda: d.lose(events, 0.5, drawn(seed)),
-        lambda: d.invent(events, 0.5, drawn(seed)),
-        lambda: d.jitter(events, 1.0, drawn(seed)),
+        lambda: d.events_lost(events, 0.5, drawn(seed)),
+        lambda: d.events_spurious(events, 0.5, drawn(seed)),
+        lambda: d.time_jitter(events, 1.0, drawn(seed)),
         lambda: d.start_late(events, 1),
         lambda: d.start_early(events, 1),
         lambda: d.play(events, 1.5),
         lambda: d.swap_polarity(events, taxels),
-        lambda: d.thin(events, 0.1, drawn(seed)),
-        lambda: d.fill(events, 0.6, drawn(seed)),
+        lambda: d.near_empty(events, 0.1, drawn(seed)),
+        lambda: d.saturated(events, 0.6, drawn(seed)),
     ):
         found = change()
         assert (found.shape, found.dtype) == (events.shape, np.uint8)

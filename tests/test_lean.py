@@ -42,8 +42,6 @@ def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lean")
     recordings_folder(folder / "data", train=_recordings(1, 24), test=_recordings(2, 12))
     own_file(folder / "net.pt", last=weights(3, gain=2.5))
-    own_file(folder / "thin.pt", last=weights(3, gain=2.5, features=4))
-    own_file(folder / "more.pt", last=weights(3, sizes=(9, 8, CLASSES + 1)))
     return folder
 
 
@@ -101,15 +99,6 @@ def test_what_is_written_decides_and_costs_as_reported(spikeloom):
     assert [taxel["events"] for taxel in report["taxels"]] == sent.tolist()
     assert report["taxels"][3] == {"events": 0, "training_differ": 0, "test_differ": 0}
     assert [layer["neurons"] for layer in report["layers"]] == [30, 9, 8, CLASSES]
-
-
-def test_the_cheapest_of_several_networks_within_a_recording_of_the_best(spikeloom):
-    code, out, _ = spikeloom("lean", "net.pt", "thin.pt", "--data", "data", "--report", "two.json")
-    report = json.loads(Path("two.json").read_text("utf-8"))
-    right = [entry["training_right"] for entry in report["candidates"]]
-    fitting = [entry for entry in report["candidates"] if entry["training_right"] >= max(right) - 1]
-    assert report["chosen"] == min(fitting, key=lambda entry: entry["training_operations"])["name"]
-    assert (code, f"taken: {report['chosen']}" in out.splitlines()) == (0, True)
 
 
 def test_silenced_is_as_if_it_were_gone(compiled):
@@ -218,22 +207,10 @@ def test_bisection_finds_the_longest_beginning():
     assert trials.most_spared(order, 4, lambda _: False).tolist() == [10, 11, 12, 13]
 
 
-def test_joined_bins():
-    netlist = chain()
-    slow = trials.coarse_netlist(netlist, 2, adapted=True)
-    assert slow.decay_v.tolist() == [round(4096 * (1 - (819 / 4096) ** 2))] * 3
-    assert slow.decay_u.tolist() == [4095] * 3
-    lasting = replace(netlist, decay_u=read_only([204, 204, 4095]))
-    keep = 4096 - 1 - trials.coarse_netlist(lasting, 2, adapted=True).decay_u
-    assert keep.tolist() == [round(3891**2 / 4096), round(3891**2 / 4096), 0]
-    assert trials.coarse_netlist(netlist, 2, adapted=False).decay_v.tolist() == netlist.decay_v.tolist()
-
-
 @pytest.mark.parametrize(
     ("words", "telling"),
     [
         ("net.pt --differ 1.5", "--differ 1.5: not a share; give a number from 0 to below 1"),
-        ("net.pt more.pt", "more.pt: 6 taxels, 2 polarities and 5 classes, net.pt has 6, 2 and 4"),
     ],
 )
 def test_mistakes(spikeloom, words, telling):

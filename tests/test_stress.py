@@ -24,19 +24,11 @@ from spikeloom.runtime.machines.loihi1.trace import unpack
 from spikeloom.runtime.machines.votes import class_counts, readout_counts
 from spikeloom.runtime.report.encode import decode, encode
 from spikeloom.runtime.report.intervals import wilson
-from spikeloom.runtime.studies.stress.battery import BATTERY, NAMES, levels_of, why_not
-from spikeloom.runtime.studies.stress.bench import (
-    Bench,
-    Sensor,
-    after_others,
-    by_length,
-    distances,
-    going_round,
-    whole,
-)
-from spikeloom.runtime.studies.stress.pair import Pair, evaluate, ready
+from spikeloom.runtime.studies.stress.bench import NAMES, Bench, by_length, distances, longer, warm_state, whole
+from spikeloom.runtime.studies.stress.pair import Pair, evaluate
+from spikeloom.runtime.studies.stress.perturbation import Sensor
 from spikeloom.runtime.studies.stress.results import Run, Spread
-from spikeloom.runtime.studies.stress.runs import clean, generator, measure
+from spikeloom.runtime.studies.stress.study import clean, generator, measure
 from spikeloom.runtime.studies.stress.verdicts import curve, parse_requirement, reasons, spread, unmet
 
 REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data")
@@ -48,7 +40,6 @@ def bench_of(network, netlist, recordings, *, checkpoint=None, edges=None, place
     pair = Pair(netlist=netlist, network=network)
     return Bench(
         pair=pair,
-        ready=ready(pair),
         sensor=Sensor(distance=distances(taxels, places, edges), places=places, edges=edges, checkpoint=checkpoint),
         events=recordings,
         labels=np.arange(count) % netlist.classes,
@@ -107,8 +98,8 @@ def test_clean_recordings_are_what_reference_and_engine_say(bench):
 
 
 def test_recordings_after_others_without_a_reset_are_one_long_run_of_the_specification(bench):
-    inputs = after_others(bench, 2, generator("warm_state", 0))
-    found = evaluate(bench.ready, inputs)
+    inputs = warm_state(bench, 2, generator("warm_state", 0))
+    found = evaluate(bench.pair, inputs)
     for i in range(3):
         slow = spec.simulate(bench.pair.netlist, inputs.events[i, :, : inputs.lengths[i]])
         layer = bench.pair.netlist.layers[-1]
@@ -118,10 +109,10 @@ def test_recordings_after_others_without_a_reset_are_one_long_run_of_the_specifi
 
 
 def test_ten_times_as_long_is_ten_recordings_of_which_the_last_counts(bench):
-    inputs = going_round(bench, 10)
+    inputs = longer(bench, 10)
     assert inputs.events.shape[2] == 10 * STEPS
     assert set(inputs.begin.tolist()) == {9 * STEPS}
-    found = evaluate(bench.ready, inputs)
+    found = evaluate(bench.pair, inputs)
     trace = engine.simulate(bench.pair.netlist, inputs.events, packed=True)
     flags = unpack(trace.packed, bench.pair.netlist.n_compartments)
     depth = bench.pair.netlist.layers[-1].depth
@@ -135,15 +126,15 @@ def test_clocks_are_no_taxels(tmp_path):
     netlist = made.pair.netlist
     ticks = netlist.clocks.events(15)
     sensor = netlist.taxels * netlist.polarities
-    silent = NAMES["taxels_dead"].disturb(made.events, 39, made.sensor, generator("taxels_dead", 0))
+    silent = NAMES["taxels_dead"](made.events, 39, made.sensor, generator("taxels_dead", 0))
     reached = whole(silent, netlist, made.lengths).events
     assert not reached[:, :sensor].any()
     assert_array_equal(reached[0, sensor:], ticks)
-    warm = after_others(made, 1, generator("warm_state", 0)).events
+    warm = warm_state(made, 1, generator("warm_state", 0)).events
     assert_array_equal(warm[0, sensor:], np.tile(ticks, 2))
-    longer = going_round(made, 10).events
-    assert_array_equal(longer[0, sensor:, :15], ticks)
-    assert not longer[0, sensor:, 15:].any()
+    long = longer(made, 10).events
+    assert_array_equal(long[0, sensor:, :15], ticks)
+    assert not long[0, sensor:, 15:].any()
 
 
 def test_recordings_of_different_length_are_disturbed_within_their_own(bench):
@@ -182,7 +173,7 @@ def test_an_overflow_stops_its_recording_and_no_other(bench):
 @pytest.mark.parametrize("name", NAMES)
 def test_every_perturbation_runs_at_its_mildest_and_harshest_the_same_for_a_seed(bench, name):
     reference, undisturbed = clean(bench)
-    levels = levels_of(name, TAXELS, full=False)
+    levels = NAMES[name].levels_of(TAXELS, full=False)
     for level in {levels[0], levels[-1]}:
         seeds = [0, 1] if NAMES[name].seeded else [0]
         runs = measure(bench, name, level, seeds, reference)
@@ -196,15 +187,20 @@ def test_every_perturbation_runs_at_its_mildest_and_harshest_the_same_for_a_seed
 
 
 def test_levels_are_in_order_and_make_sense():
-    for known in BATTERY:
-        scale = known.scale
-        for levels in (scale.levels, scale.full):
+    assert len(NAMES) == 30
+    for known in NAMES.values():
+        for full in (False, True):
+            levels = known.levels_of(39, full=full)
             numbers = [level for level in levels if not isinstance(level, str)]
             assert numbers in (sorted(numbers), sorted(numbers, reverse=True))
-            assert all(scale.least <= level <= scale.most for level in numbers)
+            assert all(known.least <= level <= known.most for level in numbers)
             assert len(set(levels)) == len(levels)
-        assert [known.disturb, known.damage, known.replay].count(None) == 2
-        assert len(scale.full) >= len(scale.levels)
+        assert known.to in ("events", "pair", "bench")
+    assert NAMES["taxels_dead"].levels_of(6, full=False, also=[2]) == (1, 2, 3, 5)
+    assert NAMES["taxels_dead"].levels_of(6, full=True) == (1, 2, 3, 4, 5)
+    assert NAMES["weight_bit_flips"].levels_of(6, full=True) == (1e-4, 0.00055, 1e-3, 0.0055, 0.01, 0.03, 0.05)
+    assert NAMES["taxels_dead"].level_of("3") == 3
+    assert NAMES["other_graph"].level_of("knn:4") == "knn:4"
 
 
 @pytest.mark.parametrize("system", ["tactilesgnet", "mlp"])
@@ -230,12 +226,12 @@ def test_all_systems_timed_and_joined(tmp_path, system):
         reference, _ = clean(made)
         spikes = list(float_spikes(checkpoint, seen, recordings).values())[-1]
         assert_array_equal(reference.votes["float"], readout_counts(network.readout, network.classes, spikes))
-        skipped = {name: why_not(name, made.pair, made.sensor) for name in NAMES}
+        skipped = {name: NAMES[name].why_not(made.pair, made.sensor) for name in NAMES}
         graphs = {"other_graph", "edges_rewired", "edges_doubled"}
         assert {name for name, why in skipped.items() if why} == (graphs if system == "mlp" else set())
         for name, why in skipped.items():
             if why is None:
-                (run,) = measure(made, name, levels_of(name, 39, full=False)[0], [0], reference)
+                (run,) = measure(made, name, NAMES[name].levels_of(39, full=False)[0], [0], reference)
                 assert run.stopped in range(3)
 
 
@@ -350,14 +346,11 @@ def test_spikes_in_common_and_requirements():
 # -- the command -------------------------------------------------------------------------------------------------------
 
 
-def test_threads_and_processes_say_the_same_and_go_on_from_what_is_there(stress, place, monkeypatch):
+def test_any_number_of_threads_says_the_same(stress, place):
     code, out, err = stress(*FEW, "-o", "one.json")
     assert (code, err) == (0, "")
     assert stress(*FEW, "--jobs", "1", "-o", "two.json")[1] == out
-    monkeypatch.setattr("spikeloom.runtime.commands.check.stress.measure_task", None)  # everything is known by now
-    assert stress(*FEW, "--jobs", "1", "-o", "two.json")[1] == out
     assert (place / "one.json").read_bytes() == (place / "two.json").read_bytes()
-    assert (place / "two.json.points").exists()
     report = json.loads((place / "one.json").read_bytes())
     wanted = set(FEW[3].split(",")) - {"other_graph"}  # the positions of its taxels are not known
     assert list(report["perturbations"]) == [name for name in NAMES if name in wanted]
@@ -413,10 +406,10 @@ def test_what_is_refused(stress, words, telling):
 def test_what_does_not_apply(bench):
     netlist = compile_network(bench.pair.network, Options(packings=(Packing(planes=2),))).netlist
     pair = Pair(netlist=netlist, network=bench.pair.network)
-    assert why_not("fewer_bits", pair, bench.sensor) == "weights are stored in several planes"
-    assert why_not("fewer_bits", bench.pair, bench.sensor) is None
+    assert NAMES["fewer_bits"].why_not(pair, bench.sensor) == "weights are stored in several planes"
+    assert NAMES["fewer_bits"].why_not(bench.pair, bench.sensor) is None
     onnx = Sensor(distance=bench.sensor.distance, places=None, edges=None, checkpoint=None)
-    assert "ONNX or NIR file has no taxel graph" in why_not("edges_rewired", pair, onnx)
+    assert "ONNX or NIR file has no taxel graph" in NAMES["edges_rewired"].why_not(pair, onnx)
 
 
 @pytest.mark.parametrize("content", ["{", '{"recordings": 3}', "foreign"])

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import swept
-from swept import KIND, Square, begun, points, square
+from swept import Square, begun, points, square
 
 from spikeloom.compiler.errors import DataError, OptionError, UnfinishedError
 from spikeloom.runtime import cli
@@ -21,8 +21,8 @@ from spikeloom.runtime.studies.jobs import only_one, sweep
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def swept_here(folder, made, *, version=1, kind=KIND, **how):
-    return sweep(made, square, folder / "x.store", kind=kind, version=version, label="squares", **how)
+def swept_here(folder, made, **how):
+    return sweep(made, square, folder / "x.store", label="squares", **how)
 
 
 def keys(store):
@@ -112,8 +112,6 @@ def test_what_is_refused(tmp_path):
         with pytest.raises(OptionError, match=words):
             swept_here(tmp_path, made, **how)
     swept_here(tmp_path, made, jobs=1)
-    with pytest.raises(DataError, match="holds results of test 1, this is test 2; delete it or give --fresh"):
-        swept_here(tmp_path, made, version=2)
     with only_one(tmp_path / "x.store"), pytest.raises(OptionError, match="another process is working on it"):
         swept_here(tmp_path, made)
     (tmp_path / "x.store").write_text("precious" * 100)

@@ -143,12 +143,6 @@ def add_network(parser: argparse.ArgumentParser) -> None:
             const=first,
             help=f"they are the {name} axis, where the shape of an ONNX or NIR input does not say",
         )
-    add_steps(parser)
-
-
-def add_steps(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how the time constants of a NIR file become decays."""
-    options = group(parser, "network")
     options.add_argument(
         "--dt", type=float, metavar="SECONDS", help="time step that a NIR file is read in (default: its own)"
     )

@@ -23,12 +23,14 @@ from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
-from spikeloom.compiler.interpret import channels_last, run_float, run_integer
-from spikeloom.compiler.ir import IntegerNetwork, Network, Projection, Sparse
+from spikeloom.compiler.interpret import channels_last, cut, run_float, run_integer
+from spikeloom.compiler.ir import IntegerNetwork, Network, Projection, Readout, Sparse
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
-from spikeloom.compiler.types import BoolArray, FloatArray
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.machines.votes import votes_by_step
 
 
 def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
@@ -66,6 +68,22 @@ def spikes_of(
         return list(run_float(model, inputs, dtype=np.dtype(dtype)).spikes)
     assert adjacency is not None, "a checkpoint has a graph"
     return list(float_spikes(model, adjacency, events, dtype=dtype).values())
+
+
+PART = 16
+"""Recordings whose float spikes are held at a time."""
+
+
+def votes_so_far(
+    readout: Readout, classes: int, model: Checkpoint | Network, adjacency: FloatArray | None, data: Recordings
+) -> IntArray:
+    """Votes of the float32 model after each step, (samples, steps, classes); a recording's stay from its end on."""
+    lengths, votes = data.step_counts, []
+    for first in range(0, len(data), PART):
+        part = slice(first, first + PART)
+        spikes = spikes_of(model, adjacency, data.events[part], "float32")[readout.population]
+        votes.append(votes_by_step(readout, classes, cut(spikes, lengths[part])))
+    return np.concatenate(votes)
 
 
 def membranes_of(

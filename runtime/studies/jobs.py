@@ -7,7 +7,6 @@ name everything that decides a result; the same command goes on from there. jobl
 from __future__ import annotations
 
 import _thread
-import argparse
 import hashlib
 import json
 import os
@@ -66,23 +65,11 @@ def content_key(facts: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
-def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say where many things are measured, and whether anew."""
-    group = parser.add_argument_group("sweep")
-    group.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
-    group.add_argument(
-        "--scheduler", metavar="tcp://HOST:PORT", help="work on the workers of this Dask scheduler instead"
-    )
-    group.add_argument("--fresh", action="store_true", help="measure anew what an earlier run left")
-
-
 def sweep(
     points: Sequence[AJob],
     measure: Callable[[AJob], Any],
     store: Path,
     *,
-    kind: str,
-    version: int,
     jobs: int | None = None,
     scheduler: str | None = None,
     fresh: bool = False,
@@ -98,8 +85,6 @@ def sweep(
         Job to JSON values; a function of a module, since it crosses process borders.
     store : Path
         SQLite file that keeps the results, in a folder that exists; with `fresh` what it holds is forgotten.
-    kind, version : str, int
-        What is measured; a store of another one is refused. The version goes up when results mean something else.
     jobs, scheduler
         Processes at a time (one a core), whose libraries use one thread each, or the address of a Dask scheduler.
     label : str
@@ -122,7 +107,7 @@ def sweep(
     from tqdm import tqdm  # here, since commands load this module before they know whether they measure
 
     keys = list(dict.fromkeys(point.key for point in points))
-    with only_one(store), closing(_opened(store, f"{kind} {version}", fresh=fresh)) as kept:
+    with only_one(store), closing(_opened(store, fresh=fresh)) as kept:
         results = {key: json.loads(result) for key, result in kept.execute("SELECT key, result FROM results")}
         first = {point.key: point for point in reversed(points)}
         waiting = [first[key] for key in keys if key not in results]
@@ -155,26 +140,16 @@ def sweep(
         return {key: results[key] for key in keys}
 
 
-def _opened(store: Path, content: str, *, fresh: bool) -> sqlite3.Connection:
-    """A store of such content, made where there is none."""
+def _opened(store: Path, *, fresh: bool) -> sqlite3.Connection:
+    """A store, made where there is none."""
     if fresh:
         store.unlink(missing_ok=True)
     database = sqlite3.connect(store)
     try:
-        with database:
-            database.execute("CREATE TABLE IF NOT EXISTS results (key TEXT PRIMARY KEY, result TEXT)")
-            database.execute("CREATE TABLE IF NOT EXISTS content (name TEXT)")
-            found = database.execute("SELECT name FROM content").fetchone()
-            if found is None:
-                database.execute("INSERT INTO content VALUES (?)", (content,))
+        database.execute("CREATE TABLE IF NOT EXISTS results (key TEXT PRIMARY KEY, result TEXT)")
     except sqlite3.Error as error:
         database.close()
         raise DataError(f"{store}: is no store of results ({error}); give another output, or delete it") from error
-    if found is not None and found[0] != content:
-        database.close()
-        raise DataError(
-            f"{store}: holds results of {found[0]}, this is {content}; delete it or give --fresh to measure anew"
-        )
     return database
 
 

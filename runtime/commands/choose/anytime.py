@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 
-import numpy as np
-
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.types import FloatArray, IntArray
@@ -16,12 +14,11 @@ from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.inputs.repeat import NETWORK, refuse
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
-from spikeloom.runtime.machines.votes import votes_by_step
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.anytime import exits
-from spikeloom.runtime.studies.anytime.sections import sections
+from spikeloom.runtime.studies.anytime.sections import picture, sections
 from spikeloom.runtime.studies.anytime.study import study
 
 NOTES = """\
@@ -35,9 +32,6 @@ ALLOWED = (0.0, 0.005, 0.01, 0.02, 0.05)
 
 DIFFER = 0.0
 """By default no calibration race may end otherwise; of real votes a little more do than of races."""
-
-PART = 16
-"""Recordings whose float spikes are held at a time."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -79,8 +73,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
         chosen=None if points is None else sorted(allowed).index(allowed[0]) + 1,
     )
     if arguments.picture is not None:
-        from spikeloom.runtime.studies.anytime.picture import picture  # Matplotlib, so only here
-
         with write_atomically(arguments.picture) as file:
             file.write(picture(result).file("png"))
     write_json(arguments.output, result)
@@ -114,16 +106,9 @@ def _float_votes(arguments: argparse.Namespace, machine: IntegerMachine, data: R
     if arguments.checkpoint is None:
         refuse(arguments, (*NETWORK, "dt", "convention"), "is for --checkpoint, which is not given; add it")
         return None
-    from spikeloom.compiler.interpret import cut
-    from spikeloom.runtime.equivalence.reference import require_match, spikes_of
+    from spikeloom.runtime.equivalence.reference import require_match, votes_so_far
 
     loaded = load_network(arguments.checkpoint, arguments, machine.netlist)
     require_match(machine.netlist, loaded.model)
-    readout, lengths = loaded.network.readout, data.step_counts
-    votes = []
-    for first in range(0, len(data), PART):
-        progress(f"float model: {first} of {len(data)}")
-        part = slice(first, first + PART)
-        spikes = spikes_of(loaded.model, loaded.adjacency, data.events[part], "float32")[readout.population]
-        votes.append(votes_by_step(readout, machine.netlist.classes, cut(spikes, lengths[part])))
-    return np.concatenate(votes)
+    progress("float model")
+    return votes_so_far(loaded.network.readout, machine.netlist.classes, loaded.model, loaded.adjacency, data)

@@ -18,8 +18,8 @@ from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.chart.choices import parse_budgets
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
 from spikeloom.runtime.studies.chart.networks import given_networks, require_grid, require_suited
-from spikeloom.runtime.studies.chart.requests import FORMAT, Data, Facts, Work
-from spikeloom.runtime.studies.jobs import add_sweep_arguments, sweep
+from spikeloom.runtime.studies.chart.work import Data, Facts, Work
+from spikeloom.runtime.studies.jobs import sweep
 
 STORE = "points.sqlite"
 
@@ -52,7 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="pick a point: energy=0.1mJ, latency=5ms or accuracy=88; may be repeated, all of them hold",
     )
     parser.add_argument("--table", metavar="NAME", help="energy table to choose and draw by (default: the first)")
-    add_sweep_arguments(parser)
+    sweeps = parser.add_argument_group("sweep")
+    sweeps.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
+    sweeps.add_argument(
+        "--scheduler", metavar="tcp://HOST:PORT", help="work on the workers of this Dask scheduler instead"
+    )
+    sweeps.add_argument("--fresh", action="store_true", help="measure anew what an earlier run left")
     parser.add_argument("-o", "--output", required=True, metavar="FOLDER")
     parser.epilog = NOTES
 
@@ -61,8 +66,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; exit code 1 if no point fits a budget."""
     from spikeloom.models.training.protocols import data_digest  # torch: no other command waits for it
     from spikeloom.runtime.studies.chart import work
-    from spikeloom.runtime.studies.chart.files import write_chart
-    from spikeloom.runtime.studies.chart.sections import printed
+    from spikeloom.runtime.studies.chart.sections import printed, write_chart
     from spikeloom.runtime.studies.chart.study import chart
 
     stores = load_target(DEFAULT)
@@ -89,8 +93,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
             jobs,
             work.measure,
             folder / STORE,
-            kind="chart",
-            version=FORMAT,
             jobs=arguments.jobs,
             scheduler=arguments.scheduler,
             fresh=arguments.fresh and label == "compiling",  # what the first half measured is not to be forgotten

@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from dataclasses import replace
 
 from spikeloom.compiler import __version__, write_netlist
 from spikeloom.compiler.errors import OptionError
-from spikeloom.models.recordings.counts import number
+from spikeloom.compiler.ir import Network
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_network, add_recordings
 from spikeloom.runtime.inputs.compilation import storage
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import encode, write_json
 from spikeloom.runtime.report.sections import Outcome
-from spikeloom.runtime.studies.pruning.sections import sections
+from spikeloom.runtime.studies.pruning.results import sections
 from spikeloom.runtime.studies.pruning.study import study
 
 NOTES = """\
 Everything is chosen on the training split and reported on --split: how many decisions change, what is right,
-operations, energy and time. Of several checkpoints the cheapest within one training recording of the best is taken.
-What -o writes is, of neurons, taxels and hops alone or together, what takes least energy on the training split.
+operations, energy and time. What -o writes is, of neurons, taxels and hops alone or together, what takes least energy
+on the training split.
 """
 
 DIFFER = 0.01
@@ -32,7 +31,7 @@ DIFFER = 0.01
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
-    parser.add_argument("checkpoint", nargs="+", metavar=NETWORK_FILES, help="trained networks for the same recordings")
+    parser.add_argument("checkpoint", metavar=NETWORK_FILES, help="trained network")
     add_network(parser)
     add_recordings(parser)
     parser.add_argument(
@@ -53,46 +52,22 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise OptionError(f"--differ {arguments.differ:g}: not a share; give a number from 0 to below 1")
     require_place(arguments.output, "-o", arguments)
     require_place(arguments.report, "--report", arguments)
-    networks = {path: load_network(path, arguments) for path in arguments.checkpoint}
-    _require_alike(networks)
-    training, test = (
-        _read(arguments, networks, "train", None),
-        _read(arguments, networks, arguments.split, arguments.limit),
-    )
-    result, netlist = study(networks, training, test, arguments.differ, arguments.output)
+    loaded = load_network(arguments.checkpoint, arguments)
+    training = _read(arguments, loaded.network, "train", None)
+    test = _read(arguments, loaded.network, arguments.split, arguments.limit)
+    result, netlist = study(loaded, training, test, arguments.differ, arguments.output)
     if arguments.output is not None:
-        chosen, lean = networks[result.chosen], {"differ": result.differ} | encode(result.rows[result.taken].removed)
-        made = {"spikeloom": __version__, "checkpoint_sha256": chosen.sha256, **chosen.origin(arguments.run)}
-        made |= storage(None, chosen.checkpoint)
+        lean = {"differ": result.differ} | encode(result.rows[result.taken].removed)
+        made = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256, **loaded.origin(arguments.run)}
+        made |= storage(None, loaded.checkpoint)
         made |= {"keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True, "lean": lean}
         write_netlist(replace(netlist, provenance=made), arguments.output)
     write_json(arguments.report, result)
     return Outcome(result, sections)
 
 
-def _require_alike(networks: Mapping[str, LoadedNetwork]) -> None:
-    """Refuse networks that do not take the same recordings."""
-    (first, known), *others = networks.items()
-    shape = known.network.input.taxels, known.network.input.polarities, known.network.classes
-    for path, loaded in others:
-        if loaded.network.input.bins != known.network.input.bins:
-            raise OptionError(
-                f"{path}: a step joins {number(loaded.network.input.bins, 'bin')}, of {first} "
-                f"{known.network.input.bins}; spikeloom chart compares such networks"
-            )
-        one = loaded.network.input.taxels, loaded.network.input.polarities, loaded.network.classes
-        if one != shape:
-            raise OptionError(
-                f"{path}: {one[0]} taxels, {one[1]} polarities and {one[2]} classes, {first} has {shape[0]}, "
-                f"{shape[1]} and {shape[2]}; give networks for the same recordings"
-            )
-
-
-def _read(
-    arguments: argparse.Namespace, networks: Mapping[str, LoadedNetwork], split: str, limit: int | None
-) -> Recordings:
+def _read(arguments: argparse.Namespace, network: Network, split: str, limit: int | None) -> Recordings:
     progress("reading the recordings")
-    network = next(iter(networks.values())).network
     return recordings(
         arguments.data,
         split,

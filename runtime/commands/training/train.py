@@ -101,7 +101,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Train every seed, write the checkpoints, report."""
     from spikeloom.runtime.studies.training.parallel import train_seeds  # processes, so only here
-    from spikeloom.runtime.studies.training.report import TrainingReport, summary, training_sections
+    from spikeloom.runtime.studies.training.report import TrainingReport, picture, summary, training_sections
 
     if arguments.seeds < 1:
         raise OptionError(f"--seeds {arguments.seeds}: at least 1 is needed; give a positive number")
@@ -120,8 +120,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
     records = [record for record, _ in results]
     if arguments.picture is not None:
         decided = [predicted for _, predicted in results if predicted is not None]
-        from spikeloom.runtime.studies.training.picture import picture  # Matplotlib, so only here
-
         kind = Path(arguments.picture).suffix.removeprefix(".")
         with write_atomically(arguments.picture) as file:
             file.write(picture(records, test.labels, decided).file(kind))

@@ -48,14 +48,6 @@ class Changes:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FloatStops:
-    """What the same rule does to the float model; its mean steps."""
-
-    changes: Changes = field(metadata=INLINE)
-    steps: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Samples:
     """What a rule comes to for every recording."""
 
@@ -82,7 +74,6 @@ class Rule:
     saved: Costs
     changes: Changes = field(metadata=INLINE)
     samples: Samples
-    model: FloatStops | None = field(default=None, metadata={**key("float"), **OPTIONAL})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,16 +132,11 @@ def study(
     calibrated_on: str | None = None,
     chosen: int | None = None,
 ) -> Anytime:
-    """Apply the proof and calibrated rules to recordings and their run; the float model's votes so far likewise."""
+    """Apply the proof and calibrated rules to recordings and their run; the float model's votes are for the windows."""
     at = exits.standing(ran.votes, ran.lengths)
     sure = exits.proven(ran.votes, at, exits.most_votes(machine, data.steps))
-    model = None
-    if model_votes is not None:
-        standing = exits.standing(model_votes, ran.lengths)
-        label = machine.netlist.readout_class
-        voters = np.bincount(label[label >= 0], minlength=machine.netlist.classes)
-        model = standing, exits.proven(model_votes, standing, voters[:, None] * np.arange(data.steps + 1))
-    rules = tuple(_rule(rule, ran, at, sure, model, data.labels) for rule in (None, *calibrated))
+    model = None if model_votes is None else exits.standing(model_votes, ran.lengths)
+    rules = tuple(_rule(rule, ran, at, sure, data.labels) for rule in (None, *calibrated))
     right = _correct(at.decision, data.labels)
     labelled = int(np.count_nonzero(data.labels != UNLABELLED))
     return Anytime(
@@ -163,9 +149,9 @@ def study(
         full=Full(
             costs=_costs(ran, ran.chip_steps - 1),
             correct=right,
-            float_correct=None if model is None else _correct(model[0].decision, data.labels),
+            float_correct=None if model is None else _correct(model.decision, data.labels),
         ),
-        windows=tuple(_window(share, data, ran, at, model and model[0]) for share in WINDOWS) if labelled else (),
+        windows=tuple(_window(share, data, ran, at, model) for share in WINDOWS) if labelled else (),
         files=tuple(data.files),
         labels=data.labels.tolist(),
         decisions=at.decision.tolist(),
@@ -182,7 +168,6 @@ def _rule(
     ran: Cumulative,
     at: exits.Standing,
     sure: BoolArray,
-    model: tuple[exits.Standing, BoolArray] | None,
     labels: IntArray,
 ) -> Rule:
     factor = np.inf if rule is None else rule.factor
@@ -194,10 +179,6 @@ def _rule(
     def saved(sums: FloatArray) -> list[float]:
         return [float(each) for each in sums[rows, last] - sums[rows, index]]
 
-    stops = None
-    if model is not None:
-        model_ends = exits.exits(model[1], model[0], factor)
-        stops = FloatStops(changes=_changes(model[0], model_ends, labels), steps=float(np.mean(model_ends + 1)))
     return Rule(
         allowed=None if rule is None else rule.allowed,
         factor=None if rule is None else rule.factor,
@@ -219,7 +200,6 @@ def _rule(
             saved_energy_j={name: saved(each) for name, each in ran.energy.items()},
             saved_time_s={name: saved(each) for name, each in ran.time.items()},
         ),
-        model=stops,
     )
 
 

@@ -17,7 +17,6 @@ from spikeloom.runtime.studies.chart.results import (
     Against,
     ChartedNetwork,
     ChosenBy,
-    Miss,
     Pick,
     Point,
     Saving,
@@ -243,7 +242,7 @@ def pick(points: Sequence[Point], budgets: Sequence[Budget], by: ChosenBy) -> Pi
         fitting=len(fitting),
         point=chosen.number,
         misses={
-            budget.what: Miss(limit=budget.limit, found=_value(chosen, budget, by))
+            budget.what: {"limit": budget.limit, "found": _value(chosen, budget, by)}
             for budget in budgets
             if excess(chosen, budget) > 1 + NEAR
         },

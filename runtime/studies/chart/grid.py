@@ -89,17 +89,21 @@ def _readers(target: Target) -> dict[str, tuple[Callable[[str], Sequence[Any]], 
         "groups": (lambda words: _numbers(words, range(1, slots + 1)), f"1 to {slots} scale groups"),
         "prune": (lambda words: _numbers(words, range(2)), "0 (keep) and 1 (leave out)"),
         "cores": (_cores, f"{', '.join(GOALS)}, or LAYER:N as in fc1:6+conv1:4, each layer once"),
-        "window": (_windows, f"1 to {WHOLE} per cent, or ranges as in 25-100%:5"),
+        "window": (
+            lambda words: _numbers(words, range(1, WHOLE + 1), WINDOW_STEP),
+            f"1 to {WHOLE} per cent, or ranges as in 25-100%:5",
+        ),
     }
 
 
-def _numbers(words: str, allowed: Collection[int]) -> list[int]:
-    """A number, or all of a range."""
-    ends = re.fullmatch(r"([0-9]{1,3})(?:-([0-9]{1,3}))?", words, re.ASCII)
+def _numbers(words: str, allowed: Collection[int], step: int = 1) -> list[int]:
+    """A number, or of a range every so many, and its end; per cent signs are for people."""
+    ends = re.fullmatch(r"([0-9]{1,3})%?(?:-([0-9]{1,3})%?(?::([0-9]{1,3})%?)?)?", words, re.ASCII)
     if ends is None:
         return []
-    found = list(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
-    return found if set(found) <= set(allowed) else []
+    first, last, every = int(ends[1]), int(ends[2] or ends[1]), int(ends[3] or step)
+    found = [*range(first, last, every), last] if first <= last and every else []
+    return list(dict.fromkeys(found)) if set(found) <= set(allowed) else []
 
 
 def _widths(words: str, allowed: Collection[int]) -> list[tuple[int, ...]]:
@@ -110,15 +114,6 @@ def _widths(words: str, allowed: Collection[int]) -> list[tuple[int, ...]]:
     if 0 in each or "-" in words:
         return []
     return [each[:1] if len(set(each)) == 1 else each]
-
-
-def _windows(words: str) -> list[int]:
-    """Per cent of each recording; of a range every so many, and its end."""
-    found = re.fullmatch(r"([0-9]{1,3})%?(?:-([0-9]{1,3})%?(?::([0-9]{1,3})%?)?)?", words, re.ASCII)
-    if found is None:
-        return []
-    first, last, step = int(found[1]), int(found[2] or found[1]), int(found[3] or WINDOW_STEP)
-    return list(dict.fromkeys([*range(first, last, step), last])) if 1 <= first <= last <= WHOLE and step else []
 
 
 def _cores(words: str) -> list[str]:

@@ -23,9 +23,6 @@ from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propag
 from spikeloom.runtime.machines.base import DEFAULT, chip_chart, trained_for
 from spikeloom.runtime.studies.chart.grid import Grid
 
-STORAGE_AXES = ("bits", "planes", "groups", "prune", "cores")
-"""Axes of the grid that networks with a storage and layout of their own do not have."""
-
 
 def from_anywhere(path: str | None) -> str | None:
     """A path that means the same in another folder; what is no file stays as it is."""
@@ -229,15 +226,7 @@ def require_suited(networks: Sequence[Given], splits: Mapping[str, Recordings], 
 
 
 def require_grid(networks: Sequence[Given], grid: Grid, target: Target) -> None:
-    """Refuse widths and layouts by layer that do not suit a network's layers, and those that no network has."""
-    own = [network.target for network in networks if network.levels is not None]
-    if len(own) == len(networks):
-        axes = [axis for axis in STORAGE_AXES if getattr(grid, axis) != getattr(Grid(), axis)]
-        if axes:
-            raise OptionError(
-                f"--grid {axes[0]}: is for {target.name}, networks for {own[0]} have a storage and a layout of their "
-                "own; omit it"
-            )
+    """Refuse widths and layouts by layer that do not suit a network's layers."""
     for network in networks:
         if network.levels is not None:
             continue

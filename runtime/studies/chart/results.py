@@ -9,7 +9,7 @@ from typing import TypeVar
 from spikeloom.runtime.report.encode import key
 from spikeloom.runtime.report.intervals import wilson
 from spikeloom.runtime.studies.chart.grid import Grid
-from spikeloom.runtime.studies.chart.requests import FORMAT
+from spikeloom.runtime.studies.chart.work import FORMAT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,7 +108,6 @@ class ChartedNetwork:
     sha256: str
     system: str
     graph: str
-    has_graph: bool
     weights: str
     fine_tuned: bool
     trained_by: str | None
@@ -145,22 +144,17 @@ class Saving:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Miss:
-    """By how much a budget is missed."""
-
-    limit: float
-    found: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Pick:
-    """The point that fits the budgets best, how many fit, what it misses, and what it gives up beside the best."""
+    """The point that fits the budgets best, how many fit, and what it gives up beside the best.
+
+    `misses` has the ``limit`` of each budget that it does not fit, and what was ``found``.
+    """
 
     budgets: tuple[str, ...]
     fits: bool
     fitting: int
     point: int
-    misses: Mapping[str, Miss]
+    misses: Mapping[str, Mapping[str, float]]
     best: int
     given_up: Against
 
@@ -178,14 +172,6 @@ class ChartedData:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Tables:
-    """Titles of tables of prices and times, by name."""
-
-    energy: Mapping[str, str]
-    time: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ChosenBy:
     """Tables by which points are chosen and drawn; none for time where nothing is timed."""
 
@@ -194,21 +180,17 @@ class ChosenBy:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
-    """What depends on the machine: simulated recordings a second, by number of the point."""
-
-    recordings_per_s: Mapping[str, float]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Chart:
-    """Every configuration of a grid, and which one to deploy."""
+    """Every configuration of a grid, and which one to deploy.
+
+    `tables` has the titles of tables of ``energy`` and ``time`` by name.
+    """
 
     spikeloom: str
     target: str
     command: str
     data: ChartedData
-    tables: Tables
+    tables: Mapping[str, Mapping[str, str]]
     chosen_by: ChosenBy
     grid: Grid
     networks: tuple[ChartedNetwork, ...]
@@ -218,8 +200,6 @@ class Chart:
     recommended: Mapping[str, int | None]
     saving: Saving | None
     budget: Pick | None
-    measured: Measured
-    digest: str = ""
     format: int = FORMAT
 
     def point(self, number: int) -> Point:
@@ -265,8 +245,8 @@ class Axis:
     value: Callable[[Point], float]
 
 
-def axes(chart: Chart, *, measured: bool = False) -> dict[str, Axis]:
-    """Costs of a chart by name; with `measured` also the speed of the simulator where the chart was made."""
+def axes(chart: Chart) -> dict[str, Axis]:
+    """Costs of a chart by name."""
     energy, time = chart.chosen_by.energy, chart.chosen_by.time
     _, beside = by_chip(chart.points, chart.target)
 
@@ -283,8 +263,4 @@ def axes(chart: Chart, *, measured: bool = False) -> dict[str, Axis]:
     named = "synaptic operations of a mean inference"
     found["operations"] = Axis("synaptic operations", named, "", lambda point: point.test.synaptic_operations)
     found["cores"] = Axis("cores", "cores in use", "", lambda point: float(point.n_cores))
-    if measured:
-        rates = chart.measured.recordings_per_s
-        named = "recordings a second on one thread, decisions only, measured where the chart was made"
-        found["speed"] = Axis("speed of the simulator", named, "", lambda point: rates[str(point.number)])
     return found

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import csv
+import io
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from pathlib import Path
+from typing import Any
 
+from spikeloom.compiler.files import write_atomically
 from spikeloom.models.recordings.counts import number
-from spikeloom.runtime.report import drawing
+from spikeloom.runtime.report import drawing, html
 from spikeloom.runtime.report.drawing import Drawing, Mark, Scatter
+from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Section, Table, Text
 from spikeloom.runtime.studies.chart.choices import UNITS
@@ -82,9 +89,9 @@ def taken(chart: Chart) -> list[Block]:
     ]
 
 
-def panels(chart: Chart, names: Sequence[str], title: str, *, across: int = 1, measured: bool = False) -> Drawing:
+def panels(chart: Chart, names: Sequence[str], title: str, *, across: int = 1) -> Drawing:
     """Figures of a chart as one drawing."""
-    costs = axes(chart, measured=measured)
+    costs = axes(chart)
     label = "test accuracy on the chip (%)"
     return drawing.scatters(title, [_scatter(chart, name, costs[name]) for name in names], label, across=across)
 
@@ -147,9 +154,9 @@ def _tip(chart: Chart, point: Point) -> str:
 def _figures(chart: Chart) -> list[Block]:
     """Test accuracy over each cost, one figure at a time, energy first."""
     figures = []
-    for name, axis in axes(chart, measured=True).items():
+    for name, axis in axes(chart).items():
         title = f"Test accuracy over {axis.title}"
-        figure = Figure(f"chart-{name}", partial(panels, chart, [name], title, measured=True), f"{title}.")
+        figure = Figure(f"chart-{name}", partial(panels, chart, [name], title), f"{title}.")
         figures.append(Details(f"over {axis.title}", [figure], "cost", unfolded=name == "energy"))
     return [*figures]
 
@@ -277,7 +284,7 @@ def _budget(chart: Chart) -> list[Block]:
         lines = [f"{wanted}: {pick.fitting} of {len(chart.points)} points fit; take #{point.number} {point.label}"]
     else:
         lines = [f"{wanted}: no point fits; the nearest is #{point.number} {point.label}"]
-        lines += [f"  misses {_missed(what, each.found, each.limit)}" for what, each in pick.misses.items()]
+        lines += [f"  misses {_missed(what, **each)}" for what, each in pick.misses.items()]
     beside = "  it is the best of all points: nothing is given up"
     if point is not best:
         up = pick.given_up
@@ -290,18 +297,16 @@ def _budget(chart: Chart) -> list[Block]:
     return [Section("Your budget", [Text("\n".join(lines)), table, Text(beside), *_commands([point])])]
 
 
-def _missed(what: str, value: float, limit: float) -> str:
+def _missed(what: str, found: float, limit: float) -> str:
     if what == "accuracy":
-        return f"{what}: expected are {100 * value:.2f} %, wanted {100 * limit:g} %"
+        return f"{what}: expected are {100 * found:.2f} %, wanted {100 * limit:g} %"
     unit = next(iter(UNITS[what]))
-    return f"{what}: it takes {si(value, unit)}, allowed {si(limit, unit)}"
+    return f"{what}: it takes {si(found, unit)}, allowed {si(limit, unit)}"
 
 
 def _points(chart: Chart) -> list[Block]:
-    rates = chart.measured.recordings_per_s
-    rows = [[*_cells(chart.chosen_by, point), f"{rates[str(point.number)]:,.0f}"] for point in chart.points]
-    caption = f"{len(rows)} points; the last column is measured on the machine that charts"
-    table = Table([*_head(chart.chosen_by), "recordings/s, measured"], rows, caption, most=0)
+    rows = [_cells(chart.chosen_by, point) for point in chart.points]
+    table = Table(_head(chart.chosen_by), rows, f"{len(rows)} points", most=0)
     return [table, Details("Commands of every point", _commands(chart.points))]
 
 
@@ -317,17 +322,12 @@ def _provenance(chart: Chart) -> list[Block]:
     files += [[network.name, network.path, network.sha256] for network in chart.networks]
     trained = [[each.name, each.system, each.trained_by or "not known"] for each in chart.networks]
     grid = [[name, ", ".join(_value(value) for value in getattr(chart.grid, name))] for name in chart.grid.__slots__]
-    titles = [
-        [f"{kind}, {name}", title]
-        for kind, tables in (("energy", chart.tables.energy), ("time", chart.tables.time))
-        for name, title in tables.items()
-    ]
+    titles = [[f"{kind}, {name}", title] for kind, tables in chart.tables.items() for name, title in tables.items()]
     return [
         Table(["", "name", "sha256"], files, "Files", words=True),
         Table(["network", "system", "trained by"], trained, "Trainings", words=True),
         Table(["axis", "values"], grid, "Grid", words=True),
         Table(["", "source"], titles, "Tables of prices and times", words=True),
-        Text(f"Hash over all figures but measured ones: {chart.digest}"),
         Text("Command that repeats this chart:"),
         Code([chart.command]),
     ]
@@ -335,3 +335,52 @@ def _provenance(chart: Chart) -> list[Block]:
 
 def _value(value: object) -> str:
     return "+".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def write_chart(folder: Path, chart: Chart) -> None:
+    """Write ``chart.json``, ``.csv``, ``.html``, ``.svg`` and ``.png``; the same bytes for the same chart."""
+    drawn = picture(chart)
+    files = {
+        "chart.json": (json.dumps(encode(chart), indent=1, allow_nan=False) + "\n").encode(),
+        "chart.csv": csv_text(chart).encode(),
+        "chart.html": page(chart).encode(),
+        "chart.svg": drawn.file("svg"),
+        "chart.png": drawn.file("png"),
+    }
+    for name, content in files.items():
+        with write_atomically(folder / name) as file:
+            file.write(content)
+
+
+def page(chart: Chart) -> str:
+    """A chart as one HTML file."""
+    name = chart.data.path.rstrip("/").rsplit("/", 1)[-1]
+    about = "Point at a mark to read its figures and the commands that make it."
+    return html.page(f"{len(chart.points)} configurations on {name}", about, sections(chart))
+
+
+def csv_text(chart: Chart) -> str:
+    """Every point as a line: what the JSON says of it, with names of nested values joined."""
+    rows = [dict(_flat(encode(point))) for point in chart.points]
+    columns = dict.fromkeys(name for row in rows for name in row)
+    file = io.StringIO()
+    out = csv.DictWriter(file, list(columns), lineterminator="\n")
+    out.writeheader()
+    out.writerows(rows)
+    return file.getvalue()
+
+
+def _flat(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        match value:
+            case dict():
+                yield from ((f"{name}_{inner}", each) for inner, each in _flat(value))
+            case list() if name == "commands":
+                yield from zip(("compile", "run"), value, strict=True)
+            case list():
+                yield name, "+".join(map(str, value))
+            case _:
+                yield name, value

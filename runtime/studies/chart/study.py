@@ -2,38 +2,32 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.systems import NO_GRAPH
 from spikeloom.runtime.machines.base import chip_chart
-from spikeloom.runtime.report.encode import decode, encode
+from spikeloom.runtime.report.encode import decode
 from spikeloom.runtime.studies.chart import choices
 from spikeloom.runtime.studies.chart.choices import Budget
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import Given
-from spikeloom.runtime.studies.chart.requests import SPLITS, Build, Built, Facts, Run, Work, commands
 from spikeloom.runtime.studies.chart.results import (
     Chart,
     ChartedData,
     ChartedNetwork,
     ChosenBy,
     Figures,
-    Measured,
     Point,
     Refused,
-    Tables,
     by_chip,
     share,
 )
-from spikeloom.runtime.studies.chart.work import Decisions, Ran, RanBoth
+from spikeloom.runtime.studies.chart.work import SPLITS, Build, Built, Decisions, Facts, Ran, Work, commands
 
 Sweep = Callable[[Sequence[Work], str], Mapping[str, Any]]
 """Measures jobs under a heading; their JSON by key."""
@@ -75,13 +69,28 @@ def chart(
     second = sweep(runs, "measuring")
     labels = {split: splits[split].labels for split in SPLITS}
     decided: dict[str, Decisions] = {name: first[job.key] for name, job in floats.items()}
-    ran = [decode(RanBoth, second[run.key]) for run in runs]
     known = {network.name: network for network in networks}
     points = []
-    for number, (run, both) in enumerate(zip(runs, ran, strict=True), 1):
-        name, storage = run.build.network.name, run.build.storage
-        typed = commands(known[name], storage, run.layout, run.window, facts.data)
-        points.append(_point(number, run, both, decided[name], labels, typed))
+    for number, run in enumerate(runs, 1):
+        name, window = run.build.network.name, str(run.window)
+        figures = {
+            split: _figures(decode(Ran, ran), decided[name][split][window], labels[split])
+            for split, ran in second[run.key].items()
+        }
+        point = Point(
+            number=number,
+            **_configuration(run.build, run.layout),
+            window=run.window,
+            n_cores=run.built.cores,
+            neurons=run.built.neurons,
+            synapses=run.built.synapses,
+            netlist=f"netlists/{run.build.files[run.layout].name}",
+            netlist_sha256=run.built.sha256,
+            train=figures["train"],
+            test=figures["test"],
+            commands=commands(known[name], run.build.storage, run.layout, run.window, facts.data),
+        )
+        points.append(point)
     charted = [_network(network, decided[network.name], labels) for network in networks]
     (own, others), (chosen_of, beside) = by_chip(points, target), by_chip(charted, target)
     own, chosen_of, expected = choices.with_expectations(own, chosen_of)
@@ -89,7 +98,7 @@ def chart(
     own = choices.with_fronts(own, by)
     others = [replace(point, front=dict.fromkeys(own[0].front, False)) for point in others]
     names = [network.name for network in networks]
-    report = Chart(
+    return Chart(
         spikeloom=__version__,
         target=target,
         command=command,
@@ -101,10 +110,10 @@ def chart(
             test=len(splits["test"]),
             steps=splits["test"].steps,
         ),
-        tables=Tables(
-            energy={table.name: table.title for chip in facts.targets.values() for table in chip.energy},
-            time={name: title for titles in times.values() for name, title in titles.items()},
-        ),
+        tables={
+            "energy": {table.name: table.title for chip in facts.targets.values() for table in chip.energy},
+            "time": {name: title for titles in times.values() for name, title in titles.items()},
+        },
         chosen_by=by,
         grid=grid,
         networks=tuple(sorted([*chosen_of, *beside], key=lambda network: names.index(network.name))),
@@ -114,10 +123,7 @@ def chart(
         recommended=choices.recommended(own, chosen_of, by, bin_s=facts.data.bin_s),
         saving=choices.saving(own, by),
         budget=choices.pick(own, budgets, by),
-        measured=Measured(recordings_per_s={str(n): both.recordings_per_s for n, both in enumerate(ran, 1)}),
     )
-    content = {name: value for name, value in encode(report).items() if name not in ("digest", "measured")}
-    return replace(report, digest=hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest())
 
 
 def _times(facts: Facts, target: str) -> dict[str, str]:
@@ -149,40 +155,15 @@ def _configuration(build: Build, layout: str) -> JsonObject:
     }
 
 
-def _point(
-    number: int, run: Run, ran: RanBoth, decided: Decisions, labels: Mapping[str, IntArray], typed: tuple[str, str]
-) -> Point:
-    built, window = run.built, str(run.window)
-    return Point(
-        number=number,
-        **_configuration(run.build, run.layout),
-        window=run.window,
-        n_cores=built.cores,
-        neurons=built.neurons,
-        synapses=built.synapses,
-        netlist=f"netlists/{run.build.files[run.layout].name}",
-        netlist_sha256=built.sha256,
-        train=_figures(ran.train, decided["train"][window], labels["train"]),
-        test=_figures(ran.test, decided["test"][window], labels["test"]),
-        commands=typed,
-    )
-
-
 def _figures(ran: Ran, decided: Sequence[int], labels: IntArray) -> Figures:
-    right = share(_same(ran.decisions, labels.tolist()), len(labels))
+    costs = asdict(ran)
+    decisions, right = costs.pop("decisions"), labels.tolist()
     return Figures(
-        correct=right.correct,
-        accuracy=right.accuracy,
-        low=right.low,
-        high=right.high,
-        samples=len(labels),
-        model=share(_same(decided, labels.tolist()), len(labels)),
-        equal=_same(ran.decisions, decided),
-        energy_j=ran.energy_j,
-        time_s=ran.time_s,
-        step_s=ran.step_s,
-        synaptic_operations=ran.synaptic_operations,
-        steps=ran.steps,
+        **asdict(share(_same(ran.decisions, right), len(right))),
+        **costs,
+        samples=len(right),
+        model=share(_same(decided, right), len(right)),
+        equal=_same(decisions, decided),
     )
 
 
@@ -204,7 +185,6 @@ def _network(network: Given, decided: Decisions, labels: Mapping[str, IntArray])
         sha256=network.sha256,
         system=network.system,
         graph=network.graph,
-        has_graph=network.graph != NO_GRAPH,
         weights=network.weights,
         fine_tuned=network.forms is not None,
         trained_by=network.training.get("command"),

@@ -1,42 +1,171 @@
 """What a chart measures, in steps that can be kept: float decisions, netlists, and netlists on recordings.
 
 Everything here is a function of files and of a request, so that a netlist is the file, byte for byte, that the command
-``compile`` would write.
+``compile`` would write. A network is rounded once for any number of layouts, a netlist is compiled once for any number
+of windows.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import Options, lay_out_again, to_integers, write_netlist
+from spikeloom.compiler import Options, __version__, lay_out_again, to_integers, write_netlist
 from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError
 from spikeloom.compiler.files import sha256_of
-from spikeloom.compiler.interpret import cut, vote
-from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.interpret import vote
+from spikeloom.compiler.targets.base import Target, load_target
+from spikeloom.compiler.types import FloatArray, JsonObject
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.recordings.windows import first_part, steps_of
+from spikeloom.models.recordings.windows import WHOLE, first_part, steps_of
+from spikeloom.runtime.equivalence.reference import votes_so_far
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.base import DEFAULT, Machine, Price, chip_chart, machine_for
-from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.encode import encode
-from spikeloom.runtime.studies.chart.networks import Given, Source
-from spikeloom.runtime.studies.chart.requests import SPLITS, Build, Built, Data, Decide, Run, Work, layout_options
+from spikeloom.runtime.studies.chart.networks import Given, Source, Storage, from_anywhere
+from spikeloom.runtime.studies.jobs import Job, content_key
 
-PART = 16
-"""Recordings whose float spikes are held at a time."""
+FORMAT = 2
+"""Of what is measured; goes up when a figure means something else."""
+
+SPLITS = ("train", "test")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Data:
+    """Where recordings are, seconds of a bin, and the hash over both splits that every process must find."""
+
+    path: str
+    bin_s: float
+    sha256: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Decide(Job):
+    """Decisions of a float model when parts of each recording have passed, in per cent."""
+
+    network: Given
+    data: Data
+    windows: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Build(Job):
+    """A network in one storage, rounded once for several layouts, and the file that keeps each netlist."""
+
+    network: Given
+    storage: Storage
+    files: Mapping[str, Path]
+    data: Data
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Built:
+    """Size and hash of a netlist, or the limits that it breaks."""
+
+    sha256: str = ""
+    cores: int = 0
+    neurons: int = 0
+    synapses: int = 0
+    refused: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run(Job):
+    """A netlist, with what makes it should its file be gone, on a part of every recording."""
+
+    build: Build
+    layout: str
+    built: Built
+    window: int
+
+
+Work = Decide | Build | Run
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Facts:
+    """What decides every result, beside what a single one is about."""
+
+    data: Data
+    targets: Mapping[str, Target]
+    folder: Path
+
+    def _key(self, network: Given, what: str, **about: Any) -> str:
+        shared = {"format": FORMAT, "spikeloom": __version__, "data": self.data.sha256, "bin_s": self.data.bin_s}
+        return content_key(shared | {"target": repr(self.targets[network.target]), "what": what} | encode(about))
+
+    @property
+    def _data(self) -> Data:
+        return replace(self.data, path=str(from_anywhere(self.data.path)))
+
+    def decide(self, network: Given, windows: tuple[int, ...]) -> Decide:
+        """Work that finds the decisions of a float network."""
+        key = self._key(network, "float", **network.identity, windows=windows)
+        travelling = network.from_anywhere()
+        return Decide(key=key, label=f"{network.name} float", network=travelling, data=self._data, windows=windows)
+
+    def build(self, network: Given, storage: Storage, layouts: tuple[str, ...]) -> Build:
+        """Work that compiles a network in a storage."""
+        about = network.identity | {"storage": storage}
+        folder = self.folder.resolve() / "netlists"
+        names = {layout: self._key(network, "netlist", **about, layout=layout) for layout in layouts}
+        return Build(
+            key=self._key(network, "build", **about, layouts=layouts),
+            label=f"{network.name} {storage.label()}",
+            network=network.from_anywhere(),
+            storage=storage,
+            files={layout: folder / f"{name}.loom" for layout, name in names.items()},
+            data=self._data,
+        )
+
+    def run(self, build: Build, layout: str, built: Built, window: int) -> Run:
+        """Work that measures a netlist."""
+        key = self._key(build.network, "run", netlist=built.sha256, window=window)
+        label = f"{build.label} {layout} {window}%"
+        return Run(key=key, label=label, build=build, layout=layout, built=built, window=window)
+
+
+# -- commands ----------------------------------------------------------------------------------------------------------
+
+
+def layout_options(layout: str) -> JsonObject:
+    """Options of ``compile`` that ask for a layout, where it is not the usual one.
+
+    Examples
+    --------
+    >>> layout_options("latency"), layout_options("fc1:6+conv1:4"), layout_options("cores")
+    ({'optimize': 'latency'}, {'cores_for': 'fc1=6,conv1=4'}, {})
+    """
+    if layout == "cores":
+        return {}
+    if ":" in layout:
+        return {"cores_for": layout.replace(":", "=").replace("+", ",")}
+    return {"optimize": layout}
+
+
+def commands(network: Given, storage: Storage, layout: str, window: int, data: Data) -> tuple[str, str]:
+    """What to type for the netlist of a network, and for its figures on a part of every recording."""
+    parts = [network.name, *storage.label().split(), *([] if layout == "cores" else [layout])]
+    file = "-".join(parts).replace(":", "").replace("+", "-") + ".loom"
+    calibrated = {} if storage.levels is not None else {"calibrate": data.path, "bin": data.bin_s}
+    stored = repeat.words(network.source.options() | storage.options() | calibrated | layout_options(layout))
+    part = None if window == WHOLE else f"{window}%"
+    read = repeat.words({"data": data.path, "bin": data.bin_s, "detail": "counts", "window": part})
+    return repeat.command("compile", network.source.path, *stored, "-o", file), repeat.command("run", file, *read)
+
+
+# -- results -----------------------------------------------------------------------------------------------------------
 
 Decisions = Mapping[str, Mapping[str, tuple[int, ...]]]
 """Of a float model, by split and window."""
@@ -54,17 +183,8 @@ class Ran:
     steps: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RanBoth:
-    """The same on both splits, and how fast the simulator is here."""
-
-    train: Ran
-    test: Ran
-    recordings_per_s: float
-
-
 def measure(work: Work) -> Any:
-    """Do one piece of a chart's work; the JSON of `Decisions`, of `Built` by layout, or of `RanBoth`."""
+    """Do one piece of a chart's work; the JSON of `Decisions`, of `Built` by layout, or of `Ran` by split."""
     if isinstance(work, Decide):
         return encode(_decide(work))
     return encode(_build(work) if isinstance(work, Build) else _run(work))
@@ -123,8 +243,6 @@ def _machine(path: Path, sha256: str) -> Machine | None:
 
 def _decide(work: Decide) -> Decisions:
     """Decisions of the float32 model by split and window; one run each, since what comes later changes nothing."""
-    from spikeloom.models.networks.reference import float_spikes  # torch, so only here
-
     source, windows = work.network.source, work.windows
     chart = _chart_of(work.network)
     if chart is not None:
@@ -132,20 +250,12 @@ def _decide(work: Decide) -> Decisions:
         splits = both_splits(work.data, network.taxels, network.classes)
         return {split: chart.decisions(source.path, source.weights, data, windows) for split, data in splits.items()}
     loaded = _network(source, work.network.sha256)
-    checkpoint, adjacency = loaded.checkpoint, loaded.adjacency
-    assert checkpoint is not None, "a chart takes checkpoints"
-    assert adjacency is not None, "and these have a first layer that sees something"
-    decided: dict[str, dict[str, tuple[int, ...]]] = {}
-    for split, data in _in_steps(work.data, checkpoint.taxels, checkpoint.classes, checkpoint.bins).items():
-        counts: dict[int, list[IntArray]] = {window: [] for window in windows}
-        steps = data.step_counts
-        for first in range(0, len(data), PART):
-            part = slice(first, first + PART)
-            *_, spikes = float_spikes(checkpoint, adjacency, data.events[part]).values()
-            for window in windows:
-                seen = cut(spikes, steps_of(steps[part], window))
-                counts[window].append(readout_counts(checkpoint.readout, checkpoint.classes, seen))
-        decided[split] = {str(window): tuple(vote(np.concatenate(each)).tolist()) for window, each in counts.items()}
+    readout, classes = loaded.network.readout, loaded.network.classes
+    decided = {}
+    for split, data in _in_steps(work.data, loaded.network.input.taxels, classes, loaded.network.input.bins).items():
+        votes, steps = votes_so_far(readout, classes, loaded.model, loaded.adjacency, data), data.step_counts
+        seen = {window: votes[np.arange(len(data)), steps_of(steps, window) - 1] for window in windows}
+        decided[split] = {str(window): tuple(vote(each).tolist()) for window, each in seen.items()}
     return decided
 
 
@@ -220,8 +330,8 @@ def _refused(error: CapacityError | ModelError) -> Built:
 # -- netlists on recordings --------------------------------------------------------------------------------------------
 
 
-def _run(work: Run) -> RanBoth:
-    """What a netlist decides on both splits, what that costs, and how fast the simulator is."""
+def _run(work: Run) -> dict[str, Ran]:
+    """What a netlist decides on both splits, and what that costs."""
     path = work.build.files[work.layout]
     machine = _machine(path, work.built.sha256)
     if machine is None:
@@ -232,12 +342,7 @@ def _run(work: Run) -> RanBoth:
         raise FormatError(f"{path}: is not the netlist that was measured before; begin anew with --fresh")
     netlist, data = machine.netlist, work.build.data
     splits = _in_steps(data, netlist.taxels, netlist.classes, netlist.bins)
-    parts = {split: first_part(each, work.window) for split, each in splits.items()}
-    return RanBoth(
-        train=_costs(machine, parts["train"], data.bin_s),
-        test=_costs(machine, parts["test"], data.bin_s),
-        recordings_per_s=_throughput(machine, parts["test"]),
-    )
+    return {split: _costs(machine, first_part(each, work.window), data.bin_s) for split, each in splits.items()}
 
 
 def _costs(machine: Machine, data: Recordings, bin_s: float) -> Ran:
@@ -258,13 +363,3 @@ def _costs(machine: Machine, data: Recordings, bin_s: float) -> Ran:
         step_s={name: max(0.0, *(price.step_s[name] for price in prices)) for name in prices[0].time_s},
         steps=float(steps.mean()),
     )
-
-
-def _throughput(machine: Machine, data: Recordings) -> float:
-    """Recordings a second on one thread, decisions only; the better of two rounds."""
-    rounds = []
-    for _ in range(2):
-        began = time.perf_counter()
-        machine.run(data.events, lengths=data.lengths, threads=1)
-        rounds.append(time.perf_counter() - began)
-    return len(data) / min(rounds)

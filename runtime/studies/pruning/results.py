@@ -1,11 +1,13 @@
-"""What ``lean`` returns."""
+"""What ``lean`` returns and prints: what is used, what may go, and what that changes and saves."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
+from spikeloom.runtime.report.numbers import percent, si
+from spikeloom.runtime.report.sections import Section, Table, Text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,25 +29,16 @@ class Costs:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Removed:
-    """What is taken away: hops and taxels by number, neurons of each layer; or how many bins are joined."""
+    """What is taken away: hops and taxels by number, neurons of each layer."""
 
     hops: tuple[int, ...] | None = field(default=None, metadata=OPTIONAL)
     taxels: tuple[int, ...] | None = field(default=None, metadata=OPTIONAL)
     neurons: Mapping[str, int] | None = field(default=None, metadata=OPTIONAL)
-    bins: int | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Changed:
-    """Training decisions that differ from those of the whole network, and right ones."""
-
-    differ: int
-    right: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Tested:
-    """The same of the reported split; decisions that become right or wrong."""
+    """Decisions that differ from those of the whole network, right ones, and those that become right or wrong."""
 
     differ: int
     right: int
@@ -60,20 +53,8 @@ class Row:
     name: str
     removed: Removed
     training: Changed
-    test: Tested
+    test: Changed
     costs: Costs = field(metadata=INLINE)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Candidate:
-    """A checkpoint on the chip, one of several."""
-
-    costs: Costs = field(metadata=INLINE)
-    name: str
-    graph: str | None
-    training_operations: float
-    training_right: int
-    test_right: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,8 +89,7 @@ class Lean:
     """What a network can do without.
 
     `taken` is the row of least energy in training among those that change few enough decisions; `overflowing` were not
-    tried, since a register could overflow. `chosen` is one of the `candidates`, of which there are none where only one
-    network was given.
+    tried, since a register could overflow.
     """
 
     taken: int
@@ -121,6 +101,81 @@ class Lean:
     source: str
     split: str
     differ: float
-    candidates: tuple[Candidate, ...]
-    chosen: str
     output: str | None
+
+
+# -- for people --------------------------------------------------------------------------------------------------------
+
+
+def sections(result: Lean) -> list[Section]:
+    """Use of layers and taxels, every row, and what is taken."""
+    samples, whole, taken = result.samples, result.rows[0], result.rows[result.taken]
+    layers = [[e.name, *(f"{n:,}" for n in (e.neurons, e.on_chip, e.never_fired))] for e in result.layers]
+    lines = [f"without {name}: not tried, what is left could leave a register" for name in result.overflowing]
+    last = [f"least energy in training: {taken.name}", *_removed(taken.removed)]
+    return [
+        Section(
+            "Accuracy",
+            [
+                Text(
+                    f"chip accuracy: {percent(whole.test.right, samples.test)} on {result.split}, "
+                    f"{whole.training.right} of {samples.training} in training"
+                )
+            ],
+        ),
+        Section(
+            "Use",
+            [Table(["layer", "neurons", "on chip", "never fired in training"], layers), Text(_taxels(result.taxels))],
+        ),
+        Section("Without", [_rows(result), Text("\n".join(lines))]),
+        Section(
+            "Taken",
+            [Text("\n".join(last + ([] if result.output is None else [f"written without them: {result.output}"])))],
+        ),
+    ]
+
+
+def _taxels(taxels: Sequence[TaxelUse]) -> str:
+    """Taxels without which nothing changes, and the one that matters most."""
+    silent = [str(i) for i, taxel in enumerate(taxels) if not taxel.events]
+    free = [str(i) for i, taxel in enumerate(taxels) if taxel.events and not taxel.training_differ]
+    most = max(range(len(taxels)), key=lambda i: taxels[i].training_differ)
+    return (
+        f"{len(silent)} of {len(taxels)} taxels without an event in training{_listed(silent)}\n"
+        f"{len(free)} more without which, one at a time, no training decision changes{_listed(free)}\n"
+        f"taxel {most} matters most: {taxels[most].training_differ} training decisions change without it"
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f" ({', '.join(names)})" if names else ""
+
+
+def _rows(result: Lean) -> Table:
+    samples, whole = result.samples, result.rows[0].costs
+    head = ["without", "differ in training", "differ", "right", "operations", "saved"]
+    head += [word for name in whole.energy_j for word in (name, "saved")]
+    head += [*(f"time, {name}" for name in whole.time_s), "neurons", "cores"]
+    body = []
+    for index, row in enumerate(result.rows):
+        costs = row.costs
+        cells = ["nothing" if index == 0 else row.name]
+        cells += [f"{row.training.differ} of {samples.training}", f"{row.test.differ} of {samples.test}"]
+        cells += [str(row.test.right), f"{costs.operations:,.0f}", _saved(costs.operations, whole.operations)]
+        for name, joules in costs.energy_j.items():
+            cells += [si(joules, "J"), _saved(joules, whole.energy_j[name])]
+        cells += [si(each, "s") for each in costs.time_s.values()]
+        body.append([*cells, f"{costs.neurons:,}", str(costs.cores)])
+    return Table(head, body)
+
+
+def _saved(left: float, whole: float) -> str:
+    return f"{100 * (1 - left / whole):.1f} %" if whole else ""
+
+
+def _removed(gone: Removed) -> list[str]:
+    """What went together."""
+    neurons = [f"{name} {count:,}" for name, count in (gone.neurons or {}).items()]
+    parts = {"hops": map(str, gone.hops or ()), "taxels": map(str, gone.taxels or ()), "neurons": neurons}
+    words = {what: ", ".join(names) for what, names in parts.items()}
+    return [f"{what} that went: {names}" for what, names in words.items() if names]

@@ -1,8 +1,8 @@
-"""The study: neurons, taxels, hops and bins are taken from a network, alone and together, and it is measured again."""
+"""The study: neurons, taxels and hops are taken from a network, alone and together, and it is measured again."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,12 +10,10 @@ import numpy as np
 from spikeloom.compiler import Compilation, Netlist, Options, compile_network
 from spikeloom.compiler.systems import TACTILESGNET
 from spikeloom.compiler.types import IntArray
-from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.pruning.results import (
-    Candidate,
     Changed,
     LayerUse,
     Lean,
@@ -23,12 +21,10 @@ from spikeloom.runtime.studies.pruning.results import (
     Row,
     Samples,
     TaxelUse,
-    Tested,
 )
 from spikeloom.runtime.studies.pruning.trials import (
     Trial,
     changed_alone,
-    coarse_netlist,
     decisions,
     priced,
     spikes_of,
@@ -36,25 +32,21 @@ from spikeloom.runtime.studies.pruning.trials import (
     without_taxels,
 )
 
-BINS = (2, 4)
-"""Bins that are joined."""
-
 
 def study(
-    networks: Mapping[str, LoadedNetwork], training: Recordings, test: Recordings, differ: float, output: str | None
+    loaded: LoadedNetwork, training: Recordings, test: Recordings, differ: float, output: str | None
 ) -> tuple[Lean, Netlist]:
-    """Choose the cheapest of several networks, by file, on the training split and take from it what that does not need.
+    """Take from a network what the training split does not need: the share `differ` of its decisions may change.
 
-    The share `differ` of training decisions may change. Hands back the network without what is taken, too, which will
-    be written to `output`.
+    Hands back the network without what is taken, too, which will be written to `output`.
     """
-    made = {path: _candidate(path, loaded, training, test) for path, loaded in networks.items()}
-    candidates = [candidate for candidate, _ in made.values()]
-    chosen = _cheapest(candidates)
-    whole = _Whole(networks[chosen], made[chosen][1], training, test, int(differ * len(training) + 1e-9))
+    progress("compiling")
+    forms = None if loaded.checkpoint is None else loaded.checkpoint.forms
+    compilation = compile_network(loaded.network, Options(forms=forms, training_events=training.events))
+    whole = _Whole(loaded, compilation, training, test, int(differ * len(training) + 1e-9))
     left = list(whole.everything())
     kept = [each for each in left if each.offered and each.row.training.differ <= whole.loose.allowed]
-    taken = min(kept, key=lambda each: priced(each.netlist, whole.training)[1].least)
+    taken = min(kept, key=lambda each: priced(each.netlist, training)[1].least)
     return Lean(
         taken=left.index(taken),
         samples=Samples(training=len(training), test=len(test)),
@@ -65,37 +57,8 @@ def study(
         source=test.source,
         split=test.split,
         differ=differ,
-        candidates=tuple(candidates) if len(candidates) > 1 else (),
-        chosen=chosen,
         output=output,
     ), taken.netlist
-
-
-def _candidate(
-    path: str, loaded: LoadedNetwork, training: Recordings, test: Recordings
-) -> tuple[Candidate, Compilation]:
-    """A checkpoint on the chip: decisions and costs."""
-    progress(f"compiling {path}")
-    forms = None if loaded.checkpoint is None else loaded.checkpoint.forms
-    compilation = compile_network(loaded.network, Options(forms=forms, training_events=training.events))
-    netlist = compilation.netlist
-    decided, cost = priced(netlist, training)
-    decided_test, cost_test = priced(netlist, test)
-    return Candidate(
-        costs=cost_test,
-        name=path,
-        graph=loaded.graph,
-        training_operations=cost.operations,
-        training_right=int(np.count_nonzero(decided == training.labels)),
-        test_right=int(np.count_nonzero(decided_test == test.labels)),
-    ), compilation
-
-
-def _cheapest(candidates: list[Candidate]) -> str:
-    """The one of fewest operations in training among those within one training recording of the best."""
-    least = max(each.training_right for each in candidates) - 1
-    fitting = [each for each in candidates if each.training_right >= least]
-    return min(fitting, key=lambda each: each.training_operations).name
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,21 +78,17 @@ class _Whole:
     ) -> None:
         self.loaded, self.compilation, self.netlist = loaded, compilation, compilation.netlist
         self.training, self.test = training, test
-        self.spikes = spikes_of(self.netlist, self.training)
-        self.wanted, self.wanted_test = decisions(self.netlist, self.training), decisions(self.netlist, self.test)
+        self.spikes = spikes_of(self.netlist, training)
+        self.wanted, self.wanted_test = decisions(self.netlist, training), decisions(self.netlist, test)
         self.strict = Trial(
-            compilation=compilation,
-            integer=compilation.integer,
-            training=self.training,
-            wanted=self.wanted,
-            allowed=0,
+            compilation=compilation, integer=compilation.integer, training=training, wanted=self.wanted, allowed=0
         )
         self.loose = replace(self.strict, allowed=allowed)
         self.trials = (self.strict, self.loose) if allowed else (self.strict,)
         self.overflowing: list[str] = []
         progress("taxels, one at a time")
-        self.changed = changed_alone(self.netlist, self.training, self.wanted)
-        self.changed_test = changed_alone(self.netlist, self.test, self.wanted_test)
+        self.changed = changed_alone(self.netlist, training, self.wanted)
+        self.changed_test = changed_alone(self.netlist, test, self.wanted_test)
 
     def everything(self) -> Iterator[_Left]:
         """All that is tried."""
@@ -146,37 +105,17 @@ class _Whole:
             yield left
             if left.row.training.differ <= self.loose.allowed:
                 cheapest = min(cheapest, (left.row.costs.operations, hops))
-        yield from self._bins()
         progress("all of it together")
         yield self._together(cheapest[1])
 
-    def _left(
-        self,
-        name: str,
-        removed: Removed,
-        netlist: Netlist,
-        scenes: tuple[Recordings, Recordings] | None = None,
-        *,
-        offered: bool = False,
-    ) -> _Left:
-        """Measure what is left, on scenes of its own if it needs such."""
-        training, test = scenes or (self.training, self.test)
-        decided = decisions(netlist, training)
-        tested, costs = priced(netlist, test)
-        before, after = self.wanted_test == test.labels, tested == test.labels
+    def _left(self, name: str, removed: Removed, netlist: Netlist, *, offered: bool = False) -> _Left:
+        """Measure what is left."""
+        tested, costs = priced(netlist, self.test)
         row = Row(
             name=name,
             removed=removed,
-            training=Changed(
-                differ=int(np.count_nonzero(decided != self.wanted)),
-                right=int(np.count_nonzero(decided == training.labels)),
-            ),
-            test=Tested(
-                differ=int(np.count_nonzero(tested != self.wanted_test)),
-                right=int(np.count_nonzero(after)),
-                gained=int(np.count_nonzero(~before & after)),
-                lost=int(np.count_nonzero(before & ~after)),
-            ),
+            training=_changed(self.wanted, decisions(netlist, self.training), self.training.labels),
+            test=_changed(self.wanted_test, tested, self.test.labels),
             costs=costs,
         )
         return _Left(row, netlist, offered)
@@ -206,15 +145,6 @@ class _Whole:
             else:
                 built = replace(self.strict, integer=integer).built()
                 yield hops, self._left(name, Removed(hops=hops), built, offered=True)
-
-    def _bins(self) -> Iterator[_Left]:
-        """Join bins, with the decays as they are and with those of as many steps."""
-        for bins in BINS:
-            progress(f"{bins} bins joined")
-            scenes = joined_bins(self.training, bins), joined_bins(self.test, bins)
-            for adapted, how in ((False, "decays as they are"), (True, "decays of as many steps")):
-                netlist = coarse_netlist(self.netlist, bins, adapted=adapted)
-                yield self._left(f"{bins} bins joined, {how}", Removed(bins=bins), netlist, scenes)
 
     def _together(self, hops: tuple[int, ...]) -> _Left:
         """Hops, then taxels, then neurons, as long as no more training decisions change than may."""
@@ -253,6 +183,16 @@ class _Whole:
                 events.tolist(), self.changed.tolist(), self.changed_test.tolist(), strict=True
             )
         )
+
+
+def _changed(whole: IntArray, less: IntArray, labels: IntArray) -> Changed:
+    before, after = whole == labels, less == labels
+    return Changed(
+        differ=int(np.count_nonzero(less != whole)),
+        right=int(np.count_nonzero(after)),
+        gained=int(np.count_nonzero(~before & after)),
+        lost=int(np.count_nonzero(before & ~after)),
+    )
 
 
 def _allowed(trial: Trial) -> str:

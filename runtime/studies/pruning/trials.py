@@ -14,7 +14,7 @@ import numpy as np
 
 from spikeloom.compiler import Compilation, Netlist, layer_of, rounded, without
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.fixedpoint import DECAY_BITS, ONE_STEP_SUM_MAX, read_only
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
 from spikeloom.compiler.ir import Form, IntegerNetwork
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import without_channels
@@ -186,18 +186,3 @@ def without_hops(
     if layer is None or layer.reached > ONE_STEP_SUM_MAX:
         return None
     return replace(integer, projections=(*layer.projections, *(p for p in integer.projections if p.post != 0)))
-
-
-def coarse_netlist(netlist: Netlist, bins: int, *, adapted: bool) -> Netlist:
-    """The netlist for joined bins: clocks as much slower; if `adapted`, what membranes and currents keep in as many."""
-    clocks = replace(netlist.clocks, steps=max(1, round(netlist.clocks.steps / bins)))
-    if not adapted:
-        return replace(netlist, clocks=clocks)
-    one = 1 << DECAY_BITS
-    keep_v, keep_u = (one - netlist.decay_v) / one, (one - 1 - netlist.decay_u) / one
-    return replace(
-        netlist,
-        clocks=clocks,
-        decay_v=read_only(np.round(one * (1 - keep_v**bins))),
-        decay_u=read_only(np.minimum(np.round(one * (1 - keep_u**bins)), one) - 1),
-    )

@@ -20,29 +20,9 @@ from spikeloom.models.sensors import read_layout, sensor_graph
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
-from spikeloom.runtime.studies.stress.disturbances import Events
-from spikeloom.runtime.studies.stress.pair import Inputs, Pair, Ready, ready
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Sensor:
-    """What perturbations must know beside the network."""
-
-    # (taxels, taxels) float64; in millimetres, or in steps on the graph where positions are not known
-    distance: FloatArray
-    places: FloatArray | None  # (taxels, dimensions) float64, or None; positions in millimetres
-    edges: IntArray | None  # (edges, 2) int64, or None; graph that the network was trained on
-    checkpoint: Checkpoint | None  # What the network was made from; None for an ONNX or NIR file
-
-    @property
-    def taxels(self) -> int:
-        """Number of taxels."""
-        return len(self.distance)
-
-    def digest(self) -> str:
-        """Hash over distances and edges."""
-        edges = b"" if self.edges is None else self.edges.tobytes()
-        return hashlib.sha256(self.distance.tobytes() + edges).hexdigest()
+from spikeloom.runtime.studies.stress import damages, disturbances
+from spikeloom.runtime.studies.stress.pair import Inputs, Pair
+from spikeloom.runtime.studies.stress.perturbation import Events, Perturbation, Sensor, perturbation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,7 +30,6 @@ class Bench:
     """What is stressed, and on what."""
 
     pair: Pair  # As compiled
-    ready: Ready  # The same, prepared
     sensor: Sensor
     # (recordings, taxels, polarities, T) uint8; in the bins of the recordings, which are disturbed before a network
     # joins them
@@ -83,8 +62,12 @@ def by_length(events: Events, lengths: IntArray, change: Callable[[Events], Even
     return changed
 
 
-def after_others(bench: Bench, before: int, rng: np.random.Generator) -> Inputs:
-    """Each recording after some others without a reset; clocks start again with each."""
+@perturbation("recordings before", (1, 2), least=1, most=100)
+def warm_state(bench: Bench, before: int, rng: np.random.Generator) -> Inputs:
+    """Other recordings run before, without a reset between.
+
+    Clocks start again with each.
+    """
     steps, lengths = bench.steps()
     flat = with_clocks(steps, bench.pair.netlist.clocks)
     order = np.stack([rng.permutation(len(flat)) for _ in range(before)] + [np.arange(len(flat))], axis=1)
@@ -96,14 +79,24 @@ def after_others(bench: Bench, before: int, rng: np.random.Generator) -> Inputs:
     return Inputs(events=events, lengths=length, begin=length - lengths)
 
 
-def going_round(bench: Bench, rounds: int) -> Inputs:
-    """Each recording again and again without a reset; clocks run on and end, as they would."""
+@perturbation("times the length", (2, 10), least=1, most=100)
+def longer(bench: Bench, rounds: int) -> Inputs:
+    """The recording goes round again without a reset; decided on the last round alone.
+
+    Clocks run on and end, as they would.
+    """
     steps, lengths = bench.steps()
     events = np.zeros((*steps.shape[:3], steps.shape[3] * rounds), np.uint8)
     for i, length in enumerate(lengths.tolist()):
         events[i, ..., : length * rounds] = np.tile(steps[i, ..., :length], rounds)
     begin = lengths * (rounds - 1)
     return Inputs(events=with_clocks(events, bench.pair.netlist.clocks), lengths=lengths * rounds, begin=begin)
+
+
+_ALL = (*vars(disturbances).values(), warm_state, longer, *vars(damages).values())
+
+NAMES = {each.name: each for each in _ALL if isinstance(each, Perturbation)}
+"""Every perturbation: of recordings, of the state that is left over, of the network."""
 
 
 # -- from files --------------------------------------------------------------------------------------------------------
@@ -115,14 +108,12 @@ def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, loaded.model)
     data = load_recordings(arguments, netlist, labels_for="stress", joined=False)
-    pair = Pair(netlist=netlist, network=loaded.network)
     places, edges = _places(arguments, netlist.taxels), _edges(arguments, loaded.checkpoint)
     digest = hashlib.sha256()
     for array in data.identity().values():
         digest.update(np.ascontiguousarray(array).tobytes())
     bench = Bench(
-        pair=pair,
-        ready=ready(pair),
+        pair=Pair(netlist=netlist, network=loaded.network),
         sensor=Sensor(
             distance=distances(netlist.taxels, places, edges), places=places, edges=edges, checkpoint=loaded.checkpoint
         ),

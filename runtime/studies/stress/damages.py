@@ -27,10 +27,17 @@ from spikeloom.compiler.fixedpoint import (
     weight_step,
 )
 from spikeloom.compiler.ir import INPUT, Network, Population, Projection
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.systems import GRAPH_SYSTEMS, TITLES
 from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.models.graphs import build_graph
+from spikeloom.models.systems import propagation_of
 from spikeloom.runtime.studies.stress.pair import Pair
+from spikeloom.runtime.studies.stress.perturbation import Sensor, perturbation
 
 Mask = npt.NDArray[np.bool_]
+
+HIDDEN = "share of hidden neurons"
 
 
 # -- weights -----------------------------------------------------------------------------------------------------------
@@ -73,8 +80,12 @@ def weight_steps(bits: IntArray) -> IntArray:
     return known[bits]
 
 
-def flip_bits(pair: Pair, share: float, rng: np.random.Generator) -> Pair:
-    """Flip each bit of synaptic memory that holds a weight with a probability; weights in two's complement."""
+@perturbation("probability", (1e-4, 1e-3, 0.01, 0.05))
+def weight_bit_flips(pair: Pair, share: float, rng: np.random.Generator) -> Pair:
+    """Each stored bit of a weight flips with a probability.
+
+    Of synaptic memory; weights in two's complement.
+    """
     code, bits = _codes(pair.netlist)
     last = np.cumsum(bits)
     total = int(last[-1]) if len(last) else 0
@@ -87,24 +98,32 @@ def flip_bits(pair: Pair, share: float, rng: np.random.Generator) -> Pair:
     return with_weights(pair, ((flipped & (2 * half - 1)) - half) * weight_steps(bits))
 
 
-def fewer_bits(pair: Pair, width: int) -> Pair:
-    """Keep so many bits of each weight at most, rounded to the nearest; scales stay."""
-    code, bits = _codes(pair.netlist)
-    factor = np.int64(1) << np.maximum(bits - width, 0)
-    most = (np.int64(1) << (np.minimum(bits, width) - 1)) - 1
-    kept = np.clip(round_half_even(code / factor), -most, most) * factor
-    return with_weights(pair, kept * weight_steps(bits))
-
-
 # -- neurons -----------------------------------------------------------------------------------------------------------
+
+
+def relays(pair: Pair) -> Mask:
+    """Compartments that relay a clock; (compartments,)."""
+    first = np.array([population.size - population.relays for population in pair.network.populations])
+    mask: Mask = first[pair.netlist.layer] <= pair.netlist.neuron
+    return mask
 
 
 def hidden(pair: Pair) -> IntArray:
     """Compartments that neither vote nor relay a clock; (…,) int64."""
-    netlist = pair.netlist
-    relays = np.array([population.size - population.relays for population in pair.network.populations])
-    ids: IntArray = np.flatnonzero((netlist.readout_class < 0) & (netlist.neuron < relays[netlist.layer]))
+    ids: IntArray = np.flatnonzero((pair.netlist.readout_class < 0) & ~relays(pair))
     return ids
+
+
+@perturbation(HIDDEN, (0.05, 0.1, 0.25, 0.5))
+def neurons_silent(pair: Pair, share: float, rng: np.random.Generator) -> Pair:
+    """Random hidden neurons never fire."""
+    return stick_neurons(pair, share, rng, firing=False)
+
+
+@perturbation(HIDDEN, (0.005, 0.02, 0.05, 0.1))
+def neurons_firing(pair: Pair, share: float, rng: np.random.Generator) -> Pair:
+    """Random hidden neurons fire in every step."""
+    return stick_neurons(pair, share, rng, firing=True)
 
 
 def stick_neurons(pair: Pair, share: float, rng: np.random.Generator, *, firing: bool) -> Pair:
@@ -137,23 +156,19 @@ def with_thresholds(pair: Pair, threshold: IntArray) -> Pair:
     A neuron with another threshold fires as one with the old one whose weights and bias are divided by the factor.
     """
     netlist = pair.netlist
-    held = np.clip(threshold, 1, THRESHOLD_MANTISSA_MAX)
-    factor = np.maximum(netlist.threshold, 1) / held
-    relays = [population.size - population.relays for population in pair.network.populations]
+    held = np.where(relays(pair), netlist.threshold, np.clip(threshold, 1, THRESHOLD_MANTISSA_MAX))
+    factor = np.maximum(netlist.threshold, 1) / np.maximum(held, 1)
     factors = []
     for number, layer in enumerate(netlist.layers):
-        ids = netlist.compartments_of(number)
-        whole = np.ones(layer.neurons)
+        ids, whole = netlist.compartments_of(number), np.ones(layer.neurons)
         whole[netlist.neuron[ids]] = factor[ids]
-        whole[relays[number] :] = 1.0
         factors.append(whole)
-    apart = np.array(relays)[netlist.layer] <= netlist.neuron
-    changed = replace(netlist, threshold=read_only(np.where(apart, netlist.threshold, held)))
     network = _rows_scaled(pair.network, factors)
     populations = tuple(
         replace(population, bias=population.bias * by)
         for population, by in zip(network.populations, factors, strict=True)
     )
+    changed = replace(netlist, threshold=read_only(held))
     return Pair(netlist=changed, network=replace(network, populations=populations))
 
 
@@ -162,30 +177,39 @@ def scale_thresholds(pair: Pair, factor: FloatArray | float) -> Pair:
     return with_thresholds(pair, round_half_even(pair.netlist.threshold * np.asarray(factor)))
 
 
-def spread_thresholds(pair: Pair, spread: float, rng: np.random.Generator) -> Pair:
-    """Each threshold drifts by a factor of its own: normal around 1, not below a twentieth."""
+@perturbation("standard deviation, share", (0.05, 0.1, 0.2, 0.4))
+def threshold_spread(pair: Pair, spread: float, rng: np.random.Generator) -> Pair:
+    """Each threshold drifts by a factor of its own.
+
+    Normal around 1, not below a twentieth.
+    """
     drift = rng.standard_normal(pair.netlist.n_compartments)
     return scale_thresholds(pair, np.maximum(1 + spread * drift, 0.05))
 
 
-def shorten_decay(pair: Pair, factor: float) -> Pair:
-    """Membranes and lasting currents keep a smaller share of themselves: decays times a factor below 1."""
-    netlist = pair.netlist
-    registers = np.array([decay_registers(layer.beta * factor, layer.alpha * factor) for layer in netlist.layers])
-    decay_u, decay_v = registers[netlist.layer].T
-    changed = replace(netlist, decay_u=read_only(decay_u), decay_v=read_only(decay_v))
-    one = 1 << DECAY_BITS
-    populations = tuple(
-        replace(population, beta=(one - v) / one, alpha=(one - 1 - u) / one)
-        for population, (u, v) in zip(pair.network.populations, registers.tolist(), strict=True)
-    )
-    return Pair(netlist=changed, network=replace(pair.network, populations=populations))
+@perturbation("times", (1.05, 1.1, 1.25, 1.5, 2), least=1, most=1000)
+def threshold_raised(pair: Pair, factor: float) -> Pair:
+    """All thresholds rise: towards a silent network."""
+    return scale_thresholds(pair, factor)
 
 
-def open_late(pair: Pair, steps: int) -> Pair:
-    """All layers but the first open their windows later: they miss the first steps of their input.
+@perturbation("times", (0.95, 0.9, 0.75, 0.5))
+def threshold_lowered(pair: Pair, factor: float) -> Pair:
+    """All thresholds fall: towards a saturated network."""
+    return scale_thresholds(pair, factor)
 
-    The float network needs no change: :func:`float_engine.prepare` takes depths from the netlist.
+
+@perturbation("units", (1, 2), most=1000)
+def ties_fire(pair: Pair, units: int) -> Pair:
+    """Thresholds fall by register units: at 1, more than every tie fires (>= for >)."""
+    return with_thresholds(pair, pair.netlist.threshold - units)
+
+
+@perturbation("steps", (1, 2, 5, 25), most=1000)
+def layers_late(pair: Pair, steps: int) -> Pair:
+    """Layers after the first open their windows late, off by one and more.
+
+    They miss the first steps of their input. The float network needs no change: it takes depths from the netlist.
     """
     layers = tuple(replace(layer, depth=layer.depth + steps) if layer.depth else layer for layer in pair.netlist.layers)
     return Pair(netlist=replace(pair.netlist, layers=layers), network=pair.network)
@@ -210,7 +234,7 @@ def _rows_scaled(network: Network, factors: list[FloatArray]) -> Network:
     return replace(network, projections=tuple(scaled(projection) for projection in network.projections))
 
 
-# -- other float networks, stored on the scales that the netlist has ---------------------------------------------------
+# -- taxel graphs ------------------------------------------------------------------------------------------------------
 
 
 def stored_alike(pair: Pair, network: Network, *, coarser: int = 1) -> Pair:
@@ -218,22 +242,46 @@ def stored_alike(pair: Pair, network: Network, *, coarser: int = 1) -> Pair:
     return Pair(netlist=store_alike(pair.netlist, network, coarser=coarser), network=network)
 
 
-def add_outliers(pair: Pair, factor: int, rng: np.random.Generator) -> Pair:
-    """In each layer one weight grows to a multiple of the largest and takes the scale with it.
-
-    The float network has that one weight more; on the chip all others are stored on a grid that is as much coarser.
-    """
-    projections = list[Projection]()
-    for projection in pair.network.projections:
-        weight = projection.weight.copy()
-        if weight.nnz:
-            place = int(rng.integers(weight.nnz))
-            weight.data[place] = np.copysign(factor * np.abs(weight.data).max(), weight.data[place])
-        projections.append(replace(projection, weight=weight))
-    return stored_alike(pair, replace(pair.network, projections=tuple(projections)), coarser=factor)
+def no_graph(_pair: Pair, sensor: Sensor) -> str | None:
+    """Why there are no edges."""
+    if sensor.checkpoint is None:
+        return "a network from an ONNX or NIR file has no taxel graph that is known"
+    system = sensor.checkpoint.system
+    return None if system in GRAPH_SYSTEMS else f"{TITLES[system]} has no taxel graph"
 
 
-# -- taxel graphs ------------------------------------------------------------------------------------------------------
+def no_places(pair: Pair, sensor: Sensor) -> str | None:
+    """Why there is no other graph."""
+    unknown = "positions of the taxels are not known, no graph can be built on them"
+    return no_graph(pair, sensor) or (unknown if sensor.places is None else None)
+
+
+def _on_graph(pair: Pair, sensor: Sensor, edges: IntArray) -> Pair:
+    checkpoint = sensor.checkpoint
+    assert checkpoint is not None, "no obstacle"
+    seen = propagation_of(checkpoint.system, edges, checkpoint.taxels, checkpoint.grid, len(checkpoint.hops))
+    return stored_alike(pair, expand(checkpoint, seen))
+
+
+@perturbation("graph", ("knn:1", "knn:4", "mst:0"), unless=no_places)
+def other_graph(pair: Pair, name: str, sensor: Sensor) -> Pair:
+    """Another taxel graph than the one of the training."""
+    assert sensor.places is not None, "no obstacle"
+    return _on_graph(pair, sensor, build_graph(name, sensor.places).edges)
+
+
+@perturbation("share of edges", (0.05, 0.1, 0.25, 0.5), unless=no_graph)
+def edges_rewired(pair: Pair, share: float, sensor: Sensor, rng: np.random.Generator) -> Pair:
+    """Edges of the taxel graph lead elsewhere."""
+    assert sensor.edges is not None, "no obstacle"
+    return _on_graph(pair, sensor, rewire(sensor.edges, sensor.taxels, share, rng))
+
+
+@perturbation("share of edges", (0.1, 0.25, 0.5, 1), unless=no_graph)
+def edges_doubled(pair: Pair, share: float, sensor: Sensor, rng: np.random.Generator) -> Pair:
+    """Edges of the taxel graph are listed twice."""
+    assert sensor.edges is not None, "no obstacle"
+    return _on_graph(pair, sensor, double(sensor.edges, share, rng))
 
 
 def _links(edges: IntArray) -> tuple[IntArray, bool]:
@@ -265,3 +313,55 @@ def double(edges: IntArray, share: float, rng: np.random.Generator) -> IntArray:
     links, both = _links(edges)
     again = links[rng.permutation(len(links))[: round(share * len(links))]]
     return np.concatenate([edges, _there_and_back(again, both)])
+
+
+# -- storage and decay -------------------------------------------------------------------------------------------------
+
+
+def several_planes(pair: Pair, _sensor: Sensor) -> str | None:
+    """Why a stored weight has no bits of its own."""
+    netlist = pair.netlist
+    exponent = netlist.format_exponent[netlist.axon_format[netlist.axon_of_synapse()]]
+    kinds = {*zip(netlist.layer[netlist.synapse_compartment()].tolist(), exponent.tolist(), strict=True)}
+    return "weights are stored in several planes" if len(kinds) > len({layer for layer, _ in kinds}) else None
+
+
+@perturbation("bits", (6, 5, 4, 3, 2), least=2, most=8, unless=several_planes)
+def fewer_bits(pair: Pair, width: int) -> Pair:
+    """Weights keep fewer bits on the scale that they have."""
+    code, bits = _codes(pair.netlist)
+    factor = np.int64(1) << np.maximum(bits - width, 0)
+    most = (np.int64(1) << (np.minimum(bits, width) - 1)) - 1
+    kept = np.clip(round_half_even(code / factor), -most, most) * factor
+    return with_weights(pair, kept * weight_steps(bits))
+
+
+@perturbation("times the largest", (2, 4, 8, 16), least=1, most=64)
+def outlier_weight(pair: Pair, factor: int, rng: np.random.Generator) -> Pair:
+    """One weight a layer grows beyond the largest and takes the scale with it.
+
+    The float network has that one weight more; on the chip all others are stored on a grid that is as much coarser.
+    """
+    projections = list[Projection]()
+    for projection in pair.network.projections:
+        weight = projection.weight.copy()
+        if weight.nnz:
+            place = int(rng.integers(weight.nnz))
+            weight.data[place] = np.copysign(factor * np.abs(weight.data).max(), weight.data[place])
+        projections.append(replace(projection, weight=weight))
+    return stored_alike(pair, replace(pair.network, projections=tuple(projections)), coarser=factor)
+
+
+@perturbation("times the decay", (0.75, 0.5, 0.25, 0))
+def shorter_decay(pair: Pair, factor: float) -> Pair:
+    """Membranes and lasting currents keep a smaller share."""
+    netlist = pair.netlist
+    registers = np.array([decay_registers(layer.beta * factor, layer.alpha * factor) for layer in netlist.layers])
+    decay_u, decay_v = registers[netlist.layer].T
+    changed = replace(netlist, decay_u=read_only(decay_u), decay_v=read_only(decay_v))
+    one = 1 << DECAY_BITS
+    populations = tuple(
+        replace(population, beta=(one - v) / one, alpha=(one - 1 - u) / one)
+        for population, (u, v) in zip(pair.network.populations, registers.tolist(), strict=True)
+    )
+    return Pair(netlist=changed, network=replace(pair.network, populations=populations))

@@ -9,11 +9,20 @@ taxels; they are not among the events here.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.runtime.studies.stress.pair import Pair
+from spikeloom.runtime.studies.stress.perturbation import TAXELS, Events, Sensor, perturbation
 
-Events = npt.NDArray[np.uint8]
+COUNTS = (1, 3, 5, 10, 20)
+STEPS = (2, 5, 10, 25, 50)
+TEMPO = (1.1, 1.25, 1.5, 2, 4)
+MOST_STEPS = 100_000
+
+DENSITY = "share of entries with an event"
+
+
+# -- taxels ------------------------------------------------------------------------------------------------------------
 
 
 def chosen(taxels: int, count: int, rng: np.random.Generator) -> IntArray:
@@ -32,6 +41,30 @@ def neighbours(distance: FloatArray, count: int, rng: np.random.Generator) -> In
     return np.append(centre, order[order != centre])[:count]
 
 
+@perturbation(TAXELS, COUNTS, most=np.inf)
+def taxels_dead(events: Events, count: int, sensor: Sensor, rng: np.random.Generator) -> Events:
+    """Random taxels send nothing."""
+    return silence(events, chosen(sensor.taxels, count, rng))
+
+
+@perturbation(TAXELS, COUNTS, most=np.inf)
+def taxels_dead_adjacent(events: Events, count: int, sensor: Sensor, rng: np.random.Generator) -> Events:
+    """A taxel and its nearest ones send nothing."""
+    return silence(events, neighbours(sensor.distance, count, rng))
+
+
+@perturbation(TAXELS, COUNTS, most=np.inf)
+def taxels_stuck(events: Events, count: int, sensor: Sensor, rng: np.random.Generator) -> Events:
+    """Random taxels send both polarities in every step."""
+    return stick(events, chosen(sensor.taxels, count, rng))
+
+
+@perturbation(TAXELS, COUNTS, most=np.inf)
+def taxels_stuck_adjacent(events: Events, count: int, sensor: Sensor, rng: np.random.Generator) -> Events:
+    """A taxel and its nearest ones send both polarities in every step."""
+    return stick(events, neighbours(sensor.distance, count, rng))
+
+
 def silence(events: Events, taxels: IntArray) -> Events:
     """Dead taxels: no events."""
     silent = events.copy()
@@ -46,20 +79,26 @@ def stick(events: Events, taxels: IntArray) -> Events:
     return stuck
 
 
-def lose(events: Events, share: float, rng: np.random.Generator) -> Events:
+# -- events ------------------------------------------------------------------------------------------------------------
+
+
+@perturbation("probability", (0.1, 0.25, 0.5, 0.75, 0.9))
+def events_lost(events: Events, share: float, rng: np.random.Generator) -> Events:
     """Each event is lost with a probability."""
     return events & (rng.random(events.shape, np.float32) >= share)
 
 
-def invent(events: Events, share: float, rng: np.random.Generator) -> Events:
-    """Each entry (taxel, polarity, step) gets an event that is not there with a probability."""
+@perturbation("probability", (0.005, 0.01, 0.02, 0.05, 0.1))
+def events_spurious(events: Events, share: float, rng: np.random.Generator) -> Events:
+    """Each empty entry gets an event with a probability."""
     return events | (rng.random(events.shape, np.float32) < share)
 
 
-def jitter(events: Events, sigma: float, rng: np.random.Generator) -> Events:
-    """Each event moves by a normal number of steps, rounded; not beyond the ends. What meets becomes one event.
+@perturbation("steps, standard deviation", (1, 2, 5, 10, 25), most=MOST_STEPS)
+def time_jitter(events: Events, sigma: float, rng: np.random.Generator) -> Events:
+    """Each event moves by a normal number of steps.
 
-    `sigma` is the standard deviation in steps.
+    Not beyond the ends; what meets becomes one event.
     """
     sample, taxel, polarity, step = np.nonzero(events)
     moved = step + np.rint(sigma * rng.standard_normal(len(step))).astype(np.int64)
@@ -68,32 +107,60 @@ def jitter(events: Events, sigma: float, rng: np.random.Generator) -> Events:
     return changed
 
 
+@perturbation("steps", STEPS, most=MOST_STEPS)
 def start_late(events: Events, steps: int) -> Events:
-    """The grasp begins later than the recording: silence first, the end is cut off."""
+    """The grasp begins later than the recording.
+
+    Silence first, the end is cut off.
+    """
     changed = np.zeros_like(events)
     changed[..., steps:] = events[..., : max(events.shape[3] - steps, 0)]
     return changed
 
 
+@perturbation("steps", STEPS, most=MOST_STEPS)
 def start_early(events: Events, steps: int) -> Events:
-    """The grasp began before the recording: its first steps are missing, silence at the end."""
+    """The first steps of the grasp are missing.
+
+    Silence at the end.
+    """
     changed = np.zeros_like(events)
     changed[..., : max(events.shape[3] - steps, 0)] = events[..., steps:]
     return changed
 
 
-def play(events: Events, speed: float) -> Events:
-    """The grasp takes place faster (above 1) or more slowly (below): events come at step / speed.
+@perturbation("times", TEMPO, least=1, most=MOST_STEPS)
+def faster(events: Events, times: float) -> Events:
+    """The grasp takes place faster."""
+    return play(events, times)
 
-    In a faster one events that meet become one, and silence follows; of a slower one the end is cut off, and each event
-    stays one event.
-    """
+
+@perturbation("times", TEMPO, least=1, most=MOST_STEPS)
+def slower(events: Events, times: float) -> Events:
+    """The grasp takes place more slowly, its end is cut off."""
+    return play(events, 1 / times)
+
+
+def play(events: Events, speed: float) -> Events:
+    """Events come at step / speed; those that meet become one, and each stays one event."""
     sample, taxel, polarity, step = np.nonzero(events)
     moved = (step / speed).astype(np.int64)
     kept = moved < events.shape[3]
     changed = np.zeros_like(events)
     changed[sample[kept], taxel[kept], polarity[kept], moved[kept]] = 1
     return changed
+
+
+def not_two_polarities(pair: Pair, _sensor: Sensor) -> str | None:
+    """Why there is nothing to exchange."""
+    count = pair.netlist.polarities
+    return None if count == 2 else f"the sensor has {count} polarities"
+
+
+@perturbation("share of taxels", (0.1, 0.25, 0.5, 1), unless=not_two_polarities)
+def polarity_swapped(events: Events, share: float, sensor: Sensor, rng: np.random.Generator) -> Events:
+    """Random taxels exchange rise and fall."""
+    return swap_polarity(events, chosen(sensor.taxels, round(share * sensor.taxels), rng))
 
 
 def swap_polarity(events: Events, taxels: IntArray) -> Events:
@@ -103,13 +170,15 @@ def swap_polarity(events: Events, taxels: IntArray) -> Events:
     return changed
 
 
-def thin(events: Events, density: float, rng: np.random.Generator) -> Events:
-    """Leave so few events at random that at most a share of all entries of each recording holds one."""
+@perturbation(DENSITY, (0.1, 0.05, 0.02, 0.005, 0.001))
+def near_empty(events: Events, density: float, rng: np.random.Generator) -> Events:
+    """Events are taken away down to a density."""
     return _filled(events, density, rng, keep=True)
 
 
-def fill(events: Events, density: float, rng: np.random.Generator) -> Events:
-    """Add events at random until at least a share of all entries of each recording holds one."""
+@perturbation(DENSITY, (0.15, 0.2, 0.3, 0.5, 1))
+def saturated(events: Events, density: float, rng: np.random.Generator) -> Events:
+    """Events are added up to a density."""
     return _filled(events, density, rng, keep=False)
 
 

@@ -6,9 +6,8 @@ What is counted is what spikes after `begin`, so that recordings may follow othe
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -16,7 +15,7 @@ from spikeloom.compiler import Netlist
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.ir import Network
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_of
 
@@ -28,21 +27,30 @@ STOPPED = -1
 """Decision where a register of the chip overflows and the simulator stops."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Pair:
-    """A netlist and the float network beside it, of the same populations."""
+    """A netlist and the float network beside it, of the same populations; prepared when it first runs."""
 
     netlist: Netlist
     network: Network
 
+    @cached_property
+    def chip(self) -> IntegerMachine:
+        """The netlist, ready to run."""
+        return integer_machine_of(self.netlist)
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Ready:
-    """A pair, prepared to run; `masks` (layers, words) uint64 has the bits of a layer's compartments."""
+    @cached_property
+    def model(self) -> float_engine.FloatEngine:
+        """The float network, likewise."""
+        return float_engine.prepare(self.network, self.netlist)
 
-    chip: IntegerMachine
-    model: float_engine.FloatEngine
-    masks: Words
+    def masks(self) -> Words:
+        """Bits of each layer's compartments in packed spikes; (layers, words) uint64."""
+        netlist = self.netlist
+        masks = np.zeros((len(netlist.layers), -(-netlist.n_compartments // 64)), np.uint64)
+        ids = np.arange(netlist.n_compartments)
+        np.bitwise_or.at(masks, (netlist.layer, ids // 64), np.left_shift(np.uint64(1), (ids % 64).astype(np.uint64)))
+        return masks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,7 +68,7 @@ class Outcome:
 
     votes: dict[str, IntArray]  # By side
     spikes: IntArray  # (recordings, layers, 3) int64; of the float network, of the chip, and those in which they differ
-    stopped: npt.NDArray[np.bool_]  # (recordings,) bool; where a register of the chip would overflow
+    stopped: BoolArray  # (recordings,) bool; where a register of the chip would overflow
     saturated: IntArray  # (recordings,) int64; membranes that were clipped
 
     def decisions(self, side: str) -> IntArray:
@@ -69,32 +77,21 @@ class Outcome:
         return np.where(self.stopped, STOPPED, decided) if side == "chip" else decided
 
 
-def ready(pair: Pair) -> Ready:
-    """Prepare a pair for runs."""
-    netlist = pair.netlist
-    masks = np.zeros((len(netlist.layers), -(-netlist.n_compartments // 64)), np.uint64)
-    ids = np.arange(netlist.n_compartments)
-    np.bitwise_or.at(masks, (netlist.layer, ids // 64), np.left_shift(np.uint64(1), (ids % 64).astype(np.uint64)))
-    return Ready(chip=integer_machine_of(netlist), model=float_engine.prepare(pair.network, netlist), masks=masks)
-
-
-def evaluate(prepared: Ready, inputs: Inputs) -> Outcome:
+def evaluate(pair: Pair, inputs: Inputs) -> Outcome:
     """Run both sides from rest."""
-    netlist = prepared.chip.netlist
-    model = float_engine.run(prepared.model, inputs.events, lengths=inputs.lengths, begin=inputs.begin)
-    packed, stopped, saturated = _chip(prepared.chip, inputs)
-    spikes = np.zeros((len(inputs.events), len(netlist.layers), 3), np.int64)
-    votes = np.zeros((len(inputs.events), netlist.classes), np.int64)
+    netlist = pair.netlist
+    model = float_engine.run(pair.model, inputs.events, lengths=inputs.lengths, begin=inputs.begin)
+    packed, stopped, saturated = _chip(pair.chip, inputs)
     depth = np.array([layer.depth for layer in netlist.layers])
-    voters = np.flatnonzero(netlist.readout_class >= 0)
-    voting = voters, depth[netlist.layer[voters]], netlist.readout_class[voters]
-    _tally(packed, model.packed, prepared.masks, depth, inputs.begin, inputs.lengths, *voting, spikes, votes)
+    spikes = np.zeros((len(inputs.events), len(netlist.layers), 3), np.int64)
     spikes[:, :, 0] = model.spikes
+    spikes[:, :, 1:] = _tally(packed, model.packed, pair.masks(), depth, inputs)
     spikes[:, :, 2] += model.elsewhere
+    votes = _votes(netlist, packed, depth, inputs)
     return Outcome(votes={"float": model.votes, "chip": votes}, spikes=spikes, stopped=stopped, saturated=saturated)
 
 
-def _chip(machine: IntegerMachine, inputs: Inputs) -> tuple[Words, npt.NDArray[np.bool_], IntArray]:
+def _chip(machine: IntegerMachine, inputs: Inputs) -> tuple[Words, BoolArray, IntArray]:
     """Packed spikes, which recordings stopped the simulator, and clipped membranes."""
     stopped = np.zeros(len(inputs.events), np.bool_)
     try:
@@ -113,39 +110,32 @@ def _chip(machine: IntegerMachine, inputs: Inputs) -> tuple[Words, npt.NDArray[n
     return packed, stopped, saturated
 
 
-@numba.njit(cache=True, nogil=True)
-def _ones(word: Any) -> Any:
-    """Bits of a word that are set."""
-    word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
-    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
+def _tally(packed: Words, model: Words, masks: Words, depth: IntArray, inputs: Inputs) -> IntArray:
+    """Spikes of the chip and those in which the float network differs, where steps count; (recordings, layers, 2)."""
+    spikes = np.zeros((len(packed), len(masks), 2), np.int64)
+    for layer, mask in enumerate(masks):
+        words = np.flatnonzero(mask)
+        chip = packed[..., words] & mask[words]
+        differ = chip ^ (model[..., words] & mask[words])
+        counts = _counts(inputs, packed.shape[1], depth[layer])
+        for column, bits in enumerate((chip, differ)):
+            ones = np.bitwise_count(bits).sum(axis=2, dtype=np.int64)
+            spikes[:, layer, column] = np.where(counts, ones, 0).sum(axis=1)
+    return spikes
 
 
-@numba.njit(cache=True, nogil=True)
-def _tally(
-    chip: Any,
-    model: Any,
-    masks: Any,
-    depth: Any,
-    begin: Any,
-    end: Any,
-    voters: Any,
-    lag: Any,
-    label: Any,
-    spikes: Any,
-    votes: Any,
-) -> None:
-    """Count spikes of the chip and those that differ, (recordings, layers, 3), and its votes, where steps count."""
-    for i in range(len(chip)):
-        for layer in range(len(masks)):
-            for word in range(masks.shape[1]):
-                mask = masks[layer, word]
-                if mask:
-                    for t in range(begin[i] + depth[layer], end[i] + depth[layer]):
-                        spikes[i, layer, 1] += _ones(chip[i, t, word] & mask)
-                        spikes[i, layer, 2] += _ones((chip[i, t, word] ^ model[i, t, word]) & mask)
-        for v in range(len(voters)):
-            word, bit = voters[v] >> 6, np.uint64(voters[v] & 63)
-            for t in range(begin[i] + lag[v], end[i] + lag[v]):
-                votes[i, label[v]] += np.int64((chip[i, t, word] >> bit) & np.uint64(1))
+def _votes(netlist: Netlist, packed: Words, depth: IntArray, inputs: Inputs) -> IntArray:
+    """Votes of the chip where steps count; (recordings, classes)."""
+    votes = np.zeros((len(packed), netlist.classes), np.int64)
+    for voter in np.flatnonzero(netlist.readout_class >= 0).tolist():
+        fires = (packed[..., voter // 64] >> np.uint64(voter % 64)) & np.uint64(1)
+        counts = _counts(inputs, packed.shape[1], depth[netlist.layer[voter]])
+        votes[:, netlist.readout_class[voter]] += np.where(counts, fires, 0).sum(axis=1).astype(np.int64)
+    return votes
+
+
+def _counts(inputs: Inputs, steps: int, lag: int) -> BoolArray:
+    """Which chip steps of each recording count for a layer that lags so much; (recordings, steps)."""
+    step = np.arange(steps)
+    counts: BoolArray = (step >= inputs.begin[:, None] + lag) & (step < inputs.lengths[:, None] + lag)
+    return counts

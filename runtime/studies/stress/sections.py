@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 
 from spikeloom.runtime.report import drawing
 from spikeloom.runtime.report.intervals import wilson
 from spikeloom.runtime.report.numbers import percent
-from spikeloom.runtime.report.sections import Block, Figure, Section, Table, Text
+from spikeloom.runtime.report.sections import Figure, Section, Table, Text
 from spikeloom.runtime.studies.stress.pair import SIDES
 from spikeloom.runtime.studies.stress.results import Curve, Point, Spread, Stress, shown
-
-ACROSS = 10
-"""Levels side by side at most."""
 
 NONE = "–"
 
@@ -28,48 +24,36 @@ has fewest of them"""
 
 
 def sections(result: Stress) -> list[Section]:
-    """Clean accuracy, verdicts, every curve, what was not measured, and requirements."""
-    clean, recordings = result.clean, result.recordings
-    lines = [f"{side} accuracy, clean: {percent(clean.right[side], recordings)}" for side in SIDES]
-    lines.append(f"decisions equal, clean: {clean.equal} of {recordings}; chance {100 / result.classes:.1f} %")
+    """What the page of a network shows, every curve, and requirements."""
+    missed = {text.partition(": ")[0]: text for text in result.missed}
+    required = [f"required {missed.get(words, f'{words}: kept')}" for words in result.required]
     return [
-        Section("Clean", [Text("\n".join(lines))]),
-        Section("Verdicts", [verdicts(result)]),
-        Section("Key", [Text(f"{KEY}\n{CURVE_KEY}")]),
-        *(
-            Section(name, [Text(_title(name, each)), *curve_tables(each)])
-            for name, each in result.perturbations.items()
-        ),
-        *(Section(name, [Text(text)]) for name, text in _not_measured(result).items()),
-        Section("Required", [Text("\n".join(_required(result)))]),
+        *stability(result),
+        Section("Key", [Text(CURVE_KEY)]),
+        *(Section(name, [Text(_title(name, each)), _table(each)]) for name, each in result.perturbations.items()),
+        Section("Required", [Text("\n".join(required))]),
     ]
 
 
 def stability(result: Stress) -> list[Section]:
-    """The same for the page of a network: verdicts, and the curves as a figure with their numbers."""
-    recordings = result.recordings
-    clean = {side: 100 * count / recordings for side, count in result.clean.right.items()}
+    """Clean accuracy, verdicts, the curves as a figure with their numbers, and what was not measured."""
+    clean, recordings = result.clean, result.recordings
+    lines = [f"{side} accuracy, clean: {percent(clean.right[side], recordings)}" for side in SIDES]
+    lines.append(f"decisions equal, clean: {clean.equal} of {recordings}; chance {100 / result.classes:.1f} %")
     title = "Accuracy under each perturbation"
-    numbers = [
-        Table(["", *map(_level, each.levels)], _rows(each.levels), f"{_title(name, each)}, in per cent", most=0)
-        for name, each in result.perturbations.items()
+    caption = (
+        f"{title} over its level, from mild to harsh, with 95 % intervals. Grey: interval of the clean accuracy on the "
+        "chip; dotted: chance; vertical lines: where the mean leaves the clean interval."
+    )
+    curves = result.perturbations.items()
+    numbers = [_table(each, f"{_title(name, each)}, in per cent", most=0) for name, each in curves]
+    drawn = [Figure("stress", partial(figure, result, title), caption, numbers)] if numbers else []
+    skipped = [Text(f"{name}: not measured, {why}") for name, why in result.not_applicable.items()]
+    return [
+        Section("Clean", [Text("\n".join(lines))]),
+        Section("Verdicts", [verdicts(result), Text(KEY), *drawn]),
+        Section("", skipped),
     ]
-    blocks: list[Block] = [
-        Text(
-            f"{len(result.perturbations)} perturbations on {recordings} recordings, {result.seeds} seeds of each that "
-            f"is left to chance; without any, the float model decides {clean['float']:.1f} % right, the chip "
-            f"{clean['chip']:.1f} %"
-        ),
-        verdicts(result),
-        Text(KEY),
-    ]
-    if numbers:
-        caption = (
-            f"{title} over its level, from mild to harsh, with 95 % intervals. Grey: interval of the clean accuracy on "
-            "the chip; dotted: chance; vertical lines: where the mean leaves the clean interval."
-        )
-        blocks.append(Figure("stress", partial(figure, result, title), caption, numbers))
-    return [Section("", [*blocks, *map(Text, _not_measured(result).values())])]
 
 
 def figure(result: Stress, title: str = "", *, across: int = 3) -> drawing.Drawing:
@@ -115,34 +99,21 @@ def why(curve: Curve) -> str:
     return "; ".join([*words, *([] if chip.leaves is None else ["other spikes, as many"])])
 
 
-def curve_tables(curve: Curve) -> list[Table]:
-    """Levels side by side, accuracies of both sides, equal decisions and common spikes below."""
-    parts = [curve.levels[i : i + ACROSS] for i in range(0, len(curve.levels), ACROSS)]
-    return [Table(["", *map(_level, part)], _rows(part)) for part in parts]
-
-
 def _title(name: str, curve: Curve) -> str:
     return f"{name}: {curve.what} ({curve.unit})"
-
-
-def _not_measured(result: Stress) -> dict[str, str]:
-    return {name: f"{name}: not measured, {why}" for name, why in result.not_applicable.items()}
-
-
-def _required(result: Stress) -> list[str]:
-    missed = {text.partition(": ")[0]: text for text in result.missed}
-    return [f"required {missed.get(words, f'{words}: kept')}" for words in result.required]
 
 
 def _level(point: Point) -> str:
     return shown(point.level)
 
 
-def _rows(levels: Sequence[Point]) -> list[list[str]]:
-    rows = [[side, *(_accuracy(point.spread(side)) for point in levels)] for side in SIDES]
-    rows.append(["equal", *(f"{100 * point.equal:.0f}" for point in levels)])
-    rows.append(["spikes", *(f"{100 * min(point.common.values()):.0f}" for point in levels)])
-    return rows
+def _table(curve: Curve, caption: str = "", *, most: int | None = None) -> Table:
+    """Levels side by side; accuracies of both sides, equal decisions and common spikes below."""
+    points = curve.levels
+    rows = [[side, *(_accuracy(point.spread(side)) for point in points)] for side in SIDES]
+    rows.append(["equal", *(f"{100 * point.equal:.0f}" for point in points)])
+    rows.append(["spikes", *(f"{100 * min(point.common.values()):.0f}" for point in points)])
+    return Table(["", *map(_level, points)], rows, caption, most=most)
 
 
 def _accuracy(spread: Spread) -> str:

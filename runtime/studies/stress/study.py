@@ -4,89 +4,28 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Mapping, Sequence
+import zlib
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import redirect_stderr
-from dataclasses import asdict, dataclass, fields
-from functools import lru_cache
-from io import StringIO
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import sha256_of
-from spikeloom.compiler.types import JsonObject
+from spikeloom.runtime.equivalence.breakdowns import undecided
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.report.console import progress
-from spikeloom.runtime.report.encode import decode, encode
-from spikeloom.runtime.studies.jobs import Job, content_key
-from spikeloom.runtime.studies.stress.battery import NAMES, TAXELS, Level, levels_of, why_not
-from spikeloom.runtime.studies.stress.bench import Bench, bench_of
-from spikeloom.runtime.studies.stress.pair import Outcome
-from spikeloom.runtime.studies.stress.results import Provenance, Run, Stress, shown
-from spikeloom.runtime.studies.stress.runs import clean, measure
+from spikeloom.runtime.studies.stress.bench import NAMES, Bench, bench_of, by_length, whole
+from spikeloom.runtime.studies.stress.pair import SIDES, Inputs, Outcome, evaluate
+from spikeloom.runtime.studies.stress.perturbation import TAXELS, Level, Perturbation
+from spikeloom.runtime.studies.stress.results import Provenance, Run, Stress
 from spikeloom.runtime.studies.stress.verdicts import Requirement, curve, unmet
 
 CHUNK = 5
-"""Seeds that a process measures at a time."""
-
-FILES = ("netlist", "checkpoint", "data", "taxels", "edges")
-"""Options that name files."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Request:
-    """Files and how they are read: the options of the command that decide a run."""
-
-    netlist: str
-    checkpoint: str
-    data: str
-    bin: float
-    split: str
-    limit: int | None
-    graph: str | None
-    taxels: str | None
-    edges: str | None
-    directed: bool
-    system: str | None
-    run: int
-    weights: str | None
-    beta: float | None
-    theta: float | None
-    polarities: int | None
-    polarities_first: bool | None
-    dt: float | None
-    convention: str | None
-
-    @classmethod
-    def of(cls, arguments: argparse.Namespace) -> Request:
-        """The part of a command's options."""
-        return cls(**{field.name: getattr(arguments, field.name) for field in fields(cls)})
-
-    def load(self) -> tuple[Bench, LoadedNetwork, str]:
-        """Read it all, see :func:`bench.bench_of`."""
-        return bench_of(argparse.Namespace(**asdict(self)))
-
-    def from_anywhere(self) -> Request:
-        """The same for a process that works in another folder."""
-        options = asdict(self)
-        named = {name: options[name] for name in FILES if options[name] and Path(options[name]).exists()}
-        return Request(**options | {name: str(Path(path).resolve()) for name, path in named.items()})
-
-    def readings(self) -> JsonObject:
-        """All but the files, which are known by their hashes."""
-        return {name: value for name, value in asdict(self).items() if name not in FILES}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Task(Job):
-    """A perturbation at a level, and the seeds to draw it with."""
-
-    request: Request
-    name: str
-    level: Level
-    seeds: tuple[int, ...]
+"""Seeds that are measured at a time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,36 +36,36 @@ class Plan:
     requirements: tuple[Requirement, ...]
     seeds: int
     full: bool
+    jobs: int | None  # Measurements at a time; one a core
+
+    def levels(self, name: str, taxels: int) -> tuple[Level, ...]:
+        """Those of a perturbation on a sensor of so many taxels."""
+        required = [wanted.level for wanted in self.requirements if wanted.name == name]
+        return NAMES[name].levels_of(taxels, full=self.full, also=required)
 
 
-Sweep = Callable[[Sequence[Task]], Mapping[str, Any]]
-
-
-def study(request: Request, plan: Plan, sweep: Sweep | None = None) -> Stress:
-    """Measure a plan and judge it; `sweep` measures tasks by :func:`measure_task`, else threads of this process do."""
-    bench, loaded, data = request.load()
-    reasons = {name: why_not(name, bench.pair, bench.sensor) for name in plan.names}
-    _require_measurable(plan, reasons, bench.sensor.taxels)
+def study(arguments: argparse.Namespace, plan: Plan) -> Stress:
+    """Measure a plan on the files that a command's options name, and judge it."""
+    bench, loaded, data = bench_of(arguments)
+    recordings, classes, taxels = len(bench.labels), bench.pair.netlist.classes, bench.sensor.taxels
+    reasons = {name: NAMES[name].why_not(bench.pair, bench.sensor) for name in plan.names}
+    for wanted in plan.requirements:
+        if reasons[wanted.name] is not None:
+            raise OptionError(f"--require {wanted}: does not apply, {reasons[wanted.name]}; omit it")
+        if NAMES[wanted.name].unit == TAXELS and float(wanted.level) > taxels:
+            raise OptionError(f"--require {wanted}: the sensor has {taxels} taxels; give a smaller level")
     progress("clean recordings")
     reference, undisturbed = clean(bench)
-    known = _provenance(request, loaded, data)
-    facts = encode(known) | {"options": request.readings(), "sensor": bench.sensor.digest()}
-    tasks = [
-        _task(request.from_anywhere(), name, level, tuple(range(first, min(first + CHUNK, seeds))), facts)
+    points = [
+        (name, level, range(first, min(first + CHUNK, seeds)))
         for name, seeds in ((name, plan.seeds if NAMES[name].seeded else 1) for name in plan.names)
         if reasons[name] is None
-        for level in _levels(name, plan, bench.sensor.taxels)
+        for level in plan.levels(name, taxels)
         for first in range(0, seeds, CHUNK)
     ]
-    if sweep is None:
-        runs = _in_threads(tasks, bench, reference)
-    else:
-        found = sweep(tasks)
-        runs = [[decode(Run, run) for run in found[task.key]["runs"]] for task in tasks]
     measured: dict[str, dict[Level, list[Run]]] = {}
-    for task, some in zip(tasks, runs, strict=True):
-        measured.setdefault(task.name, {}).setdefault(task.level, []).extend(some)
-    recordings, classes = len(bench.labels), bench.pair.netlist.classes
+    for (name, level, _), runs in zip(points, _measured(points, bench, reference, plan.jobs), strict=True):
+        measured.setdefault(name, {}).setdefault(level, []).extend(runs)
     curves = {name: curve(name, each, undisturbed, recordings, classes) for name, each in measured.items()}
     return Stress(
         recordings=recordings,
@@ -138,68 +77,109 @@ def study(request: Request, plan: Plan, sweep: Sweep | None = None) -> Stress:
         not_applicable={name: reason for name, reason in reasons.items() if reason is not None},
         required=tuple(map(str, plan.requirements)),
         missed=unmet(plan.requirements, curves),
-        provenance=known,
+        provenance=_provenance(arguments, loaded, data),
     )
 
 
-def _require_measurable(plan: Plan, reasons: Mapping[str, str | None], taxels: int) -> None:
-    for wanted in plan.requirements:
-        if reasons[wanted.name] is not None:
-            raise OptionError(f"--require {wanted}: does not apply, {reasons[wanted.name]}; omit it")
-        if NAMES[wanted.name].scale is TAXELS and float(wanted.level) > taxels:
-            raise OptionError(f"--require {wanted}: the sensor has {taxels} taxels; give a smaller level")
-
-
-def _levels(name: str, plan: Plan, taxels: int) -> tuple[Level, ...]:
-    required = [wanted.level for wanted in plan.requirements if wanted.name == name]
-    return levels_of(name, taxels, full=plan.full, also=required)
-
-
-def _provenance(request: Request, loaded: LoadedNetwork, data: str) -> Provenance:
+def _provenance(arguments: argparse.Namespace, loaded: LoadedNetwork, data: str) -> Provenance:
     return Provenance(
         spikeloom=__version__,
-        netlist_sha256=sha256_of(request.netlist),
+        netlist_sha256=sha256_of(arguments.netlist),
         checkpoint_sha256=loaded.sha256,
         **loaded.read_as,
         graph=loaded.graph,
         data_sha256=data,
-        netlist=Path(request.netlist).name,
-        checkpoint=Path(request.checkpoint).name,
-        data=Path(request.data).name,
-        split=request.split,
+        netlist=Path(arguments.netlist).name,
+        checkpoint=Path(arguments.checkpoint).name,
+        data=Path(arguments.data).name,
+        split=arguments.split,
     )
 
 
-# -- where tasks are measured ------------------------------------------------------------------------------------------
-
-
-def _task(request: Request, name: str, level: Level, seeds: tuple[int, ...], facts: Mapping[str, Any]) -> Task:
-    key = content_key({**facts, "perturbation": name, "level": level, "seeds": seeds})
-    return Task(key=key, label=f"{name} {shown(level)}", request=request, name=name, level=level, seeds=seeds)
-
-
-def _in_threads(tasks: Sequence[Task], bench: Bench, reference: Outcome) -> list[list[Run]]:
-    """Runs of each task, several at a time in this process."""
-    pool = ThreadPoolExecutor(os.cpu_count())
+def _measured(
+    points: Sequence[tuple[str, Level, Sequence[int]]], bench: Bench, reference: Outcome, jobs: int | None
+) -> list[list[Run]]:
+    """Runs of each point, several at a time in threads: kernels let go of the interpreter's lock."""
+    pool = ThreadPoolExecutor(jobs or os.cpu_count())
     try:
-        waiting = [pool.submit(measure, bench, task.name, task.level, task.seeds, reference) for task in tasks]
+        waiting = [pool.submit(measure, bench, *point, reference) for point in points]
         for done, finished in enumerate(as_completed(waiting), 1):
             finished.result()
-            progress(f"stress: {done} of {len(tasks)} points")
+            progress(f"stress: {done} of {len(points)} points")
     finally:
         pool.shutdown(cancel_futures=True)
     return [each.result() for each in waiting]
 
 
-def measure_task(task: Task) -> JsonObject:
-    """JSON values of a task's runs, in a process of its own."""
-    bench, reference = _loaded(task.request)
-    return {"runs": encode(measure(bench, task.name, task.level, task.seeds, reference))}
+# -- one point ---------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=1)
-def _loaded(request: Request) -> tuple[Bench, Outcome]:
-    """The bench of a process, and what its clean recordings do."""
-    with redirect_stderr(StringIO()):  # the command has said it
-        bench, _, _ = request.load()
-    return bench, clean(bench)[0]
+def generator(name: str, seed: int) -> np.random.Generator:
+    """Source of a perturbation's chance: the same for all levels, so that a harsher one contains a milder one."""
+    return np.random.default_rng([seed, zlib.crc32(name.encode())])
+
+
+def clean(bench: Bench) -> tuple[Outcome, Run]:
+    """Nothing is wrong."""
+    inputs = whole(bench.events, bench.pair.netlist, bench.lengths)
+    outcome = evaluate(bench.pair, inputs)
+    return outcome, _run(bench, outcome, None, slice(None), inputs, outcome)
+
+
+def measure(bench: Bench, name: str, level: Level, seeds: Sequence[int], reference: Outcome) -> list[Run]:
+    """One perturbation at one level, once for each seed; one seed is enough for what has no part in chance.
+
+    Seeds run together where only recordings differ. `reference` is of the clean recordings.
+    """
+    trouble, count = NAMES[name], len(bench.events)
+    if trouble.to == "pair":
+        runs = []
+        for seed in seeds:
+            damaged = trouble.done(bench.pair, level, bench.sensor, generator(name, seed))
+            inputs = whole(bench.events, damaged.netlist, bench.lengths)
+            outcome = evaluate(damaged, inputs)
+            runs.append(_run(bench, outcome, seed, slice(None), inputs, reference))
+        return runs
+    many = [_inputs(bench, trouble, level, generator(name, seed)) for seed in seeds]
+    longest = max(inputs.events.shape[2] for inputs in many)
+    filled = [np.pad(each.events, ((0, 0), (0, 0), (0, longest - each.events.shape[2]))) for each in many]
+    inputs = Inputs(
+        events=np.concatenate(filled),
+        lengths=np.concatenate([inputs.lengths for inputs in many]),
+        begin=np.concatenate([inputs.begin for inputs in many]),
+    )
+    outcome = evaluate(bench.pair, inputs)
+    parts = [slice(i * count, (i + 1) * count) for i in range(len(seeds))]
+    return [_run(bench, outcome, seed, part, inputs, reference) for seed, part in zip(seeds, parts, strict=True)]
+
+
+def _inputs(bench: Bench, trouble: Perturbation, level: Level, rng: np.random.Generator) -> Inputs:
+    if trouble.to == "bench":
+        inputs: Inputs = trouble.done(bench, level, bench.sensor, rng)
+        return inputs
+    events = by_length(bench.events, bench.lengths, lambda part: trouble.done(part, level, bench.sensor, rng))
+    return whole(events, bench.pair.netlist, bench.lengths)
+
+
+def _run(bench: Bench, outcome: Outcome, seed: int | None, part: slice, inputs: Inputs, reference: Outcome) -> Run:
+    """Counts over the recordings of one seed."""
+    netlist = bench.pair.netlist
+    decided = {side: outcome.decisions(side)[part] for side in SIDES}
+    spikes = outcome.spikes[part].sum(axis=0).tolist()
+    steps = int((inputs.lengths - inputs.begin)[part].sum())
+    held = np.bincount(netlist.layer, minlength=len(netlist.layers)).tolist()
+    kinds = {side: np.unique_counts(values) for side, values in decided.items()}
+    signs = {side: undecided(reference.votes[side], outcome.votes[side][part], bench.files) for side in SIDES}
+    return Run(
+        seed=seed,
+        right={side: int(np.count_nonzero(values == bench.labels)) for side, values in decided.items()},
+        equal=int(np.count_nonzero(decided["float"] == decided["chip"])),
+        layers={
+            layer.name: (*counts, neurons * steps)
+            for layer, counts, neurons in zip(netlist.layers, spikes, held, strict=True)
+        },
+        signs={side: {sign.kind: sign.count for sign in each} for side, each in signs.items()},
+        most={side: (int(k.values[np.argmax(k.counts)]), int(k.counts.max())) for side, k in kinds.items()},
+        stopped=int(np.count_nonzero(outcome.stopped[part])),
+        saturated=int(outcome.saturated[part].sum()),
+    )

@@ -17,8 +17,9 @@ from statistics import fmean
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.equivalence.breakdowns import OFTEN
 from spikeloom.runtime.report.intervals import of_mean, wilson
-from spikeloom.runtime.studies.stress.battery import NAMES, Level, level_of
+from spikeloom.runtime.studies.stress.bench import NAMES
 from spikeloom.runtime.studies.stress.pair import SIDES
+from spikeloom.runtime.studies.stress.perturbation import Level
 from spikeloom.runtime.studies.stress.results import Breaks, Curve, Point, Run, Spread, shown
 
 ROBUST, DEGRADES, BREAKS = "robust", "degrades", "breaks"
@@ -74,7 +75,7 @@ def parse_requirement(words: str) -> Requirement:
         share = math.nan
     if not 0 <= share <= 1:
         raise OptionError(f"--require {words}: {right.strip()!r} is no share; give a number from 0 to 1")
-    return Requirement(name=name, level=level_of(name, level), share=share)
+    return Requirement(name=name, level=NAMES[name].level_of(level), share=share)
 
 
 def unmet(requirements: Sequence[Requirement], curves: Mapping[str, Curve]) -> tuple[str, ...]:
@@ -114,7 +115,7 @@ def curve(name: str, runs: Mapping[Level, Sequence[Run]], clean: Run, recordings
     first = next((point for point in levels if point.level in left), None)
     return Curve(
         what=NAMES[name].what,
-        unit=NAMES[name].scale.unit,
+        unit=NAMES[name].unit,
         seeded=NAMES[name].seeded,
         levels=levels,
         breaks=breaks,
