@@ -15,10 +15,8 @@ from spikeloom.compiler.fixedpoint import BIAS_EXPONENT_MAX, BIAS_MANTISSA_MAX, 
 from spikeloom.compiler.ir import (
     INPUT,
     IntegerNetwork,
-    IntegerPopulation,
     IntegerProjection,
     Network,
-    Population,
     Projection,
     depths,
 )
@@ -33,50 +31,32 @@ def _names_are_unique(network: Network | IntegerNetwork) -> Faults:
 
 
 def _projections_fit(network: Network | IntegerNetwork) -> Faults:
-    populations: tuple[Population | IntegerPopulation, ...] = network.populations
-    sizes = {INPUT: network.input.size} | {i: population.size for i, population in enumerate(populations)}
+    sizes = {INPUT: network.input.size} | {i: population.size for i, population in enumerate(network.populations)}
     projections: tuple[Projection | IntegerProjection, ...] = network.projections
-    for i, projection in enumerate(projections):
-        expected = (sizes.get(projection.post), sizes.get(projection.pre))
-        if projection.post == INPUT or projection.weight.shape != expected:
-            yield f"projection {i} has shape {projection.weight.shape}, its populations ask for {expected}"
-        if not projection.weight.has_canonical_format:
+    for i, p in enumerate(projections):
+        expected = (sizes.get(p.post), sizes.get(p.pre))
+        if p.post == INPUT or p.weight.shape != expected:
+            yield f"projection {i} has shape {p.weight.shape}, its populations ask for {expected}"
+        if not p.weight.has_canonical_format:
             yield f"projection {i} has unsorted or repeated synapses"
+        if p.pre > p.post:
+            yield f"projection {i} runs from population {p.pre} to {p.post}, not forward"
 
 
-def _populations_exist(network: Network | IntegerNetwork) -> bool:
-    """Whether every projection joins populations that there are; :func:`_projections_fit` says which does not."""
+def _steps_are_kept(network: Network | IntegerNetwork) -> Faults:
     count = len(network.populations)
-    return all(INPUT <= p.pre < count and 0 <= p.post < count for p in network.projections)
-
-
-def _runs_forward(network: Network | IntegerNetwork) -> Faults:
     projections: tuple[Projection | IntegerProjection, ...] = network.projections
-    for i, projection in enumerate(projections):
-        if projection.pre > projection.post:
-            yield f"projection {i} runs from population {projection.pre} to {projection.post}, not forward"
-
-
-def _no_layer_is_skipped(network: Network | IntegerNetwork) -> Faults:
-    if not _populations_exist(network):
-        return
+    if not all(INPUT <= p.pre < count and 0 <= p.post < count for p in projections):
+        return  # to populations that there are not, which is said above
     depth = {INPUT: -1} | dict(enumerate(depths(network)))
-    projections: tuple[Projection | IntegerProjection, ...] = network.projections
-    for i, projection in enumerate(projections):
-        if projection.pre == projection.post:
-            continue  # what a step fires arrives in the next, on the chip and here
-        early = depth[projection.post] - depth[projection.pre] - 1
-        if early > 0:
+    for i, p in enumerate(projections):
+        early = depth[p.post] - depth[p.pre] - 1
+        if p.pre != p.post and early > 0:  # of a recurrent one, what a step fires arrives in the next here, too
             yield f"projection {i} skips a layer: a spike takes one step on the chip, so it would arrive {early} early"
-
-
-def _everything_is_reached(network: Network | IntegerNetwork) -> Faults:
-    if not _populations_exist(network):
-        return
     reached = {INPUT}
-    for post, pre in sorted((p.post, p.pre) for p in network.projections):  # a recurrent one after the others
+    for post, pre in sorted((p.post, p.pre) for p in projections):  # a recurrent one after the others
         reached |= {post} if pre in reached else set()
-    for post in sorted(set(range(len(network.populations))) - reached):
+    for post in sorted(set(range(count)) - reached):
         yield f"population {network.populations[post].name!r} is not reached from the input"
 
 
@@ -128,9 +108,7 @@ def _mantissas_hold(network: IntegerNetwork) -> Faults:
 _SHARED: tuple[Callable[[Network | IntegerNetwork], Faults], ...] = (
     _names_are_unique,
     _projections_fit,
-    _runs_forward,
-    _no_layer_is_skipped,
-    _everything_is_reached,
+    _steps_are_kept,
     _readout_fits,
 )
 

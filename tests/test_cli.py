@@ -20,8 +20,8 @@ from spikeloom.compiler import __version__, lift
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.netlist import netlist_text
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.targets.loihi1.netlist_text import netlist_text
 from spikeloom.compiler.targets.price_tables import EVENTS
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.recordings.grasps import synthetic_split

@@ -12,7 +12,7 @@ from scipy import sparse
 from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent
-from spikeloom.compiler.targets.loihi1.netlist_text import netlist_text
+from spikeloom.compiler.targets.loihi1.netlist import netlist_text
 from spikeloom.compiler.text import text
 
 replace = dataclasses.replace

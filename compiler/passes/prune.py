@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Network, Sparse, row_parts, with_data
+from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection, Network, Sparse, row_parts, with_data
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.range_proof import settled
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import FloatArray, IntArray
 
 Mask = npt.NDArray[np.bool_]
 """Some neurons of a population, (neurons,) bool."""
@@ -78,22 +78,28 @@ def _grow(network: Net, post: int, known: Known, judge: Callable[[Net, int, Know
             known[post] = more
 
 
-def _never_fires(network: Network, post: int, silent: Known) -> Mask:
-    """Neurons of one population that cannot fire as long as those that are known to be silent do not."""
-    population = network.populations[post]
-    up, total = np.zeros(population.size), np.abs(population.bias)
-    inputs = 0
+def _sums(network: Net, post: int, silent: Known) -> tuple[FloatArray, FloatArray]:
+    """Sums of the positive weights into each neuron from those that are not silent, and of all their magnitudes."""
+    up, total = np.zeros((2, network.populations[post].size))
     for p in network.projections:
         if p.post == post:
             fires = (~silent[p.pre]).astype(np.float64)
             for rows in row_parts(p.weight):
-                weight = p.weight[rows]
+                part = replace(p, weight=p.weight[rows])
+                weight = part.effective() if isinstance(part, IntegerProjection) else part.weight
                 up[rows] += weight.maximum(0) @ fires
                 total[rows] += abs(weight) @ fires
-            inputs += p.weight.shape[1]
+    return up, total
+
+
+def _never_fires(network: Network, post: int, silent: Known) -> Mask:
+    """Neurons of one population that cannot fire as long as those that are known to be silent do not."""
+    population = network.populations[post]
+    up, total = _sums(network, post, silent)
+    inputs = sum(p.weight.shape[1] for p in network.projections if p.post == post)
     lasts = population.alpha * (1 + 8 * FLOAT32_ROUNDING)
     gathered = np.inf if lasts >= 1 else 1 / (1 - lasts)
-    slack = (inputs + 8) * FLOAT32_ROUNDING * total * gathered
+    slack = (inputs + 8) * FLOAT32_ROUNDING * (total + np.abs(population.bias)) * gathered
     with np.errstate(invalid="ignore"):
         most = np.maximum(np.where(up > 0, up * gathered, 0.0) + population.bias + slack, 0)
     kept = population.beta * (1 + 8 * FLOAT32_ROUNDING)
@@ -151,15 +157,11 @@ def removable(network: IntegerNetwork) -> tuple[Masks, Masks]:
 
 
 def _silent(network: IntegerNetwork, post: int, silent: Known) -> Mask:
-    """Neurons of one population that cannot fire as long as those that are known to be silent do not."""
+    """The same on the chip: the membrane stays at or below its threshold, register rounding included."""
     population = network.populations[post]
-    up = np.zeros(population.size)
-    for p in network.projections:
-        if p.post == post:
-            fires = (~silent[p.pre]).astype(np.float64)
-            for rows in row_parts(p.weight):
-                up[rows] += replace(p, weight=p.weight[rows]).effective().maximum(0) @ fires
-    return _cannot_reach(population, up * (1 << MEMBRANE_SHIFT))
+    inflow = _sums(network, post, silent)[0] * (1 << MEMBRANE_SHIFT)
+    step = np.maximum(settled(inflow, population.realised_alpha) + population.bias, 0)
+    return settled(step, population.realised_beta) <= population.threshold << MEMBRANE_SHIFT
 
 
 def _unread(network: IntegerNetwork, pre: int, unread: Known, silent: Known) -> Mask:
@@ -170,12 +172,6 @@ def _unread(network: IntegerNetwork, pre: int, unread: Known, silent: Known) -> 
             counts = np.repeat(~(silent[p.post] | unread[p.post]), np.diff(p.weight.indptr)) & (p.weight.data != 0)
             received[p.weight.indices[counts]] = True
     return ~received & ~silent[pre]
-
-
-def _cannot_reach(population: IntegerPopulation, inflow: npt.NDArray[np.float64]) -> Mask:
-    """Whether the membrane stays at or below its threshold whatever arrives, register rounding included."""
-    step = np.maximum(settled(inflow, population.realised_alpha) + population.bias, 0)
-    return settled(step, population.realised_beta) <= population.threshold << MEMBRANE_SHIFT
 
 
 def without_channels(network: IntegerNetwork, channels: Mask) -> IntegerNetwork:
@@ -221,14 +217,11 @@ def compact(network: IntegerNetwork, gone: Masks) -> tuple[IntegerNetwork, tuple
 
 
 def removals(network: Network, silent: Masks, unread: Masks, quiet: Masks) -> tuple[Removal, ...]:
-    """Count what was left out of `network`, layer by layer.
-
-    Neurons that are `quiet` on the training recordings count as such only if some input can make them fire.
-    """
-    proven, gone = never_fires(network), either(silent, unread)
+    """Count what was left out of `network`, layer by layer; `quiet` are those that go by evidence, not by proof."""
+    gone = either(silent, unread)
     found = []
     for post, population in enumerate(network.populations):
-        by_evidence = quiet[post] & ~proven[post] & gone[post]
+        by_evidence = quiet[post] & gone[post]
         synapses = 0
         for p in network.projections:
             if p.post == post:

@@ -16,9 +16,8 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.choose import Layout
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, netlist_text
 from spikeloom.compiler.targets.loihi1.netlist_file import inconsistencies
-from spikeloom.compiler.targets.loihi1.netlist_text import layout_text, netlist_text
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
@@ -41,7 +40,7 @@ class Compilation:
     # Spikes per step by population, likewise; the placement weighs traffic by them
     rates: tuple[FloatArray, ...] | None = None
     connected: Network = LATER  # The same network without the weights of neurons that do nothing (`disconnect`)
-    quiet: Masks = ()  # Neurons that never fired in training and are to go for it
+    quiet: Masks = ()  # Neurons that never fired in training and are to go for it, although some input makes them fire
     integer: IntegerNetwork = LATER  # In the integers of the chip (`quantize`)
     choices: tuple[Choice, ...] = ()  # Scale of each layer and why
     exactness: tuple[Exactness, ...] = ()  # What is in the way of equal spikes, where these were asked for; else empty
@@ -87,4 +86,9 @@ class Compilation:
         newest = self.newest
         if isinstance(newest, Netlist):
             return netlist_text(newest)
-        return text(newest) + ("" if self.layout is LATER else layout_text(self.layout, self.held))
+        lines = [text(newest)]
+        for core, chunks in enumerate(() if self.layout is LATER else self.layout.parts.cores):
+            named = ((self.held.populations[chunk.population].name, chunk) for chunk in chunks)
+            names = ", ".join(f"{name} {chunk.first}…{chunk.last - 1}" for name, chunk in named)
+            lines.append(f"(core {core} (tile {self.placement.tiles[core]}) (neurons {names}))\n")
+        return "".join(lines)

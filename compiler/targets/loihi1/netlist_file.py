@@ -9,7 +9,7 @@ import numpy as np
 from spikeloom.compiler.archive import Kind
 from spikeloom.compiler.dynamics import MOST_STEPS
 from spikeloom.compiler.targets.base import COMPARTMENTS
-from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
+from spikeloom.compiler.targets.loihi1.netlist import PER_COMPARTMENT, Layer, Netlist
 from spikeloom.compiler.targets.netlist_file import NetlistFile, bounds_faults, is_outside, length_faults, range_faults
 
 LAYER: Kind = {
@@ -19,10 +19,6 @@ LAYER: Kind = {
     **dict.fromkeys(("beta", "theta", "alpha"), float),
 }
 """Entries of :class:`netlist.Layer`."""
-
-PER_COMPARTMENT = (
-    *("neuron", "decay_u", "decay_v", "threshold", "bias_mantissa", "bias_exponent", "scale", "readout_class"),
-)
 
 
 def inconsistencies(netlist: Netlist) -> list[str]:

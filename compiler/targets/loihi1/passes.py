@@ -45,11 +45,12 @@ def _calibrate(done: Compilation) -> Compilation:
 
 def _disconnect(done: Compilation) -> Compilation:
     quiet = prune.none_of(done.network)
-    if done.options.prune_unused and done.calibration is not None:
-        quiet = prune.never_fired(done.network, done.calibration)
     if done.options.keep_all or done.options.forms is not None:
         return replace(done, connected=done.network, quiet=quiet)
-    gone = prune.either(prune.never_fires(done.network), quiet)
+    gone = proven = prune.never_fires(done.network)
+    if done.options.prune_unused and done.calibration is not None:
+        gone = prune.either(proven, prune.never_fired(done.network, done.calibration))
+        quiet = tuple(left & ~silent for left, silent in zip(gone, proven, strict=True))
     return replace(done, connected=prune.disconnect(done.network, gone), quiet=quiet)
 
 

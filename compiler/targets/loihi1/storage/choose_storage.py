@@ -62,27 +62,18 @@ class Choice:
     headroom: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Candidate:
-    """A layer at one scale, its calibration flips, how many scales were compared, and how it was rounded."""
-
-    layer: Rounded
-    flips: int | None
-    tried: int
-    compensated: bool = False
-
-
 def _register(population: Population) -> str:
     """Register that the sums of a population fill first."""
     return "current" if current_load(decay_registers(population.beta, population.alpha)[0]) > 1 else "accumulator"
 
 
-def _moved(stored: Rounded, layer: FloatLayer) -> int | None:
-    """Calibration spikes that differ from float64; None without calibration."""
-    return None if layer.calibration is None else int(flips(stored, layer.post, layer.calibration).sum())
+def _counted(stored: Rounded, layer: FloatLayer, *, tried: int) -> Rounded:
+    """The same with the calibration spikes that differ from float64, where there is a calibration."""
+    moved = None if layer.calibration is None else int(flips(stored, layer.post, layer.calibration).sum())
+    return replace(stored, flips=moved, tried=tried)
 
 
-def shortlist(layer: FloatLayer, packing: Packing, exponents: tuple[int, ...], *, clip: bool = True) -> list[Candidate]:
+def shortlist(layer: FloatLayer, packing: Packing, exponents: tuple[int, ...], *, clip: bool = True) -> list[Rounded]:
     """Scales of one population worth a closer look, best first; a single one without calibration, else ModelError.
 
     Without `clip` every weight must fit its planes.
@@ -100,38 +91,32 @@ def shortlist(layer: FloatLayer, packing: Packing, exponents: tuple[int, ...], *
             f"accumulator ({ONE_STEP_SUM_MAX} units a step){lasting if register == 'current' else ''}; use more bits "
             "or smaller weights"
         )
-    counted = [Candidate(layer=stored, flips=_moved(stored, layer), tried=len(found)) for stored in found]
-    counted.sort(key=_fewest)
+    tried = len(found)
+    counted = sorted((_counted(stored, layer, tried=tried) for stored in found), key=lambda c: c.fewest)
     if packing.groups > 1:
-        several = grouped(layer, counted[0].layer, packing.groups, factors[-1])
+        several = grouped(layer, counted[0], packing.groups, factors[-1])
         if several is not None:
-            several_scales = replace(counted[0], layer=several, flips=_moved(several, layer))
-            counted = [min(several_scales, counted[0], key=_fewest)]
+            counted = [min(_counted(several, layer, tried=tried), counted[0], key=lambda c: c.fewest)]
     if layer.calibration is not None:
-        other = compensated(layer, counted[0].layer.form, layer.calibration)
-        if other is not None and (moved := _moved(other, layer) or 0) < _fewest(counted[0]):
-            counted.insert(0, replace(counted[0], layer=other, flips=moved, compensated=True))
-    return [c for c in counted[:SHORTLIST] if _fewest(c) <= SHORTLIST_RATIO * _fewest(counted[0])]
+        other = compensated(layer, counted[0].form, layer.calibration)
+        if other is not None and (other := _counted(other, layer, tried=tried)).fewest < counted[0].fewest:
+            counted.insert(0, other)
+    return [c for c in counted[:SHORTLIST] if c.fewest <= SHORTLIST_RATIO * counted[0].fewest]
 
 
-def _fewest(candidate: Candidate) -> int:
-    return candidate.flips or 0
-
-
-def round_with_more(layer: FloatLayer, candidate: Candidate, calibration: Calibration) -> Candidate:
+def round_with_more(layer: FloatLayer, candidate: Rounded, calibration: Calibration) -> Rounded:
     """Let the errors of a layer cancel on ``MANY`` recordings at the storage that was chosen on ``FEW``.
 
     What keeps fewer spikes there is dropped.
     """
     many = fewer(calibration, MANY)
-    stored = compensated(layer, candidate.layer.form, many)
-    if stored is None or flips(stored, layer.post, many).sum() > flips(candidate.layer, layer.post, many).sum():
+    stored = compensated(layer, candidate.form, many)
+    if stored is None or flips(stored, layer.post, many).sum() > flips(candidate, layer.post, many).sum():
         return candidate
-    moved = int(flips(stored, layer.post, fewer(many)).sum())
-    return replace(candidate, layer=stored, flips=moved, compensated=True)
+    return replace(stored, flips=int(flips(stored, layer.post, fewer(many)).sum()), tried=candidate.tried)
 
 
-def settle(network: Network, shortlists: list[list[Candidate]], calibration: Calibration) -> list[Candidate]:
+def settle(network: Network, shortlists: list[list[Rounded]], calibration: Calibration) -> list[Rounded]:
     """Pick one scale per population, in order, by how far the whole network's class counts move from float64."""
     wanted = calibration.spikes[network.readout.population].sum(axis=1, dtype=np.int64)
     chosen = [candidates[0] for candidates in shortlists]
@@ -139,7 +124,7 @@ def settle(network: Network, shortlists: list[list[Candidate]], calibration: Cal
         if len(candidates) > 1:
             distances = []
             for trial in candidates:
-                layers = [trial.layer if i == post else kept.layer for i, kept in enumerate(chosen)]
+                layers = [trial if i == post else kept for i, kept in enumerate(chosen)]
                 spikes = run_integer(assemble(network, layers), calibration.events).spikes[network.readout.population]
                 distances.append(int(np.abs(spikes.sum(axis=1, dtype=np.int64) - wanted).sum()))
             chosen[post] = candidates[distances.index(min(distances))]
@@ -157,13 +142,13 @@ def assemble(network: Network, layers: Sequence[Rounded]) -> IntegerNetwork:
     )
 
 
-def explain_choice(layer: FloatLayer, chosen: Candidate) -> Choice:
+def explain_choice(layer: FloatLayer, chosen: Rounded) -> Choice:
     """Say what was chosen for a population."""
-    form, scale = chosen.layer.form, chosen.layer.population.scale
+    form, scale = chosen.form, chosen.population.scale
     held = reach(form.bits, form.exponents) * step_units(form.bits, form.exponents)
     clipped = zeroed = weights = 0
     for p in layer.projections:
-        planes = [plane for plane in chosen.layer.projections if plane.pre == p.pre]
+        planes = [plane for plane in chosen.projections if plane.pre == p.pre]
         for rows in row_parts(p.weight):
             weight = p.weight[rows]
             stored = (abs(replace(plane, weight=plane.weight[rows]).effective()) for plane in planes)
@@ -175,7 +160,7 @@ def explain_choice(layer: FloatLayer, chosen: Candidate) -> Choice:
     return Choice(
         layer=layer.population.name,
         bits=form.bits,
-        planes=len({p.exponent for p in chosen.layer.projections}),
+        planes=len({p.exponent for p in chosen.projections}),
         groups=len(np.unique(form.threshold)),
         exponent=form.exponents[0],
         scale=float(scale.min()),
@@ -187,7 +172,7 @@ def explain_choice(layer: FloatLayer, chosen: Candidate) -> Choice:
         candidates=chosen.tried,
         flips=chosen.flips,
         spikes=None if layer.calibration is None else int(np.count_nonzero(layer.calibration.spikes[layer.post])),
-        headroom=1 - chosen.layer.reached / ONE_STEP_SUM_MAX,
+        headroom=1 - chosen.reached / ONE_STEP_SUM_MAX,
     )
 
 
@@ -228,7 +213,7 @@ def choose_storage(
         settled = zip(layers, settle(network, shortlists, few), packings, strict=True)
         chosen = [c if packing.planes == 1 else round_with_more(layer, c, calibration) for layer, c, storage in settled]
     choices = tuple(map(explain_choice, layers, chosen))
-    return assemble(network, [c.layer for c in chosen]), choices
+    return assemble(network, chosen), choices
 
 
 def round_to_forms(
@@ -246,5 +231,5 @@ def round_to_forms(
             overflow = f"the {_register(layer.population)} may overflow"
             what = "a bias has no register value" if stored is None else overflow
             raise ModelError(f"{name}: at the scale that it was fine-tuned for, {what}; fine-tune it again")
-        chosen.append(Candidate(layer=stored, flips=_moved(stored, layer), tried=1))
-    return assemble(network, [c.layer for c in chosen]), tuple(map(explain_choice, layers, chosen))
+        chosen.append(_counted(stored, layer, tried=1))
+    return assemble(network, chosen), tuple(map(explain_choice, layers, chosen))

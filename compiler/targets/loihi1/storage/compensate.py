@@ -70,7 +70,7 @@ def compensated(layer: FloatLayer, form: Form, calibration: Calibration) -> Roun
         except ValueError:
             return None
         reached = float(np.max(loads(integer, planes), initial=0))
-        return Rounded(form=form, population=integer, projections=planes, reached=reached)
+        return Rounded(form=form, population=integer, projections=planes, reached=reached, compensated=True)
 
     nearest = np.rint(held).astype(np.int64)
     plain = stored_as(nearest, np.zeros(population.size))

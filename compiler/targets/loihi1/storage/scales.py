@@ -76,6 +76,14 @@ class Rounded:
     # Largest one-sided sum of one step that any input brings, weight units. A current that outlasts its step counts as
     # the sum that fills the accumulator as far as it fills its own register.
     reached: float
+    flips: int | None = None  # Calibration spikes that differ from float64, where they were counted
+    tried: int = 1  # Scales that were compared
+    compensated: bool = False  # Whether weights were rounded so that their errors cancel
+
+    @property
+    def fewest(self) -> int:
+        """What candidates are sorted by."""
+        return self.flips or 0
 
 
 def rounded(layer: FloatLayer, form: Form) -> Rounded | None:

@@ -18,14 +18,20 @@ from spikeloom.compiler.passes.calibrate import Calibration, fewer
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.options import Packing
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import (
-    Candidate,
     Choice,
     assemble,
     explain_choice,
     round_with_more,
     shortlist,
 )
-from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, finest_thresholds, flips, in_batches, layer_of
+from spikeloom.compiler.targets.loihi1.storage.scales import (
+    FloatLayer,
+    Rounded,
+    finest_thresholds,
+    flips,
+    in_batches,
+    layer_of,
+)
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.compiler.types import IntArray
 
@@ -64,22 +70,22 @@ def make_exact(
     chosen, found = [], []
     layers = [layer_of(network, post, few) for post in range(len(network.populations))]
     for layer in layers:
-        best: Candidate | None = None
+        best: Rounded | None = None
         tried: list[tuple[int, int, int]] = []
         for packing in ladder:
             if packing.planes > 2 and best is not None and not _full_range(layer, best).any():
                 break  # the planes hold every weight already
             candidate = shortlist(layer, packing, exponents, clip=False)[0]
-            moved = candidate.flips or 0
+            moved = candidate.fewest
             tried.append((packing.planes, packing.groups, moved))
-            if best is None or moved <= (best.flips or 0):
+            if best is None or moved <= best.fewest:
                 best = candidate
-            if not moved and not flips(candidate.layer, layer.post, calibration).any():
+            if not moved and not flips(candidate, layer.post, calibration).any():
                 break
         assert best is not None, "the ladder has steps"
         if best.flips:
             best = round_with_more(layer, best, calibration)
-        moved_by = flips(best.layer, layer.post, calibration)
+        moved_by = flips(best, layer.post, calibration)
         chosen.append(replace(best, flips=int(moved_by.sum())))
         found.append(
             Exactness(
@@ -93,21 +99,21 @@ def make_exact(
         )
     on_all = [replace(layer, calibration=calibration) for layer in layers]
     choices = tuple(map(explain_choice, on_all, chosen))
-    return assemble(network, [c.layer for c in chosen]), choices, tuple(found)
+    return assemble(network, chosen), choices, tuple(found)
 
 
-def _full_range(layer: FloatLayer, candidate: Candidate) -> npt.NDArray[np.bool_]:
+def _full_range(layer: FloatLayer, candidate: Rounded) -> npt.NDArray[np.bool_]:
     """Whether the largest weight of each neuron fills the planes; shape (neurons,)."""
-    form, scale = candidate.layer.form, candidate.layer.population.scale
+    form, scale = candidate.form, candidate.population.scale
     steps = layer.peaks() * scale / step_units(form.bits, form.exponents)
     full: npt.NDArray[np.bool_] = steps >= AT_LIMIT * reach(form.bits, form.exponents)
     return full
 
 
-def _limits(layer: FloatLayer, candidate: Candidate, moved: IntArray, slots: int) -> tuple[tuple[str, int], ...]:
-    form = candidate.layer.form
+def _limits(layer: FloatLayer, candidate: Rounded, moved: IntArray, slots: int) -> tuple[tuple[str, int], ...]:
+    form = candidate.form
     finest = finest_thresholds(layer, form.bits, form.exponents)
-    fullest = "24-bit current" if current_load(candidate.layer.population.decay_u) > 1 else "21-bit accumulator"
+    fullest = "24-bit current" if current_load(candidate.population.decay_u) > 1 else "21-bit accumulator"
     cause = np.full(layer.population.size, fullest, dtype=object)
     cause[_full_range(layer, candidate)] = "range of the planes"
     cause[form.threshold >= AT_LIMIT * THRESHOLD_MANTISSA_MAX] = "17-bit threshold"

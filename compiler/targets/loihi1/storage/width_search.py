@@ -22,14 +22,14 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.options import Packing, check_packings
-from spikeloom.compiler.targets.loihi1.storage.choose_storage import Candidate, assemble, settle, shortlist
-from spikeloom.compiler.targets.loihi1.storage.scales import layer_of
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import assemble, settle, shortlist
+from spikeloom.compiler.targets.loihi1.storage.scales import Rounded, layer_of
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
 Widths = tuple[int, ...]
 """Packing width of each layer."""
 
-Offers = list[dict[int, list[Candidate]]]
+Offers = list[dict[int, list[Rounded]]]
 """Scales worth a closer look of each layer, best first, by width; widest width first."""
 
 
@@ -150,7 +150,7 @@ def search_widths(
     def attempt(bits: Widths) -> WidthPoint:
         if bits not in tried:
             tell(f"trying combination {len(tried) + 1}")
-            integer = assemble(network, [offers[post][width][0].layer for post, width in enumerate(bits)])
+            integer = assemble(network, [offers[post][width][0] for post, width in enumerate(bits)])
             weights = sum(p.bits * p.weight.count_nonzero() for p in integer.projections)
             tried[bits] = point(bits, integer, -(-int(weights) // target.limit("synapse.word_bits")))
         return tried[bits]
@@ -167,7 +167,7 @@ def search_widths(
         tell(f"building the best of them: {len(built) + len(best)}")
         for bits in sorted(best):
             scales = settle(network, [offers[post][width] for post, width in enumerate(bits)], calibration)
-            integer = assemble(network, [candidate.layer for candidate in scales])
+            integer = assemble(network, scales)
             size = _size(integer, target, rates)
             made = None if size is None else point(bits, integer, *size)
             built[bits] = made
@@ -188,7 +188,7 @@ def _offers(network: Network, target: Target, widths: Widths, groups: int, calib
     exponents = target.choices["synapse.exponent"]
     offers: Offers = []
     for post in range(len(network.populations)):
-        offer: dict[int, list[Candidate]] = {}
+        offer: dict[int, list[Rounded]] = {}
         faults: list[ModelError] = []
         for bits in reversed(widths):
             try:
