@@ -25,8 +25,8 @@ from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
 from spikeloom.compiler.targets.loihi1.layout.forecast import Forecast, sample
-from spikeloom.compiler.targets.loihi1.layout.latency_search import estimate, fastest
-from spikeloom.compiler.targets.loihi1.layout.partition import cut, partition
+from spikeloom.compiler.targets.loihi1.layout.latency_search import fastest
+from spikeloom.compiler.targets.loihi1.layout.partition import Partition, cut, partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.options import GOALS
 from spikeloom.runtime.machines.loihi1 import engine, timing
@@ -192,13 +192,20 @@ def test_the_search_comes_near_the_best_cut(seed):
     target = small_target(chip_cores=24)
     forecast = forecast_of(network, calibration, target)
     found = fastest(forecast)
+
+    def expected(chunks):
+        """On as few tiles as hold a core for each chunk."""
+        parts = Partition(cores=tuple((chunk,) for chunk in chunks), bound=1)
+        return forecast.expect(parts, -(-len(chunks) // target.limit("mesh.tile_cores"))).step_ns
+
     every = []
     for first in range(1, 24):
         for second in range(1, min(24 - first, sizes[2]) + 1):
             chunks = cut(forecast.needs, {0: first, 1: second})
             if len(chunks) <= 24:
-                every.append(estimate(forecast, [(chunk,) for chunk in chunks]))
-    assert estimate(forecast, found) <= 1.03 * min(every)
+                every.append(expected(chunks))
+    assert expected(found.chunks) == pytest.approx(found.step / 1000)
+    assert found.step <= 1.03 * 1000 * min(every)
 
 
 @settings(deadline=None, max_examples=6, phases=WITHOUT_SHRINKING)

@@ -7,7 +7,6 @@ far as the core's memory allows it, because a zero inside a dense list is visite
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy.typing as npt
 
 from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
 from spikeloom.compiler.ir import INPUT, MANTISSA, IntegerNetwork, depths, fan_in
-from spikeloom.compiler.passes.prune import none_of
+from spikeloom.compiler.passes.prune import Masks, none_of
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import (
     Chunk,
@@ -52,23 +51,12 @@ def _entries(
     return length, target, weight
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Origin:
-    """What a network was before neurons were left out."""
-
-    network: IntegerNetwork  # With all neurons
-    identity: tuple[IntArray, ...]  # For each population, which of its neurons the chip holds
-    # Neurons removed although they fire, because their spikes reach no neuron
-    unread: tuple[npt.NDArray[np.bool_], ...]
-
-
-def _layers(origin: Origin) -> tuple[Layer, ...]:
-    network = origin.network
+def _layers(network: IntegerNetwork, removed: Masks) -> tuple[Layer, ...]:
     return tuple(
         Layer(
             name=population.name,
             neurons=population.size,
-            unread=tuple(np.flatnonzero(origin.unread[post]).tolist()),
+            unread=tuple(np.flatnonzero(removed[post]).tolist()),
             depth=depth,
             beta=population.beta,
             theta=population.theta,
@@ -87,15 +75,17 @@ def emit(
     tiles: tuple[int, ...],
     target: Target,
     provenance: Mapping[str, Any],
-    origin: Origin | None = None,
+    *,
+    origin: IntegerNetwork | None = None,
+    identity: tuple[IntArray, ...] | None = None,
+    unread: Masks | None = None,
 ) -> Netlist:
     """Assemble the netlist of a partitioned network, with a tile for each core and JSON values to remember.
 
-    `origin` is what the network was before neurons were left out; itself by default.
+    Where neurons were left out, `origin` is the network with all of them, `identity` says for each population which of
+    them are held, and `unread` which were removed although they fire, because their spikes reach no neuron.
     """
-    if origin is None:
-        identity = tuple(np.arange(population.size) for population in network.populations)
-        origin = Origin(network=network, identity=identity, unread=none_of(network))
+    identity = identity or tuple(np.arange(population.size) for population in network.populations)
     compartment_id = [np.zeros(population.size, np.int64) for population in network.populations]
     placed: list[tuple[Chunk, int, int]] = []  # chunk, core, base on it
     counts: list[int] = []
@@ -144,14 +134,12 @@ def emit(
         taxels=network.input.taxels,
         polarities=network.input.polarities,
         classes=network.classes,
-        layers=_layers(origin),
+        layers=_layers(origin or network, unread or none_of(network)),
         core_tile=read_only(tiles),
         core_compartments=read_only(np.concatenate([[0], np.cumsum(counts)])),
         core_axons=read_only(np.concatenate([[0], np.cumsum(axons_per_core)])),
         layer=read_only(np.concatenate([np.full(chunk.size, chunk.population) for chunk in order])),
-        neuron=read_only(
-            np.concatenate([origin.identity[c.population][n] for c, n in zip(order, neurons, strict=True)])
-        ),
+        neuron=read_only(np.concatenate([identity[c.population][n] for c, n in zip(order, neurons, strict=True)])),
         decay_u=read_only(np.concatenate([np.full(len(n), p.decay_u) for p, n in rows])),
         decay_v=read_only(np.concatenate([np.full(len(n), p.decay_v) for p, n in rows])),
         threshold=read_only(np.concatenate([p.threshold[n] for p, n in rows])),

@@ -12,7 +12,7 @@ from spikeloom.compiler.pipeline import Pass, run
 from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.compilation import LATER, Compilation
-from spikeloom.compiler.targets.loihi1.emit import Origin, emit
+from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
@@ -99,12 +99,21 @@ def _place(done: Compilation) -> Compilation:
 
 
 def _emit(done: Compilation) -> Compilation:
-    origin = Origin(network=done.integer, identity=done.identity, unread=done.unread)
     parts, tiles = done.layout.parts, done.layout.placement.tiles
     provenance = dict(done.options.provenance)
     if done.choices:
         provenance["compensated"] = [choice.layer for choice in done.choices if choice.compensated]
-    return replace(done, netlist=emit(done.held, parts, tiles, done.target, provenance, origin))
+    made = emit(
+        done.held,
+        parts,
+        tiles,
+        done.target,
+        provenance,
+        origin=done.integer,
+        identity=done.identity,
+        unread=done.unread,
+    )
+    return replace(done, netlist=made)
 
 
 def _legalize(done: Compilation) -> Compilation:

@@ -25,7 +25,7 @@ STORE = "points.sqlite"
 
 NOTES = """\
 Axes of the grid: bits (2-6, 8, or one a layer as in 8+4+4+8), planes (1-3), groups (1-8), prune (0, 1), cores (cores,
-energy, latency, or LAYER:N as in fc1:6+conv1:4), window (per cent of each recording, 25-100% is every quarter,
+latency, or LAYER:N as in fc1:6+conv1:4), window (per cent of each recording, 25-100% is every quarter,
 25-100%:5 every twentieth). Choices are made on the training split, the test split is reported. A chart that was
 interrupted goes on with the same command; netlists and figures are kept in FOLDER. Networks for different chips stand
 beside each other by the prices of their own: fronts and choices are among the points of the chip of the first network.

@@ -20,7 +20,7 @@ from spikeloom.compiler.targets.base import PICOSECONDS, Target
 from spikeloom.compiler.targets.loihi1.layout.chips import place_on_chips
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
 from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation, Forecast, sample
-from spikeloom.compiler.targets.loihi1.layout.latency_search import estimate, fastest, tiles_for
+from spikeloom.compiler.targets.loihi1.layout.latency_search import fastest, tiles_for
 from spikeloom.compiler.targets.loihi1.layout.partition import Partition, arrange, partition
 from spikeloom.compiler.targets.loihi1.layout.place import Placement, core_traffic, place_within
 from spikeloom.compiler.types import FloatArray, IntArray
@@ -100,9 +100,10 @@ def lay_out(
     if forecast is None:
         raise OptionError(f"--optimize {goal}: {target.title} has no time table; give another target")
     assert usual.expected is not None, "a forecast tells it on one chip"
-    cores = fastest(forecast)
-    if cores is None or estimate(forecast, cores) >= usual.expected.step_ns * PICOSECONDS:
+    trial = fastest(forecast)
+    if trial is None or trial.step >= usual.expected.step_ns * PICOSECONDS:
         return usual, usual
-    fast = placed(arrange(forecast.needs, cores), tiles_for(forecast, len(cores)))
+    alone = arrange(forecast.needs, [(chunk,) for chunk in trial.chunks])
+    fast = placed(alone, tiles_for(forecast, len(trial.chunks)))
     assert fast.expected is not None, "likewise"
     return (fast if fast.expected.step_ns < usual.expected.step_ns else usual), usual

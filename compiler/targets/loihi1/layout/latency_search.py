@@ -14,8 +14,8 @@ import numpy as np
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_tiles
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk
-from spikeloom.compiler.targets.loihi1.layout.forecast import Core, Forecast
-from spikeloom.compiler.targets.loihi1.layout.partition import chunks_of, cut, cut_layer, order_on_core
+from spikeloom.compiler.targets.loihi1.layout.forecast import Forecast
+from spikeloom.compiler.targets.loihi1.layout.partition import chunks_of, cut, cut_layer
 from spikeloom.compiler.types import FloatArray, IntArray
 
 SHORTER = 0.9
@@ -39,31 +39,19 @@ def _fewest_tiles(forecast: Forecast, cores: int) -> int:
     return -(-cores // forecast.needs.target.limit("mesh.tile_cores"))
 
 
-def _score(time: float, cores: int) -> float:
-    return time * (1 + WORTH * cores)
-
-
-def _busy(forecast: Forecast, core: Core) -> FloatArray:
-    longest: FloatArray = np.maximum(*forecast.core(core))
-    return longest
-
-
-def estimate(forecast: Forecast, cores: list[Core]) -> float:
-    """Expected picoseconds of a step, on as few tiles as can be."""
-    forecast.charge(tuple(cores))
-    busy = [_busy(forecast, order_on_core(forecast.needs, core)) for core in cores]
-    return float(np.max(busy, axis=0).mean()) + forecast.time.barrier(_fewest_tiles(forecast, len(cores)))
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Trial:
+class Trial:
     """Layers cut evenly, each chunk on a core of its own."""
 
     chunks: list[Chunk]
-    score: float  # What is made small
+    step: float  # Expected picoseconds of a step, on as few tiles as can be
     critical: int  # Population that takes longest in most steps
     longest: float  # Mean picoseconds of the slowest core of the slowest layer
-    barrier: int  # Picoseconds
+
+    @property
+    def score(self) -> float:
+        """What is made small."""
+        return self.step * (1 + WORTH * len(self.chunks))
 
 
 _Cut = tuple[list[Chunk], FloatArray, dict[int, IntArray]]
@@ -100,11 +88,11 @@ class _Search:
             except OptionError:
                 chunks = []
             if chunks:
-                slowest = np.max([_busy(self.forecast, (chunk,)) for chunk in chunks], axis=0)
+                slowest = np.max([np.maximum(*self.forecast.core((chunk,))) for chunk in chunks], axis=0)
                 self._cuts[key] = chunks, slowest, self.needs.source_axons(chunks)
         return self._cuts[key]
 
-    def attempt(self, least: dict[int, int]) -> _Trial | None:
+    def attempt(self, least: dict[int, int]) -> Trial | None:
         """Judge the cut into so many chunks, or None if there is no such cut."""
         self.needs.forget()
         chunks: list[Chunk] = []
@@ -120,12 +108,11 @@ class _Search:
             return None
         every = np.array([times[population] for population in sorted(times)])
         barrier = self.forecast.time.barrier(_fewest_tiles(self.forecast, len(chunks)))
-        return _Trial(
+        return Trial(
             chunks=sorted(chunks),
-            score=_score(float(every.max(axis=0).mean()) + barrier, len(chunks)),
+            step=float(every.max(axis=0).mean()) + barrier,
             critical=sorted(times)[int(np.argmax(np.bincount(np.argmax(every, axis=0))))],
             longest=float(every.mean(axis=1).max()),
-            barrier=barrier,
         )
 
     def _near(self, population: int, count: int, steps: int) -> int | None:
@@ -134,7 +121,7 @@ class _Search:
         at = bisect_left(useful, count) + steps
         return useful[at] if 0 <= at < len(useful) else None
 
-    def shrink(self) -> list[_Trial]:
+    def shrink(self) -> list[Trial]:
         """Fewest cores with which no layer takes longer than some time, for shorter and shorter times."""
         trials = []
         trial = self.attempt(chunks_of(cut(self.needs, {})))
@@ -153,7 +140,7 @@ class _Search:
             trial = self.attempt(counts)
         return trials
 
-    def polish(self, trial: _Trial) -> _Trial:
+    def polish(self, trial: Trial) -> Trial:
         """Change the cores of one layer, or of the critical one and another, as long as that helps."""
         while True:
             before, counts, slow = trial, chunks_of(trial.chunks), trial.critical
@@ -169,50 +156,12 @@ class _Search:
                 return trial
 
 
-def fastest(forecast: Forecast) -> list[Core] | None:
-    """Cores of the shortest expected step that a greedy search finds, None if there is no room for any.
+def fastest(forecast: Forecast) -> Trial | None:
+    """The shortest expected step that a greedy search finds, None if there is no room for any cut.
 
-    The fewest cores for ever shorter times are cut; the best of these cuts is then changed as long as that helps. The
-    best of those with another barrier is kept too. Last, cores are merged where that makes no step longer.
+    The fewest cores for ever shorter times are cut; the best of these cuts is then changed as long as that helps.
+    Layers share no core: on no network tried did a merged core leave a step as short.
     """
     search = _Search(forecast)
-    best: dict[int, _Trial] = {}
-    for trial in search.shrink():
-        if trial.barrier not in best or trial.score < best[trial.barrier].score:
-            best[trial.barrier] = trial
-    ranked = sorted(best.values(), key=lambda trial: trial.score)
-    found = [_merged(forecast, trial.chunks) for trial in ranked[1:]]
-    found += [_merged(forecast, search.polish(trial).chunks) for trial in ranked[:1]]
-    return min(found, key=lambda cores: _score(estimate(forecast, cores), len(cores)), default=None)
-
-
-def _merged(forecast: Forecast, chunks: list[Chunk]) -> list[Core]:
-    """Put chunks of different layers on one core, lightest first, where that makes no step longer."""
-    needs = forecast.needs
-    cores: list[Core] = [(chunk,) for chunk in chunks]
-    forecast.charge(tuple(cores))
-    loads = {core: forecast.core(core) for core in cores}
-    weight = {core: float(np.maximum(*load).mean()) for core, load in loads.items()}
-    longest = np.max([np.maximum(*load) for load in loads.values()], axis=0)
-    most = longest.mean() * (1 + WORTH)
-    waiting = sorted(cores, key=lambda core: weight[core])
-    while waiting:
-        core = waiting.pop(0)
-        for other in sorted((c for c in cores if c != core), key=lambda c: weight[c]):
-            if {chunk.population for chunk in core} & {chunk.population for chunk in other}:
-                continue
-            # a chunk that starts higher on its core may need other lists, so this is looked at again below
-            together = np.max([mine + its for mine, its in zip(loads[core], loads[other], strict=True)], axis=0)
-            if np.maximum(together, longest).mean() > most:
-                break  # the others are heavier
-            joint = order_on_core(needs, (*core, *other))
-            if needs.excess(joint):
-                continue
-            load = forecast.core(joint)
-            if np.maximum(np.maximum(*load), longest).mean() <= most:
-                loads[joint], weight[joint] = load, float(np.maximum(*load).mean())
-                longest = np.maximum(longest, np.maximum(*load))
-                cores = [*(c for c in cores if c not in (core, other)), joint]
-                waiting = sorted([*(c for c in waiting if c != other), joint], key=lambda core: weight[core])
-                break
-    return cores
+    trials = search.shrink()
+    return search.polish(min(trials, key=lambda trial: trial.score)) if trials else None
