@@ -248,7 +248,7 @@ def test_a_network_without_outliers_becomes_exact():
     verify(integer)
     assert moved(integer, calibration) == 0
     for choice, each in zip(choices, found, strict=True):
-        assert (choice.flips, each.flips, each.limits) == (0, 0, ())
+        assert (choice.flips, each.flips, each.limits, each.decay) == (0, 0, (), 0)
         assert each.tried[0][:2] == (1, 1)
         assert choice.spikes == each.spikes
 

@@ -124,11 +124,12 @@ def _exactness(layers: Sequence[Exactness]) -> Iterator[Block]:
                 "  ".join(f"{planes}×{groups}: {moved:,}" for planes, groups, moved in layer.tried),
                 f"{layer.flips:,} of {layer.spikes:,}",
                 ", ".join(f"{name} {count:,}" for name, count in layer.limits),
+                f"{layer.decay:,}",
             ]
             for layer in layers
         ]
         yield Text("spike-exact: not reached; spikes that still move on the training recordings")
-        head = ["layer", "planes×groups: moved on 32", "moved on all", "limited by"]
+        head = ["layer", "planes×groups: moved on 32", "moved on all", "limited by", "12-bit decay alone"]
         yield Table(head, rows)
 
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, reach, step_units
+from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, decay_registers, kept_shares, reach, step_units
+from spikeloom.compiler.interpret import float_recurrence, product
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.calibrate import Calibration, fewer
 from spikeloom.compiler.targets.base import Target
@@ -28,6 +29,7 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     Rounded,
     finest_thresholds,
     flips,
+    in_batches,
     layer_of,
 )
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
@@ -50,6 +52,7 @@ class Exactness:
     flips: int  # Spikes that move in what was taken, on all calibration recordings
     spikes: int  # All spikes of the float64 model
     limits: tuple[tuple[str, int], ...]  # Spikes that still move, by what keeps their neuron's scale from being finer
+    decay: int  # Spikes that move if nothing but the 12-bit decay deviates
 
 
 def make_exact(
@@ -91,6 +94,7 @@ def make_exact(
                 spikes=int(np.count_nonzero(calibration.spikes[layer.post])),
                 flips=int(moved_by.sum()),
                 limits=_limits(layer, best, moved_by, slots) if moved_by.any() else (),
+                decay=_decay_flips(layer, calibration) if moved_by.any() else 0,
             )
         )
     on_all = [replace(layer, calibration=calibration) for layer in layers]
@@ -116,3 +120,18 @@ def _limits(layer: FloatLayer, candidate: Rounded, moved: IntArray, slots: int) 
     cause[form.threshold < SHARED * finest] = f"{slots} thresholds a core"
     counted = {str(name): int(moved[cause == name].sum()) for name in sorted(set(cause))}
     return tuple((name, count) for name, count in sorted(counted.items(), key=lambda pair: -pair[1]) if count)
+
+
+def _decay_flips(layer: FloatLayer, calibration: Calibration) -> int:
+    """Spikes that move if nothing but the decays is rounded."""
+    alpha, beta = kept_shares(*decay_registers(layer.population.beta, layer.population.alpha))
+    realised = replace(layer.population, alpha=alpha, beta=beta)
+    wanted = calibration.spikes[layer.post]
+    sources = [(p.weight, calibration.source(p.pre, layer.post)) for p in layer.projections]
+
+    def moved(part: slice) -> IntArray:
+        sums = sum(product(weight, spikes[part], np.float64) for weight, spikes in sources)
+        spikes, _ = float_recurrence(realised, np.asarray(sums))
+        return np.asarray(np.count_nonzero(spikes != wanted[part]))
+
+    return int(np.sum(in_batches(calibration, moved)))
