@@ -15,8 +15,10 @@ from spikeloom.compiler.fixedpoint import BIAS_EXPONENT_MAX, BIAS_MANTISSA_MAX, 
 from spikeloom.compiler.ir import (
     INPUT,
     IntegerNetwork,
+    IntegerPopulation,
     IntegerProjection,
     Network,
+    Population,
     Projection,
     depths,
 )
@@ -31,7 +33,8 @@ def _names_are_unique(network: Network | IntegerNetwork) -> Faults:
 
 
 def _projections_fit(network: Network | IntegerNetwork) -> Faults:
-    sizes = {INPUT: network.input.size} | {i: population.size for i, population in enumerate(network.populations)}
+    populations: tuple[Population | IntegerPopulation, ...] = network.populations
+    sizes = {INPUT: network.input.size} | {i: population.size for i, population in enumerate(populations)}
     projections: tuple[Projection | IntegerProjection, ...] = network.projections
     for i, p in enumerate(projections):
         expected = (sizes.get(p.post), sizes.get(p.pre))
