@@ -167,12 +167,6 @@ def test_one_more_window_compiles_only_what_is_gone_or_damaged(made, again, spik
 # -- choices -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_exit_code_says_that_no_point_fits_a_budget(again, spikeloom):
-    code, out, _ = spikeloom(*CHART, "-o", "again", "--budget", "energy=1pJ", "--budget", "accuracy=100")
-    assert code == 1
-    assert "energy=1pJ and accuracy=100: no point fits; the nearest is #" in out
-
-
 def read_as(*checkpoints):
     """Options of a command that names checkpoints only."""
     options = dict.fromkeys(("graph", "taxels", "edges", "system", "weights", "beta", "theta"))

@@ -17,7 +17,6 @@ from made_files import weights as made_weights
 
 from spikeloom.__main__ import main as start
 from spikeloom.compiler import __version__, lift
-from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import netlist_text
@@ -320,13 +319,6 @@ def test_help_imports_no_command():
     code = "import sys; from spikeloom.runtime import cli\ntry: cli.main(['--help'])\nexcept SystemExit: pass\n"
     check = "sys.exit(bool({'numpy', 'torch', 'matplotlib', 'numba', 'onnx'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code + check], check=False, stdout=subprocess.DEVNULL).returncode == 0
-
-
-def test_debug_shows_where_it_happened(capsys):
-    with pytest.raises(ModelError) as failure:
-        cli.main(["inspect", "--debug", "nowhere.pt"])
-    assert str(failure.value).startswith("nowhere.pt: no such file")
-    assert capsys.readouterr() == ("", "")
 
 
 def test_progress_goes_to_a_terminal_only(spikeloom, monkeypatch):

@@ -169,7 +169,7 @@ def gone(pids: list[int]) -> bool:
 
 def test_interrupted_and_killed_it_says_what_is_kept_and_resumes_to_the_same_bytes(data, capsys):
     """The moment of a signal is not fixed: wherever it falls, the result must be the same."""
-    kept, words = Path("x.pt.state.validation"), ("--epochs", "25", "-o", "x.pt")
+    kept, words = Path("x.pt.state.validation"), ("--epochs", "15", "-o", "x.pt")
     process = started(*words, until=kept.exists)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
@@ -190,7 +190,7 @@ def test_interrupted_and_killed_it_says_what_is_kept_and_resumes_to_the_same_byt
     process.kill()
     process.communicate()
     as_json(capsys, *WORDS, *words, "--resume")
-    as_json(capsys, *WORDS, "--epochs", "25", "-o", "whole.pt")
+    as_json(capsys, *WORDS, "--epochs", "15", "-o", "whole.pt")
     assert Path("x.pt").read_bytes() == Path("whole.pt").read_bytes()
 
 
