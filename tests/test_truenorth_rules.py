@@ -9,8 +9,7 @@ from random_crossbars import CHIP, relays, with_limit
 from random_networks import chain
 
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron
-from spikeloom.compiler.targets.truenorth.legalize import faults
-from spikeloom.compiler.targets.truenorth.needs import needs
+from spikeloom.compiler.targets.truenorth.legalize import faults, needs
 
 SOURCE = "core 0, neuron 0"
 

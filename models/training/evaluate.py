@@ -13,14 +13,13 @@ from torch import Tensor
 
 from spikeloom.compiler.errors import DataError
 from spikeloom.models.networks.layers import time_first
-from spikeloom.models.networks.networks import TrainedModule
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.recipes import CROSS_ENTROPY, RELEASED, Recipe
 
 TEST_BATCH = 2  # larger batches outgrow the cache
 
 
-def evaluate(network: TrainedModule, recordings: Recordings, recipe: Recipe = RELEASED) -> tuple[float, int]:
+def evaluate(network: torch.nn.Module, recordings: Recordings, recipe: Recipe = RELEASED) -> tuple[float, int]:
     """Mean loss, and how many recordings are classified correctly; equal top rates count for the lowest class."""
     loss, correct = 0.0, 0
     with torch.no_grad():
@@ -32,7 +31,7 @@ def evaluate(network: TrainedModule, recordings: Recordings, recipe: Recipe = RE
     return loss / len(recordings), correct
 
 
-def predict(network: TrainedModule, recordings: Recordings) -> NDArray[np.int64]:
+def predict(network: torch.nn.Module, recordings: Recordings) -> NDArray[np.int64]:
     """Class of each recording; equal top rates count for the lowest one."""
     found = []
     with torch.no_grad(), one_thread():
@@ -67,9 +66,9 @@ def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
     return torch.nn.functional.mse_loss(rates, target)
 
 
-def _rates(network: TrainedModule, events: NDArray[np.uint8]) -> Tensor:
+def _rates(network: torch.nn.Module, events: NDArray[np.uint8]) -> Tensor:
     """Spike rates on the CPU, computed where the network is."""
-    rates: Tensor = network(time_first(events).to(network.adjacency.device)).cpu()
+    rates: Tensor = network(time_first(events).to(next(network.parameters()).device)).cpu()
     return rates
 
 

@@ -36,7 +36,7 @@ from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.networks import Weights
 from spikeloom.models.networks.quantised import QuantisedNet
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.training.evaluate import one_thread, rate_loss, require_finite
+from spikeloom.models.training.evaluate import evaluate, one_thread, rate_loss, require_finite
 from spikeloom.models.training.initial_storage import initial_forms
 from spikeloom.models.training.resume import restore, set_rate, write_state
 
@@ -138,7 +138,7 @@ def finetune(
         model = QuantisedNet(checkpoint, adjacency, forms)
         model.make_legal()
         optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE, amsgrad=True)
-        before = count_right(model, test)
+        _, before = evaluate(model, test)
         if resume and state is not None and state.exists():
             epochs_before, _ = restore(state, options, model, optimizer, order)
             history = [TunedEpoch(**epoch) for epoch in epochs_before]
@@ -152,7 +152,7 @@ def finetune(
                 bar.update()
                 if after_epoch is not None:
                     after_epoch(history[-1])
-        after = count_right(model, test)
+        _, after = evaluate(model, test)
     return Tuned(weights=_weights(model), forms=forms, history=tuple(history), before=before, after=after)
 
 
@@ -182,16 +182,6 @@ def _epoch(
         total += float(loss.detach()) * len(chosen)
         correct += int(np.sum(rates.detach().numpy().argmax(axis=1) == labels))
     return TunedEpoch(epoch=index + 1, loss=total / len(order), correct=correct)
-
-
-def count_right(model: QuantisedNet, recordings: Recordings) -> int:
-    """Recordings that the quantised model decides right; equal top rates count for the lowest class."""
-    right = 0
-    with torch.no_grad():
-        for index, label in enumerate(recordings.labels):
-            events = recordings.events[index : index + 1, ..., : recordings.steps_of(index)]
-            right += int(model(time_first(events)).numpy()[0].argmax() == label)
-    return right
 
 
 def _weights(model: QuantisedNet) -> Weights:
