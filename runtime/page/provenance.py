@@ -21,7 +21,7 @@ from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.network import LoadedNetwork
-from spikeloom.runtime.report.encode import INLINE, key
+from spikeloom.runtime.report.encode import INLINE
 
 PACKAGES = ("numpy", "scipy", "torch", "numba", "networkx")
 """Packages whose versions may move a float spike."""
@@ -37,23 +37,15 @@ class Origin:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
-    """What to type, and what for."""
-
-    what: str = field(metadata=key("for"))
-    command: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Provenance:
-    """Files and their hashes, titles of the chip's tables, versions, and the commands that repeat the page."""
+    """Files and their hashes, titles of the chip's tables, versions, and the commands that repeat the page, by what each is for."""
 
     netlist: Origin
     checkpoint: Origin
     data: Origin
     tables: Mapping[str, str]
     versions: Mapping[str, str]
-    commands: tuple[Command, ...]
+    commands: Mapping[str, str]
 
 
 def provenance(
@@ -95,7 +87,7 @@ def provenance(
     )
 
 
-def _commands(arguments: argparse.Namespace, netlist: Netlist, recording: str) -> tuple[Command, ...]:
+def _commands(arguments: argparse.Namespace, netlist: Netlist, recording: str) -> dict[str, str]:
     """What to type, and what each is for."""
 
     def name(given: Any) -> str:
@@ -121,7 +113,7 @@ def _commands(arguments: argparse.Namespace, netlist: Netlist, recording: str) -
     if "weight_bits" in netlist.provenance:
         compiled = repeat.words(_compile_options(netlist.provenance, data))
         lines = {"the netlist": ["compile", checkpoint, *model, *compiled, "-o", net]} | lines
-    return tuple(Command(what=what, command=repeat.command(*words)) for what, words in lines.items())
+    return {what: repeat.command(*words) for what, words in lines.items()}
 
 
 def _compile_options(made: Mapping[str, Any], data: str) -> JsonObject:

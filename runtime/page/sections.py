@@ -273,7 +273,7 @@ def _provenance(made: Provenance) -> list[Block]:
         if found
     ]
     versions = ", ".join(f"{name} {number}" for name, number in made.versions.items())
-    commands = [block for line in made.commands for block in (Text(f"{line.what}:"), Code([line.command]))]
+    commands = [block for what, line in made.commands.items() for block in (Text(f"{what}:"), Code([line]))]
     return [
         Table(["", "name", "sha256"], files, "Files; the hash of recordings is over events and labels", words=True),
         *tables,

@@ -1,4 +1,4 @@
-"""What the page of a network shows of this chip: costs with figures, cores on the mesh, energy and time by step."""
+"""What the page of a network shows of this chip: costs with figures, and cores on the mesh."""
 
 from __future__ import annotations
 
