@@ -38,7 +38,7 @@ class Origin:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Provenance:
-    """Files and their hashes, titles of the chip's tables, versions, and the commands that repeat the page, by what each is for."""
+    """Files and their hashes, titles of the chip's tables, versions, and what to type for all of it again."""
 
     netlist: Origin
     checkpoint: Origin
