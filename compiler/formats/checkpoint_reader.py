@@ -119,21 +119,11 @@ def read_checkpoint(
         raise OptionError(f"--system {system}: unknown; choose from {', '.join(SYSTEMS)}")
     if faults := constant_faults(beta, theta):
         raise OptionError(faults[0])
-    where = str(path)
     try:
-        content = read_whole(Path(path), "checkpoint", GIVE)
+        found = _read(read_whole(Path(path), "checkpoint", GIVE), run, weights)
     except ModelError as error:
-        raise ModelError(f"{where}: {error}") from error
-    members = members_of(where, content)
-    if members is None:
-        found = read_torch(where, content, run)
-        if weights not in (None, "last"):
-            raise ModelError(f"{where}: --weights {weights}: the file holds the last epoch only; omit --weights")
-    else:
-        if run != 0:
-            raise ModelError(f"{where}: --run {run}: the file holds only run 0; omit --run")
-        found = read_own(where, content, members, weights)
-    _require_fit(where, found, system, beta, theta)
+        raise ModelError(f"{path}: {error}") from error
+    _require_fit(str(path), found, system, beta, theta)
     given = [name for name, value in (("beta", beta), ("theta", theta)) if value is not None]
     return replace(
         found,
@@ -161,29 +151,31 @@ def content_digest(manifest: Mapping[str, Any], arrays: Mapping[str, npt.NDArray
     return hashlib.sha256(f"{json.dumps(stated, sort_keys=True)}\n{arrays_digest(arrays)}".encode()).hexdigest()
 
 
-def members_of(where: str, content: bytes) -> dict[str, bytes] | None:
-    """Members of a file in our own format, or None if it is something else; no zip may claim more than it has."""
-    if content[:2] != b"PK":
-        return None
+def _read(content: bytes, run: int, weights: str | None) -> Checkpoint:
+    """Checkpoint of any layout; no zip may claim more than it has. Messages lack the path."""
     try:
-        members = stored_members(content)
+        members = stored_members(content) if content[:2] == b"PK" else {}
     except ValueError as error:
-        raise ModelError(f"{where}: is truncated or damaged ({error}); copy it again") from error
-    return members if "manifest.json" in members else None
+        raise ModelError(f"is truncated or damaged ({error}); copy it again") from error
+    if "manifest.json" in members:
+        if run != 0:
+            raise ModelError(f"--run {run}: the file holds only run 0; omit --run")
+        return _read_own(content, members, weights)
+    found = read_torch(content, run)
+    if weights not in (None, "last"):
+        raise ModelError(f"--weights {weights}: the file holds the last epoch only; omit --weights")
+    return found
 
 
-def read_own(where: str, content: bytes, members: dict[str, bytes], weights: str | None) -> Checkpoint:
-    """Check a file of our own format, called `where` in messages, and take one set of weights from its members.
-
-    Raises ModelError as :func:`read_checkpoint` says.
-    """
-    manifest, arrays = _signed_content(where, members)
+def _read_own(content: bytes, members: dict[str, bytes], weights: str | None) -> Checkpoint:
+    """Check a file of our own format, and take one set of weights from its members."""
+    manifest, arrays = _signed_content(members)
     if faults := _manifest_faults(manifest):
-        raise ModelError(f"{where}: {'; '.join(faults)}; {_AGAIN}")
+        raise ModelError(f"{'; '.join(faults)}; {_AGAIN}")
     sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
     weights = sets[0] if weights is None else weights
     if weights not in sets:
-        raise ModelError(f"{where}: --weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
+        raise ModelError(f"--weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
     chosen = {name.removeprefix(f"{weights}/"): a for name, a in arrays.items() if name.startswith(f"{weights}/")}
     system, towers = manifest["architecture"], manifest.get("towers", 1)
     edges = read_only(np.array(manifest["graph"]["edges"], np.int64).reshape(-1, 2))
@@ -202,7 +194,7 @@ def read_own(where: str, content: bytes, members: dict[str, bytes], weights: str
     if edges.size and edges.max() >= manifest["taxels"]:
         faults.append(f"the graph joins taxels outside 0..{manifest['taxels'] - 1}")
     if faults:
-        raise ModelError(f"{where}: {'; '.join(faults)}; {_AGAIN}")
+        raise ModelError(f"{'; '.join(faults)}; {_AGAIN}")
     found = Checkpoint(
         **layers_of(chosen),
         beta=float(manifest["beta"]),
@@ -220,10 +212,10 @@ def read_own(where: str, content: bytes, members: dict[str, bytes], weights: str
         towers=towers,
         bins=manifest.get("bins", 1),
     )
-    return replace(found, forms=_forms(where, manifest["forms"], found)) if "forms" in manifest else found
+    return replace(found, forms=_forms(manifest["forms"], found)) if "forms" in manifest else found
 
 
-def _signed_content(where: str, members: Mapping[str, bytes]) -> tuple[dict[str, Any], Arrays]:
+def _signed_content(members: Mapping[str, bytes]) -> tuple[dict[str, Any], Arrays]:
     """Manifest and arrays that match the hash which the manifest states."""
     try:
         manifest = json.loads(members["manifest.json"])
@@ -231,16 +223,14 @@ def _signed_content(where: str, members: Mapping[str, bytes]) -> tuple[dict[str,
         if len(arrays) + 1 != len(members) or any(array.dtype != "<f4" for array in arrays.values()):
             raise ValueError("members that are no arrays of float32")
     except (ValueError, RecursionError) as error:
-        raise ModelError(f"{where}: {DAMAGED}") from error
+        raise ModelError(DAMAGED) from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise ModelError(f"{where}: {NOT_A_CHECKPOINT}")
+        raise ModelError(NOT_A_CHECKPOINT)
     version = manifest.get("version")
     if type(version) is not int or not 1 <= version <= VERSION:
-        raise ModelError(
-            f"{where}: has format version {version!r}, this program reads up to {VERSION}; update spikeloom"
-        )
+        raise ModelError(f"has format version {version!r}, this program reads up to {VERSION}; update spikeloom")
     if content_digest(manifest, arrays) != manifest.get("sha256"):
-        raise ModelError(f"{where}: its content does not match its hash, so it was altered; {_AGAIN}")
+        raise ModelError(f"its content does not match its hash, so it was altered; {_AGAIN}")
     return manifest, arrays
 
 
@@ -258,12 +248,12 @@ def _manifest_faults(manifest: Mapping[str, Any]) -> list[str]:
     return faults + constant_faults(manifest["beta"], manifest["theta"])
 
 
-def _forms(where: str, entries: list[dict[str, Any]], checkpoint: Checkpoint) -> tuple[Form, ...]:
+def _forms(entries: list[dict[str, Any]], checkpoint: Checkpoint) -> tuple[Form, ...]:
     """Storage of every layer of a fine-tuned network."""
     fits = [(entry["layer"], len(entry["threshold"])) for entry in entries] == [*checkpoint.neurons.items()]
     gaps = [(entry["bits"], b - a) for entry in entries for a, b in pairwise(entry["exponents"])]
     if not fits or not all(0 < gap <= plane_distance(bits) for bits, gap in gaps):
-        raise ModelError(f"{where}: the manifest has no usable forms; {_AGAIN}")
+        raise ModelError(f"the manifest has no usable forms; {_AGAIN}")
     return tuple(
         Form(bits=entry["bits"], exponents=tuple(entry["exponents"]), threshold=read_only(entry["threshold"]))
         for entry in entries

@@ -42,20 +42,20 @@ BETA, THETA = 0.2, 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""
 
 
-def read_torch(where: str, content: bytes, run: int) -> Checkpoint:
-    """Read the content of a torch file, called `where` in messages; raises as :func:`read_checkpoint`."""
-    loaded = _load(where, content)
+def read_torch(content: bytes, run: int) -> Checkpoint:
+    """Read the content of a torch file; raises as :func:`read_checkpoint`."""
+    loaded = _load(content)
     if isinstance(loaded, dict) and "net_list" in loaded:
         states, layout = loaded["net_list"], "released"
         if not isinstance(states, list | tuple) or not states:
-            raise ModelError(f"{where}: net_list holds no run; give the file of a finished training")
+            raise ModelError("net_list holds no run; give the file of a finished training")
     else:
         states, layout = [loaded], "state_dict"
     if not 0 <= run < len(states):
         held = "only run 0" if len(states) == 1 else f"runs 0 to {len(states) - 1}"
-        raise ModelError(f"{where}: --run {run}: the file holds {held}; choose one that it holds")
+        raise ModelError(f"--run {run}: the file holds {held}; choose one that it holds")
     return Checkpoint(
-        **layers_of(_unified(where, _arrays(where, states[run], len(content)))),
+        **layers_of(_unified(_arrays(states[run], len(content)))),
         beta=BETA,
         theta=THETA,
         assumed=("beta", "theta"),
@@ -66,7 +66,7 @@ def read_torch(where: str, content: bytes, run: int) -> Checkpoint:
     )
 
 
-def _load(where: str, content: bytes) -> Any:
+def _load(content: bytes) -> Any:
     """Let torch read the content, after a look at what it is; a zip has been opened before."""
     if content[:2] == b"PK":
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -74,7 +74,7 @@ def _load(where: str, content: bytes) -> Any:
     else:
         torch_file = content[:1] == b"\x80"
     if not torch_file:
-        raise ModelError(f"{where}: {NOT_A_CHECKPOINT}")
+        raise ModelError(NOT_A_CHECKPOINT)
     import torch
 
     try:
@@ -84,26 +84,26 @@ def _load(where: str, content: bytes) -> Any:
     except Exception as error:  # torch raises nearly anything on damaged files
         if isinstance(error, pickle.UnpicklingError) and (named := re.search(r"GLOBAL ([\w.]+)", str(error))):
             raise ModelError(
-                f"{where}: is a pickle that calls {named[1]}, allowed are tensors alone, since code in a file could "
+                f"is a pickle that calls {named[1]}, allowed are tensors alone, since code in a file could "
                 "do anything; save the state_dict and nothing else"
             ) from error
         if re.search(r"Unsupported operand 1(4\d|5[0-2])\b", str(error)):  # what protocol 4 added
             raise ModelError(
-                f"{where}: is pickled with protocol 4 or newer, which torch does not read without running it; "
+                "is pickled with protocol 4 or newer, which torch does not read without running it; "
                 "save it with torch.save as it is by default"
             ) from error
         known = content[:2] == b"PK" or content.startswith(_OLD_TORCH)
-        raise ModelError(f"{where}: {DAMAGED if known else NOT_A_CHECKPOINT}") from error
+        raise ModelError(DAMAGED if known else NOT_A_CHECKPOINT) from error
 
 
-def _arrays(where: str, state: Any, file_size: int) -> Arrays:
+def _arrays(state: Any, file_size: int) -> Arrays:
     """Convert the tensors of a state dict to float32 arrays."""
     import torch
 
     if not isinstance(state, Mapping) or not any(re.match(r"(conv|fc)\d", str(key)) for key in state):
         keys = [printable(str(key)) for key in state] if isinstance(state, Mapping) else [type(state).__name__]
         raise ModelError(
-            f"{where}: holds neither net_list nor weights of a TactileSGNet, but {', '.join(keys[:5]) or 'nothing'}; "
+            f"holds neither net_list nor weights of a TactileSGNet, but {', '.join(keys[:5]) or 'nothing'}; "
             "give its state_dict"
         )
     faults = [
@@ -112,7 +112,7 @@ def _arrays(where: str, state: Any, file_size: int) -> Arrays:
         if (fault := _tensor_fault(value, file_size)) is not None
     ]
     if faults:
-        _refuse(where, faults)
+        _refuse(faults)
     return {str(name): value.detach().to(torch.float32).numpy() for name, value in state.items()}
 
 
@@ -129,7 +129,7 @@ def _tensor_fault(value: Any, file_size: int) -> str | None:
     return None
 
 
-def _unified(where: str, arrays: Arrays) -> Arrays:
+def _unified(arrays: Arrays) -> Arrays:
     """Check everything and bring both key styles to the names of our own format."""
     hops = [int(match[1]) for key in arrays if (match := re.fullmatch(r"conv1\.lins\.(0|[1-9]\d?)\.weight", key))]
     features: int | str
@@ -152,7 +152,7 @@ def _unified(where: str, arrays: Arrays) -> Arrays:
         columns = arrays["conv1.lin.weight"].shape[1]
         faults = [f"conv1.lin.weight has {columns} columns, not a whole number of hops with {CHANNELS} channels each"]
     if faults:
-        _refuse(where, faults)
+        _refuse(faults)
     if hops:
         filters = np.stack([arrays.pop(f"conv1.lins.{k}.weight") for k in range(len(hops))])
     else:
@@ -161,8 +161,8 @@ def _unified(where: str, arrays: Arrays) -> Arrays:
     return {"conv1.hops": filters, "conv1.bias": arrays.pop(bias), **arrays}
 
 
-def _refuse(where: str, faults: list[str]) -> NoReturn:
-    raise ModelError(f"{where}: {'; '.join(faults)}; give the weights of a TactileSGNet")
+def _refuse(faults: list[str]) -> NoReturn:
+    raise ModelError(f"{'; '.join(faults)}; give the weights of a TactileSGNet")
 
 
 def _training(loaded: Mapping[str, Any], run: int, runs: int) -> JsonObject:

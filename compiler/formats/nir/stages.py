@@ -60,11 +60,6 @@ def through(value: Value, matrix: Sparse, shape: tuple[int, ...]) -> Value:
     return Value(shape=shape, terms=terms, bias=matrix @ value.bias, alpha=value.alpha, held=matrix @ value.held)
 
 
-def shifted(value: Value, bias: FloatArray) -> Value:
-    """A constant added; `bias` is (size,)."""
-    return replace(value, bias=value.bias + bias)
-
-
 def added(values: Sequence[Value]) -> Value:
     """The sum of several, as a node with several edges gets; ModelError if their shapes or their filters differ."""
     first = values[0]
@@ -125,7 +120,7 @@ def _linear(node: Node, value: Value, _steps: Steps) -> Value:
     result = through(value, block_diagonal(sparse.csr_array(weight), copies), (*value.shape[:-1], rows))
     if node.type == "Linear":
         return result
-    return shifted(result, np.tile(_each(node, "bias", rows), copies))
+    return replace(result, bias=result.bias + np.tile(_each(node, "bias", rows), copies))
 
 
 def _each(node: Node, key: str, size: int) -> FloatArray:
@@ -183,7 +178,7 @@ def _conv(node: Node, value: Value, _steps: Steps) -> Value:
     result = through(value, matrix, out)
     if not node.has("bias"):
         return result
-    return shifted(result, np.repeat(_each(node, "bias", out[0]), math.prod(out[1:])))
+    return replace(result, bias=result.bias + np.repeat(_each(node, "bias", out[0]), math.prod(out[1:])))
 
 
 def _pool(node: Node, value: Value, _steps: Steps) -> Value:
@@ -220,7 +215,8 @@ def _integrator(node: Node, value: Value, steps: Steps) -> Value:
     gain = (1 - kept) * spread(node, "r", value.size, value.shape)
     drive = (1 - kept) * spread(node, "v_leak", value.size, value.shape)
     if not alpha:
-        return shifted(scaled(value, gain), drive)
+        own = scaled(value, gain)
+        return replace(own, bias=own.bias + drive)
     with node.named():
         return filtered(value, alpha, gain, drive)
 

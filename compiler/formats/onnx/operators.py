@@ -34,9 +34,8 @@ from spikeloom.compiler.formats.onnx.affine import (
     spread,
     through,
 )
-from spikeloom.compiler.formats.onnx.evaluate import FLOATING, MOVES, NUMERIC, evaluate, shapes_of
+from spikeloom.compiler.formats.onnx.evaluate import FLOATING, LINEAR, MOVES, NUMERIC, evaluate, shapes_of
 from spikeloom.compiler.formats.onnx.file import BOOL, Node
-from spikeloom.compiler.formats.onnx.matrices import LINEAR
 
 MIRRORED = {
     "Greater": "Less",
