@@ -122,7 +122,7 @@ def prepare(
     def caused(amount: IntArray | BoolArray, source: IntArray, receiver: IntArray) -> FloatArray:
         """Sums over synapses, axons or neurons; (sources, groups)."""
         sums = np.bincount(source * len(neurons) + receiver, amount.astype(np.float64), size * len(neurons))
-        return sums.reshape(size, len(neurons))
+        return np.asarray(sums, np.float64).reshape(size, len(neurons))
 
     axon = netlist.axon_of_synapse()
     if dense is None:
