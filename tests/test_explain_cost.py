@@ -89,16 +89,16 @@ def test_a_rung_that_is_proven_is_what_it_would_be(spikeloom, monkeypatch):
 
 def test_why_a_netlist_runs_step_by_step(place):
     netlist = read_netlist(place / "net.loom")
-    assert blocks.obstacle(netlist) is None
+    assert not isinstance(blocks.lay_out_blocks(netlist), str)
     assert (
-        blocks.obstacle(large_netlist(1, proved=True))
+        blocks.lay_out_blocks(large_netlist(1, proved=True))
         == "a layer is recurrent or receives from others than the one before it"
     )
     axon = Axon(source=0, targets=((0, 254),), exponent=7)
-    assert blocks.obstacle(build([Neuron()], [axon], n_inputs=1, depths=[0])) is None
+    assert not isinstance(blocks.lay_out_blocks(build([Neuron()], [axon], n_inputs=1, depths=[0])), str)
     assert (
-        blocks.obstacle(build([Neuron()], [axon, axon], n_inputs=1, depths=[0]))
+        blocks.lay_out_blocks(build([Neuron()], [axon, axon], n_inputs=1, depths=[0]))
         == "a sum may leave 16 bits, or a membrane or current its register"
     )
     slow = replace(netlist, decay_v=read_only(np.zeros(netlist.n_compartments)))
-    assert blocks.obstacle(slow) == "a sum may leave 16 bits, or a membrane or current its register"
+    assert blocks.lay_out_blocks(slow) == "a sum may leave 16 bits, or a membrane or current its register"

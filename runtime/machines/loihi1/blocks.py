@@ -61,14 +61,12 @@ def _is_pipeline(netlist: Netlist) -> bool:
     return True
 
 
-def lay_out_blocks(netlist: Netlist) -> Blocks | None:
-    """Make blocks of a netlist.
-
-    None where a register could overflow or saturate, a layer is recurrent or receives from others than the one before
-    it, or synapses are so scattered that rows of 64 would waste memory.
-    """
-    if not _is_pipeline(netlist) or not _in_range(netlist):
-        return None
+def lay_out_blocks(netlist: Netlist) -> Blocks | str:
+    """Make blocks of a netlist, or say why there are none."""
+    if not _is_pipeline(netlist):
+        return "a layer is recurrent or receives from others than the one before it"
+    if not _in_range(netlist):
+        return "a sum may leave 16 bits, or a membrane or current its register"
     seats = _seats(netlist)
 
     # rows: one for each block and each source that reaches it
@@ -85,7 +83,7 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | None:
 
     rows, dense = _rows(netlist, seats, [np.unique(places(core)[0]) for core in range(netlist.n_cores)], width)
     if len(rows) * LANES * 2 > SPARE + BYTES_A_SYNAPSE * netlist.n_synapses:
-        return None
+        return "synapses too scattered for rows of 64"
     row_block, row_source = np.divmod(rows, width)
     net, reached = np.zeros(len(rows) * LANES, np.int16), np.zeros(len(rows), np.uint64)
     for core in range(netlist.n_cores):
@@ -129,17 +127,6 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | None:
         compartment=compartment,
         whole=_whole(compartment.reshape(-1, LANES)),
     )
-
-
-def obstacle(netlist: Netlist) -> str | None:
-    """Why there are no blocks of a netlist; None if there are."""
-    if not _is_pipeline(netlist):
-        return "a layer is recurrent or receives from others than the one before it"
-    if not _in_range(netlist):
-        return "a sum may leave 16 bits, or a membrane or current its register"
-    if lay_out_blocks(netlist) is None:
-        return "synapses too scattered for rows of 64"
-    return None
 
 
 class _Seats(NamedTuple):

@@ -64,12 +64,9 @@ def prepare(netlist: Netlist, *, stepwise: bool = False, charges: Charges | None
     add to the sums of each chip step in a trace.
     """
     blocks = None if stepwise else lay_out_blocks(netlist)
-    return Engine(
-        netlist=netlist,
-        blocks=blocks,
-        tables=tables_of(netlist) if blocks is None else None,
-        charges=charges,
-    )
+    if blocks is None or isinstance(blocks, str):
+        return Engine(netlist=netlist, blocks=None, tables=tables_of(netlist), charges=charges)
+    return Engine(netlist=netlist, blocks=blocks, tables=None, charges=charges)
 
 
 def advance(

@@ -23,7 +23,7 @@ from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.base import Beside, EventArray, Price, Run, one_by_one
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import description, engine, spec
-from spikeloom.runtime.machines.loihi1.blocks import obstacle
+from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.costs import cumulative
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
@@ -67,8 +67,8 @@ class Loihi(IntegerMachine):
     @property
     def kernel(self) -> str:
         """Which kernel the engine takes."""
-        found = obstacle(self.netlist)
-        return "layer by layer, 64 neurons at a time" if found is None else f"step by step: {found}"
+        found = lay_out_blocks(self.netlist)
+        return f"step by step: {found}" if isinstance(found, str) else "layer by layer, 64 neurons at a time"
 
     def legal(self) -> None:
         """Refuse a netlist that uses too much of a limit."""

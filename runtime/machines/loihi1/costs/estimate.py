@@ -5,8 +5,9 @@ Every message is scheduled for these, and energy is told by core. Spikes are the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.cost import Costs
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
 from spikeloom.runtime.machines.loihi1.trace import Counts, side_by_side
+
+T = TypeVar("T", Counts, SimpleTimes, DetailedTimes)
 
 PART = 16
 """Recordings whose spikes are kept at a time in detail ``cycle``."""
@@ -62,67 +65,55 @@ def estimate(
         If several chips shall be simulated by the cycle. Their events are counted and priced but not timed: links
         between chips have no public latency.
     """
-    if detail == "cycle":
+    deep = detail == "cycle"
+    if deep:
         require_one_chip(netlist.core_tile, target, "--detail cycle")
     timed = target.time if chip_count(netlist.core_tile, target) == 1 else ()
     latencies = {table.name: timing.prepare(netlist, target, table) for table in timed}
     charges = side_by_side([timing.charges(each) for each in latencies.values()]) if latencies else None
     prepared = engine.prepare(netlist, charges=charges)
     steps = np.full(len(events), events.shape[2]) if lengths is None else np.asarray(lengths, np.int64)
-    detailed: dict[str, DetailedTimes] = {}
-    if detail == "cycle":
-        counts, charged, detailed, updates = _deep(prepared, latencies, events, steps, spikes, progress)
-    else:
-        trace = engine.simulate(prepared, events, lengths=steps, spikes=spikes is not None)
-        counts, charged = trace.counts, trace.charged
-        if spikes is not None:
-            spikes[:] = trace.spikes
-    chip_steps = steps + netlist.max_depth
-    sums = [] if charged is None else np.split(charged, len(latencies), axis=2)
-    simple = {
-        name: timing.simple_times(each, own, chip_steps)
-        for (name, each), own in zip(latencies.items(), sums, strict=True)
-    }
-    cores: Mapping[str, FloatArray] = {}
-    if detail == "cycle":
-        by_core = replace(counts, updates=updates)
-        cores = cost.estimate(cost.prepare(netlist, target, "core"), by_core, chip_steps).energy
-    costs = cost.estimate(cost.prepare(netlist, target), counts, chip_steps)
-    return counts, Estimate(costs=costs, steps=steps, simple=simple, detailed=detailed, cores=cores)
-
-
-def _deep(
-    prepared: engine.Engine,
-    latencies: Mapping[str, timing.Latencies],
-    events: engine.EventArray,
-    steps: IntArray,
-    spikes: BoolArray | None,
-    progress: Callable[[int], object] | None,
-) -> tuple[Counts, IntArray | None, dict[str, DetailedTimes], IntArray]:
-    """Counts, charges, detailed times and updates of each core; some recordings at a time, as their spikes are kept."""
-    found: dict[str, list[DetailedTimes]] = {name: [] for name in latencies}
-    counts, charged, updates = [], [], []
-    for first in range(0, len(events), PART):
-        part = slice(first, first + PART)
-        trace = engine.simulate(prepared, events[part], lengths=steps[part], spikes=True, updated=True)
-        assert trace.spikes is not None, "spikes were wanted"
-        assert trace.updated is not None, "updates were wanted"
+    size = PART if deep else max(1, len(events))
+    counts, updates = [], []
+    simple: dict[str, list[SimpleTimes]] = {name: [] for name in latencies}
+    detailed: dict[str, list[DetailedTimes]] = {name: [] for name in latencies if deep}
+    for first in range(0, max(1, len(events)), size):
+        part = slice(first, first + size)
+        own = steps[part] + netlist.max_depth
+        trace = engine.simulate(
+            prepared, events[part], lengths=steps[part], spikes=deep or spikes is not None, updated=deep
+        )
         counts.append(trace.counts)
-        charged += [] if trace.charged is None else [trace.charged]
-        updates.append(cost.updates_by_core(prepared.netlist, trace.updated))
-        own = steps[part] + prepared.netlist.max_depth
-        given = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after a recording's end
-        for name, each in latencies.items():
-            found[name].append(timing.detailed(each, trace.spikes, trace.updated, given, steps=own))
+        sums = [] if trace.charged is None else np.split(trace.charged, len(latencies), axis=2)
+        for (name, latency), charged in zip(latencies.items(), sums, strict=True):
+            simple[name].append(timing.simple_times(latency, charged, own))
         if spikes is not None:
             spikes[part] = trace.spikes
+        if not deep:
+            continue
+        assert trace.spikes is not None, "spikes were wanted"
+        assert trace.updated is not None, "updates were wanted"
+        updates.append(cost.updates_by_core(netlist, trace.updated))
+        given = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after a recording's end
+        for name, times in detailed.items():
+            times.append(timing.detailed(latencies[name], trace.spikes, trace.updated, given, steps=own))
         if progress is not None:
             progress(min(first + PART, len(events)))
-    joined = {
-        name: DetailedTimes(
-            **{f.name: np.concatenate([getattr(t, f.name) for t in times]) for f in fields(DetailedTimes)}
-        )
-        for name, times in found.items()
-    }
-    whole = Counts(**{f.name: np.concatenate([getattr(c, f.name) for c in counts]) for f in fields(Counts)})
-    return whole, np.concatenate(charged) if charged else None, joined, np.concatenate(updates)
+    whole, chip_steps = _joined(Counts, counts), steps + netlist.max_depth
+    cores: Mapping[str, FloatArray] = {}
+    if deep:
+        by_core = replace(whole, updates=np.concatenate(updates))
+        cores = cost.estimate(cost.prepare(netlist, target, "core"), by_core, chip_steps).energy
+    return whole, Estimate(
+        costs=cost.estimate(cost.prepare(netlist, target), whole, chip_steps),
+        steps=steps,
+        simple={name: _joined(SimpleTimes, times) for name, times in simple.items()},
+        detailed={name: _joined(DetailedTimes, times) for name, times in detailed.items()},
+        cores=cores,
+    )
+
+
+def _joined(kind: type[T], parts: Sequence[T]) -> T:
+    """One dataclass of arrays from those of some recordings each."""
+    names = [field.name for field in fields(kind)]
+    return kind(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
