@@ -264,7 +264,7 @@ def small_timed(recordings, **values):
 
 
 def test_the_learning_rate_falls_as_a_cosine():
-    training = grasps(1)
+    training = grasps(1, per_class=1)
     recipe, sizes = small_timed(training)
     whole = train(training, training, ADJACENCY, sizes, epochs=4, recipe=recipe)
     assert [epoch.learning_rate for epoch in whole.history] == pytest.approx(

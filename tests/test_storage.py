@@ -327,7 +327,7 @@ def test_figures_are_those_of_the_compiler():
     """Every point that is built counts what the compiled netlist does, and no other built point beats it."""
     checkpoint, network, events, labels = drawn(2)
     samples, flat = 9, channels(events)
-    made = search_widths(network, LOIHI, flat, labels, widths=WIDTHS, groups=2, samples=samples)
+    made = search_widths(network, LOIHI, flat, labels, widths=(2, 8), groups=2, samples=samples)
     picked = np.linspace(0, len(events) - 1, samples).round().astype(int)
     wanted = vote(run_float(network, flat[picked]).spikes[-1].sum(axis=1))
     assert (made.samples, made.float_right) == (samples, np.count_nonzero(wanted == labels[picked]))
