@@ -37,7 +37,7 @@ from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.encode import encode
 
 CHECKPOINTS = tuple(name for name in FLOAT if name not in ("recurrent", "onnx"))
-STEP_BY_STEP = ("recurrent", "gcn", "onnx")
+STEP_BY_STEP = ("recurrent", "onnx")
 """Those that the kernel of layers does not take: a loop, or sums that may leave 16 bits."""
 
 
