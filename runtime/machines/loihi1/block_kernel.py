@@ -605,6 +605,12 @@ def run_recordings(
             _copy_membranes(blocks, steps, scratch.membranes, membranes[r])
 
 
+@compiled
+def _charge_row(rows: IntArray, source: int, sums: IntArray) -> None:
+    for i in range(sums.size):
+        sums[i] += rows[source, i]
+
+
 @compiled_and_cached
 def add_charges(
     events: AnyArray,
@@ -627,16 +633,14 @@ def add_charges(
         for channel in range(events.shape[1]):
             for t in range(lengths[r]):
                 if events[r, channel, t]:
-                    charged[r, t] += channels[channel]
+                    _charge_row(channels, channel, charged[r, t])
         totals = np.empty(sums, np.int64)
         for t in range(fired.shape[1]):
             totals[:] = 0
             for w in range(fired.shape[2]):
                 left = fired[r, t, w]
                 while left:
-                    source = w * LANES + _lowest(left)
-                    for i in range(sums):
-                        totals[i] += spikes[source, i]
+                    _charge_row(spikes, w * LANES + _lowest(left), totals)
                     left &= left - np.uint64(1)
             for kind in range(kinds.shape[0]):
                 count = 0
@@ -644,4 +648,5 @@ def add_charges(
                     count += _bits(updated[r, t, w] & members[kind, w])
                 for i in range(sums):
                     totals[i] += count * kinds[kind, i]
-            charged[r, t] += totals
+            for i in range(sums):
+                charged[r, t, i] += totals[i]
