@@ -30,7 +30,7 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import propagation
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.votes import predictions
-from spikeloom.runtime.report.intervals import of_mean
+from spikeloom.runtime.report.numbers import of_mean
 
 Json = dict[str, Any]
 

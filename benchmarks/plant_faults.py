@@ -50,7 +50,7 @@ NUMERIC = {
     "runtime/machines/loihi1": "block_kernel blocks engine kernel spec timing timing_kernel",
     "runtime/machines/loihi1/costs": "cost cumulative",
     "runtime/machines/truenorth": "cost engine kernel spec trace twins",
-    "runtime/report": "intervals",
+    "runtime/report": "numbers",
     "runtime/studies/anytime": "exits",
 }
 """Modules to plant faults in, by folder."""

@@ -33,7 +33,7 @@ from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.machines.votes import predictions
-from spikeloom.runtime.report.intervals import wilson
+from spikeloom.runtime.report.numbers import wilson
 
 Scheme = dict[str, Any]
 

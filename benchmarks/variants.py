@@ -22,7 +22,7 @@ from joined import measured
 
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.recordings.events import load_data
-from spikeloom.runtime.report.intervals import of_mean
+from spikeloom.runtime.report.numbers import of_mean
 
 Json = dict[str, Any]
 

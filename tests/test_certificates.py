@@ -11,7 +11,7 @@ from made_files import CLASSES, FEATURES, TAXELS, events, ring, small_checkpoint
 from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float, vote
-from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.equivalence.certain_spikes import SPARE, _layers, _Membranes, certain_spikes
 from spikeloom.runtime.equivalence.certificates import certify, wins
@@ -81,7 +81,7 @@ def runs(checkpoint, adjacency, recordings, seed=0):
 def test_certain_spikes_are_those_of_every_run(folder, seed, gain, beta):
     checkpoint, adjacency = model(folder, last=weights(seed, sizes=SIZES, gain=gain), beta=beta)
     recordings = events(seed, samples=3)
-    certainty = certain_spikes(checkpoint, adjacency, recordings)
+    certainty = certain_spikes(Factored(checkpoint, adjacency), recordings)
     for run in runs(checkpoint, adjacency, recordings, seed):
         for (certain, doubt), spikes in zip(certainty, run, strict=True):
             assert not (certain & doubt).any()
@@ -98,7 +98,7 @@ def test_certain_spikes_among_many_ties(folder, seed, step, decimal):
     last = {name: (np.round(array / 0.25) * unit).astype(np.float32) for name, array in weights(seed).items()}
     checkpoint, adjacency = model(folder, last=last, theta=4 * unit, beta=0.5)
     recordings = events(seed, samples=3)
-    certainty = certain_spikes(checkpoint, adjacency, recordings)
+    certainty = certain_spikes(Factored(checkpoint, adjacency), recordings)
     for run in runs(checkpoint, adjacency, recordings, seed):
         for (certain, doubt), spikes in zip(certainty, run, strict=True):
             np.testing.assert_array_equal(certain[~doubt], spikes[~doubt])
@@ -117,7 +117,7 @@ def test_uncertain_spikes_reach_the_next_layer(folder):
     arrays["fc2.bias"][:] = [0.25, 0.75, 0.75]
     arrays["fc2.weight"][:, 0] = [0.125, 0.125, -0.5]
     checkpoint, adjacency = model(folder, last=arrays, beta=0.0)
-    (_, conv), (fc1, doubt1), (fc2, doubt2), (_, doubt3) = certain_spikes(checkpoint, adjacency, events(0))
+    (_, conv), (fc1, doubt1), (fc2, doubt2), (_, doubt3) = certain_spikes(Factored(checkpoint, adjacency), events(0))
     assert not conv.any()
     assert doubt1[..., 0].all()
     assert fc1[..., 1].all()
@@ -135,7 +135,9 @@ def test_an_uncertain_spike_leaves_both_membranes(folder):
     checkpoint, adjacency = model(folder, last=arrays, beta=0.5)
     recordings = np.zeros((1, TAXELS, 2, 4), np.uint8)
     recordings[0, 0, 0, 0] = recordings[0, 0, 1, 1] = 1
-    certain, doubt = (array[0, :, :FEATURES] for array in certain_spikes(checkpoint, adjacency, recordings)[0])
+    certain, doubt = (
+        array[0, :, :FEATURES] for array in certain_spikes(Factored(checkpoint, adjacency), recordings)[0]
+    )
     assert doubt[0].tolist() == [True, False, False, False, True]
     # 0 + 0.375, or 0.25 + 0.375: below and above the threshold
     assert doubt[1].tolist() == [False, False, False, False, True]
@@ -154,9 +156,9 @@ def test_cancelling_hops_count_with_their_magnitudes(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=arrays, graph=graph, beta=0.0)
     assert not expand(checkpoint, adjacency).projections[0].weight.toarray().any()
     recordings = np.ones((1, TAXELS, 2, 1), np.uint8)
-    _, doubt = certain_spikes(checkpoint, adjacency, recordings)[0]
+    _, doubt = certain_spikes(Factored(checkpoint, adjacency), recordings)[0]
     assert doubt.all()
-    _, quiet = certain_spikes(checkpoint, adjacency, np.zeros_like(recordings))[0]
+    _, quiet = certain_spikes(Factored(checkpoint, adjacency), np.zeros_like(recordings))[0]
     assert not quiet.any()
 
 
@@ -173,7 +175,7 @@ def test_a_membrane_that_was_not_reset_is_below_its_threshold():
 def test_roundings_and_magnitudes_of_the_released_operator_are_those_of_its_loops(tmp_path):
     """Of K = 3 on a ring: each hop adds two neighbours to a taxel's sum, then channels and hops are summed."""
     checkpoint, adjacency = model(tmp_path, 3)
-    first, *others = _layers(checkpoint, adjacency)
+    first, *others = _layers(Factored(checkpoint, adjacency))
     sums = 3 * (2 + 1)
     assert (first.roundings, first.per_spike) == (SPARE + sums + 2 + 1 + 4, False)
     assert all((layer.roundings, layer.per_spike) == (SPARE, True) for layer in others)
@@ -192,7 +194,7 @@ def test_roundings_and_magnitudes_of_the_released_operator_are_those_of_its_loop
 def by_hand(checkpoint, adjacency, recordings, chip, kept=None, lengths=None):
     """Equal and different entries per layer, entry by entry."""
     found = []
-    for layer, (certain, doubt) in enumerate(certain_spikes(checkpoint, adjacency, recordings)):
+    for layer, (certain, doubt) in enumerate(certain_spikes(Factored(checkpoint, adjacency), recordings)):
         equal = different = 0
         neurons = range(certain.shape[2]) if kept is None else kept[layer]
         for sample in range(len(recordings)):
@@ -210,7 +212,7 @@ def test_entries_are_counted_once_each(folder):
     netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(Packing(bits=4),))).netlist
     recordings = events(4, samples=5, steps=12)
     chip, decisions = on_chip(netlist, recordings)
-    found = certify(checkpoint, adjacency, lift(netlist), recordings, chip, decisions)
+    found = certify(Factored(checkpoint, adjacency), lift(netlist), recordings, chip, decisions)
     assert list(found.layers) == ["conv1", "fc1", "fc2", "fc3"]
     expected = by_hand(checkpoint, adjacency, recordings, chip)
     assert [(layer.equal, layer.different) for layer in found.layers.values()] == expected
@@ -233,7 +235,9 @@ def test_parts_of_layers_and_of_recordings(folder):
     chip, decisions = on_chip(netlist, recordings)
     inside = (np.arange(12) < lengths[:, None])[:, :, None]
     parts = [spikes[..., part] & inside for spikes, part in zip(chip, kept, strict=True)]
-    found = certify(checkpoint, adjacency, lift(netlist), recordings, parts, decisions, kept=kept, lengths=lengths)
+    found = certify(
+        Factored(checkpoint, adjacency), lift(netlist), recordings, parts, decisions, kept=kept, lengths=lengths
+    )
     assert [layer.entries for layer in found.layers.values()] == [26 * len(part) for part in kept]
     expected = by_hand(checkpoint, adjacency, recordings, parts, kept, lengths)
     assert [(layer.equal, layer.different) for layer in found.layers.values()] == expected
@@ -251,7 +255,7 @@ def test_a_network_far_from_its_thresholds_is_certified_whole(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=far_from_thresholds(), beta=0.0, theta=0.25)
     netlist = compile_network(expand(checkpoint, adjacency)).netlist
     files = tuple("abcdef")
-    verdict = verify(netlist, checkpoint, adjacency, events(2, steps=8), np.arange(6) % CLASSES, files)
+    verdict = verify(netlist, Factored(checkpoint, adjacency), events(2, steps=8), np.arange(6) % CLASSES, files)
     found = verdict.certificate
     assert all(layer.equal == layer.entries > 0 for layer in found.layers.values())
     assert all(layer.chip > 0 for layer in verdict.spikes.values())
@@ -261,7 +265,9 @@ def test_a_network_far_from_its_thresholds_is_certified_whole(tmp_path):
 def test_the_same_network_at_its_thresholds_is_not(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=far_from_thresholds(), beta=0.5, theta=0.5)
     netlist = compile_network(expand(checkpoint, adjacency)).netlist
-    verdict = verify(netlist, checkpoint, adjacency, events(2, steps=8), np.zeros(6, np.int64), tuple("abcdef"))
+    verdict = verify(
+        netlist, Factored(checkpoint, adjacency), events(2, steps=8), np.zeros(6, np.int64), tuple("abcdef")
+    )
     # these very sums are exact, so that no spike differs; another order of sums is not known to be
     assert verdict.first_divergence is None
     assert verdict.certificate.layers["conv1"].undecided > 0
@@ -273,7 +279,7 @@ def test_registers_without_a_proof_are_named(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path, beta=4095 / 4096)
     netlist = compile_network(expand(checkpoint, adjacency), Options(keep_all=True)).netlist
     recordings = events(2, steps=8)
-    found = certify(checkpoint, adjacency, lift(netlist), recordings, *on_chip(netlist, recordings))
+    found = certify(Factored(checkpoint, adjacency), lift(netlist), recordings, *on_chip(netlist, recordings))
     assert found.unproven == ("conv1", "fc1", "fc2", "fc3")
 
 

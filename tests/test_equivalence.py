@@ -12,13 +12,13 @@ from random_netlists import Neuron, build
 from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.interpret import channels_last, run_float
-from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.runtime.equivalence.reference import LADDER, realised
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.votes import class_counts, predictions
-from spikeloom.runtime.report.intervals import wilson
+from spikeloom.runtime.report.numbers import wilson
 
 LAYERS = ["conv1", "fc1", "fc2", "fc3"]
 LABELS = np.array([0, 1, 2, 3, 0, 1])
@@ -41,7 +41,7 @@ def small(tmp_path_factory):
 @pytest.fixture(scope="module")
 def verdict(small):
     checkpoint, adjacency, netlist = small
-    return verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES)
+    return verify(netlist, Factored(checkpoint, adjacency), events(2), LABELS, FILES)
 
 
 def by_specification(netlist, recordings):
@@ -84,7 +84,9 @@ def test_the_first_divergence_is_the_first(tmp_path, seed, bits):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
     options = Options(packings=(Packing(bits=bits),), keep_all=bits == 6)
     netlist, recordings = compile_network(expand(checkpoint, adjacency), options).netlist, events(2 + seed, samples=3)
-    found = verify(netlist, checkpoint, adjacency, recordings, LABELS[:3], FILES[:3], spec_samples=1).first_divergence
+    found = verify(
+        netlist, Factored(checkpoint, adjacency), recordings, LABELS[:3], FILES[:3], spec_samples=1
+    ).first_divergence
     reference = list(float_spikes(checkpoint, adjacency, recordings).values())
     chip, registers = by_specification(netlist, recordings)
     sample, step, layer, neuron = next(
@@ -151,7 +153,7 @@ def test_saturation_is_a_rung_of_its_own(tmp_path):
     recordings = np.zeros((1, 6, 2, 80), np.uint8)
     recordings[:, :, :, 30:] = 1
     netlist = compile_network(expand(checkpoint, adjacency)).netlist
-    found = verify(netlist, checkpoint, adjacency, recordings, LABELS[:1], FILES[:1])
+    found = verify(netlist, Factored(checkpoint, adjacency), recordings, LABELS[:1], FILES[:1])
     ladder = rungs(found)
     assert ladder["rounding"]["fc1"] < ladder["saturation"]["fc1"] == found.spikes["fc1"].different
     assert found.first_divergence.layer == "fc1"
@@ -170,7 +172,7 @@ def exact_network(folder):
 def test_no_divergence_at_all(tmp_path):
     checkpoint, adjacency = exact_network(tmp_path)
     netlist = compile_network(expand(checkpoint, adjacency)).netlist
-    found = verify(netlist, checkpoint, adjacency, events(2, steps=8), LABELS, FILES)
+    found = verify(netlist, Factored(checkpoint, adjacency), events(2, steps=8), LABELS, FILES)
     assert found.first_divergence is None
     assert all(layer.float == layer.chip > 0 for layer in found.spikes.values())
     assert all(set(different.values()) == {0} for different in rungs(found).values())
@@ -184,14 +186,14 @@ def test_ill_posed_spikes_are_told_from_faults(tmp_path):
     arrays["fc2.weight"][:, :2] = [1.0, 2.0**-25]
     checkpoint, adjacency = small_checkpoint(tmp_path, last=arrays, beta=0.0, theta=1.0)
     netlist = compile_network(expand(checkpoint, adjacency), Options(keep_all=True)).netlist
-    found = verify(netlist, checkpoint, adjacency, events(0), LABELS, FILES)
+    found = verify(netlist, Factored(checkpoint, adjacency), events(0), LABELS, FILES)
     assert found.spikes["fc2"].float == 0
     assert found.spikes["fc2"].ill_posed == 6 * STEPS * 8
     assert found.spikes["fc1"].ill_posed == 0
     assert rungs(found)["float64"] == {"conv1": 0, "fc1": 0, "fc2": 6 * STEPS * 8, "fc3": 0}
     # a finer chip would have sided with float64; this one stands for it
     finer = dataclasses.replace(netlist, threshold=read_only(netlist.threshold - (netlist.layer == 2)))
-    first = verify(finer, checkpoint, adjacency, events(0), LABELS, FILES).first_divergence
+    first = verify(finer, Factored(checkpoint, adjacency), events(0), LABELS, FILES).first_divergence
     assert (first.layer, first.step, first.neuron, first.ill_posed) == ("fc2", 0, 0, True)
 
 
@@ -212,9 +214,11 @@ def test_a_single_wrong_bit_is_found_out(small, monkeypatch, field):
                 getattr(trace.counts, field.removeprefix("counted "))[0, -1] += 1
         return trace
 
-    assert verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES, spec_samples=1).spec_equals_engine
+    assert verify(netlist, Factored(checkpoint, adjacency), events(2), LABELS, FILES, spec_samples=1).spec_equals_engine
     monkeypatch.setattr(engine, "simulate", wrong)
-    assert not verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES, spec_samples=1).spec_equals_engine
+    assert not verify(
+        netlist, Factored(checkpoint, adjacency), events(2), LABELS, FILES, spec_samples=1
+    ).spec_equals_engine
 
 
 def test_every_asked_for_recording_is_compared(small, monkeypatch):
@@ -228,7 +232,7 @@ def test_every_asked_for_recording_is_compared(small, monkeypatch):
     monkeypatch.setattr(spec, "simulate", watched)
     for asked, compared in ((4, 4), (9, 6)):
         seen.clear()
-        found = verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES, spec_samples=asked)
+        found = verify(netlist, Factored(checkpoint, adjacency), events(2), LABELS, FILES, spec_samples=asked)
         assert len(seen) == found.spec_samples == compared
         np.testing.assert_array_equal(seen[-1], events(2)[compared - 1].reshape(12, STEPS))
 

@@ -93,9 +93,7 @@ def test_layers_beside_each_other():
     network = module_network(net, torch.zeros(1, 4))
     assert [(p.pre, p.post) for p in network.projections] == [(-1, 0), (-1, 1), (0, 2), (1, 2)]
     events = events_of(network)
-    found = verify(
-        compile_module(net, torch.zeros(1, 4)).netlist, network, None, events, np.arange(3) % 2, tuple("abc")
-    )
+    found = verify(compile_module(net, torch.zeros(1, 4)).netlist, network, events, np.arange(3) % 2, tuple("abc"))
     assert found.spec_equals_engine
 
 

@@ -330,7 +330,7 @@ def test_unread_neurons_are_not_compared(tmp_path):
     compilation = compile_network(expand(changed, adjacency))
     netlist, labels = compilation.netlist, np.zeros(6, np.int64)
     assert netlist.layers[0].unread == (0, 1, 2)
-    verdict = verify(netlist, changed, adjacency, events(2), labels, tuple("abcdef"))
+    verdict = verify(netlist, Factored(changed, adjacency), events(2), labels, tuple("abcdef"))
     reference = run_float(compilation.network, channels_last(events(2))).spikes[0]
     assert reference[..., :3].any()
     assert verdict.spikes["conv1"].float == int(reference[..., 3:].sum())

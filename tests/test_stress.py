@@ -14,7 +14,7 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.towers import join
 from spikeloom.compiler.interpret import vote
-from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.models.graphs import NEUTOUCH, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime import cli
@@ -23,7 +23,7 @@ from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.trace import unpack
 from spikeloom.runtime.machines.votes import class_counts, readout_counts
 from spikeloom.runtime.report.encode import decode, encode
-from spikeloom.runtime.report.intervals import wilson
+from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.stress.bench import NAMES, Bench, by_length, distances, longer, warm_state, whole
 from spikeloom.runtime.studies.stress.pair import Pair, evaluate
 from spikeloom.runtime.studies.stress.perturbation import Sensor
@@ -89,7 +89,7 @@ def test_clean_recordings_are_what_reference_and_engine_say(bench):
         ids = bench.pair.netlist.compartments_of(layer)
         assert counted.layers[name][1] == trace.counts.spikes[:, ids].sum()
         assert counted.layers[name][3] == len(ids) * 8 * STEPS
-    known = bench.pair.netlist, bench.sensor.checkpoint, adjacency, bench.events, bench.labels, bench.files
+    known = bench.pair.netlist, Factored(bench.sensor.checkpoint, adjacency), bench.events, bench.labels, bench.files
     for name, spikes in verify(*known).spikes.items():
         assert counted.layers[name][:3] == (spikes.float, spikes.chip, spikes.different)
     equal = np.count_nonzero(vote(found.votes["chip"]) == vote(counts))

@@ -13,7 +13,7 @@ from test_dynamics import surrogate_spike
 from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float
-from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, Grid, in_order
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.graphs import NEUTOUCH, build_graph
@@ -248,7 +248,7 @@ def test_fine_tuned_on_the_chips_integers_they_are_the_chip(tmp_path, system):
     )
     again = read_checkpoint(tmp_path / "tuned.pt")
     netlist = compile_network(expand(again, seen), Options(forms=again.forms)).netlist
-    verdict = verify(netlist, again, seen, test.events[:4], test.labels[:4], test.files[:4])
+    verdict = verify(netlist, Factored(again, seen), test.events[:4], test.labels[:4], test.files[:4])
     assert verdict.quantised_different == 0
     assert verdict.spikes["fc1"].chip > 0
 

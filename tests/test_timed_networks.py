@@ -25,7 +25,7 @@ from spikeloom.compiler.fixedpoint import (
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.ir import Input
-from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.passes.prune import never_fires
 from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
@@ -176,7 +176,7 @@ def test_what_is_certain_is_so_in_both_precisions(folder, seed, alpha, beta):
     dynamics = Dynamics(betas=(0.2, beta, beta, beta), alphas=(0.0, alpha, alpha, alpha), clocks=TIMING.clocks)
     checkpoint, seen, network = float_network(folder, dynamics=dynamics, seed=seed)
     events = events_of(seed, samples=2, steps=30)
-    certainty = certain_spikes(checkpoint, seen, events)
+    certainty = certain_spikes(Factored(checkpoint, seen), events)
     runs = [list(float_spikes(checkpoint, seen, events, dtype=kind).values()) for kind in ("float32", "float64")]
     runs.append(list(run_float(network, channels_last(events, TIMING.clocks), dtype=np.float32).spikes))
     for layer, (sure, doubt) in enumerate(certainty):
@@ -192,7 +192,7 @@ def test_a_radius_covers_the_gathered_rounding():
     network = replace(network, populations=(replace(network.populations[0], alpha=0.95),))
     network = replace(network, input=Input(taxels=1, polarities=1))
     events = np.ones((1, 1, 1, 2000), np.uint8)  # the current climbs to 0.5, the threshold, and stays below
-    ((sure, doubt),) = certain_spikes(network, None, events)
+    ((sure, doubt),) = certain_spikes(network, events)
     assert not sure[0, :100].any()
     assert not doubt[0, :100].any()
     assert doubt[0, -1].all()
@@ -208,7 +208,7 @@ def test_the_decay_alone_is_a_rung_of_the_ladder(tmp_path):
         assert [p.realised_alpha for p in integer.populations[1:]] == [0.5] * 3
         events = events_of(21, samples=8, steps=200)
         netlist = compile_network(network).netlist
-        verdict = verify(netlist, checkpoint, seen, events, np.zeros(8, np.int64), ("r",) * 8, spec_samples=1)
+        verdict = verify(netlist, Factored(checkpoint, seen), events, np.zeros(8, np.int64), ("r",) * 8, spec_samples=1)
         different = {rung.stage: sum(rung.different.values()) for rung in verdict.ladder}
         moved.append(different["beta"] - different["float64"])
     assert moved[0] == 0

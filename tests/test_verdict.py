@@ -10,7 +10,7 @@ from made_files import CLASSES, events, small_checkpoint, weights
 
 from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
 from spikeloom.runtime.equivalence.verdict import (
     LayerSpikes,
@@ -166,7 +166,7 @@ def test_votes_that_decide_little(before, after, expected):
 def verified(folder, arrays, recordings, packing, **options):
     checkpoint, adjacency = small_checkpoint(folder, last=arrays)
     netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(packing,), **options)).netlist
-    made = verify(netlist, checkpoint, adjacency, recordings, LABELS, FILES)
+    made = verify(netlist, Factored(checkpoint, adjacency), recordings, LABELS, FILES)
     return {breakdown.kind: breakdown for breakdown in made.breakdowns}
 
 

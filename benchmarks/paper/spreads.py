@@ -13,7 +13,7 @@ from cells import PUBLISHED, RUNS, SAME_AS, Cell, Row
 from scipy.stats import f_oneway, spearmanr
 
 from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, TACTILESGNET
-from spikeloom.runtime.report.intervals import of_mean
+from spikeloom.runtime.report.numbers import of_mean
 
 PROTOCOLS = {
     "best": "best epoch on test (paper's protocol)",

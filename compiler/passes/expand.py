@@ -32,7 +32,7 @@ from spikeloom.compiler.systems import TACTILESGNET, TITLES, in_order
 from spikeloom.compiler.types import FloatArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Factored:
     """Trained weights and what their first layer sees, not yet written out as synapses."""
 

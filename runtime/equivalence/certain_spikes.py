@@ -20,10 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import BATCH, DENORMAL, channels_last
 from spikeloom.compiler.ir import INPUT, Network, Population
-from spikeloom.compiler.passes.expand import effective_weight, expand, stack_of
+from spikeloom.compiler.passes.expand import Factored, effective_weight, expand, stack_of
 from spikeloom.compiler.systems import TACTILESGNET, in_order
 from spikeloom.compiler.types import BoolArray, FloatArray
 
@@ -60,22 +59,22 @@ class _Layer:
     loops: int
 
 
-def _layers(model: Checkpoint | Network, adjacency: FloatArray | None) -> list[_Layer]:
+def _layers(model: Factored | Network) -> list[_Layer]:
     if isinstance(model, Network):
         return [_plain(model, post) for post in range(len(model.populations))]
-    assert adjacency is not None, "a checkpoint has a graph"
-    network = expand(model, adjacency)
+    checkpoint, adjacency = model.checkpoint, model.propagation
+    network = expand(checkpoint, adjacency)
     first, *others = (_plain(network, post) for post in range(len(network.populations)))
-    hops = model.hops.astype(np.float64)
+    hops = checkpoint.hops.astype(np.float64)
     # Hop after hop on its own, as the released operator does: its terms may cancel only after they were rounded.
-    spelled = in_order(model.system, effective_weight(stack_of(model, np.abs(adjacency)), np.abs(hops)))
+    spelled = in_order(checkpoint.system, effective_weight(stack_of(checkpoint, np.abs(adjacency)), np.abs(hops)))
     magnitude = first.magnitude.copy()
     neurons, channels = len(spelled), spelled[0].size  # the relays of clocks come after the neurons
     magnitude[:channels, :neurons] = spelled.reshape(neurons, channels).T
     # Of a graph the longest sum into a taxel, hop after hop; of a stack that into a place, filter after filter.
     gathered = int(np.count_nonzero(adjacency, axis=-1).max(initial=0)) + 1
     chain = len(hops) * gathered + hops.shape[2] * len(hops) + 1 + len(hops)
-    if model.system == TACTILESGNET:
+    if checkpoint.system == TACTILESGNET:
         chain = (len(hops) - 1) * gathered + hops.shape[2] + 1 + len(hops)
     return [
         replace(first, magnitude=magnitude, roundings=SPARE + chain, per_spike=False),
@@ -190,17 +189,17 @@ def _spikes(layer: _Layer, certain: BoolArray, doubt: BoolArray) -> tuple[BoolAr
     return fired, unsure
 
 
-def certain_spikes(
-    model: Checkpoint | Network, adjacency: FloatArray | None, events: npt.NDArray[np.uint8]
-) -> list[tuple[BoolArray, BoolArray]]:
+def certain_spikes(model: Factored | Network, events: npt.NDArray[np.uint8]) -> list[tuple[BoolArray, BoolArray]]:
     """Spikes of the float model that no order of summation can change, in float32 or finer.
 
     Of each layer two arrays (samples, steps, neurons) bool: entries that surely spike, and entries that may or may not.
-    All others surely do not. `events` is (samples, taxels, polarities, steps) uint8, `adjacency` the normalised
-    propagation matrix of a checkpoint; a network sums over its synapses.
+    All others surely do not. `events` is (samples, taxels, polarities, steps) uint8; a network sums over its
+    synapses.
     """
-    layers = _layers(model, adjacency)
-    inputs = channels_last(events, model.input.clocks if isinstance(model, Network) else model.dynamics.clocks)
+    layers = _layers(model)
+    inputs = channels_last(
+        events, model.input.clocks if isinstance(model, Network) else model.checkpoint.dynamics.clocks
+    )
 
     def batch(part: BoolArray) -> list[tuple[BoolArray, BoolArray]]:
         sent = {INPUT: (part, np.zeros_like(part))}

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import cut
 from spikeloom.compiler.ir import IntegerNetwork, Network
+from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.range_proof import prove_ranges
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.equivalence.certain_spikes import certain_spikes
 from spikeloom.runtime.machines.votes import readout_counts
 
@@ -72,8 +72,7 @@ def wins(decisions: IntArray, least: IntArray, most: IntArray) -> BoolArray:
 
 
 def certify(
-    model: Checkpoint | Network,
-    adjacency: FloatArray | None,
+    model: Factored | Network,
     integer: IntegerNetwork,
     events: npt.NDArray[np.uint8],
     chip: Sequence[BoolArray],
@@ -91,7 +90,7 @@ def certify(
     neurons = [slice(None)] * len(chip) if kept is None else kept
     float_model = [
         (cut(certain[..., part], lengths), cut(doubt[..., part], lengths))
-        for part, (certain, doubt) in zip(neurons, certain_spikes(model, adjacency, events), strict=True)
+        for part, (certain, doubt) in zip(neurons, certain_spikes(model, events), strict=True)
     ]
     steps = events.shape[3] * len(events) if lengths is None else int(lengths.sum())
     layers = {}

@@ -19,13 +19,12 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler import Netlist
-from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.interpret import channels_last, cut, run_float, run_integer
 from spikeloom.compiler.ir import IntegerNetwork, Network, Projection, Readout, Sparse
-from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
@@ -33,7 +32,7 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.votes import votes_by_step
 
 
-def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
+def require_match(netlist: Netlist, model: Factored | Network) -> None:
     """Refuse a netlist and a checkpoint or float network whose taxels, channels, timing or layers differ."""
     ours = {"taxels": netlist.taxels, "channels": netlist.polarities}
     ours |= _timing(netlist.clocks, netlist.bins) | {layer.name: layer.neurons for layer in netlist.layers}
@@ -42,8 +41,9 @@ def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
         theirs = {"taxels": model.input.taxels, "channels": model.input.polarities}
         theirs |= _timing(model.input.clocks, model.input.bins) | {p.name: p.size for p in model.populations}
     else:
-        theirs = {"taxels": model.taxels, "channels": model.hops.shape[2]}
-        theirs |= _timing(model.dynamics.clocks, model.bins) | model.neurons
+        checkpoint = model.checkpoint
+        theirs = {"taxels": checkpoint.taxels, "channels": checkpoint.hops.shape[2]}
+        theirs |= _timing(checkpoint.dynamics.clocks, checkpoint.bins) | checkpoint.neurons
     if ours != theirs:
         sizes = [", ".join(f"{name} {neurons}" for name, neurons in side.items()) for side in (ours, theirs)]
         raise ModelError(
@@ -57,38 +57,31 @@ def _timing(clocks: Clocks, bins: int) -> dict[str, int]:
     return found | ({"bins of a step": bins} if bins > 1 else {})
 
 
-def spikes_of(
-    model: Checkpoint | Network, adjacency: FloatArray | None, events: npt.NDArray[np.uint8], dtype: str
-) -> list[BoolArray]:
+def spikes_of(model: Factored | Network, events: npt.NDArray[np.uint8], dtype: str) -> list[BoolArray]:
     """Float spikes of each layer: of a checkpoint in its own operator order, of a network as sums over synapses."""
     from spikeloom.models.networks.reference import float_spikes  # torch, so only here
 
     if isinstance(model, Network):
         inputs = channels_last(events, model.input.clocks)
         return list(run_float(model, inputs, dtype=np.dtype(dtype)).spikes)
-    assert adjacency is not None, "a checkpoint has a graph"
-    return list(float_spikes(model, adjacency, events, dtype=dtype).values())
+    return list(float_spikes(model.checkpoint, model.propagation, events, dtype=dtype).values())
 
 
 PART = 16
 """Recordings whose float spikes are held at a time."""
 
 
-def votes_so_far(
-    readout: Readout, classes: int, model: Checkpoint | Network, adjacency: FloatArray | None, data: Recordings
-) -> IntArray:
+def votes_so_far(readout: Readout, classes: int, model: Factored | Network, data: Recordings) -> IntArray:
     """Votes of the float32 model after each step, (samples, steps, classes); a recording's stay from its end on."""
     lengths, votes = data.step_counts, []
     for first in range(0, len(data), PART):
         part = slice(first, first + PART)
-        spikes = spikes_of(model, adjacency, data.events[part], "float32")[readout.population]
+        spikes = spikes_of(model, data.events[part], "float32")[readout.population]
         votes.append(votes_by_step(readout, classes, cut(spikes, lengths[part])))
     return np.concatenate(votes)
 
 
-def membranes_of(
-    model: Checkpoint | Network, adjacency: FloatArray | None, events: npt.NDArray[np.uint8]
-) -> list[npt.NDArray[np.floating]]:
+def membranes_of(model: Factored | Network, events: npt.NDArray[np.uint8]) -> list[npt.NDArray[np.floating]]:
     """Membranes of each layer in float32, likewise."""
     from spikeloom.models.networks.reference import float_membranes  # torch, so only here
 
@@ -97,24 +90,20 @@ def membranes_of(
         kept = run_float(model, inputs, dtype=np.float32, membranes=True).membranes
         assert kept is not None, "membranes were wanted"
         return list(kept)
-    assert adjacency is not None, "a checkpoint has a graph"
-    return list(float_membranes(model, adjacency, events).values())
+    return list(float_membranes(model.checkpoint, model.propagation, events).values())
 
 
-def taxel_and_feature(model: Checkpoint | Network, layer: int, neuron: int) -> tuple[int, int] | tuple[None, None]:
+def taxel_and_feature(model: Factored | Network, layer: int, neuron: int) -> tuple[int, int] | tuple[None, None]:
     """Where a neuron of a graph convolution lies; others, and relays of clocks, lie nowhere."""
-    if layer or isinstance(model, Network) or model.system not in GRAPH_SYSTEMS:
+    if layer or isinstance(model, Network) or model.checkpoint.system not in GRAPH_SYSTEMS:
         return None, None
-    taxel, feature = divmod(neuron, model.hops.shape[1])
-    return (taxel, feature) if taxel < model.taxels else (None, None)
+    taxel, feature = divmod(neuron, model.checkpoint.hops.shape[1])
+    return (taxel, feature) if taxel < model.checkpoint.taxels else (None, None)
 
 
-def float_network(model: Checkpoint | Network, adjacency: FloatArray | None) -> Network:
+def float_network(model: Factored | Network) -> Network:
     """The float stage of a model."""
-    if isinstance(model, Network):
-        return model
-    assert adjacency is not None, "a checkpoint has a graph"
-    return expand(model, adjacency)
+    return model if isinstance(model, Network) else expand(model.checkpoint, model.propagation)
 
 
 LADDER = ("float64", "beta", "weights", "bias_threshold", "rounding", "saturation")

@@ -106,7 +106,6 @@ class Verdict:
     weights: Rounding
     first_divergence: Divergence | None
     ladder: tuple[Rung, ...]
-    same_checkpoint: bool
     quantised_different: int | None
     breakdowns: tuple[Breakdown, ...]
     not_compared: Mapping[str, int]
@@ -114,6 +113,7 @@ class Verdict:
     engine: str
     engine_different: int | None
     required: Mapping[str, float] = field(metadata=HIDDEN)
+    same_checkpoint: bool = True
     explained_cost: tuple[Part, ...] | None = field(default=None, metadata=OPTIONAL)
 
     json_properties = ("samples", "accuracy", "decision_agreement", "levels", "missed")

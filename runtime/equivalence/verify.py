@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler import Netlist
-from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.interpret import channels_last, cut, vote
 from spikeloom.compiler.ir import Network
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.compiler.passes.expand import Factored
+from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
 from spikeloom.runtime.equivalence.certificates import certify
 from spikeloom.runtime.equivalence.reference import (
@@ -35,25 +35,15 @@ from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_o
 from spikeloom.runtime.machines.votes import readout_counts
 
 
-def _compiled_from(netlist: Netlist, checkpoint: Checkpoint | Network, sha256: str | None) -> bool:
-    """Whether a netlist says that it was compiled from this file, and this epoch."""
-    made = netlist.provenance
-    if isinstance(checkpoint, Network):
-        return made.get("checkpoint_sha256") == sha256
-    return made.get("checkpoint_sha256") == checkpoint.sha256 and made.get("weights") == checkpoint.weights
-
-
 def verify(
     netlist: Netlist,
-    checkpoint: Checkpoint | Network,
-    adjacency: FloatArray | None,
+    source: Factored | Network,
     events: npt.NDArray[np.uint8],
     labels: IntArray,
     files: tuple[str, ...],
     *,
     lengths: IntArray | None = None,
-    original: Checkpoint | Network | None = None,
-    sha256: str | None = None,
+    original: Factored | Network | None = None,
     spec_samples: int = 3,
     engine_name: str = ENGINES[0],
     required: Mapping[str, float] | None = None,
@@ -63,14 +53,12 @@ def verify(
 
     Parameters
     ----------
-    checkpoint : Checkpoint or Network
-        What the netlist was compiled from, or another of the same architecture; `sha256` is that of a network's file.
-    adjacency : (taxels, taxels) float64, or None
-        Normalised propagation matrix of a checkpoint's graph.
+    source : Factored or Network
+        What the netlist was compiled from, a checkpoint on its graph or a network, or another of the same architecture.
     events, labels, files, lengths
         Recordings (samples, taxels, polarities, steps) uint8, their classes, names, and steps that count.
-    original : Checkpoint or Network, optional
-        Float model to compare with; by default the weights of `checkpoint` itself.
+    original : Factored or Network, optional
+        Float model to compare with; by default `source` itself.
     spec_samples, engine_name
         Recordings on which the specification runs beside the engine; which of ``ENGINES`` runs, too.
     required : mapping of level to share, optional
@@ -87,15 +75,15 @@ def verify(
     if not 1 <= spec_samples:
         raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")
     begin = progress or (lambda _part: None)
-    model = checkpoint if original is None else original
-    require_match(netlist, checkpoint)
+    model = source if original is None else original
+    require_match(netlist, source)
     require_match(netlist, model)
     machine = integer_machine_of(netlist)
-    network, integer, names = float_network(model, adjacency), machine.integer, machine.layers
+    network, integer, names = float_network(model), machine.integer, machine.layers
     machine.require_sensor(events)
     machine.require_engine(engine_name)
-    tuned = isinstance(checkpoint, Checkpoint) and checkpoint.forms is not None
-    origin = network if original is None else float_network(checkpoint, adjacency)
+    tuned = isinstance(source, Factored) and source.checkpoint.forms is not None
+    origin = network if original is None else float_network(source)
     weights = check_rounding(machine, origin, fine_tuned=tuned)
     kept = machine.compared()
 
@@ -103,9 +91,9 @@ def verify(
         return [cut(spikes, lengths)[..., keep] for spikes, keep in zip(layers, kept, strict=True)]
 
     begin("float32 reference")
-    reference = compared(spikes_of(model, adjacency, events, "float32"))
+    reference = compared(spikes_of(model, events, "float32"))
     begin("float64 beside it")
-    wide = compared(spikes_of(model, adjacency, events, "float64"))
+    wide = compared(spikes_of(model, events, "float64"))
 
     begin("chip")
     ran = machine.run(events, lengths=lengths, spikes=True)
@@ -113,12 +101,11 @@ def verify(
     chip = [ran.spikes[name][..., keep] for name, keep in zip(names, kept, strict=True)]
 
     quantised_different = None
-    if isinstance(checkpoint, Checkpoint) and tuned:
+    if isinstance(source, Factored) and tuned:
         begin("fine-tuned model")
         from spikeloom.models.networks.quantised import quantised_spikes  # torch, so only here
 
-        assert adjacency is not None, "a checkpoint has a graph"
-        torch_spikes = [*quantised_spikes(checkpoint, adjacency, events).values()]
+        torch_spikes = [*quantised_spikes(source.checkpoint, source.propagation, events).values()]
         pairs = zip(compared(torch_spikes), chip, strict=True)
         quantised_different = sum(int(np.count_nonzero(a != b)) for a, b in pairs)
 
@@ -137,11 +124,11 @@ def verify(
     ladder.append(rung("saturation", chip))
 
     begin("first divergence")
-    divergence = _first_divergence(machine, model, adjacency, reference, chip, wide, events, files)
+    divergence = _first_divergence(machine, model, reference, chip, wide, events, files)
     float_counts = readout_counts(network.readout, network.classes, reference[network.readout.population])
     neurons = [np.arange(each.size)[keep] for each, keep in zip(integer.populations, kept, strict=True)]
     begin("certificate")
-    certificate = certify(model, adjacency, integer, events, chip, ran.decisions, kept=kept, lengths=lengths)
+    certificate = certify(model, integer, events, chip, ran.decisions, kept=kept, lengths=lengths)
     return Verdict(
         files=files,
         labels=labels,
@@ -163,7 +150,6 @@ def verify(
         weights=weights,
         first_divergence=divergence,
         ladder=tuple(ladder),
-        same_checkpoint=_compiled_from(netlist, checkpoint, sha256),
         quantised_different=quantised_different,
         breakdowns=breakdowns(names, reference, chip, neurons, (float_counts, ran.votes), files),
         not_compared={name: int(out.sum()) for name, out in zip(names, machine.unread, strict=True) if out.any()},
@@ -176,8 +162,7 @@ def verify(
 
 def _first_divergence(
     machine: IntegerMachine,
-    model: Checkpoint | Network,
-    adjacency: FloatArray | None,
+    model: Factored | Network,
     reference: list[BoolArray],
     chip: list[BoolArray],
     wide: list[BoolArray],
@@ -216,7 +201,7 @@ def _first_divergence(
         neuron=neuron,
         taxel=taxel,
         feature=feature,
-        float_membrane=float(membranes_of(model, adjacency, recording)[index][0, step, neuron]),
+        float_membrane=float(membranes_of(model, recording)[index][0, step, neuron]),
         chip_membrane=register / (scale * (1 << MEMBRANE_SHIFT)),
         chip_register=register,
         theta=layer.theta,

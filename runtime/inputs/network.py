@@ -70,16 +70,11 @@ class LoadedNetwork:
         return None
 
     @property
-    def source(self) -> Factored | Network:
-        """What the compiler starts from: the checkpoint on its graph where there is one."""
+    def model(self) -> Factored | Network:
+        """What is compiled, and run in its own operator order: the checkpoint on its graph where there is one."""
         if self.checkpoint is None or self.adjacency is None:
             return self.network
-        return Factored(checkpoint=self.checkpoint, propagation=self.adjacency)
-
-    @property
-    def model(self) -> Checkpoint | Network:
-        """What float spikes are computed from: the checkpoint in its own operator order where there is one."""
-        return self.network if self.checkpoint is None else self.checkpoint
+        return Factored(self.checkpoint, self.adjacency)
 
 
 def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Netlist | None = None) -> LoadedNetwork:

@@ -119,7 +119,7 @@ def recording(machine: IntegerMachine, loaded: LoadedNetwork, data: Recordings, 
     run = machine.run(events, spikes=True, membranes=True)
     assert run.spikes is not None, "spikes were wanted"
     assert run.membranes is not None, "membranes were wanted"
-    sent = spikes_of(loaded.model, loaded.adjacency, events, "float32")
+    sent = spikes_of(loaded.model, events, "float32")
     ours = [spikes[0] & ~unread for spikes, unread in zip(sent, machine.unread, strict=True)]
     chip = [spikes[0] & ~unread for spikes, unread in zip(run.spikes.values(), machine.unread, strict=True)]
     readout = loaded.network.readout
@@ -146,7 +146,7 @@ def recording(machine: IntegerMachine, loaded: LoadedNetwork, data: Recordings, 
             machine,
             loaded,
             (ours, chip),
-            [membranes[0] for membranes in membranes_of(loaded.model, loaded.adjacency, events)],
+            [membranes[0] for membranes in membranes_of(loaded.model, events)],
             [
                 registers[0] / (population.scale * (1 << MEMBRANE_SHIFT))
                 for population, registers in zip(machine.integer.populations, run.membranes.values(), strict=True)

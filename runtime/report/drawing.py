@@ -10,14 +10,13 @@ import io
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial, wraps
+from functools import wraps
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec
 
 import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.types import JsonObject
-from spikeloom.runtime.report import sections
 from spikeloom.runtime.report.numbers import counted, si
 
 if TYPE_CHECKING:
@@ -126,7 +125,7 @@ def sheet(title: str, height: float, *, width: float = WIDTH) -> Drawing:
     return Drawing(Figure(figsize=(width, height), layout="constrained"), title)
 
 
-def _scale(axes: Any, unit: str) -> None:
+def scale(axes: Any, unit: str) -> None:
     """Numbers of an axis with SI prefixes; letters for thousands and millions without a unit."""
     axes.set_major_formatter(lambda value, _: si(value, unit) if unit else counted(value))
 
@@ -154,15 +153,6 @@ def bars(title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str],
     if len(series) > 1:
         drawing.figure.legend(loc="outside upper left", ncols=len(series))
     return drawing
-
-
-def bar_figure(
-    name: str, title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str], unit: str, caption: str
-) -> sections.Figure:
-    """Bars for a page, with their numbers as a table."""
-    cells = [[label, *(si(value, unit) for value in values)] for label, values in rows.items()]
-    numbers = [sections.Table(["", *series], cells, title, most=0)]
-    return sections.Figure(name, partial(bars, title, rows, series, unit), f"{title}. {caption}", numbers)
 
 
 @styled
@@ -226,147 +216,4 @@ def raster(
     axes.set_yticks(shown, [str(neurons[index]) for index in shown], fontsize=7)
     axes.set(xlabel="step", ylabel=kind)
     drawing.figure.legend(loc="outside upper left", ncols=3)
-    return drawing
-
-
-# -- accuracy over a cost ----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Mark:
-    """A point of a scatter plot; one with a name has a ring, and its interval of y.
-
-    `weight`, up to 1, is for its size; values are positive, since the axis is logarithmic.
-    """
-
-    x: float
-    y: float
-    series: str
-    tip: str
-    weight: float = 1.0
-    name: str = ""
-    interval: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Scatter:
-    """One panel: marks, the stairs of a front, a level with its name, and the horizontal axis with its unit."""
-
-    marks: Sequence[Mark]
-    front: Sequence[tuple[float, float]]
-    level: tuple[float, str]
-    axis: str
-    unit: str
-
-
-@styled
-def scatters(title: str, panels: Sequence[Scatter], label: str, *, across: int = 1) -> Drawing:
-    """Marks over logarithmic axes, a panel for each; colours and shapes are for series."""
-    down = -(-len(panels) // across)
-    drawing = sheet(title, 4.5 * down, width=WIDTH if across == 1 else 7.2 * across)
-    rows = drawing.figure.subplots(down, across, squeeze=False, sharey=True)
-    for axes, panel in zip(rows.flat, panels, strict=False):
-        _scatter(drawing, axes, panel)
-    for axes in rows.flat[len(panels) :]:
-        axes.set_visible(False)
-    for row in rows:
-        row[0].set_ylabel(label)
-    handles, names = rows.flat[0].get_legend_handles_labels()
-    drawing.figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 6), fontsize=8)
-    if across > 1:
-        drawing.figure.suptitle(title, fontsize=10)
-    return drawing
-
-
-def _scatter(drawing: Drawing, axes: Axes, panel: Scatter) -> None:
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    for index, series in enumerate(dict.fromkeys(mark.series for mark in panel.marks)):
-        own = [mark for mark in panel.marks if mark.series == series]
-        colour, hollow = COLOURS[index % len(COLOURS)], index // len(COLOURS) % 2 == 1
-        axes.scatter(
-            [mark.x for mark in own],
-            [mark.y for mark in own],
-            s=[14 + 30 * mark.weight for mark in own],
-            marker=MARKERS[index % len(MARKERS)],
-            facecolors="none" if hollow else colour,
-            edgecolors=colour,
-            linewidths=0.9,
-            label=series,
-            zorder=3,
-        )
-    if len(panel.front) > 1:
-        x, y = zip(*panel.front, strict=True)
-        axes.step(x, y, where="post", color=GREY, lw=1.0, ls=(0, (5, 2)), label="front on the test split", zorder=2)
-    axes.axhline(panel.level[0], color=GREY, lw=0.9, ls=":", label=panel.level[1], zorder=1)
-    named = [mark for mark in panel.marks if mark.interval is not None]
-    for place, mark in enumerate(named):
-        low, high = mark.interval or (mark.y, mark.y)
-        axes.plot([mark.x, mark.x], [low, high], color=GREY, lw=1.0, zorder=2)
-        axes.plot(mark.x, mark.y, "o", ms=12, mfc="none", mec=GREY, mew=1.4, zorder=4)
-        # in turn above and below the interval, where there are no marks
-        at, shift = (low, -11) if place % 2 else (high, 4)
-        offset: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontweight": "bold"}
-        axes.annotate(mark.name, (mark.x, at), (0, shift), fontsize=8, zorder=5, **offset)
-    drawing.tips += [(axes, m.x, m.y, m.tip) for m in sorted(panel.marks, key=lambda mark: mark.x)]
-    axes.set_xscale("log")
-    axes.set_xlabel(panel.axis)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    _scale(axes.xaxis, panel.unit)
-    axes.grid(True)
-    axes.margins(0.06, 0.08)
-
-
-# -- curves with intervals ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Curves:
-    """One panel of curves of float model and chip in per cent over named levels."""
-
-    title: str
-    axis: str
-    levels: Sequence[str]
-    # ``float`` and ``chip``: low end, mean and high end at each level
-    sides: Mapping[str, Sequence[tuple[float, float, float]]]
-    leaves: Mapping[str, int | None]  # Level at which a side leaves the grey band
-    band: tuple[float, float]  # (float, float)
-    chance: float
-
-
-LOOKS: Mapping[str, tuple[str, str, Any]] = {"float": (FLOAT, "s", (0, (5, 2))), "chip": (CHIP, "o", "-")}
-"""Colour, marker and dash of a side."""
-
-
-@styled
-def curves(title: str, panels: Sequence[Curves], *, across: int = 3, names: int = 6) -> Drawing:
-    """Panels of curves with intervals; at most so many `names` of levels below each."""
-    across = max(min(across, len(panels)), 1)
-    down = max(-(-len(panels) // across), 1)
-    drawing = sheet(title, 2.3 * down + 0.4, width=max(WIDTH, 3.2 * across))
-    rows = drawing.figure.subplots(down, across, squeeze=False, sharey=True)
-    for axes in rows.flat[len(panels) :]:
-        axes.set_visible(False)
-    for axes, panel in zip(rows.flat, panels, strict=False):
-        axes.axhspan(*panel.band, color=GREY, alpha=0.2, lw=0)
-        axes.axhline(panel.chance, color=GREY, ls=":", lw=1)
-        for side, shift in (("float", -0.07), ("chip", 0.07)):
-            colour, marker, dash = LOOKS[side]
-            low, mean, high = np.array(panel.sides[side]).T
-            at = np.arange(len(panel.levels)) + shift
-            reach = np.maximum([mean - low, high - mean], 0)
-            look = {"color": colour, "marker": marker, "ls": dash, "ms": 3.5, "lw": 1.3, "elinewidth": 1, "capsize": 2}
-            axes.errorbar(at, mean, yerr=reach, label="float model" if side == "float" else side, **look)
-            leaves = panel.leaves[side]
-            if leaves is not None:
-                axes.axvline(leaves + 2 * shift, color=colour, ls=dash, lw=1, alpha=0.6)
-            for x, level, (a, b, c) in zip(at, panel.levels, panel.sides[side], strict=True):
-                drawing.tips.append((axes, x, b, f"{panel.title}; {level}, {side}: {b:.1f} % ({a:.1f} … {c:.1f})"))
-        every = -(-len(panel.levels) // names)
-        axes.set_xticks(range(0, len(panel.levels), every), panel.levels[::every], fontsize=7)
-        axes.set(xlim=(-0.5, len(panel.levels) - 0.5), ylim=(-3, 103), title=panel.title, xlabel=panel.axis)
-        axes.grid(axis="y")
-    handles, labels = rows.flat[0].get_legend_handles_labels()
-    drawing.figure.legend(handles, labels, loc="outside upper left", ncols=2)
     return drawing

@@ -133,7 +133,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             sys.stderr.write(done.text())
 
     compilation = compile_network(
-        asked.source,
+        asked.model,
         replace(
             options,
             forms=None if checkpoint is None else checkpoint.forms,

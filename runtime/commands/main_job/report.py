@@ -84,11 +84,9 @@ def _report(
     verdict = verify(
         netlist,
         loaded.model,
-        loaded.adjacency,
         data.events,
         data.labels,
         data.files,
-        sha256=loaded.sha256,
         spec_samples=arguments.spec_samples,
         lengths=data.lengths,
         required={"E0": 1.0},

@@ -71,12 +71,10 @@ def run(arguments: argparse.Namespace) -> Outcome:
     verdict = verify(
         netlist,
         loaded.model,
-        loaded.adjacency,
         data.events,
         data.labels,
         data.files,
         original=None if original is None else original.model,
-        sha256=loaded.sha256,
         spec_samples=arguments.spec_samples,
         engine_name=arguments.engine,
         lengths=data.lengths,
@@ -85,5 +83,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
     )
     if (difference := loaded.differs_from(netlist.provenance, arguments.run)) is not None:
         sys.stderr.write(f"spikeloom: warning: {arguments.netlist}: {difference}\n")
-    verdict = replace(verdict, explained_cost=account.explained(arguments.explain_cost))
+    explained = account.explained(arguments.explain_cost)
+    verdict = replace(verdict, same_checkpoint=difference is None, explained_cost=explained)
     return Outcome(verdict, sections, 1 if verdict.missed else 0)

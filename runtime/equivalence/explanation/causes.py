@@ -16,10 +16,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.interpret import Activity, run_float, step_late
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
+from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.types import BoolArray, FloatArray
 from spikeloom.runtime.equivalence.explanation.replay import (
     LEFT_OUT,
@@ -58,7 +58,7 @@ def explain(
     events: BoolArray,
     observed: Activity,
     *,
-    model: Checkpoint | Network | None = None,
+    model: Factored | Network | None = None,
     rounding: Rounding | None = None,
     absent: Sequence[BoolArray] | None = None,
     unread: Sequence[BoolArray] | None = None,
@@ -130,7 +130,7 @@ def _name_causes(
     ideal: Activity,
     observed: Activity,
     *,
-    model: Checkpoint | Network,
+    model: Factored | Network,
     absent: BoolArray,
     pruned: bool,
     compensated: bool,

@@ -72,7 +72,7 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
         source, origin = network.network, provenance(network)
     else:
         loaded = load_network(path, arguments)
-        source, origin = loaded.source, {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256}
+        source, origin = loaded.model, {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256}
         origin |= loaded.origin(arguments.run) | {"in_time": arguments.in_time}
     progress("compiling")
 

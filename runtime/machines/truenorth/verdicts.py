@@ -17,7 +17,7 @@ from spikeloom.runtime.machines.truenorth.machine import machine_of
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import OPTIONAL, key
-from spikeloom.runtime.report.intervals import wilson
+from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.sections import Section, Table, Text
 
 

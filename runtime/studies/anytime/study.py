@@ -11,7 +11,7 @@ from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL, key
-from spikeloom.runtime.report.intervals import wilson
+from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.anytime import exits
 
 WINDOWS = tuple(range(5, 101, 5))

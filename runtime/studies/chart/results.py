@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from spikeloom.runtime.report.encode import key
-from spikeloom.runtime.report.intervals import wilson
+from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.work import FORMAT
 

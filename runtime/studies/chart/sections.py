@@ -8,17 +8,22 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from spikeloom.compiler.files import write_atomically
 from spikeloom.models.recordings.counts import number
-from spikeloom.runtime.report import drawing, html
-from spikeloom.runtime.report.drawing import Drawing, Mark, Scatter
+from spikeloom.runtime.report import html
+from spikeloom.runtime.report.drawing import COLOURS, GREY, WIDTH, Drawing, scale, sheet, styled
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Section, Table, Text
 from spikeloom.runtime.studies.chart.choices import UNITS
 from spikeloom.runtime.studies.chart.results import Axis, Chart, ChosenBy, Point, axes, by_chip, price
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MARKERS = ("o", "s", "^", "D", "v", "P", "<", ">")
 
 NAMES = {
     "cheapest": "cheapest within one sample of float",
@@ -89,11 +94,23 @@ def taken(chart: Chart) -> list[Block]:
     ]
 
 
+@styled
 def panels(chart: Chart, names: Sequence[str], title: str, *, across: int = 1) -> Drawing:
-    """Figures of a chart as one drawing."""
-    costs = axes(chart)
-    label = "test accuracy on the chip (%)"
-    return drawing.scatters(title, [_scatter(chart, name, costs[name]) for name in names], label, across=across)
+    """Accuracy over some costs, a panel for each; colours and shapes are for series."""
+    costs, down = axes(chart), -(-len(names) // across)
+    drawing = sheet(title, 4.5 * down, width=WIDTH if across == 1 else 7.2 * across)
+    rows = drawing.figure.subplots(down, across, squeeze=False, sharey=True)
+    for panel, name in zip(rows.flat, names, strict=False):
+        _scatter(drawing, panel, chart, name, costs[name])
+    for panel in rows.flat[len(names) :]:
+        panel.set_visible(False)
+    for row in rows:
+        row[0].set_ylabel("test accuracy on the chip (%)")
+    handles, series = rows.flat[0].get_legend_handles_labels()
+    drawing.figure.legend(handles, series, loc="outside lower center", ncols=min(len(series), 6), fontsize=8)
+    if across > 1:
+        drawing.figure.suptitle(title, fontsize=10)
+    return drawing
 
 
 def picture(chart: Chart) -> Drawing:
@@ -115,28 +132,61 @@ def series_of(points: Sequence[Point]) -> str:
     return next((name for name in names if len({getattr(point, name) for point in points}) > 1), "network")
 
 
-def _scatter(chart: Chart, name: str, axis: Axis) -> Scatter:
+def _scatter(drawing: Drawing, panel: Axes, chart: Chart, name: str, axis: Axis) -> None:
+    """Points, the stairs of the front, the float model's level; rings and intervals around recommended points."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     points = [point for point in chart.points if axis.value(point) > 0]
     series = series_of(chart.points)
+
+    def place(point: Point) -> tuple[float, float]:
+        return axis.value(point), 100 * point.test.accuracy
+
+    for index, value in enumerate(dict.fromkeys(str(getattr(point, series)) for point in points)):
+        members = [point for point in points if str(getattr(point, series)) == value]
+        colour, hollow = COLOURS[index % len(COLOURS)], index // len(COLOURS) % 2 == 1
+        panel.scatter(
+            [axis.value(point) for point in members],
+            [100 * point.test.accuracy for point in members],
+            s=[14 + 30 * point.window / 100 for point in members],
+            marker=MARKERS[index % len(MARKERS)],
+            facecolors="none" if hollow else colour,
+            edgecolors=colour,
+            linewidths=0.9,
+            label=value,
+            zorder=3,
+        )
+    front = sorted(place(point) for point in points if point.front.get(name))
+    if len(front) > 1:
+        panel.step(
+            *zip(*front, strict=True),
+            where="post",
+            color=GREY,
+            lw=1.0,
+            ls=(0, (5, 2)),
+            label="front on the test split",
+            zorder=2,
+        )
     network = max(by_chip(chart.networks, chart.target)[0], key=lambda each: each.expected)
-    return Scatter(
-        marks=[
-            Mark(
-                x=axis.value(point),
-                y=100 * point.test.accuracy,
-                series=str(getattr(point, series)),
-                tip=_tip(chart, point),
-                weight=point.window / 100,
-                name=f"#{point.number} {', '.join(chart.taken.get(point.number, []))}",
-                interval=(100 * point.test.low, 100 * point.test.high) if point.number in chart.taken else None,
-            )
-            for point in points
-        ],
-        front=sorted((axis.value(point), 100 * point.test.accuracy) for point in points if point.front.get(name)),
-        level=(100 * network.whole.accuracy, f"float model of {network.name}"),
-        axis=axis.words,
-        unit=axis.unit,
-    )
+    level = f"float model of {network.name}"
+    panel.axhline(100 * network.whole.accuracy, color=GREY, lw=0.9, ls=":", label=level, zorder=1)
+    for index, point in enumerate(point for point in points if point.number in chart.taken):
+        (x, y), low, high = place(point), 100 * point.test.low, 100 * point.test.high
+        panel.plot([x, x], [low, high], color=GREY, lw=1.0, zorder=2)
+        panel.plot(x, y, "o", ms=12, mfc="none", mec=GREY, mew=1.4, zorder=4)
+        # in turn above and below the interval, where there are no marks
+        at, shift = (low, -11) if index % 2 else (high, 4)
+        words = f"#{point.number} {', '.join(chart.taken[point.number])}"
+        offset: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontweight": "bold"}
+        panel.annotate(words, (x, at), (0, shift), fontsize=8, zorder=5, **offset)
+    drawing.tips += [(panel, *place(point), _tip(chart, point)) for point in sorted(points, key=axis.value)]
+    panel.set_xscale("log")
+    panel.set_xlabel(axis.words)
+    panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    panel.xaxis.set_minor_formatter(NullFormatter())
+    scale(panel.xaxis, axis.unit)
+    panel.grid(True)
+    panel.margins(0.06, 0.08)
 
 
 def _tip(chart: Chart, point: Point) -> str:

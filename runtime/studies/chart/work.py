@@ -253,7 +253,7 @@ def _decide(work: Decide) -> Decisions:
     readout, classes = loaded.network.readout, loaded.network.classes
     decided = {}
     for split, data in _in_steps(work.data, loaded.network.input.taxels, classes, loaded.network.input.bins).items():
-        votes, steps = votes_so_far(readout, classes, loaded.model, loaded.adjacency, data), data.step_counts
+        votes, steps = votes_so_far(readout, classes, loaded.model, data), data.step_counts
         seen = {window: votes[np.arange(len(data)), steps_of(steps, window) - 1] for window in windows}
         decided[split] = {str(window): tuple(vote(each).tolist()) for window, each in seen.items()}
     return decided
@@ -279,7 +279,7 @@ def _build(work: Build) -> dict[str, Built]:
     training = _in_steps(work.data, sensor.taxels, network.network.classes, sensor.bins)["train"]
     try:
         stored = to_integers(
-            network.source,
+            network.model,
             Options(
                 forms=None if network.checkpoint is None else network.checkpoint.forms,
                 packings=parse_packings(some),

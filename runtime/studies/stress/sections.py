@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
-from spikeloom.runtime.report import drawing
-from spikeloom.runtime.report.intervals import wilson
-from spikeloom.runtime.report.numbers import percent
+import numpy as np
+
+from spikeloom.runtime.report.drawing import CHIP, FLOAT, GREY, WIDTH, Drawing, sheet, styled
+from spikeloom.runtime.report.numbers import percent, wilson
 from spikeloom.runtime.report.sections import Figure, Section, Table, Text
 from spikeloom.runtime.studies.stress.pair import SIDES
 from spikeloom.runtime.studies.stress.results import Curve, Point, Spread, Stress, shown
 
 NONE = "–"
+
+LOOKS: dict[str, tuple[str, str, Any, float]] = {
+    "float": (FLOAT, "s", (0, (5, 2)), -0.07),
+    "chip": (CHIP, "o", "-", 0.07),
+}
+"""Colour, marker, dash and shift of a side."""
+
+NAMED = 6
+"""Levels that are named below a panel, at most."""
 
 KEY = (
     "leaves: first level below the clean interval; chance: first level no better than chance; least: fewest decisions "
@@ -56,10 +67,46 @@ def stability(result: Stress) -> list[Section]:
     ]
 
 
-def figure(result: Stress, title: str = "", *, across: int = 3) -> drawing.Drawing:
-    """A panel for each perturbation."""
-    panels = [_panel(result, name, each) for name, each in result.perturbations.items()]
-    return drawing.curves(title, panels, across=across)
+@styled
+def figure(result: Stress, title: str = "", *, across: int = 3) -> Drawing:
+    """A panel for each perturbation: accuracies of both sides in per cent over its levels, with their intervals."""
+    panels = result.perturbations.items()
+    across = max(min(across, len(panels)), 1)
+    down = max(-(-len(panels) // across), 1)
+    drawing = sheet(title, 2.3 * down + 0.4, width=max(WIDTH, 3.2 * across))
+    rows = drawing.figure.subplots(down, across, squeeze=False, sharey=True)
+    for axes in rows.flat[len(panels) :]:
+        axes.set_visible(False)
+    low, high = wilson(result.clean.right["chip"], result.recordings)
+    for axes, (name, curve) in zip(rows.flat, panels, strict=False):
+        axes.axhspan(100 * low, 100 * high, color=GREY, alpha=0.2, lw=0)
+        axes.axhline(100 / result.classes, color=GREY, ls=":", lw=1)
+        for side in SIDES:
+            _curve(drawing, axes, name, curve, side)
+        every = -(-len(curve.levels) // NAMED)
+        axes.set_xticks(range(0, len(curve.levels), every), list(map(_level, curve.levels))[::every], fontsize=7)
+        axes.set(xlim=(-0.5, len(curve.levels) - 0.5), ylim=(-3, 103), title=_heading(name, curve), xlabel=curve.unit)
+        axes.grid(axis="y")
+    handles, labels = rows.flat[0].get_legend_handles_labels()
+    drawing.figure.legend(handles, labels, loc="outside upper left", ncols=2)
+    return drawing
+
+
+def _curve(drawing: Drawing, axes: Any, name: str, curve: Curve, side: str) -> None:
+    """Accuracy of a side, and a line where it leaves the clean interval."""
+    colour, marker, dash, shift = LOOKS[side]
+    spreads = [point.spread(side) for point in curve.levels]
+    low, mean, high = 100 * np.array([(spread.low, spread.mean, spread.high) for spread in spreads]).T
+    at = np.arange(len(spreads)) + shift
+    reach = np.maximum([mean - low, high - mean], 0)
+    look = {"color": colour, "marker": marker, "ls": dash, "ms": 3.5, "lw": 1.3, "elinewidth": 1, "capsize": 2}
+    axes.errorbar(at, mean, yerr=reach, label="float model" if side == "float" else side, **look)
+    order = [point.level for point in curve.levels]
+    if (leaves := curve.breaks[side].leaves) is not None:
+        axes.axvline(order.index(leaves) + 2 * shift, color=colour, ls=dash, lw=1, alpha=0.6)
+    for x, point, a, b, c in zip(at, curve.levels, low, mean, high, strict=True):
+        tip = f"{_heading(name, curve)}; {_level(point)}, {side}: {b:.1f} % ({a:.1f} … {c:.1f})"
+        drawing.tips.append((axes, x, b, tip))
 
 
 def picture(result: Stress) -> bytes:
@@ -103,6 +150,10 @@ def _title(name: str, curve: Curve) -> str:
     return f"{name}: {curve.what} ({curve.unit})"
 
 
+def _heading(name: str, curve: Curve) -> str:
+    return f"{name}: {curve.verdict}"
+
+
 def _level(point: Point) -> str:
     return shown(point.level)
 
@@ -122,19 +173,3 @@ def _accuracy(spread: Spread) -> str:
     if len(spread.values) == 1:
         return mean
     return f"{mean}±{100 * max(spread.high - spread.mean, spread.mean - spread.low):.0f}"
-
-
-def _panel(result: Stress, name: str, curve: Curve) -> drawing.Curves:
-    low, high = wilson(result.clean.right["chip"], result.recordings)
-    order = [point.level for point in curve.levels]
-    ends = {side: [point.spread(side) for point in curve.levels] for side in SIDES}
-    leaves = {side: curve.breaks[side].leaves for side in SIDES}
-    return drawing.Curves(
-        title=f"{name}: {curve.verdict}",
-        axis=curve.unit,
-        levels=[_level(point) for point in curve.levels],
-        sides={side: [(100 * e.low, 100 * e.mean, 100 * e.high) for e in each] for side, each in ends.items()},
-        leaves={side: None if place is None else order.index(place) for side, place in leaves.items()},
-        band=(100 * low, 100 * high),
-        chance=100 / result.classes,
-    )

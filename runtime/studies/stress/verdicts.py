@@ -16,7 +16,7 @@ from statistics import fmean
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.equivalence.breakdowns import OFTEN
-from spikeloom.runtime.report.intervals import of_mean, wilson
+from spikeloom.runtime.report.numbers import of_mean, wilson
 from spikeloom.runtime.studies.stress.bench import NAMES
 from spikeloom.runtime.studies.stress.pair import SIDES
 from spikeloom.runtime.studies.stress.perturbation import Level

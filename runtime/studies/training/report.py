@@ -14,7 +14,7 @@ from spikeloom.compiler.types import IntArray
 from spikeloom.models.training.recipes import MSE
 from spikeloom.models.training.record import Reached, TrainingRecord
 from spikeloom.runtime.report.drawing import COLOURS, Drawing, sheet, styled
-from spikeloom.runtime.report.intervals import wilson
+from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.sections import Section, Table, Text
 
 TITLES = {

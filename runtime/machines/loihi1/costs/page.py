@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from functools import partial
+
 import numpy as np
 
 from spikeloom.compiler.targets.base import Target
@@ -16,8 +19,9 @@ from spikeloom.runtime.machines.loihi1.costs.result import CostReport, cost_repo
 from spikeloom.runtime.machines.loihi1.costs.sections import sections
 from spikeloom.runtime.machines.loihi1.trace import Counts
 from spikeloom.runtime.machines.page_parts import BatchParts, Core, Cores, Fill, Mesh, Way
-from spikeloom.runtime.report.drawing import bar_figure
-from spikeloom.runtime.report.sections import Block, Outcome, Section
+from spikeloom.runtime.report.drawing import bars
+from spikeloom.runtime.report.numbers import si
+from spikeloom.runtime.report.sections import Block, Figure, Outcome, Section, Table
 
 FILLS = ("core.compartments", "core.synapse_words", "core.axons_in", "core.axons_out")
 """Limits of which the fullest says how full a core is: those that a larger network uses up."""
@@ -100,16 +104,25 @@ def _figures(found: CostReport) -> list[Block]:
     if tables:
         layers = {layer.name: list(layer.amounts.energy_j.values()) for layer in found.layers}
         title, caption = "Energy of a mean inference by layer", "Synapses belong to the layer that receives."
-        blocks.append(bar_figure("energy-layers", title, layers, tables, "J", caption))
+        blocks.append(_bars("energy-layers", title, layers, tables, "J", caption))
         parts = next(iter(found.energy_by_part_j.values()))
         shares = {part: [found.energy_by_part_j[name][part] for name in tables] for part in parts}
         title = "Energy of a mean inference by part of the chip"
         caption = "Synapse: visited entries; soma: neuron updates and spikes; network: packets and hops."
-        blocks.append(bar_figure("energy-parts", title, shares, tables, "J", caption))
+        blocks.append(_bars("energy-parts", title, shares, tables, "J", caption))
     if found.time:
         first = found.time[0].table
         cores = {f"core {core.core}": [core.sweep_s[first], core.receive_s[first]] for core in found.cores}
         title = "Time of a mean inference by core"
         caption = "Both go on at once; a step lasts as long as the slowest core."
-        blocks.append(bar_figure("time-cores", title, cores, ["sweep and send", "receive"], "s", caption))
+        blocks.append(_bars("time-cores", title, cores, ["sweep and send", "receive"], "s", caption))
     return blocks
+
+
+def _bars(
+    name: str, title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str], unit: str, caption: str
+) -> Figure:
+    """Bars, with their numbers as a table."""
+    cells = [[label, *(si(value, unit) for value in values)] for label, values in rows.items()]
+    numbers = [Table(["", *series], cells, title, most=0)]
+    return Figure(name, partial(bars, title, rows, series, unit), f"{title}. {caption}", numbers)
