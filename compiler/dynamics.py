@@ -94,7 +94,7 @@ class Dynamics:
         return self == PLAIN
 
     def beta(self, layer: int, common: float) -> float:
-        """Membrane decay of a layer, 0 for the first."""
+        """Share of a membrane that a layer keeps; layers count from 0."""
         return self.betas[layer] if self.betas else common
 
     def alpha(self, layer: int) -> float:

@@ -159,8 +159,8 @@ def _go_on(words: Sequence[str], more: Sequence[str]) -> str:
 
     Examples
     --------
-    >>> _go_on(["chart", "a b.pt", "--fresh"], ()), _go_on(["reproduce", "--resume"], ["--resume"])
-    ("spikeloom chart 'a b.pt'", 'spikeloom reproduce --resume')
+    >>> _go_on(["chart", "a b.pt", "--fresh"], ()), _go_on(["train", "--resume"], ["--resume"])
+    ("spikeloom chart 'a b.pt'", 'spikeloom train --resume')
     """
     return shlex.join(["spikeloom", *(w for w in words if w != "--fresh"), *(w for w in more if w not in words)])
 

@@ -240,6 +240,16 @@ def test_calibration_prefers_scales_that_keep_spikes_then_those_that_keep_class_
     assert distance == min(distance for flips, distance in best if flips <= 1.25 * fewest)
 
 
+@pytest.mark.parametrize("planes", [(2, 1), (1, 2)])
+def test_layers_of_several_planes_and_no_others_are_rounded_on_more_recordings(planes, monkeypatch):
+    rng, more = np.random.default_rng(3), []
+    network = chain(rng.normal(0, 0.2, (8, 12)), rng.normal(0, 0.3, (4, 8)))
+    monkeypatch.setattr(choice_module, "round_with_more", lambda layer, chosen, _: more.append(layer.post) or chosen)
+    packings = [Packing(planes=each) for each in planes]
+    choose_storage(network, LOIHI, packings=packings, calibration=calibrate(network, recordings(network, 4)))
+    assert more == [planes.index(2)]
+
+
 @pytest.mark.parametrize(
     ("samples", "picked"), [(1, [0]), (4, [0, 1, 2, 3]), (5, [0, 1, 3, 4]), (100, [0, 33, 66, 99])]
 )

@@ -1,1 +1,1 @@
-"""One file per pass; the order lives in each target's ``PASSES``."""
+"""What the passes of every chip share; their order stands in each target's ``PASSES``."""

@@ -1,1 +1,1 @@
-"""What a run costs: events times price tables."""
+"""What was simulated and why, and the yardsticks of others; prices stand with each machine."""

@@ -245,7 +245,7 @@ def machine_of(netlist: Netlist) -> Machine:
 
 
 def machine_for(path: str | os.PathLike[str]) -> Machine:
-    """Read a netlist file, whatever chip it is for; SpikeloomError if it is none, or breaks a limit of its chip."""
+    """Read a netlist file, whatever chip it is for; SpikeloomError if it is none."""
     name = stated(Path(path), "target")
     known = name is not None and name.isidentifier() and has_machine(name)
     machine: Machine = _module(name if known and name else DEFAULT).load(path)

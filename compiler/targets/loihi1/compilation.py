@@ -30,7 +30,7 @@ LATER: Any = None
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Compilation:
-    """Everything that one compilation was given and has made so far; each field is filled in by one pass."""
+    """Everything that one compilation was given and has made so far; the pass in brackets fills a field in."""
 
     source: Factored | Network | IntegerNetwork  # What is compiled
     options: Options  # What was asked for

@@ -53,7 +53,7 @@ class Layer:
     # beta, theta: Decay and threshold of the float model
     beta: float
     theta: float
-    weight_bits: int  # Packing width of the mantissas
+    weight_bits: int  # Storage width of the mantissas
     synapses: int  # Structural synapses into the layer, before zeros were dropped
     max_fan_in: int  # Largest structural fan-in of a neuron
     alpha: float = 0.0  # Current decay of the float model

@@ -20,9 +20,9 @@ MAX_PLANES = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Packing:
-    """Packing of one population."""
+    """How one population is to be stored: what was asked for; a ``Form`` is what came of it."""
 
-    bits: int = 8  # Packing width of a mantissa
+    bits: int = 8  # Storage width of a mantissa
     planes: int = 1  # Times that a synapse may be stored, with different exponents
     groups: int = 1  # Different thresholds, and so scales, at most
 
@@ -31,7 +31,7 @@ class Packing:
 class Options:
     """Options of a compilation."""
 
-    forms: Sequence[Form] | None = None  # Packing that the network was fine-tuned for, by population
+    forms: Sequence[Form] | None = None  # Storage that the network was fine-tuned for, by population
     # Packing of each layer, or one for all; 8 bits by default. A fine-tuned network brings its own and takes none.
     packings: Sequence[Packing] | None = None
     # Add planes and scales until every spike on the training recordings, all of them, is the float64 model's, see

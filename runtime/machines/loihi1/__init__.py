@@ -1,1 +1,1 @@
-"""Loihi 1, step by step."""
+"""Loihi 1: its definition, the fast engine equal to it, and its prices."""

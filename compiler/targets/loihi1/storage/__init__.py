@@ -1,1 +1,1 @@
-"""How weights become integers: widths, scales, planes, and the proof that nothing overflows."""
+"""How weights become integers: widths, scales and planes."""

@@ -211,7 +211,7 @@ def choose_storage(
         chosen = [candidates[0] for candidates in shortlists]
     else:
         settled = zip(layers, settle(network, shortlists, few), packings, strict=True)
-        chosen = [c if packing.planes == 1 else round_with_more(layer, c, calibration) for layer, c, storage in settled]
+        chosen = [c if packing.planes == 1 else round_with_more(layer, c, calibration) for layer, c, packing in settled]
     choices = tuple(map(explain_choice, layers, chosen))
     return assemble(network, chosen), choices
 

@@ -27,7 +27,7 @@ from spikeloom.compiler.targets.loihi1.storage.scales import Rounded, layer_of
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
 Widths = tuple[int, ...]
-"""Packing width of each layer."""
+"""Storage width of each layer."""
 
 Offers = list[dict[int, list[Rounded]]]
 """Scales worth a closer look of each layer, best first, by width; widest width first."""
@@ -112,7 +112,7 @@ def search_widths(
     labels : (recordings,) int64
         Class of each, -1 where it is not known.
     widths, groups
-        Packing widths of a mantissa; different scales in a layer, at most.
+        Storage widths of a mantissa; different scales in a layer, at most.
     lengths : (recordings,) int64, optional
         Steps of each recording that count.
     tell : callable, optional
