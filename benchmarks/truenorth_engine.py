@@ -17,8 +17,7 @@ import numpy as np
 
 from spikeloom.compiler.dynamics import Clocks, with_clocks
 from spikeloom.compiler.targets.truenorth.codebook import BIN_TICKS
-from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
-from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.truenorth import engine

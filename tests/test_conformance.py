@@ -21,7 +21,7 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.targets.loihi1.netlist import netlist_text
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist
-from spikeloom.compiler.targets.truenorth.netlist_file import crossbar_bytes
+from spikeloom.compiler.targets.truenorth.netlist import crossbar_bytes
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.cli import build_parser, main
 from spikeloom.runtime.equivalence import float_engine

@@ -80,7 +80,7 @@ def test_neurons_are_mapped_in_the_order_of_their_compartments():
     neurons = [Neuron(layer=layer) for layer in (0, 1, 0, 0)] + [Neuron(core=1)]
     netlist = build(neurons, [Axon(source=0, targets=((0, 2),))], n_inputs=1, depths=[0, 1])
     netlist = replace(netlist, neuron=read_only([5, 0, 9, 7, 8]), core_tile=read_only([31, 31]))
-    assert sanafe.members(netlist).tolist() == [0, 0, 3, 1, 2]
+    assert netlist.number_in_layer().tolist() == [0, 0, 3, 1, 2]
     mapped = lines(netlist)[lines(netlist).index("mappings:") + 1 :]
     assert mapped == [
         "  - input.0..0: {core: '31.2'}",

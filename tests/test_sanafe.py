@@ -101,7 +101,7 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
     meter = cost.prepare(netlist, LOIHI, "core", **as_priced)
     parts = cost.by_part(LOIHI, cost.count(meter, counts, steps))["sanafe"]
 
-    names, number = sanafe.group_names(netlist), sanafe.members(netlist)
+    names, number = sanafe.group_names(netlist), netlist.number_in_layer()
     compartment = {(names[netlist.layer[c]], int(number[c])): c for c in range(netlist.n_compartments)}
     runs = []
     for i, (first, second) in enumerate(zip(theirs[::2], theirs[1::2], strict=True)):

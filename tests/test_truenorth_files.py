@@ -17,9 +17,9 @@ from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.targets.truenorth.builder import Draft, history_free
 from spikeloom.compiler.targets.truenorth.legalize import faults
-from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
-from spikeloom.compiler.targets.truenorth.netlist_file import (
+from spikeloom.compiler.targets.truenorth.netlist import (
     FILE,
+    CrossbarNetlist,
     crossbar_bytes,
     inconsistencies,
     read_crossbars,

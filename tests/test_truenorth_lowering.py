@@ -37,7 +37,7 @@ from spikeloom.compiler.targets.truenorth.codebook import (
     run_levels,
 )
 from spikeloom.compiler.targets.truenorth.in_time import first_spikes, lower_in_time
-from spikeloom.compiler.targets.truenorth.lower import lower
+from spikeloom.compiler.targets.truenorth.native import lower
 from spikeloom.models.truenorth.network import run_network
 from spikeloom.runtime.machines.truenorth import engine, spec
 from spikeloom.runtime.machines.truenorth.twins import find_twins

@@ -16,8 +16,7 @@ from random_crossbars import WEIGHTS, alone, crossbars, events
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats import ranc
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron
-from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE
-from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
+from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE, write_crossbars
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.truenorth import spec
 

@@ -16,7 +16,7 @@ from spikeloom.compiler.dynamics import clocks_over
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.targets.truenorth.native import faults
 from spikeloom.compiler.targets.truenorth.native_file import PARTS, is_trained, read_trained, write_trained
-from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars, write_crossbars
+from spikeloom.compiler.targets.truenorth.netlist import read_crossbars, write_crossbars
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, Surrogate
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released

@@ -45,8 +45,6 @@ SECONDS, MEMORY = 30, 4 * 2**30
 
 TRIAL = f"""
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 try:
     import resource
     resource.setrlimit(resource.RLIMIT_CPU, ({SECONDS}, {SECONDS}))
@@ -59,7 +57,6 @@ try:
 except ModelError:
     pass  # refused, as it will be here
 """
-
 
 AGAIN = "export it again"
 

@@ -29,20 +29,21 @@ from spikeloom.compiler.types import IntArray
 EventArray = npt.NDArray[np.uint8] | npt.NDArray[np.bool_]
 
 
-def unsupported(netlist: CrossbarNetlist) -> list[str]:
-    """What a network uses that RANC has not, with the number of neurons that do.
+def _require_supported(netlist: CrossbarNetlist) -> None:
+    """Refuse what RANC has not, with the number of neurons that use it.
 
     A neuron that saturates at zero, is reset to zero and has no other use of its negative threshold is expressed as a
     reset; all others that saturate are not.
     """
     resets = (netlist.reset_mode == RESET_TO) & (netlist.reset == netlist.negative_threshold)
-    found = {
+    used = {
         "a leak with reversal": (netlist.leak_reversal > 0) & (netlist.leak != 0),
         "a random threshold": netlist.mask_bits > 0,
         "a reset that does nothing": netlist.reset_mode == RESET_NONE,
         "a negative threshold that saturates": (netlist.negative_saturates > 0) & ~resets,
     }
-    return [f"{name} ({np.count_nonzero(which)} neurons)" for name, which in found.items() if which.any()]
+    if missing := [f"{name} ({np.count_nonzero(which)} neurons)" for name, which in used.items() if which.any()]:
+        raise ModelError(f"--to ranc: RANC has no {', no '.join(missing)}; leave them out of the network")
 
 
 def export(netlist: CrossbarNetlist, events: EventArray | None = None) -> Iterator[str]:
@@ -50,9 +51,7 @@ def export(netlist: CrossbarNetlist, events: EventArray | None = None) -> Iterat
 
     Events (n_inputs, T) of a recording become packets, with the clocks; without it there are none.
     """
-    missing = unsupported(netlist)
-    if missing:
-        raise ModelError(f"--to ranc: RANC has no {', no '.join(missing)}; leave them out of the network")
+    _require_supported(netlist)
     x, y = netlist.core_x - netlist.core_x.min(), netlist.core_y - netlist.core_y.min()
     voters = np.flatnonzero(netlist.readout_class >= 0)
     bus = (0, int(y.max()) + 1)  # a row of its own above all cores
@@ -74,8 +73,7 @@ def export(netlist: CrossbarNetlist, events: EventArray | None = None) -> Iterat
         yield f'"{name}": {value},'
     yield f'"output_bus": {json.dumps({"coordinates": list(bus), "num_outputs": len(voters) + 1})},'
     yield '"packets": ['
-    packets = _packets(netlist, events, x, y)
-    yield ",\n".join(json.dumps(tick, separators=(",", ":")) for tick in packets)
+    yield ",\n".join(json.dumps(tick, separators=(",", ":")) for tick in _packets(netlist, events, x, y))
     yield "],"
     yield '"cores": ['
     aims = _aims(netlist, bus, voters)

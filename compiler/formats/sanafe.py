@@ -54,15 +54,6 @@ def floating_layers(netlist: Netlist) -> tuple[str, ...]:
     return tuple(group_names(netlist)[layer] for layer in lasting)
 
 
-def members(netlist: Netlist) -> IntArray:
-    """Number of each compartment in its group; shape (compartments,)."""
-    number = np.empty(netlist.n_compartments, np.int64)
-    for layer in range(len(netlist.layers)):
-        ids = netlist.compartments_of(layer)
-        number[ids] = np.arange(len(ids))
-    return number
-
-
 def dense_neurons(netlist: Netlist) -> BoolArray:
     """Which compartments name the unit of dense synapses."""
     in_dense_list = netlist.format_index_bits[netlist.axon_format[netlist.axon_of_synapse()]] == 0
@@ -99,7 +90,7 @@ def cores(netlist: Netlist, target: Target) -> tuple[str, ...]:
 def export(netlist: Netlist, target: Target) -> Iterator[str]:
     """Lines of the file; OptionError if the netlist takes several chips, ModelError if one has no room for inputs."""
     room = target.limit("core.compartments")
-    names, number, places = group_names(netlist), members(netlist), cores(netlist, target)
+    names, number, places = group_names(netlist), netlist.number_in_layer(), cores(netlist, target)
     yield f"# spikeloom netlist for SANA-FE {VERSION} and its loihi.yaml; give the neurons of group {INPUT} 'spikes'"
     if netlist.clocks.channels:
         length, first = netlist.clocks.steps, netlist.n_inputs - netlist.clocks.channels

@@ -17,7 +17,7 @@ import numpy as np
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, THRESHOLD_MANTISSA_MAX, round_half_even
-from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes
+from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes, tree_of
 from spikeloom.compiler.formats.netx.reader import OWN, integers_of
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation
@@ -121,13 +121,16 @@ def _shift(name: str, weight: IntArray, threshold: int) -> int:
     )
 
 
-def tree_of(network: IntegerNetwork, blocks: Sequence[DenseLayer]) -> Tree:
-    """Content of the file."""
-    layers: Tree = {"0": {"type": "input", "shape": np.array([network.input.size])}}
+def file_bytes(network: IntegerNetwork, blocks: Sequence[DenseLayer]) -> bytes:
+    """Content of the file, HDF5 as lava-dl writes it; equal networks give equal bytes.
+
+    Neurons name their type by a single text of ten letters, layers by a list of one.
+    """
+    layers: Tree = {"0": {"type": np.array(["input"], "S10"), "shape": np.array([network.input.size])}}
     for number, block in enumerate(blocks, 1):
         neurons, inputs = block.weight.shape
         layers[str(number)] = {
-            "type": "dense" if block.own is None else "dense_rec",
+            "type": np.array(["dense" if block.own is None else "dense_rec"], "S10"),
             "shape": np.array([neurons]),
             "inFeatures": np.array(inputs),
             "outFeatures": np.array(neurons),
@@ -135,7 +138,7 @@ def tree_of(network: IntegerNetwork, blocks: Sequence[DenseLayer]) -> Tree:
             **({} if block.own is None else {"weight_rec": block.own.astype(np.int16)}),
             "bias": block.bias,
             "neuron": {
-                "type": "CUBA",
+                "type": np.array("CUBA", "S10"),
                 "iDecay": np.array(block.decay_u + 1),
                 "vDecay": np.array(block.decay_v),
                 "vThMant": np.array(block.threshold),
@@ -151,31 +154,14 @@ def tree_of(network: IntegerNetwork, blocks: Sequence[DenseLayer]) -> Tree:
         **({"bins": np.array(network.input.bins)} if network.input.bins > 1 else {}),
         "label": network.readout.label,
     }
-    return {"layer": layers, OWN: own}
-
-
-def file_bytes(tree: Tree) -> bytes:
-    """HDF5 of a tree as lava-dl writes it; equal trees give equal bytes."""
-    return hdf5_bytes(_texts_of_ten(tree))
-
-
-def _texts_of_ten(tree: Tree) -> Tree:
-    """Neurons name their type by a single text of ten letters, layers by a list of one."""
-    return {
-        name: _texts_of_ten(value)
-        if isinstance(value, dict)
-        else np.array(value if value == "CUBA" else [value], "S10")
-        if isinstance(value, str)
-        else value
-        for name, value in tree.items()
-    }
+    return hdf5_bytes({"layer": layers, OWN: own})
 
 
 def moved_spikes(
     network: IntegerNetwork, blocks: Sequence[DenseLayer], events: BoolArray
 ) -> dict[str, tuple[int, int]]:
     """Spikes of each layer that the rounding moves, and how many the netlist has; events (samples, steps, channels)."""
-    written, _ = integers_of(tree_of(network, blocks))
+    written, _ = integers_of(tree_of(file_bytes(network, blocks)))
     before, after = (run_integer(one, events).spikes for one in (network, written))
     return {
         block.name: (int(np.count_nonzero(a != b)), int(np.count_nonzero(a)))

@@ -19,7 +19,7 @@ from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
 from spikeloom.compiler.formats.nir.neurons import Neurons, facts_of, neurons_of
 from spikeloom.compiler.formats.nir.stages import KNOWN, STAGES, Value, added, rows_of, scaled, spikes_of
-from spikeloom.compiler.formats.nir.steps import CONVENTIONS, Steps, require_steps, stated_step, written_step
+from spikeloom.compiler.formats.nir.steps import CONVENTIONS, Steps, require_step, stated_step, written_step
 from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.types import FloatArray, IntArray
@@ -59,7 +59,7 @@ def read_nir(
             hint = "" if written is None else f", but its r is tau / {written:g}, as of steps of {written:g} s"
             raise OptionError(f"{path}: NIR keeps no time step{hint}; give --dt SECONDS")
         steps = Steps(dt=dt, convention=convention or CONVENTIONS[0])
-        require_steps(dt)
+        require_step(dt)
         with np.errstate(all="ignore"):  # what is not finite is refused at the end
             return network_of(graph, steps, polarities, polarities_first)
     except ModelError as error:

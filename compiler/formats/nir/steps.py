@@ -51,7 +51,7 @@ class Steps:
         return np.maximum(kept, 0)
 
 
-def require_steps(dt: float) -> None:
+def require_step(dt: float) -> None:
     """Refuse a time step that is none."""
     if not 0 < dt < math.inf:
         raise OptionError(f"--dt {dt:g}: is no time step; give seconds above 0")

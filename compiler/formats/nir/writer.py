@@ -23,8 +23,8 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes
 from spikeloom.compiler.formats.names import plain_names
-from spikeloom.compiler.formats.nir.steps import require_steps
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Sparse
+from spikeloom.compiler.formats.nir.steps import require_step
+from spikeloom.compiler.ir import INPUT, IntegerPopulation, Sparse
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import FORGETS
 
@@ -37,12 +37,6 @@ DENSE_LIMIT = 2**28
 Float32 = npt.NDArray[np.float32]
 
 
-def node_names(network: IntegerNetwork) -> tuple[str, ...]:
-    """Names of the layers' neurons; what separates names in a file becomes an underscore."""
-    names = [population.name for population in network.populations]
-    return plain_names(names, taken=["input", "output", "votes"])
-
-
 def export(netlist: Netlist, dt: float) -> bytes:
     """Content of the file, for steps of `dt` seconds; equal netlists give equal bytes.
 
@@ -53,9 +47,10 @@ def export(netlist: Netlist, dt: float) -> bytes:
     OptionError
         If there is no such time step.
     """
-    require_steps(dt)
+    require_step(dt)
     network = lift(netlist)
-    names = node_names(network)
+    # what separates names in a file becomes an underscore
+    names = plain_names([population.name for population in network.populations], taken=["input", "output", "votes"])
     nodes: dict[str, Tree] = {"input": {"type": "Input", "shape": np.array([network.input.size])}}
     edges: list[tuple[str, str]] = []
     for post, (population, name) in enumerate(zip(network.populations, names, strict=True)):

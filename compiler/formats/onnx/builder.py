@@ -28,6 +28,8 @@ INNER = "step/"
 END = 2**63 - 1
 """A slice with this end reaches to the end of its axis."""
 
+Constant = npt.NDArray[Any] | np.generic
+
 Proto = Any
 """A message of the onnx package, which ships no types."""
 
@@ -41,6 +43,11 @@ class Port:
     shape: tuple[int | str, ...]
 
 
+def one_each(values: npt.NDArray[Any], kind: npt.DTypeLike) -> Constant:
+    """One number for each neuron, or a single number where all are the same."""
+    return (values[0] if np.all(values == values[0]) else values).astype(kind)
+
+
 @dataclass(slots=True)
 class Nodes:
     """Nodes in order, and the constants that they read."""
@@ -48,28 +55,27 @@ class Nodes:
     nodes: list[Proto] = field(default_factory=list)
     constants: dict[str, npt.NDArray[Any]] = field(default_factory=dict)
 
-    def constant(self, name: str, value: npt.ArrayLike, kind: npt.DTypeLike) -> str:
-        """Hold an array; returns its name."""
-        self.constants[name] = np.ascontiguousarray(value, dtype=kind).reshape(np.shape(value))
+    def constant(self, name: str, value: Constant) -> str:
+        """Hold an array for several nodes; returns its name."""
+        self.constants[name] = np.asarray(value, order="C")
         return name
 
-    def column(self, name: str, values: npt.NDArray[Any], kind: npt.DTypeLike) -> str:
-        """Hold one number for each neuron, or a single number where all are the same; returns the name."""
-        return self.constant(name, values[0] if np.all(values == values[0]) else values, kind)
-
-    def add(self, operator: str, inputs: Sequence[str], output: str, **attributes: Any) -> str:
-        """Append a node with one output; returns the output's name."""
-        self.nodes.append(_onnx().helper.make_node(operator, inputs, [output], name=output, **attributes))
+    def add(self, operator: str, inputs: Sequence[str | Constant], output: str, **attributes: Any) -> str:
+        """Append a node with one output; constants among its inputs are held. Returns the output's name."""
+        names = [
+            given if isinstance(given, str) else self.constant(f"{output}/input{place}", given)
+            for place, given in enumerate(inputs)
+        ]
+        self.nodes.append(_onnx().helper.make_node(operator, names, [output], name=output, **attributes))
         return output
 
     def cast(self, source: str, output: str, kind: npt.DTypeLike) -> str:
         """Append a conversion to a numpy type."""
         return self.add("Cast", [source], output, to=_type(kind))
 
-    def filled(self, name: str, value: int, kind: npt.DTypeLike, sizes: Sequence[str]) -> str:
+    def filled(self, name: str, value: Constant, sizes: Sequence[str | Constant]) -> str:
         """Append an array of one number everywhere."""
-        shape = self.add("Concat", sizes, f"{name}/shape", axis=0)
-        return self.add("Expand", [self.constant(f"{name}/value", value, kind), shape], name)
+        return self.add("Expand", [value, self.add("Concat", sizes, f"{name}/shape", axis=0)], name)
 
     def graph(self, name: str, inputs: Sequence[Port], outputs: Sequence[Port]) -> Proto:
         """All of it as a message."""
@@ -128,8 +134,8 @@ def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes
     graph.add("Shape", ["events"], "batch", start=1, end=2)
     graph.add("Squeeze", ["duration"], "length")
     if drain:
-        sizes = [graph.constant("drain", [drain], np.int64), "batch", graph.constant("channels", [channels], np.int64)]
-        sequence = graph.add("Concat", ["events", graph.filled("tail", 0, np.uint8, sizes)], "filled", axis=0)
+        tail = graph.filled("tail", np.uint8(0), [np.array([drain]), "batch", np.array([channels])])
+        sequence = graph.add("Concat", ["events", tail], "filled", axis=0)
     begun = [_rest(graph, state) for state in states]
     kept = [Port(name=f"{name}/fired", kind=np.bool_, shape=("batch", size)) for name, (size, _) in layers.items()]
     kept += [port for port in outputs if port.name == "overflow"]
@@ -149,10 +155,7 @@ def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes
     for name, (size, depth) in layers.items():
         trains = f"{name}/fired/steps"
         if drain:
-            ends = [
-                graph.constant(f"{name}/{side}", [at], np.int64)
-                for side, at in (("begin", depth), ("end", depth - drain or END))
-            ]
+            ends = np.array([depth]), np.array([depth - drain or END])
             trains = graph.add("Slice", [trains, *ends], f"{name}/trains")
         graph.cast(trains, f"{name}.spikes", np.uint8)
         found += [
@@ -172,20 +175,18 @@ def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes
 
 def _rest(graph: Nodes, state: Port) -> str:
     """Zeros at the start of recordings, (batch, neurons) or a scalar."""
-    name = f"{state.name}/rest"
+    name, zero = f"{state.name}/rest", np.zeros((), state.kind)
     if not state.shape:
-        return graph.constant(name, 0, state.kind)
-    return graph.filled(name, 0, state.kind, ["batch", graph.constant(f"{state.name}/size", state.shape[1:], np.int64)])
+        return graph.constant(name, zero)
+    return graph.filled(name, zero, ["batch", np.array(state.shape[1:])])
 
 
 def _counted(graph: Nodes, name: str, size: int) -> str:
     """Spikes of a recording. A product with ones adds up bytes ten times faster than ReduceSum, which wants int32."""
-    row = [graph.constant("single", [1], np.int64), "duration"]
-    ones = graph.filled(f"{name}/ones", 1, np.uint8, row)
-    flat = graph.add("Reshape", [f"{name}.spikes", graph.constant("flat", [0, -1], np.int64)], f"{name}/flat")
+    ones = graph.filled(f"{name}/ones", np.uint8(1), [np.array([1]), "duration"])
+    flat = graph.add("Reshape", [f"{name}.spikes", np.array([0, -1])], f"{name}/flat")
     total = graph.add("MatMulInteger", [ones, flat], f"{name}/total")
-    form = graph.constant(f"{name}.counts/form", [-1, size], np.int64)
-    return graph.add("Reshape", [total, form], f"{name}.counts")
+    return graph.add("Reshape", [total, np.array([-1, size])], f"{name}.counts")
 
 
 def model_bytes(model: Model, *, name: str, about: str, facts: Mapping[str, Any]) -> bytes:

@@ -38,7 +38,7 @@ import numpy as np
 
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
-from spikeloom.compiler.formats.onnx.builder import Model, Nodes, Port, model_bytes, next_of, whole_recordings
+from spikeloom.compiler.formats.onnx.builder import Model, Nodes, Port, model_bytes, next_of, one_each, whole_recordings
 from spikeloom.compiler.formats.onnx.writer_layers import Layer, digits, of_sign, plan
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
@@ -98,7 +98,7 @@ def _chip_step(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
     graph = Nodes()
     states = [Port(name="step", kind=np.int64, shape=())]
     received = {INPUT: "events"} | {layer.index: f"{layer.name}.spikes" for layer in layers}
-    graph.add("Add", ["step", graph.constant("increment", 1, np.int64)], "step_next")
+    graph.add("Add", ["step", np.int64(1)], "step_next")
     windows = {depth: _window(graph, depth) for depth in sorted({layer.depth for layer in layers})}
     flags: list[str] = []
     for layer in layers:
@@ -111,14 +111,12 @@ def _chip_step(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
         flags += _integrate(graph, layer, spikes, windows[layer.depth])
     outputs = []
     if flags:
-        most = graph.add("Max", flags, "overflow/most")
-        graph.add("Greater", [most, graph.constant("nothing", 0, np.int32)], "overflow")
+        graph.add("Greater", [graph.add("Max", flags, "overflow/most"), np.int32(0)], "overflow")
         outputs.append(Port(name="overflow", kind=np.bool_, shape=("batch",)))
     votes, voting = "votes", [layer for layer in layers if np.any(layer.label >= 0)]
     for layer in voting:
-        poll = layer.label[:, None] == np.arange(netlist.classes)
-        label = graph.constant(f"{layer.name}/label", poll, np.uint8)
-        more = graph.add("MatMulInteger", [f"{layer.name}.spikes_next", label], f"{layer.name}/votes")
+        poll = (layer.label[:, None] == np.arange(netlist.classes)).astype(np.uint8)
+        more = graph.add("MatMulInteger", [f"{layer.name}.spikes_next", poll], f"{layer.name}/votes")
         last = "votes_next" if layer is voting[-1] else f"{layer.name}/voted"
         votes = graph.add("Add", [votes, more], last)
     if voting:
@@ -133,8 +131,7 @@ def _chip_step(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
 
 def _window(graph: Nodes, depth: int) -> str:
     """Whether layers of a depth integrate in this chip step; bool scalar."""
-    name = f"window{depth}"
-    begin = graph.constant(f"{name}/begin", depth, np.int64)
+    name, begin = f"window{depth}", np.int64(depth)
     begun = graph.add("GreaterOrEqual", ["step", begin], f"{name}/begun")
     since = graph.add("Sub", ["step", begin], f"{name}/since")
     return graph.add("And", [begun, graph.add("Less", [since, "length"], f"{name}/lasts")], name)
@@ -145,7 +142,7 @@ def _integrate(graph: Nodes, layer: Layer, spikes: list[str], is_open: str) -> l
 
     A closed window holds all registers at zero.
     """
-    name, kind, word = layer.name, layer.kind, np.dtype(layer.kind).name
+    name, kind = layer.name, layer.kind
     window = graph.cast(is_open, f"{name}/window", kind)
     sums = [_sums(graph, layer, spikes, sign) for sign in ((1, -1) if layer.checked else (0,))]
     inflow = graph.add("Sub", sums, f"{name}/sum") if layer.checked else sums[0]
@@ -156,20 +153,16 @@ def _integrate(graph: Nodes, layer: Layer, spikes: list[str], is_open: str) -> l
         graph.add("Mul", [current, window], f"{name}.current_next")
     overflow = [_overflow(graph, layer, sums, current, is_open)] if layer.checked else []
     if layer.bias.any():
-        bias = graph.column(f"{name}/bias", layer.bias, kind)
+        bias = graph.constant(f"{name}/bias", one_each(layer.bias, kind))
         inflow = graph.add("Add", [inflow, bias], f"{name}/inflow") if inflow else bias
     value = _decayed(graph, layer, f"{name}.membrane", layer.decay_v, f"{name}/decayed")
     if inflow:
         value = graph.add("Add", [value, inflow], f"{name}/driven")
     if layer.saturates:
-        ends = [
-            graph.constant(f"{end}/{word}", sign * MEMBRANE_MAX, kind) for end, sign in (("lowest", -1), ("highest", 1))
-        ]
-        value = graph.add("Clip", [value, *ends], f"{name}/clipped")
+        value = graph.add("Clip", [value, kind(-MEMBRANE_MAX), kind(MEMBRANE_MAX)], f"{name}/clipped")
     value = graph.add("Mul", [value, window], f"{name}/gated")
-    threshold = graph.column(f"{name}/threshold", layer.threshold, kind)
-    fired = graph.add("Greater", [value, threshold], f"{name}/fired")
-    graph.add("Where", [fired, graph.constant(f"zero/{word}", 0, kind), value], f"{name}.membrane_next")
+    fired = graph.add("Greater", [value, one_each(layer.threshold, kind)], f"{name}/fired")
+    graph.add("Where", [fired, kind(0), value], f"{name}.membrane_next")
     graph.cast(fired, f"{name}.spikes_next", np.uint8)
     return overflow
 
@@ -181,11 +174,10 @@ def _sums(graph: Nodes, layer: Layer, spikes: list[str], sign: int) -> str:
     for received, weights in zip(spikes, layer.sources.values(), strict=True):
         for digit, factor in digits(of_sign(weights, sign)):
             own = f"{name}/{count}"
-            product = graph.add("MatMulInteger", [received, graph.constant(f"{own}/weight", digit, np.int8)], own)
+            product = graph.add("MatMulInteger", [received, digit], own)
             if layer.kind is not np.int32:
                 product = graph.cast(product, f"{own}/wide", layer.kind)
-            unit = graph.column(f"{own}/unit", factor << MEMBRANE_SHIFT, layer.kind)
-            scaled = graph.add("Mul", [product, unit], f"{own}/scaled")
+            scaled = graph.add("Mul", [product, one_each(factor << MEMBRANE_SHIFT, layer.kind)], f"{own}/scaled")
             total = graph.add("Add", [total, scaled], f"{own}/sum") if total else scaled
             count += 1
     return total
@@ -193,19 +185,17 @@ def _sums(graph: Nodes, layer: Layer, spikes: list[str], sign: int) -> str:
 
 def _decayed(graph: Nodes, layer: Layer, register: str, lost: IntArray, name: str) -> str:
     """Keep ``(4096 - lost) / 4096``: a product and an integer division, which truncates toward zero."""
-    kept = graph.column(f"{name}/kept", 2**DECAY_BITS - lost, layer.kind)
-    one = graph.constant(f"one/{np.dtype(layer.kind).name}", 2**DECAY_BITS, layer.kind)
-    return graph.add("Div", [graph.add("Mul", [register, kept], f"{name}/product"), one], name)
+    product = graph.add("Mul", [register, one_each(2**DECAY_BITS - lost, layer.kind)], f"{name}/product")
+    return graph.add("Div", [product, layer.kind(2**DECAY_BITS)], name)
 
 
 def _overflow(graph: Nodes, layer: Layer, sums: list[str], current: str, is_open: str) -> str:
     """Whether the chip would stop here, 0 or 1 (batch,): a sum of weights of one sign, or the current, is too large."""
-    name, kind = f"{layer.name}/overflow", np.dtype(layer.kind).name
-    found = [(register, graph.constant(f"sum/{kind}", ACCUMULATOR_MAX, layer.kind)) for register in sums]
+    name = f"{layer.name}/overflow"
+    found = [(register, ACCUMULATOR_MAX) for register in sums]
     if current:
-        size = graph.add("Abs", [current], f"{name}/size")
-        found.append((size, graph.constant(f"current/{kind}", CURRENT_MAX, layer.kind)))
-    over = [graph.add("Greater", list(pair), f"{name}/over{i}") for i, pair in enumerate(found)]
+        found.append((graph.add("Abs", [current], f"{name}/size"), CURRENT_MAX))
+    over = [graph.add("Greater", [one, layer.kind(most)], f"{name}/over{i}") for i, (one, most) in enumerate(found)]
     total = over[0]
     for i, each in enumerate(over[1:], 1):
         total = graph.add("Or", [total, each], f"{name}/any{i}")

@@ -91,11 +91,10 @@ def _step(checkpoint: Checkpoint, adjacency: FloatArray, sizes: dict[str, int]) 
             current = _convolution(nodes, checkpoint, adjacency, size)
         spikes = Port(name=f"{name}.spikes", kind=np.uint8, shape=("batch", size))
         membrane = Port(name=f"{name}.membrane", kind=np.float32, shape=("batch", size))
-        kept = nodes.add("Mul", [membrane.name, nodes.constant("beta", checkpoint.beta, np.float32)], f"{name}/kept")
+        kept = nodes.add("Mul", [membrane.name, np.float32(checkpoint.beta)], f"{name}/kept")
         value = nodes.add("Add", [kept, current], f"{name}/value")
-        theta = nodes.constant("theta", checkpoint.theta, np.float32)
-        fired = nodes.add("Greater", [value, theta], f"{name}/fired")
-        nodes.add("Where", [fired, nodes.constant("zero", 0, np.float32), value], next_of(membrane).name)
+        fired = nodes.add("Greater", [value, np.float32(checkpoint.theta)], f"{name}/fired")
+        nodes.add("Where", [fired, np.float32(0), value], next_of(membrane).name)
         received = nodes.cast(fired, spikes.name, np.uint8)
         inputs.append(membrane)
         outputs += [spikes, next_of(membrane)]
@@ -103,7 +102,7 @@ def _step(checkpoint: Checkpoint, adjacency: FloatArray, sizes: dict[str, int]) 
     more = nodes.cast(received, "votes/more", np.int32)
     if checkpoint.towers > 1:  # their output neurons are summed by class
         poll = checkpoint.readout.label[:, None] == np.arange(checkpoint.classes)
-        more = nodes.add("MatMul", [more, nodes.constant("votes/label", poll, np.int32)], "votes/classes")
+        more = nodes.add("MatMul", [more, poll.astype(np.int32)], "votes/classes")
     nodes.add("Add", ["votes", more], "votes_next")
     return nodes, [*inputs, votes], [*outputs, next_of(votes)]
 
@@ -114,32 +113,27 @@ def _dense(nodes: Nodes, checkpoint: Checkpoint, layer: int, received: str) -> s
     name = dense.name
     weight = dense.weight if checkpoint.towers == 1 else expand_dense(checkpoint, layer).toarray()
     spikes = nodes.cast(received, f"{name}/spikes", np.float32)
-    product = nodes.add("MatMul", [spikes, nodes.constant(f"{name}/weight", weight.T, np.float32)], f"{name}/product")
-    return nodes.add("Add", [product, nodes.constant(f"{name}/bias", dense.bias, np.float32)], f"{name}/current")
+    product = nodes.add("MatMul", [spikes, weight.T.astype(np.float32)], f"{name}/product")
+    return nodes.add("Add", [product, dense.bias.astype(np.float32)], f"{name}/current")
 
 
 def _convolution(nodes: Nodes, checkpoint: Checkpoint, adjacency: FloatArray, size: int) -> str:
     """``sum_k A^k x g_k + b``, a hop at a time; (batch, taxels * features)."""
     taxels, channels = checkpoint.taxels, checkpoint.hops.shape[2]
-    split = nodes.constant("conv1/split", [-1, taxels, channels], np.int64)
-    beside = nodes.constant("conv1/beside", [taxels, -1], np.int64)
-    apart = nodes.constant("conv1/apart", [taxels, -1, channels], np.int64)
-    column = nodes.constant("conv1/column", [-1, channels], np.int64)
-    spread = nodes.constant("conv1/adjacency", adjacency, np.float32)
-    events = nodes.add("Reshape", [nodes.cast("events", "conv1/events", np.float32), split], "conv1/taxels")
+    spread = nodes.constant("conv1/adjacency", adjacency.astype(np.float32))
+    numbers, by_taxel = nodes.cast("events", "conv1/events", np.float32), np.array([-1, taxels, channels])
+    events = nodes.add("Reshape", [numbers, by_taxel], "conv1/taxels")
     # taxels first: a hop is then one product with a wide matrix
     first = nodes.add("Transpose", [events], "conv1/first", perm=[1, 0, 2])
-    reached = nodes.add("Reshape", [first, beside], "conv1/hop0")
+    reached = nodes.add("Reshape", [first, np.array([taxels, -1])], "conv1/hop0")
     total = ""
     for k, taps in enumerate(checkpoint.hops):
         if k:
             reached = nodes.add("MatMul", [spread, reached], f"conv1/hop{k}")
-        apart_k = nodes.add("Reshape", [reached, apart], f"conv1/apart{k}")
-        turned = nodes.add("Transpose", [apart_k], f"conv1/turned{k}", perm=[1, 0, 2])
-        rows = nodes.add("Reshape", [turned, column], f"conv1/rows{k}")
-        filters = nodes.constant(f"conv1/filter{k}", taps.T, np.float32)
-        term = nodes.add("MatMul", [rows, filters], f"conv1/term{k}")
+        apart = nodes.add("Reshape", [reached, np.array([taxels, -1, channels])], f"conv1/apart{k}")
+        turned = nodes.add("Transpose", [apart], f"conv1/turned{k}", perm=[1, 0, 2])
+        rows = nodes.add("Reshape", [turned, np.array([-1, channels])], f"conv1/rows{k}")
+        term = nodes.add("MatMul", [rows, taps.T.astype(np.float32)], f"conv1/term{k}")
         total = nodes.add("Add", [total, term], f"conv1/sum{k}") if total else term
-    biased = nodes.add("Add", [total, nodes.constant("conv1/bias", checkpoint.conv_bias, np.float32)], "conv1/biased")
-    form = nodes.constant("conv1/form", [-1, size], np.int64)
-    return nodes.add("Reshape", [biased, form], "conv1/current")
+    biased = nodes.add("Add", [total, checkpoint.conv_bias.astype(np.float32)], "conv1/biased")
+    return nodes.add("Reshape", [biased, np.array([-1, size])], "conv1/current")

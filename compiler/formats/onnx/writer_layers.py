@@ -14,18 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from spikeloom.compiler.fixedpoint import (
-    ACCUMULATOR_MAX,
-    CURRENT_MAX,
-    DECAY_BITS,
-    MEMBRANE_MAX,
-    MEMBRANE_SHIFT,
-    largest_current,
-)
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.formats.onnx.builder import require_room
 from spikeloom.compiler.ir import INPUT
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, Reach, reach
 from spikeloom.compiler.types import IntArray
 
 ONE = 2**DECAY_BITS
@@ -106,20 +99,15 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
     Raises ModelError if their weights as dense matrices are more than a file holds.
     """
     names = plain_names([layer.name for layer in netlist.layers], taken=["input"])
-    inner = netlist.axon_source >= netlist.n_inputs
-    pre_of_axon = np.where(inner, netlist.layer[np.where(inner, netlist.axon_source - netlist.n_inputs, 0)], INPUT)
+    pre_of_axon = np.append(np.full(netlist.n_inputs, INPUT), netlist.layer)[netlist.axon_source]
     # zeros of dense lists are no synapses
     weight = netlist.effective_weight()
     real = weight != 0
     weight, axon, target = weight[real], netlist.axon_of_synapse()[real], netlist.synapse_compartment()[real]
     pre, post = pre_of_axon[axon], netlist.layer[target]
     pairs = np.unique(np.stack([post, pre], axis=1), axis=0)
-    place = np.zeros(netlist.n_compartments, np.int64)
-    counts = {INPUT: netlist.n_inputs}
-    for index in range(len(netlist.layers)):
-        ids = netlist.compartments_of(index)
-        place[ids] = np.arange(len(ids))
-        counts[index] = len(ids)
+    place = netlist.number_in_layer()
+    counts = {INPUT: netlist.n_inputs} | dict(enumerate(np.bincount(netlist.layer, minlength=len(names)).tolist()))
     require_room(sum(counts[a] * counts[b] for b, a in pairs.tolist()))
     row = np.append(np.arange(netlist.n_inputs), place)[netlist.axon_source[axon]]
 
@@ -129,40 +117,26 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
         positive, negative = (sparse.coo_array(each, shape=(counts[a], counts[b])).toarray() for each in entries)
         return positive, negative
 
-    bounds = one_step_bounds(netlist)
+    reached = reach(netlist)
     layers = [
-        _layer(netlist, index, name, {a: weights(a, b) for b, a in pairs.tolist() if b == index}, bounds)
+        _layer(netlist, index, name, {a: weights(a, b) for b, a in pairs.tolist() if b == index}, reached)
         for index, name in enumerate(names)
         if counts[index]
     ]
     return tuple(sorted(layers, key=lambda layer: layer.depth))
 
 
-def _layer(
-    netlist: Netlist,
-    index: int,
-    name: str,
-    sources: dict[int, Weights],
-    bounds: tuple[IntArray, IntArray],
-) -> Layer:
+def _layer(netlist: Netlist, index: int, name: str, sources: dict[int, Weights], reached: Reach) -> Layer:
     ids = netlist.compartments_of(index)
-    up, down = (bound[ids] << MEMBRANE_SHIFT for bound in bounds)
+    sums, current, highest, stored = (bound[ids] for bound in reached)
     lost_u, lost_v = netlist.decay_u[ids] + 1, netlist.decay_v[ids]
     threshold = netlist.threshold[ids] << MEMBRANE_SHIFT
     bias = netlist.bias_mantissa[ids] << netlist.bias_exponent[ids]
-    lasting_up, lasting_down = (largest_current(bound[ids], netlist.decay_u[ids]) for bound in bounds)
-    highest = np.maximum(lasting_up, lasting_down)
-    checked = bool(np.any(np.maximum(up, down) > ACCUMULATOR_MAX) or np.any(highest > CURRENT_MAX))
-    fall = lasting_down + np.maximum(-bias, 0)
-    lowest = np.where(lost_v > 0, fall * ONE // np.maximum(lost_v, 1), np.where(fall > 0, MEMBRANE_MAX + 1, 0))
-    rise = (threshold * (ONE - lost_v) >> DECAY_BITS) + lasting_up + np.maximum(bias, 0)
-    stored = np.minimum(np.maximum(threshold, lowest), MEMBRANE_MAX)
-    gathered = _gathered(sources)
-    current = np.minimum(highest, CURRENT_MAX) + gathered
+    held_current, held = np.minimum(current, CURRENT_MAX), np.minimum(stored, MEMBRANE_MAX)
     widest = max(
-        int((stored * (ONE - lost_v)).max()),
-        int((np.minimum(highest, CURRENT_MAX) * (ONE - lost_u)).max()),
-        int((stored + current + np.abs(bias)).max()),
+        int((held * (ONE - lost_v)).max()),
+        int((held_current * (ONE - lost_u)).max()),
+        int((held + held_current + np.abs(bias)).max()) + _gathered(sources),
     )
     return Layer(
         index=index,
@@ -176,8 +150,8 @@ def _layer(
         bias=bias,
         label=netlist.readout_class[ids],
         remembers=bool(np.any(lost_u != ONE)),
-        checked=checked,
-        saturates=bool(np.any(rise > MEMBRANE_MAX) or np.any(lowest > MEMBRANE_MAX)),
+        checked=bool(np.any(sums > ACCUMULATOR_MAX) or np.any(current > CURRENT_MAX)),
+        saturates=bool(np.any(np.maximum(highest, stored) > MEMBRANE_MAX)),
         kind=np.int32 if widest <= NARROW else np.int64,
     )
 

@@ -26,12 +26,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
-from spikeloom.compiler.fixedpoint import in_units
+from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, in_units, largest_current
 from spikeloom.compiler.text import digest, sensor, span
 from spikeloom.compiler.types import FloatArray, IntArray
 
@@ -144,6 +144,14 @@ class Netlist:
         ids = np.flatnonzero(self.layer == layer)
         return ids[np.argsort(self.neuron[ids], kind="stable")]
 
+    def number_in_layer(self) -> IntArray:
+        """Place of each compartment among those of its layer; shape (compartments,)."""
+        number = np.empty(self.n_compartments, np.int64)
+        for layer in range(len(self.layers)):
+            ids = self.compartments_of(layer)
+            number[ids] = np.arange(len(ids))
+        return number
+
     def core_of_compartment(self) -> IntArray:
         """Core of each compartment; shape (compartments,)."""
         return np.repeat(np.arange(self.n_cores), np.diff(self.core_compartments))
@@ -193,6 +201,33 @@ def one_step_bounds(netlist: Netlist) -> tuple[IntArray, IntArray]:
             # float64 sums of integers below 2**53 are exact
             sums[first:last] = np.bincount(compartment - first, np.maximum(share, 0), last - first)
     return positive, negative
+
+
+class Reach(NamedTuple):
+    """What no input can exceed, as magnitudes in membrane units; all (compartments,) int64."""
+
+    sums: IntArray  # of the weights of one sign that one step brings
+    current: IntArray
+    highest: IntArray  # the membrane, held against the threshold
+    stored: IntArray  # the membrane after that, of either sign
+
+
+def reach(netlist: Netlist) -> Reach:
+    """Bounds of the registers of each compartment, whatever the input."""
+    bounds = one_step_bounds(netlist)
+    up, down = (largest_current(sums, netlist.decay_u) for sums in bounds)
+    bias = netlist.bias_mantissa << netlist.bias_exponent
+    # a membrane is left at the threshold at most; below zero it loses as much as it can gain at the far end
+    above, lost = np.maximum(netlist.threshold << MEMBRANE_SHIFT, 0), netlist.decay_v
+    gained = down + np.maximum(-bias, 0)
+    endless = np.where(gained > 0, MEMBRANE_MAX + 1, 0)
+    below = np.where(lost > 0, (gained << DECAY_BITS) // np.maximum(lost, 1), endless)
+    return Reach(
+        sums=np.maximum(*bounds) << MEMBRANE_SHIFT,
+        current=np.maximum(up, down),
+        highest=(above * (2**DECAY_BITS - lost) >> DECAY_BITS) + up + np.maximum(bias, 0),
+        stored=np.maximum(above, below),
+    )
 
 
 def netlist_text(netlist: Netlist) -> str:

@@ -59,7 +59,7 @@ def signed_range(bits: int) -> tuple[int, int]:
 def _owner(core: int, who: str, others: int) -> str:
     """The first offender on a core, and how many more there are."""
     place = f"core {core}{', ' * bool(who)}" if core >= 0 else ""
-    return f"{place}{who}" + (f" (and {others} more on this core)" if others else "")
+    return f"{place}{who}" + (f" (and {others} more{' on this core' * (core >= 0)})" if others else "")
 
 
 def _cores(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
@@ -201,19 +201,13 @@ def _feeds(netlist: CrossbarNetlist, _chip: Target) -> Iterator[Broken]:
 
 def _clocks(netlist: CrossbarNetlist, _chip: Target) -> Iterator[Broken]:
     columns = netlist.aims()[1], netlist.clock_core, netlist.clock_line, netlist.clock_period, netlist.clock_phase
-    for row, (axon, core, line, period, phase) in enumerate(np.stack(columns, axis=1).tolist()):
-        who = -1, f"clock {row}"
-        if period < 1:
-            yield [(*who, f"a period of {period} ticks")], "1 or more", "clock", "say every how many ticks it spikes"
-        if phase < 0:
-            yield [(*who, f"phase {phase}")], "0 or later", "clock", "start it with the recording"
-        if axon < 0:
-            yield (
-                [(*who, f"line {line} of core {core}")],
-                "an axon of a core",
-                "target",
-                "add the axon, or omit the clock",
-            )
+    rows = [(f"clock {row}", *entry) for row, entry in enumerate(np.stack(columns, axis=1).tolist())]
+    still = [(-1, who, f"a period of {period} ticks") for who, _, _, _, period, _ in rows if period < 1]
+    early = [(-1, who, f"phase {phase}") for who, *_, phase in rows if phase < 0]
+    lost = [(-1, who, f"line {line} of core {core}") for who, axon, core, line, *_ in rows if axon < 0]
+    yield still, "1 or more", "clock", "say every how many ticks it spikes"
+    yield early, "0 or later", "clock", "start it with the recording"
+    yield lost, "an axon of a core", "target", "add the axon, or omit the clock"
 
 
 def needs(network: Network, chip: Target) -> tuple[Violation, ...]:

@@ -19,10 +19,8 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.codebook import COPIES, LevelNetwork, in_levels
 from spikeloom.compiler.targets.truenorth.in_time import lower_in_time
 from spikeloom.compiler.targets.truenorth.legalize import needs, require_legal
-from spikeloom.compiler.targets.truenorth.lower import lower
-from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork
-from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
-from spikeloom.compiler.targets.truenorth.netlist_file import inconsistencies
+from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork, lower
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, inconsistencies
 from spikeloom.compiler.text import digest, span, text
 
 WAYS = (

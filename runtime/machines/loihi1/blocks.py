@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, largest_current
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
+from spikeloom.compiler.fixedpoint import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, reach
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.loihi1.block_kernel import LANES, Blocks
 
@@ -29,25 +29,15 @@ NEVER = 2**31 - 1
 
 def _in_range(netlist: Netlist) -> bool:
     """Whether no input whatever brings a sum, a membrane or a product that the kernel cannot hold."""
-    positive, negative = one_step_bounds(netlist)
-    if max(int(positive.max(initial=0)), int(negative.max(initial=0))) > SUM_MAX:
-        return False
-    bias = netlist.bias_mantissa << netlist.bias_exponent
-    keep, lost_u = 2**DECAY_BITS - netlist.decay_v, netlist.decay_u + 1
-    lasts = lost_u != 2**DECAY_BITS
-    up, down = (largest_current(sums, netlist.decay_u) for sums in (positive, negative))
-    if np.any(np.maximum(up, down) > CURRENT_MAX):
-        return False
-    # a membrane is left at the threshold at most; below zero it loses as much as it can gain at the far end
-    above = np.maximum(netlist.threshold << MEMBRANE_SHIFT, 0)
-    gained = down + np.maximum(-bias, 0)
-    if np.any((keep == 2**DECAY_BITS) & (gained > 0)):
-        return False
-    below = (gained << DECAY_BITS) // np.maximum(2**DECAY_BITS - keep, 1) + 1
-    highest = (above * keep >> DECAY_BITS) + up + np.maximum(bias, 0)
-    stored = np.maximum(above, below)
-    narrow = np.all((stored * keep < 2**32) | lasts)  # beside a lasting current products are taken in two parts
-    return bool(np.all(highest <= MEMBRANE_MAX) and np.all(stored <= MEMBRANE_MAX) and narrow)
+    reached = reach(netlist)
+    lasts = netlist.decay_u + 1 != 2**DECAY_BITS
+    product = reached.stored * (2**DECAY_BITS - netlist.decay_v)
+    return bool(
+        np.all(reached.sums <= SUM_MAX << MEMBRANE_SHIFT)
+        and np.all(reached.current <= CURRENT_MAX)
+        and np.all(np.maximum(reached.highest, reached.stored) <= MEMBRANE_MAX)
+        and np.all((product < 2**32) | lasts)  # beside a lasting current products are taken in two parts
+    )
 
 
 def _is_pipeline(netlist: Netlist) -> bool:

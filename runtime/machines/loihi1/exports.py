@@ -160,7 +160,7 @@ def _netx(request: Request) -> Export:
         layers=layers,
         recordings=count,
     )
-    content = netx.file_bytes(netx.tree_of(network, blocks))
+    content = netx.file_bytes(network, blocks)
     return Export(content=[content], facts=facts, synapses=facts.synapses, lines=tuple(lines))
 
 

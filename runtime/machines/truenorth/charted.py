@@ -12,8 +12,7 @@ from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.truenorth.native import SYSTEM, highest_level
 from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained
-from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
-from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Options
 from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.recordings.evtouch import Recordings

@@ -18,8 +18,7 @@ from spikeloom.compiler.targets.truenorth.codebook import PartialSums, in_levels
 from spikeloom.compiler.targets.truenorth.in_time import first_spikes
 from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
-from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
-from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Compilation, Options
 from spikeloom.compiler.types import BoolArray, JsonObject
 from spikeloom.runtime.inputs.files import shipped

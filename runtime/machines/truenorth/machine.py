@@ -15,8 +15,7 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import with_tables
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
-from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
-from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.base import EventArray, Machine, Price, Run, one_by_one
 from spikeloom.runtime.machines.truenorth import cost, engine, spec
