@@ -195,7 +195,7 @@ def test_fetch(monkeypatch, tmp_path):
 
 def test_matplotlib_is_loaded_for_pictures_only():
     code = (
-        "import sys, spikeloom.runtime.commands.exchange.data, spikeloom.runtime.commands.exchange.data_picture\n"
+        "import sys, spikeloom.runtime.commands.exchange.data\n"
         "assert not {'matplotlib', 'torch'} & set(sys.modules), 'loaded early'"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -59,7 +59,7 @@ def test_a_network_counted_by_hand():
 
 
 def test_prices_are_the_published_ones():
-    assert {name: price.value for name, price in HOROWITZ.items()} == {
+    assert HOROWITZ == {
         "float32_add": 0.9,
         "float32_multiply": 3.7,
         "int8_multiply": 0.2,

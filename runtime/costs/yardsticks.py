@@ -28,7 +28,6 @@ from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GCN, TACTILESGNET
-from spikeloom.compiler.targets.base import Quantity
 from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.report.encode import key
 from spikeloom.runtime.report.numbers import si
@@ -40,13 +39,8 @@ FLOAT_BYTES = 4
 """Bytes of a float32 parameter."""
 
 _SOURCE = "Horowitz, ISSCC 2014, figure 1.1.9 (45 nm, 0.9 V)"
-HOROWITZ: Mapping[str, Quantity] = {
-    "float32_add": Quantity(value=0.9, unit="pJ", source=_SOURCE),
-    "float32_multiply": Quantity(value=3.7, unit="pJ", source=_SOURCE),
-    "int8_multiply": Quantity(value=0.2, unit="pJ", source=_SOURCE),
-    "int32_add": Quantity(value=0.1, unit="pJ", source=_SOURCE),
-}
-"""Energy of one operation."""
+HOROWITZ = {"float32_add": 0.9, "float32_multiply": 3.7, "int8_multiply": 0.2, "int32_add": 0.1}
+"""Energy of one operation, pJ."""
 
 MULTIPLY_ACCUMULATE = {
     "float32": ("float32_multiply", "float32_add"),
@@ -99,7 +93,7 @@ class Arithmetic:
     @property
     def energy_j(self) -> float:
         """Energy per recording."""
-        parts = [HOROWITZ[part].value for part in MULTIPLY_ACCUMULATE[self.numbers]]
+        parts = [HOROWITZ[part] for part in MULTIPLY_ACCUMULATE[self.numbers]]
         return (self.macs * sum(parts) + self.acs * parts[-1]) * 1e-12
 
 
@@ -111,9 +105,7 @@ class Yardsticks:
     neurobench: NeuroBench
     arithmetic: tuple[Arithmetic, ...]
     graph: str | None = None
-    prices_pj: Mapping[str, float] = field(
-        default_factory=lambda: {name: price.value for name, price in HOROWITZ.items()}
-    )
+    prices_pj: Mapping[str, float] = field(default_factory=HOROWITZ.copy)
     source: str = _SOURCE
     not_counted: str = NOT_COUNTED
 

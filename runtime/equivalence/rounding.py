@@ -30,7 +30,7 @@ from spikeloom.compiler.fixedpoint import (
     reach,
     step_units,
 )
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network, Sparse
+from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection, Network, Projection, Sparse
 from spikeloom.compiler.passes.prune import never_fires
 from spikeloom.compiler.types import BoolArray
 from spikeloom.runtime.machines.integer import IntegerMachine
@@ -132,8 +132,16 @@ def _may_be_zero(integer: IntegerNetwork, post: int, silent: BoolArray, pruned: 
     return silent | ~stored
 
 
-def _sum(parts: Sequence[Sparse], shape: tuple[int, int]) -> Sparse:
-    return sum((part.astype(np.float64) for part in parts), start=sparse.csr_array(shape, dtype=np.float64))
+def summed(stage: Network | IntegerNetwork, pre: int, post: int) -> Sparse:
+    """Weights from one population to another, mantissas of planes added up; float64."""
+    size = stage.input.size if pre == INPUT else stage.populations[pre].size
+    found = sparse.csr_array((stage.populations[post].size, size), dtype=np.float64)
+    projections: tuple[Projection | IntegerProjection, ...] = stage.projections
+    for projection in projections:
+        if (projection.pre, projection.post) == (pre, post):
+            weight = projection.effective() if isinstance(projection, IntegerProjection) else projection.weight
+            found = found + weight.astype(np.float64)
+    return found
 
 
 def _check_layer(
@@ -156,16 +164,14 @@ def _check_layer(
     weights, wrong, farthest = 0, 0, 0.0
     lost = np.zeros((2, wanted.size))  # what each neuron's weights lose to, and gain on, the checkpoint's; weight units
     for pre in sorted({p.pre for stage in (network, integer) for p in stage.projections if p.post == post}):
-        size = network.input.size if pre == INPUT else network.populations[pre].size
-        real = _sum([p.weight for p in network.projections if (p.pre, p.post) == (pre, post)], (wanted.size, size))
+        real, stored = summed(network, pre, post), summed(integer, pre, post)
         real.data = np.clip(real.data * np.repeat(chip.scale, np.diff(real.indptr)), -most, most)
-        stored = _sum([p.effective() for p in planes if p.pre == pre], (wanted.size, size))
         row, column = (abs(real) + abs(stored)).nonzero()
         if not len(row):
             continue
         off = np.asarray((stored - real)[row, column]).ravel()
         kept = np.asarray(stored[row, column]).ravel()
-        sends, silent = (~channels, np.zeros(size, np.bool_)) if pre == INPUT else (~absent[pre], zeroed[pre])
+        sends, silent = (~channels, np.zeros(len(channels), np.bool_)) if pre == INPUT else (~absent[pre], zeroed[pre])
         counts = held[row] & sends[column] & ~((kept == 0) & (zeroed[post][row] | silent[column]))
         row, off = row[counts], off[counts]
         weights += len(off)

@@ -12,9 +12,8 @@ import numpy as np
 from spikeloom.runtime.equivalence.sections import sections as verdict_sections
 from spikeloom.runtime.machines.page_parts import Cores
 from spikeloom.runtime.page import pictures
-from spikeloom.runtime.page.provenance import Provenance
 from spikeloom.runtime.page.recording import LayerRaster, Recording, Trace
-from spikeloom.runtime.page.results import Decisions, Report, Taxels
+from spikeloom.runtime.page.results import Decisions, Provenance, Report, Taxels
 from spikeloom.runtime.report import drawing
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Outcome, Section, Table, Text

@@ -20,7 +20,7 @@ from spikeloom.models.recordings.fetch import DATA_SETS, data_folder, fetch_data
 from spikeloom.models.recordings.grasps import SPLITS, SYNTHETIC, synthetic_split
 from spikeloom.models.recordings.release import SOURCES, write_event_lines, write_released
 from spikeloom.models.sensors import read_layout
-from spikeloom.runtime.commands.exchange.described import describe, described_sections
+from spikeloom.runtime.commands.exchange.described import describe, described_sections, picture
 from spikeloom.runtime.commands.options import add_bin_option, add_common
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import require_bins
@@ -142,8 +142,6 @@ def _describe(arguments: Arguments) -> Outcome:
     if places is None and recordings.taxels == len(NEUTOUCH):
         places = NEUTOUCH
     if arguments.picture is not None:
-        from spikeloom.runtime.commands.exchange.data_picture import picture  # Matplotlib, so only here
-
         with write_atomically(arguments.picture) as file:
             file.write(picture(result, places).file("png"))
     return Outcome(result, described_sections)

@@ -112,6 +112,20 @@ class Display:
         sys.stdout.flush()
 
 
+@dataclass(slots=True, kw_only=True)
+class Summary:
+    """All grasps together; `early` counts those that ended before their length, where they may."""
+
+    kind: str = "end"
+    grasps: int = 0
+    bins: int = 0
+    events: int = 0
+    repeated: int = 0
+    late: int = 0
+    interrupted: bool = False
+    early: int | None = field(default=None, metadata=OPTIONAL)
+
+
 @dataclass(kw_only=True, eq=False)
 class Watch:
     """Bins events and steps a stream; one pass over the lines, any number of grasps."""
@@ -130,15 +144,10 @@ class Watch:
     epoch: float = 0.0  # Wall clock at the origin
     decided: bool = False
     last: tuple[Step, ...] = ()
-    grasps: int = 0
-    stepped: int = 0  # Bins of all grasps
-    events: int = 0
-    repeated: int = 0
-    late: int = 0
-    early: int = 0
+    found: Summary = field(default_factory=Summary)
 
-    def run(self) -> bool:
-        """Follow the lines to their end; return whether the user, or the reader of our output, ended it before."""
+    def run(self) -> None:
+        """Follow the lines to their end, or until the user, or the reader of our output, ends it before."""
         try:
             while True:
                 if self.real and self._is_open() and not self.lines.arrived(self._wall(self.stream.index + 2)):
@@ -150,13 +159,13 @@ class Watch:
                 elif entry is not Mark.NOTHING:
                     self._end_grasp()
                     if entry is Mark.END_OF_STREAM:
-                        return False
+                        return
         except KeyboardInterrupt:
             if self._is_open() and self.stream.index:  # what the open bin holds is not all of it
                 self._decide()
         except BrokenPipeError:
             pass
-        return True
+        self.found.interrupted = True
 
     def _is_open(self) -> bool:
         """Whether a grasp has begun and is not decided."""
@@ -168,7 +177,7 @@ class Watch:
 
     def _take(self, event: Event) -> None:
         """Put an event into its bin; step the bins before it."""
-        self.events += 1
+        self.found.events += 1
         if self.origin is None:
             self.origin = event.time_s if self.from_first else Decimal(0)
             self.epoch = time.monotonic() - float(event.time_s - self.origin)
@@ -183,9 +192,9 @@ class Watch:
         while self._is_open() and self.stream.index < index:
             self._close_bin()
         if self.decided or index < self.stream.index:
-            self.late += 1
+            self.found.late += 1
             return
-        self.repeated += int(self.column[event.channel])
+        self.found.repeated += int(self.column[event.channel])
         self.column[event.channel] = 1
 
     def _close_bin(self, *, wait: bool = True) -> None:
@@ -195,7 +204,7 @@ class Watch:
         step = self.stream.step(self.column)
         self.last = (step,)
         self.column[:] = 0
-        self.display.bin(self.grasps + 1, step)
+        self.display.bin(self.found.grasps + 1, step)
         if step.index + 1 == self.bins:
             self._decide()
         elif self.may_end is not None and self.may_end(step.index, step.counts):
@@ -215,24 +224,11 @@ class Watch:
         bins = self.stream.index
         self.decided = True
         last = self.last[-1] if early else (*self.last, *self.stream.finish())[-1]
-        self.grasps += 1
-        self.stepped += bins
-        self.early += early
-        self.display.grasp(self.grasps, bins, last, early=None if self.may_end is None else early)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Summary:
-    """All grasps together; `early` counts those that ended before their length, where they may."""
-
-    kind: str = "end"
-    grasps: int
-    bins: int
-    events: int
-    repeated: int
-    late: int
-    interrupted: bool
-    early: int | None = field(default=None, metadata=OPTIONAL)
+        self.found.grasps += 1
+        self.found.bins += bins
+        if self.found.early is not None:
+            self.found.early += early
+        self.display.grasp(self.found.grasps, bins, last, early=None if self.may_end is None else early)
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
@@ -274,20 +270,12 @@ def run(arguments: argparse.Namespace) -> Outcome:
             from_first=arguments.origin == "first",
             real=arguments.speed == "real",
             may_end=None if factor is None else exits.live(integer_machine(machine), arguments.bins, factor),
+            found=Summary(early=None if factor is None else 0),
         )
-        interrupted = session.run()
-    if not session.events and not interrupted:
+        session.run()
+    if not session.found.events and not session.found.interrupted:
         raise DataError(f"{name}: empty stream, no event found; give lines 'time_s,taxel,polarity'")
-    summary = Summary(
-        grasps=session.grasps,
-        bins=session.stepped,
-        events=session.events,
-        repeated=session.repeated,
-        late=session.late,
-        interrupted=interrupted,
-        early=None if factor is None else session.early,
-    )
-    return Outcome(summary, sections)
+    return Outcome(session.found, sections)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,9 +16,8 @@ from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
-from spikeloom.runtime.page.provenance import provenance
 from spikeloom.runtime.page.recording import recording
-from spikeloom.runtime.page.results import Report, decisions, taxels
+from spikeloom.runtime.page.results import Report, decisions, provenance, taxels
 from spikeloom.runtime.page.sections import about, sections
 from spikeloom.runtime.report import html
 from spikeloom.runtime.report.sections import Outcome, Section, Text

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, reach, step_units
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection, Network, Projection
+from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.equivalence.rounding import SLACK
+from spikeloom.runtime.equivalence.rounding import SLACK, summed
 
 WEIGHTS, BIAS, BETA = "weight rounding", "bias rounding", "realised beta"
 TRUNCATION, SATURATION, TIE = "round toward zero", "saturation or overflow", "tie (> or >=)"
@@ -52,25 +52,15 @@ def sources_into(network: Network, integer: IntegerNetwork, post: int) -> tuple[
 def weights_into(network: Network, integer: IntegerNetwork, post: int, rows: IntArray) -> FloatArray:
     """Weights in membrane units into neurons of a population, (3, neurons, sources), by ``Variant.weights``."""
     pres, scale = sources_into(network, integer, post), integer.populations[post].scale[rows]
-    real, stored = _dense(network, post, pres, rows) * scale[:, None], _dense(integer, post, pres, rows)
+    real, stored = (
+        np.concatenate([summed(stage, pre, post)[rows].toarray() for pre in pres], axis=1)
+        for stage in (network, integer)
+    )
+    real *= scale[:, None]
     planes = {(p.bits, p.exponent) for p in integer.projections if p.post == post}
     bits, exponents = min(b for b, _ in planes), tuple(sorted({e for _, e in planes}))
     clipped = np.abs(real) > reach(bits, exponents) * step_units(bits, exponents) * SLACK
     return np.stack([stored, real, np.where(clipped, real, stored)]) * (1 << MEMBRANE_SHIFT)
-
-
-def _dense(stage: Network | IntegerNetwork, post: int, pres: tuple[int, ...], rows: IntArray) -> FloatArray:
-    """Weights into neurons, those of all sources side by side; mantissas of planes added up."""
-    blocks = []
-    for pre in pres:
-        block = np.zeros((len(rows), stage.input.size if pre == INPUT else stage.populations[pre].size))
-        projections: tuple[Projection | IntegerProjection, ...] = stage.projections
-        for projection in projections:
-            if (projection.pre, projection.post) == (pre, post):
-                weight = projection.effective() if isinstance(projection, IntegerProjection) else projection.weight
-                block += weight[rows].toarray()
-        blocks.append(block)
-    return np.concatenate(blocks, axis=1)
 
 
 def variants_of(
