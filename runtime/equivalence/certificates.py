@@ -62,12 +62,10 @@ def wins(decisions: IntArray, least: IntArray, most: IntArray) -> BoolArray:
     >>> wins(np.array([0, 0, 0]), least, most).tolist()
     [True, False, True]
     """
-    rows = np.arange(len(decisions))
-    own = least[rows, decisions][:, None]
-    classes = np.arange(least.shape[1])
-    beaten = np.where(classes < decisions[:, None], most < own, most <= own)
-    beaten[rows, decisions] = True
-    sure: BoolArray = np.logical_and.reduce(beaten, axis=1)
+    rows, classes = np.arange(len(decisions)), np.arange(least.shape[1])
+    ahead = least[rows, decisions][:, None] - most
+    ahead[rows, decisions] = 0  # no class has to beat itself
+    sure: BoolArray = np.all(ahead >= (classes < decisions[:, None]), axis=1)
     return sure
 
 

@@ -63,12 +63,8 @@ def storage(packings: tuple[Packing, ...] | None, checkpoint: Checkpoint | None)
     """The same for the provenance of a netlist."""
     if checkpoint is not None and checkpoint.forms is not None:
         return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}
-    known = packings or (Packing(),)
-    return {
-        "weight_bits": _one_or_list([packing.bits for packing in known]),
-        "planes": _one_or_list([packing.planes for packing in known]),
-        "scale_groups": _one_or_list([packing.groups for packing in known]),
-    }
+    known, names = packings or (Packing(),), {"weight_bits": "bits", "planes": "planes", "scale_groups": "groups"}
+    return {name: _one_or_list([getattr(packing, field) for packing in known]) for name, field in names.items()}
 
 
 def _one_or_list(values: list[int]) -> int | list[int]:

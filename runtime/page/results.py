@@ -36,14 +36,23 @@ PACKAGES = ("numpy", "scipy", "torch", "numba", "networkx")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Decisions:
-    """Every recording's decisions; a matrix (classes, classes) of each side counts them, rows by label."""
+    """Every recording's decisions."""
 
     classes: int
-    matrices: Mapping[str, IntArray]
     files: tuple[str, ...]
     labels: IntArray
     model: IntArray = field(metadata=key("float"))
     chip: IntArray
+
+    json_properties = ("matrices",)
+
+    @property
+    def matrices(self) -> Mapping[str, IntArray]:
+        """Of each side how often a label (rows) is decided as a class, (classes, classes)."""
+        found = {side: np.zeros((self.classes, self.classes), np.int64) for side in ("float", "chip")}
+        np.add.at(found["float"], (self.labels, self.model), 1)
+        np.add.at(found["chip"], (self.labels, self.chip), 1)
+        return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -97,22 +106,6 @@ class Report:
     output: str
     described: Outcome = field(metadata=HIDDEN)
     chip: BatchParts = field(metadata=HIDDEN)
-
-
-def decisions(verdict: Verdict, classes: int) -> Decisions:
-    """Confusion matrices of both sides, and every recording's decisions."""
-    sides = {"float": verdict.float_predictions, "chip": verdict.chip_predictions}
-    matrices = {side: np.zeros((classes, classes), np.int64) for side in sides}
-    for side, decided in sides.items():
-        np.add.at(matrices[side], (verdict.labels, decided), 1)
-    return Decisions(
-        classes=classes,
-        matrices=matrices,
-        files=verdict.files,
-        labels=verdict.labels,
-        model=verdict.float_predictions,
-        chip=verdict.chip_predictions,
-    )
 
 
 def taxels(

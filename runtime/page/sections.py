@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.runtime.equivalence.sections import sections as verdict_sections
+from spikeloom.runtime.equivalence.verdict import sections as verdict_sections
 from spikeloom.runtime.machines.page_parts import Cores
 from spikeloom.runtime.page import pictures
 from spikeloom.runtime.page.recording import LayerRaster, Recording, Trace
@@ -78,7 +78,7 @@ def _cards(report: Report) -> dict[str, tuple[str, str]]:
 
 
 def _decisions(found: Decisions) -> list[Block]:
-    ours, chip = found.matrices["float"], found.matrices["chip"]
+    ours, chip = found.matrices.values()
     pairs = sorted(np.argwhere(ours + chip).tolist(), key=lambda pair: -int(ours[*pair] + chip[*pair]))
     wrong = [
         [f"{label} as {decided}", str(ours[label, decided]), str(chip[label, decided])]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import sha256_of, write_atomically
@@ -17,11 +16,11 @@ from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
 from spikeloom.runtime.page.recording import recording
-from spikeloom.runtime.page.results import Report, decisions, provenance, taxels
+from spikeloom.runtime.page.results import Decisions, Report, provenance, taxels
 from spikeloom.runtime.page.sections import about, sections
 from spikeloom.runtime.report import html
 from spikeloom.runtime.report.sections import Outcome, Section, Text
-from spikeloom.runtime.studies.stress.results import read_stress
+from spikeloom.runtime.studies.stress.results import Stress, read_stress
 
 NOTES = """\
 The page opens from disk and loads nothing; its figures are inline SVG, each with its numbers as a table. What is
@@ -61,8 +60,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise ModelError(f"{arguments.netlist}: {difference}")  # the page would blame the chip for it
     data = load_recordings(arguments, netlist, labels_for="report")
     machine.require_sensor(data.events)
-    chosen = None if arguments.recording is None else find_recording(data, arguments.recording, "--recording")
-    report = replace(_report(arguments, machine, loaded, data, chosen), stress=battery)
+    report = _report(arguments, machine, loaded, data, battery)
     made = report.provenance
     title = f"{made.netlist.file} on {made.data.file}"
     with write_atomically(arguments.output) as file:
@@ -75,10 +73,15 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
 
 def _report(
-    arguments: argparse.Namespace, machine: IntegerMachine, loaded: LoadedNetwork, data: Recordings, chosen: int | None
+    arguments: argparse.Namespace,
+    machine: IntegerMachine,
+    loaded: LoadedNetwork,
+    data: Recordings,
+    stress: Stress | None,
 ) -> Report:
-    """All that the page shows, but for what other commands found."""
+    """All that the page shows."""
     netlist = machine.netlist
+    chosen = None if arguments.recording is None else find_recording(data, arguments.recording, "--recording")
     account = Account(machine, data, checked=arguments.spec_samples)
     verdict = verify(
         netlist,
@@ -98,9 +101,15 @@ def _report(
     account.begin("the recording")
     origin = provenance(arguments, netlist, machine.target, loaded, data, data.files[chosen])
     described = machine.describe(origin.netlist.sha256)
-    report = Report(
+    return Report(
         verify=verdict,
-        decisions=decisions(verdict, netlist.classes),
+        decisions=Decisions(
+            classes=netlist.classes,
+            files=verdict.files,
+            labels=verdict.labels,
+            model=verdict.float_predictions,
+            chip=verdict.chip_predictions,
+        ),
         netlist=described.result,
         cores=chip.cores,
         taxels=taxels(netlist, loaded, data, chip.spikes, arguments.taxels),
@@ -110,5 +119,6 @@ def _report(
         output=arguments.output,
         described=described,
         chip=chip,
+        stress=stress,
+        explained_cost=account.explained(arguments.explain_cost),
     )
-    return replace(report, explained_cost=account.explained(True)) if arguments.explain_cost else report

@@ -9,8 +9,7 @@ from dataclasses import replace
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_explain_cost, add_netlist_and_model, add_recordings
 from spikeloom.runtime.costs.simulated import Account
-from spikeloom.runtime.equivalence.sections import sections
-from spikeloom.runtime.equivalence.verdict import parse_requirements
+from spikeloom.runtime.equivalence.verdict import parse_requirements, sections
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
