@@ -25,12 +25,8 @@ def sensor_layout(
     by row; axes of length 1 in front are the batch's. How many polarities there are, and whether they are the outer
     axis, the shape says by default; of a flat one there are 2, and they are not.
 
-    Raises
-    ------
-    ModelError
-        If the shape does not say, or says another number than `polarities`.
-    OptionError
-        If there are no such polarities.
+    Raises ModelError if the shape does not say, or says another number than `polarities`; OptionError if there are no
+    such polarities.
 
     Examples
     --------

@@ -88,30 +88,16 @@ def read_checkpoint(
     theta: float | None = None,
     system: str | None = None,
 ) -> Checkpoint:
-    """Read a checkpoint of any known layout.
+    """Read a checkpoint of any known layout; `run` is one of those of a released file.
 
-    Parameters
-    ----------
-    path : path
-        File.
-    run : int
-        Which run of a released file.
-    weights : {"last", "best", "clean"}, optional
-        Which epoch, where the file holds several; the first of these that it holds without. The best one was chosen
-        on the test split, the clean one on a part of the training split.
-    beta, theta : float, optional
-        Decay and threshold; taken from the file, or from the released code where the file does not say.
-    system : str, optional
-        Which system it must be; files in the released layout hold a TactileSGNet.
+    weights: which epoch, ``last``, ``best`` (on the test split) or ``clean`` (on a part of the training split), where
+    the file holds several; the first of these that it holds by default.
+    beta, theta: decay and threshold, where the file does not say; those of the released code by default.
+    system: which it must be; files in the released layout hold a TactileSGNet.
 
-    Raises
-    ------
-    ModelError
-        If the file is no checkpoint, holds code, is damaged or altered, lacks the set or run, or its
-        tensors do not make the system; every fault of the tensors is listed.
-    OptionError
-        If `system` is another than the file's, or `weights`, `beta` or `theta` has a value that does not exist, or a
-        fine-tuned network had another one.
+    Raises ModelError if the file is no checkpoint, holds code, is damaged or altered, lacks the set or run, or its
+    tensors do not make the system, with every fault of them; OptionError if an option contradicts the file, or has a
+    value that does not exist.
     """
     if weights is not None and weights not in WEIGHTS:
         raise OptionError(f"--weights {weights}: unknown; choose from {', '.join(WEIGHTS)}")

@@ -104,14 +104,10 @@ def blocks_of(tree: Tree) -> list[Block]:
 def read_netx(
     path: str | os.PathLike[str], *, polarities: int | None = None, polarities_first: bool | None = None
 ) -> ReadNetwork[IntegerNetwork]:
-    """Read a network; polarities as of :func:`sensor_layout.sensor_layout`.
+    """Read a network; polarities are as of :func:`sensor_layout.sensor_layout`.
 
-    Raises
-    ------
-    ModelError
-        If the file cannot be read, or holds what the chip's neurons here do not do; the message names the layer.
-    OptionError
-        If there are no such polarities.
+    Raises ModelError if the file cannot be read, or holds what the chip's neurons here do not do, naming the layer;
+    OptionError if there are no such polarities.
     """
     try:
         tree, sha256 = read_hdf5(Path(path), "netx file")

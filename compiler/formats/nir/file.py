@@ -14,13 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import networkx as nx
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, read_hdf5
+from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree
 from spikeloom.compiler.formats.names import printable
 
 GRAPH, INPUT_NODE, OUTPUT_NODE = "NIRGraph", "Input", "Output"
@@ -69,13 +68,8 @@ class Graph:
         return found[0]
 
 
-def read_graph(path: Path) -> Graph:
-    """Read a file; ModelError, without the path, if it is none or inconsistent."""
-    return graph_of(*read_hdf5(path, "NIR file"))
-
-
 def graph_of(tree: Tree, sha256: str) -> Graph:
-    """Graph of the content of a file; raises as :func:`read_graph`."""
+    """Graph of the content of a file; ModelError, without the path, if it is none or inconsistent."""
     root = tree.get("node")
     if not isinstance(root, dict) or "type" not in root:
         raise ModelError(f"has no node, so it is no NIR file; {AGAIN}")

@@ -14,8 +14,9 @@ from scipy import sparse
 from spikeloom.compiler.dynamics import MOST_STEPS, RELAY_WEIGHT, Clocks
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble, class_of_each, in_order
+from spikeloom.compiler.formats.hdf5 import read_hdf5
 from spikeloom.compiler.formats.names import printable, unique_names
-from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, loops, read_graph
+from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, graph_of, loops
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
 from spikeloom.compiler.formats.nir.neurons import Neurons, facts_of, neurons_of
 from spikeloom.compiler.formats.nir.stages import KNOWN, STAGES, Value, added, rows_of, scaled, spikes_of
@@ -43,16 +44,11 @@ def read_nir(
     The `convention` (``euler`` by default) says how time constants become decays, see :mod:`nir.neurons`; polarities
     are those of :func:`sensor_layout.sensor_layout`.
 
-    Raises
-    ------
-    ModelError
-        If the file cannot be read, or holds something else than a network that spikes, feed-forward but for recurrent
-        layers; the message names the node.
-    OptionError
-        If there is no time step, or an option has no such value.
+    Raises ModelError if the file cannot be read, or holds something else than a network that spikes, feed-forward but
+    for recurrent layers, naming the node; OptionError if there is no time step, or an option has no such value.
     """
     try:
-        graph = read_graph(Path(path))
+        graph = graph_of(*read_hdf5(Path(path), "NIR file"))
         dt = stated_step(graph) if dt is None else dt
         if dt is None:
             written = written_step(graph)

@@ -40,12 +40,7 @@ Float32 = npt.NDArray[np.float32]
 def export(netlist: Netlist, dt: float) -> bytes:
     """Content of the file, for steps of `dt` seconds; equal netlists give equal bytes.
 
-    Raises
-    ------
-    ModelError
-        If NIR cannot say what the netlist does.
-    OptionError
-        If there is no such time step.
+    Raises ModelError if NIR cannot say what the netlist does, OptionError if there is no such time step.
     """
     require_step(dt)
     network = lift(netlist)

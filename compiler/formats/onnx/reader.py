@@ -35,24 +35,12 @@ OPEN_STEPS = 3
 def read_onnx(
     path: str | os.PathLike[str], *, polarities: int | None = None, polarities_first: bool | None = None
 ) -> ReadNetwork[Network]:
-    """Read a network.
+    """Read a network; polarities are as of :func:`sensor_layout.sensor_layout`.
 
-    Parameters
-    ----------
-    path : path
-        File; data that it keeps beside itself must lie in its folder.
-    polarities : int, optional
-        Polarities of the input, where its shape does not tell.
-    polarities_first : bool, optional
-        Whether the input counts polarity by polarity, where its shape does not tell.
+    Data that the file keeps beside itself must lie in its folder.
 
-    Raises
-    ------
-    ModelError
-        If the file cannot be read, or holds something else than a feed-forward network of leaky integrate-and-fire
-        neurons with affine stages; the message names the operator.
-    OptionError
-        If there are no such polarities.
+    Raises ModelError if the file cannot be read, or holds something else than a feed-forward network of leaky
+    integrate-and-fire neurons with affine stages, naming the operator; OptionError if there are no such polarities.
     """
     try:
         # A constant may divide by zero on its way, as degrees of lonely taxels do; what counts is checked at the end.

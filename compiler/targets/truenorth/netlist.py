@@ -238,11 +238,7 @@ def inconsistencies(netlist: CrossbarNetlist) -> list[str]:
     on_core = np.diff(netlist.core_neurons)[netlist.core_of_axon()][netlist.axon_of_synapse()]
     if netlist.n_synapses and (netlist.synapse_neuron.min() < 0 or np.any(netlist.synapse_neuron >= on_core)):
         found.append("synapse_neuron points beyond its core")
-    step = np.diff(netlist.synapse_neuron)
-    inner = np.ones(len(step), np.bool_)
-    starts = netlist.axon_synapses[1:-1]
-    inner[starts[(starts > 0) & (starts < netlist.n_synapses)] - 1] = False
-    if np.any(step[inner] <= 0):
+    if np.any((np.diff(netlist.synapse_neuron) <= 0) & (np.diff(netlist.axon_of_synapse()) == 0)):
         found.append("synapse_neuron does not rise along an axon")
     return found
 
