@@ -10,7 +10,7 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron
 from spikeloom.compiler.targets.truenorth.native import UNIT, NativeNetwork, Stage, highest_level, steepest_leak
 from spikeloom.runtime.machines.truenorth import engine, spec
-from spikeloom.runtime.machines.truenorth.trace import Counts, Trace
+from spikeloom.runtime.machines.truenorth.spec import Counts, Trace
 
 CHIP = load_target("truenorth")
 

@@ -21,7 +21,7 @@ from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.graphs import Graph
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.recordings.events import load_data
-from spikeloom.models.training.protocols import data_digest
+from spikeloom.models.recordings.evtouch import data_digest
 from spikeloom.runtime.studies.chart import work as chart_work
 from spikeloom.runtime.studies.chart.networks import Storage, given_networks
 

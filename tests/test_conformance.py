@@ -32,7 +32,7 @@ from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.trace import aligned, unpack
 from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
 from spikeloom.runtime.machines.truenorth import spec as crossbar_spec
-from spikeloom.runtime.machines.truenorth.trace import Counts, Trace
+from spikeloom.runtime.machines.truenorth.spec import Counts, Trace
 from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.encode import encode
 

@@ -32,7 +32,7 @@ def test_dead_and_stuck_taxels_and_no_others(events, seed, count):
     taxels = d.chosen(events.shape[1], count, drawn(seed))
     others = np.setdiff1d(np.arange(events.shape[1]), taxels)
     assert len(set(taxels.tolist())) == min(count, events.shape[1])
-    dead, stuck = d.silence(events, taxels), d.stick(events, taxels)
+    dead, stuck = d.held(events, taxels, 0), d.held(events, taxels, 1)
     assert not dead[:, taxels].any()
     assert stuck[:, taxels].all()
     for found in (dead, stuck):
@@ -160,8 +160,7 @@ def test_recordings_that_were_given_stay_as_they_are(events, seed):
     before = events.copy()
     taxels = np.array([0])
     for change in (
-        lambda: d.silence(events, taxels),
-        lambda: d.stick(events, taxels),
+        lambda: d.held(events, taxels, 1),
         lambda: d.events_lost(events, 0.5, drawn(seed)),
         lambda: d.events_spurious(events, 0.5, drawn(seed)),
         lambda: d.time_jitter(events, 1.0, drawn(seed)),

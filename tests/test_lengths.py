@@ -13,8 +13,7 @@ from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.training.evaluate import evaluate, predict
-from spikeloom.models.training.protocols import validation_split
-from spikeloom.models.training.train import train
+from spikeloom.models.training.train import train, validation_split
 from spikeloom.runtime.cli import main
 
 STEPS = (5, 40, 17, 17, 90, 1)

@@ -24,8 +24,7 @@ from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.quantised import QuantisedNet, quantised_spikes
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.training.finetune import finetune
-from spikeloom.models.training.initial_storage import initial_forms
+from spikeloom.models.training.finetune import finetune, initial_forms
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned

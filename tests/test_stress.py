@@ -25,8 +25,7 @@ from spikeloom.runtime.machines.votes import class_counts, readout_counts
 from spikeloom.runtime.report.encode import decode, encode
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.stress.bench import NAMES, Bench, by_length, distances, longer, warm_state, whole
-from spikeloom.runtime.studies.stress.pair import Pair, evaluate
-from spikeloom.runtime.studies.stress.perturbation import Sensor
+from spikeloom.runtime.studies.stress.pair import Pair, Sensor, evaluate
 from spikeloom.runtime.studies.stress.results import Run, Spread
 from spikeloom.runtime.studies.stress.study import clean, generator, measure
 from spikeloom.runtime.studies.stress.verdicts import curve, parse_requirement, reasons, spread, unmet

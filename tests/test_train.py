@@ -18,10 +18,9 @@ from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.training.evaluate import evaluate
-from spikeloom.models.training.protocols import state_files, train_both, validation_split
 from spikeloom.models.training.recipes import DECAY_EPOCHS, RELEASED, Recipe
 from spikeloom.models.training.record import training_record
-from spikeloom.models.training.train import Epoch, train
+from spikeloom.models.training.train import Epoch, state_files, train, train_both, validation_split
 
 GRAPH = build_graph("manual")
 ADJACENCY = normalised_adjacency(GRAPH.edges, 39)

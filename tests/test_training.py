@@ -18,7 +18,7 @@ from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.studies.jobs import only_one
-from spikeloom.runtime.studies.training import parallel
+from spikeloom.runtime.studies.training import training as trainings
 
 ROOT = Path(__file__).resolve().parents[1]
 WORDS = ("train", "--data", "data", "--graph", "manual")
@@ -259,7 +259,7 @@ def fails(_job):
     ("run", "error", "told"), [(dies, OptionError, "go on with --resume"), (fails, DataError, "the loss is nan")]
 )
 def test_a_worker_that_fails_ends_all(run, error, told, monkeypatch):
-    monkeypatch.setattr(parallel, "run_job", run)
+    monkeypatch.setattr(trainings, "run_job", run)
     job = Named(output=Path("x.pt"))
     with pytest.raises(error, match=told):
-        parallel._side_by_side([job, job], [0, 1], {})
+        trainings._side_by_side([job, job], [0, 1], {})

@@ -11,7 +11,7 @@ from random_crossbars import random_network
 
 from spikeloom.compiler.targets.truenorth.native_file import write_trained
 from spikeloom.models.recordings.events import load_data
-from spikeloom.models.training.protocols import data_digest
+from spikeloom.models.recordings.evtouch import data_digest
 from spikeloom.runtime.studies.chart import work as chart_work
 
 NATIVE, LOIHI = "native.pt", "ring.pt"

@@ -19,6 +19,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.errors import DataError
 from spikeloom.models.recordings.counts import EventCounts
 
@@ -203,3 +204,12 @@ def require_class(where: str, label: int, classes: int | None) -> None:
             f"{where}: label {label}, the network has {classes} classes (0..{classes - 1}); "
             "use the network that was trained on these objects"
         )
+
+
+def data_digest(training: Recordings, test: Recordings) -> str:
+    """Hash over both splits, whatever their names."""
+    splits = {"train": training, "test": test}
+    names = {"events": "", "labels": "_labels", "lengths": "_lengths"}
+    return arrays_digest(
+        {f"{split}{names[key]}": array for split, data in splits.items() for key, array in data.identity().items()}
+    )

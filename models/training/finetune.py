@@ -1,7 +1,7 @@
 """Quantisation-aware fine-tuning: train a network on the very integers that the chip will hold.
 
 The storage of each layer is fixed first: a width, an exponent and a scale for every group of neurons, chosen so that
-the rounded weights, weighted by how often their inputs spike, are nearest to the trained ones. Then the network is
+the rounded weights, weighted by how often their inputs spike, are nearest to the trained ones [2]_. Then the network is
 trained on, with every weight rounded in the forward pass [1]_. Everything runs on one thread and from one seed, so
 the same input gives the same weights.
 
@@ -9,6 +9,7 @@ References
 ----------
 .. [1] Y. Bengio, N. Léonard, A. Courville, "Estimating or propagating gradients through stochastic neurons for
    conditional computation", 2013, arXiv:1308.3432: the straight-through estimator.
+.. [2] F. Li, B. Zhang, B. Liu, "Ternary weight networks", 2016, arXiv:1605.04711: scales nearest to the weights.
 """
 
 from __future__ import annotations
@@ -25,11 +26,19 @@ from tqdm import tqdm
 
 from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.fixedpoint import (
+    BIAS_EXPONENT_MAX,
+    BIAS_MANTISSA_MAX,
+    MEMBRANE_SHIFT,
+    THRESHOLD_MANTISSA_MAX,
+    reach,
+    step_units,
+)
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.interpret import channels_last
-from spikeloom.compiler.ir import Form
-from spikeloom.compiler.passes.calibrate import calibrate, evenly_spaced
+from spikeloom.compiler.ir import Form, Network
+from spikeloom.compiler.passes.calibrate import Calibration, calibrate, evenly_spaced
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import Target
 from spikeloom.models.networks.layers import time_first
@@ -37,7 +46,6 @@ from spikeloom.models.networks.networks import Weights
 from spikeloom.models.networks.quantised import QuantisedNet
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.evaluate import evaluate, one_thread, rate_loss, require_finite
-from spikeloom.models.training.initial_storage import initial_forms
 from spikeloom.models.training.resume import restore, set_rate, write_state
 
 BATCH = 4
@@ -45,6 +53,15 @@ BATCH = 4
 
 LEARNING_RATE = 1e-3
 """At the start; it falls to zero along half a cosine."""
+
+QUIET = 1e-4
+"""Spike rate that an input without spikes is given, so that its weights still count."""
+
+COARSEST = 12
+"""Least threshold, in weight units: a coarser one would be off by more than the weights."""
+
+SHARES = 40
+"""Scales that are tried for each neuron."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,3 +206,64 @@ def _weights(model: QuantisedNet) -> Weights:
     for name, weight, bias in zip(model.names[1:], model.weights, model.biases, strict=True):
         found |= {f"{name}.weight": weight, f"{name}.bias": bias}
     return {name: parameter.detach().numpy().copy() for name, parameter in found.items()}
+
+
+# -- the storage to begin with -----------------------------------------------------------------------------------------
+
+
+def initial_forms(
+    network: Network, calibration: Calibration, bits: Sequence[int], groups: int, exponents: tuple[int, ...]
+) -> tuple[Form, ...]:
+    """Storage whose rounded weights are nearest to the trained ones, neurons grouped by scale.
+
+    `calibration` gives the rate of each input; every layer has its width in `bits` and so many scales at most.
+
+    ModelError if no exponent gives a threshold and biases that the registers hold.
+    """
+    forms = []
+    for post, (population, width) in enumerate(zip(network.populations, bits, strict=True)):
+        incoming = [p for p in network.projections if p.post == post]
+        weight = np.concatenate([p.weight.toarray() for p in incoming], axis=1)
+        rate = np.concatenate([calibration.source(p.pre, p.post).mean(axis=(0, 1)) for p in incoming]) + QUIET
+        step = _grouped(_nearest_steps(weight, rate, reach(width, (0,))), groups)  # model units in one step
+        for exponent in sorted(exponents):
+            threshold = np.rint(population.theta * step_units(width, (exponent,)) / step).astype(np.int64)
+            if threshold.min() >= COARSEST:
+                break
+        largest = np.abs(threshold * population.bias).max(initial=0) / population.theta * (1 << MEMBRANE_SHIFT)
+        if threshold.max() > THRESHOLD_MANTISSA_MAX or largest > BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX:
+            raise ModelError(
+                f"{population.name}: its weights are too small for its threshold or biases at {width} bits: the "
+                "registers overflow; give it more bits"
+            )
+        forms.append(Form(bits=width, exponents=(exponent,), threshold=np.maximum(threshold, 1)))
+    return tuple(forms)
+
+
+def _nearest_steps(weight: NDArray[np.float64], rate: NDArray[np.float64], codes: int) -> NDArray[np.float64]:
+    """Step of each neuron at which its rounded weights are nearest, in squares weighted by `rate`; shape (neurons,)."""
+    peak = np.maximum(np.abs(weight).max(axis=1), 1e-9)
+    best = np.full(len(weight), np.inf)
+    chosen: NDArray[np.float64] = peak / codes
+    for share in np.geomspace(1, 1 / 30, SHARES):
+        step = peak * share / codes
+        rounded = np.clip(np.rint(weight / step[:, None]), -codes, codes) * step[:, None]
+        error = (rate * (weight - rounded) ** 2).sum(axis=1)
+        better = error < best
+        best[better], chosen[better] = error[better], step[better]
+    unused = ~weight.any(axis=1)  # where a window sees no taxel any step will do
+    if not unused.all():
+        chosen[unused] = np.exp(np.log(chosen[~unused]).mean())
+    return chosen
+
+
+def _grouped(values: NDArray[np.float64], groups: int) -> NDArray[np.float64]:
+    """Replace each value by the geometric mean of its group; groups by Lloyd's rule from quantiles."""
+    logs = np.log(values)
+    centres = np.quantile(logs, (np.arange(groups) + 0.5) / groups)
+    nearest = np.zeros(len(logs), np.int64)
+    for _ in range(50):
+        nearest = np.abs(logs[:, None] - centres).argmin(axis=1)
+        centres = np.array([logs[nearest == g].mean() if np.any(nearest == g) else centres[g] for g in range(groups)])
+    shared: NDArray[np.float64] = np.exp(centres[nearest])
+    return shared

@@ -1,7 +1,7 @@
 """How a network is trained, as data: the released way, and one for networks that tell the time.
 
 A recipe is what ``train --recipe`` names; single values may be overridden there. It says nothing of the data, the
-system or the graph, and nothing of how a training is reported (:mod:`training.protocols`).
+system or the graph, and nothing of how a training is reported (:mod:`training.train`).
 """
 
 from __future__ import annotations

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spikeloom.compiler.types import JsonObject
+from spikeloom.models.recordings.evtouch import Recordings, data_digest
 
 if TYPE_CHECKING:
-    from spikeloom.models.recordings.evtouch import Recordings
-    from spikeloom.models.training.protocols import Reported
+    from spikeloom.models.training.train import Reported
 
 CHOSEN_ON = {"last": "nothing", "best": "the test split", "clean": "a part of the training split"}
 """What decided which epoch the weights of a set are from."""
@@ -90,8 +90,6 @@ def training_record(
     split; the last one is not chosen at all.
     """
     import torch  # two seconds that whoever reads records need not wait
-
-    from spikeloom.models.training.protocols import data_digest
 
     history = reported.trained.history
     chosen = {"last": len(history), "best": reported.trained.best_epoch, "clean": reported.clean_epoch}

@@ -75,34 +75,15 @@ def sweep(
     fresh: bool = False,
     label: str,
 ) -> JsonObject:
-    """Measure jobs, as far as the store does not know them.
+    """Measure jobs, as far as the store does not know them; their results by key, as JSON gives them back.
 
-    Parameters
-    ----------
-    points : sequence of Job
-        Begun in this order; of those with equal keys the first is measured.
-    measure : callable
-        Job to JSON values; a function of a module, since it crosses process borders.
-    store : Path
-        SQLite file that keeps the results, in a folder that exists; with `fresh` what it holds is forgotten.
-    jobs, scheduler
-        Processes at a time (one a core), whose libraries use one thread each, or the address of a Dask scheduler.
-    label : str
-        Of the progress bar.
+    They are begun in this order; of those with equal keys the first is measured. `measure` makes JSON values of a job,
+    a function of a module, since it crosses process borders. `store` is an SQLite file in a folder that exists; with
+    `fresh` what it holds is forgotten. `jobs` are processes at a time (one a core), whose libraries use one thread
+    each, `scheduler` is the address of a Dask scheduler instead; `label` is that of the progress bar.
 
-    Returns
-    -------
-    dict of str to JSON values
-        Result of each job by its key, in their order, as JSON gives it back (tuples are lists).
-
-    Raises
-    ------
-    UnfinishedError
-        If a process died; it carries the results that are there.
-    SpikeloomError, OSError, MemoryError
-        What a measurement raised, with a note that names it; or an option or the store cannot be used.
-    KeyboardInterrupt
-        On an interrupt or a request to end; its text says what is kept.
+    What a measurement raises is raised with a note that names it; UnfinishedError, which carries the results that are
+    there, if a process died. The text of a KeyboardInterrupt says what is kept.
     """
     from tqdm import tqdm  # here, since commands load this module before they know whether they measure
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
+from spikeloom.models.recordings.evtouch import data_digest
 from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_model
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.machines.base import DEFAULT
@@ -64,7 +65,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; exit code 1 if no point fits a budget."""
-    from spikeloom.models.training.protocols import data_digest  # torch: no other command waits for it
     from spikeloom.runtime.studies.chart import work
     from spikeloom.runtime.studies.chart.sections import printed, write_chart
     from spikeloom.runtime.studies.chart.study import chart

@@ -16,6 +16,7 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
 from spikeloom.models.recordings.events import joined_bins
+from spikeloom.models.recordings.evtouch import data_digest
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_checkpoint
 from spikeloom.runtime.inputs import repeat
@@ -150,7 +151,6 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
     training, test = (joined_bins(each, checkpoint.bins) for each in found)
     from spikeloom.models.networks.checkpoint import save_again
     from spikeloom.models.training.finetune import finetune as tune
-    from spikeloom.models.training.protocols import data_digest
     from spikeloom.models.training.record import CHOSEN_ON
 
     try:

@@ -35,7 +35,7 @@ from spikeloom.runtime.inputs.network import load_graph, sensor_places
 from spikeloom.runtime.inputs.recordings import recordings, require_bins
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
-from spikeloom.runtime.studies.training.training import Job, output_of
+from spikeloom.runtime.studies.training.training import Job, output_of, train_seeds
 
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -100,7 +100,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Train every seed, write the checkpoints, report."""
-    from spikeloom.runtime.studies.training.parallel import train_seeds  # processes, so only here
     from spikeloom.runtime.studies.training.report import TrainingReport, picture, summary, training_sections
 
     if arguments.seeds < 1:

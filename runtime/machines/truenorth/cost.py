@@ -19,7 +19,7 @@ from spikeloom.compiler.targets.base import EnergyTable, Target
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.machines.base import Price
-from spikeloom.runtime.machines.truenorth.trace import Counts
+from spikeloom.runtime.machines.truenorth.spec import Counts
 from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 

@@ -14,7 +14,7 @@ from spikeloom.compiler.targets.truenorth.legalize import signed_range
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO, CrossbarNetlist
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.truenorth import kernel
-from spikeloom.runtime.machines.truenorth.trace import Counts, EventArray, Trace, check_channels
+from spikeloom.runtime.machines.truenorth.spec import Counts, EventArray, Trace, check_channels
 from spikeloom.runtime.machines.truenorth.twins import Twins, find_twins
 
 LONGEST_GAP = 8
@@ -181,7 +181,7 @@ def simulate(
     engine = network if isinstance(network, Engine) else prepare(network)
     netlist = engine.netlist
     check_channels(netlist, events.shape[1])
-    samples, channels, whole = events.shape
+    samples, _, whole = events.shape
     steps = np.full(samples, whole) if lengths is None else np.asarray(lengths, np.int64)
     most = netlist.ticks(whole)
     if most >= MOST_TICKS:
@@ -192,11 +192,10 @@ def simulate(
     spiked, votes, overflows = np.zeros((3, samples, neurons), np.int64)
     raster = np.zeros((samples, most if spikes else 0, neurons), np.bool_)
     held = np.zeros((samples, most if membranes else 0, neurons), np.int32)
-    inputs, merged = np.zeros((samples, channels), np.int64), np.zeros(samples, np.int64)
+    merged = np.zeros(samples, np.int64)
 
     def one(sample: int) -> None:
         arriving = np.ascontiguousarray(events[sample, :, : steps[sample]].T).astype(np.uint8)
-        inputs[sample] = np.count_nonzero(arriving, axis=0)
         arrays = (axons, spiked, votes, overflows, raster, held)
         merged[sample] = kernel.run(
             arriving,
@@ -217,7 +216,6 @@ def simulate(
         return simulate(again, events, lengths=lengths, seed=seed, spikes=spikes, membranes=membranes)
     counts = Counts(
         ticks=steps * netlist.bin_ticks + netlist.drain,
-        inputs=inputs,
         spikes=spiked[:, twins.neuron],
         votes=votes[:, twins.neuron],
         axons=axons[:, twins.axon],

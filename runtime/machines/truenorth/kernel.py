@@ -16,7 +16,7 @@ import numpy.typing as npt
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.loihi1.kernel import compiled, compiled_and_cached
-from spikeloom.runtime.machines.truenorth.trace import MIX_1, MIX_2, STEP_NEURON, STEP_TICK
+from spikeloom.runtime.machines.truenorth.spec import MIX_1, MIX_2, STEP_NEURON, STEP_TICK
 
 Int32 = npt.NDArray[np.int32]
 
@@ -88,7 +88,7 @@ class Tallies(NamedTuple):
 
 @compiled
 def draw(seed: Any, neuron: Any, tick: Any, bits: Any) -> Any:
-    """As :func:`trace.random_bits`, of at least one bit."""
+    """As :func:`spec.random_bits`, of at least one bit."""
     x = seed + (np.uint64(neuron) + _ONE) * _STEP_NEURON + (np.uint64(tick) + _ONE) * _STEP_TICK
     x = (x ^ (x >> _30)) * _MIX_1
     x = (x ^ (x >> _27)) * _MIX_2

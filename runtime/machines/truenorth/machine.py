@@ -20,7 +20,7 @@ from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.base import EventArray, Machine, Price, Run, one_by_one
 from spikeloom.runtime.machines.truenorth import cost, engine, spec
 from spikeloom.runtime.machines.truenorth.describe import describe
-from spikeloom.runtime.machines.truenorth.trace import Trace, differences
+from spikeloom.runtime.machines.truenorth.spec import Trace, differences
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
 

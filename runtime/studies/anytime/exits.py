@@ -23,13 +23,14 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.equivalence.certificates import wins
 from spikeloom.runtime.machines.integer import IntegerMachine
+from spikeloom.runtime.report.encode import key
 
 CONFIDENCE = 0.95
 """Of the bound on the share of other races that end otherwise."""
@@ -127,14 +128,18 @@ class Calibrated:
     """A factor, in votes per root of a step left, and what it rests on.
 
     So many races may end otherwise (`allowed`, a share), and so many `differ`; of other such races at most the share
-    `bound` does, with the confidence of ``CONFIDENCE`` [1]_.
+    `bound` does, with the confidence of ``CONFIDENCE`` [1]_. The proof alone rests on no races: ``PROOF``.
     """
 
-    allowed: float
+    allowed: float | None
     factor: float
-    races: int
-    differ: int
-    bound: float
+    races: int | None
+    differ: int | None = field(metadata=key("races_differ"))
+    bound: float | None
+
+
+PROOF = Calibrated(allowed=None, factor=np.inf, races=None, differ=None, bound=None)
+"""No vote ends early but those that nothing can change."""
 
 
 def races(votes: IntArray, lengths: IntArray) -> Standing:

@@ -10,6 +10,7 @@ import numpy as np
 from spikeloom.runtime.report.drawing import CHIP, COLOURS, DASHES, FLOAT, GREY, Drawing, sheet, styled
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.studies.anytime.exits import Calibrated
 from spikeloom.runtime.studies.anytime.study import Anytime, Costs, Right, Rule
 
 SHOWN = (5, 10, 25, 50, 75, 90, 100)
@@ -33,9 +34,8 @@ def _lines(result: Anytime) -> list[str]:
     live = f"live: spikeloom watch NET.loom --bins {result.bins} --until-sure"
     if result.chosen is None:
         return [*lines, live]
-    rule = result.rules[result.chosen]
-    assert rule.factor is not None, "a chosen rule is calibrated"
-    assert rule.bound is not None, "likewise"
+    rule = result.rules[result.chosen].stop
+    assert rule.bound is not None, "a chosen rule is calibrated"
     return [
         *lines,
         f"calibrated on {rule.races} races for second place of {result.calibrated_on}, split train; of others at most "
@@ -60,17 +60,17 @@ def window_table(result: Anytime) -> Table:
     return Table(["observed", "bins", *(f"{name}, % right" for name in sides)], rows)
 
 
-def _allowed(rule: Rule) -> str:
+def _allowed(rule: Calibrated) -> str:
     return f"{100 * (rule.allowed or 0):g} %"
 
 
 def _short(rule: Rule) -> str:
-    return "proven" if rule.allowed is None else f"sure, {_allowed(rule)}"
+    return "proven" if rule.stop.allowed is None else f"sure, {_allowed(rule.stop)}"
 
 
 def rule_name(rule: Rule) -> str:
     """What a rule allows."""
-    return _short(rule) if rule.allowed is None else f"{_short(rule)} may differ"
+    return _short(rule) if rule.stop.allowed is None else f"{_short(rule)} may differ"
 
 
 def rule_table(result: Anytime) -> Table:
@@ -89,7 +89,7 @@ def rule_table(result: Anytime) -> Table:
 
     rows = [["all is seen", "", *cells(full.costs), "", shown(full.correct)]]
     for rule in result.rules:
-        ahead = "more than can come" if rule.factor is None else f"{rule.factor:.3f}·√left"
+        ahead = "more than can come" if rule.stop.allowed is None else f"{rule.stop.factor:.3f}·√left"
         changed = [str(rule.changes.differ), shown(rule.changes.correct)]
         rows.append([rule_name(rule), ahead, *cells(rule.mean), *changed])
     return Table(head, rows)

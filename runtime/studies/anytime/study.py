@@ -60,16 +60,9 @@ class Samples:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rule:
-    """A rule, see :class:`exits.Calibrated`, and what it comes to; of the proof the first five fields are None.
+    """A rule and what it comes to: `mean` is what is spent up to the stop, `saved` the shares that are not."""
 
-    `mean` is what is spent up to the stop, `saved` the shares that are not.
-    """
-
-    allowed: float | None
-    factor: float | None
-    races: int | None
-    races_differ: int | None
-    bound: float | None
+    stop: exits.Calibrated = field(metadata=INLINE)
     mean: Costs
     saved: Costs
     changes: Changes = field(metadata=INLINE)
@@ -136,7 +129,7 @@ def study(
     at = exits.standing(ran.votes, ran.lengths)
     sure = exits.proven(ran.votes, at, exits.most_votes(machine, data.steps))
     model = None if model_votes is None else exits.standing(model_votes, ran.lengths)
-    rules = tuple(_rule(rule, ran, at, sure, data.labels) for rule in (None, *calibrated))
+    rules = tuple(_rule(rule, ran, at, sure, data.labels) for rule in (exits.PROOF, *calibrated))
     right = _correct(at.decision, data.labels)
     labelled = int(np.count_nonzero(data.labels != UNLABELLED))
     return Anytime(
@@ -164,14 +157,13 @@ def study(
 
 
 def _rule(
-    rule: exits.Calibrated | None,
+    rule: exits.Calibrated,
     ran: Cumulative,
     at: exits.Standing,
     sure: BoolArray,
     labels: IntArray,
 ) -> Rule:
-    factor = np.inf if rule is None else rule.factor
-    ends, last = exits.exits(sure, at, factor), ran.chip_steps - 1
+    ends, last = exits.exits(sure, at, rule.factor), ran.chip_steps - 1
     index = np.where(ends == ran.lengths - 1, last, np.minimum(ends + ran.depth, last))
     rows = np.arange(len(ends))
     mean, whole = _costs(ran, index), _costs(ran, last)
@@ -180,11 +172,7 @@ def _rule(
         return [float(each) for each in sums[rows, last] - sums[rows, index]]
 
     return Rule(
-        allowed=None if rule is None else rule.allowed,
-        factor=None if rule is None else rule.factor,
-        races=None if rule is None else rule.races,
-        races_differ=None if rule is None else rule.differ,
-        bound=None if rule is None else rule.bound,
+        stop=rule,
         mean=mean,
         saved=Costs(
             chip_steps=_share(mean.chip_steps, whole.chip_steps),

@@ -70,7 +70,14 @@ def sections(chart: Chart) -> list[Section]:
             "Accuracy against cost",
             [*_figures(chart), *_fronts(chart), *_others(chart), Details("What is drawn", meanings, unfolded=True)],
         ),
-        Section("Every point", [*_points(chart), *_refused(chart)]),
+        Section(
+            "Every point",
+            [
+                _table(chart.points, chart.chosen_by, f"{len(chart.points)} points", 0),
+                Details("Commands of every point", _commands(chart.points)),
+                *_refused(chart),
+            ],
+        ),
         Section("Provenance", [Details("Files, grid and tables", _provenance(chart), unfolded=True)]),
     ]
 
@@ -274,31 +281,26 @@ def _commands(points: Iterable[Point]) -> list[Block]:
     return [block for point in points for block in (Text(f"#{point.number}:"), Code(point.commands))]
 
 
-def _fronts(chart: Chart) -> list[Block]:
-    blocks: list[Block] = []
+def _table(points: Sequence[Point], by: ChosenBy, caption: str, most: int | None = LISTED) -> Table:
+    return Table(_head(by), [_cells(by, point) for point in points], caption, most=most)
+
+
+def _fronts(chart: Chart) -> Iterator[Block]:
     for name in ("energy", "latency"):
         on = sorted((p for p in chart.points if p.front.get(name)), key=lambda point: point.test.accuracy)
-        note, caption = "(a description, no choice)", f"Front of test accuracy and {name}"
-        blocks += _listed(f"front of test accuracy and {name} {note}:", on, chart.chosen_by, caption) if on else []
-    return blocks
+        if on:
+            words = Text(f"front of test accuracy and {name} (a description, no choice):")
+            yield Section("", [words, _table(on, chart.chosen_by, f"Front of test accuracy and {name}")])
 
 
-def _listed(words: str, points: Sequence[Point], by: ChosenBy, caption: str) -> list[Block]:
-    """Some points as a table of their own."""
-    rows = [_cells(by, point) for point in points]
-    return [Section("", [Text(words), Table(_head(by), rows, caption, most=LISTED)])]
-
-
-def _others(chart: Chart) -> list[Block]:
+def _others(chart: Chart) -> Iterator[Block]:
     """Points of other chips, each under its own names of prices and time."""
     _, others = by_chip(chart.points, chart.target)
-    blocks: list[Block] = []
     for chip in dict.fromkeys(point.target for point in others):
         own = [point for point in others if point.target == chip]
-        words = f"on {chip}, whose prices are others (no choice, no front):"
+        words = Text(f"on {chip}, whose prices are others (no choice, no front):")
         by = ChosenBy(energy=next(iter(own[0].test.energy_j)), time=next(iter(own[0].test.time_s), None))
-        blocks += _listed(words, own, by, f"Points of {chip}")
-    return blocks
+        yield Section("", [words, _table(own, by, f"Points of {chip}")])
 
 
 def _times(ratios: Mapping[str, float | None], what: str) -> str:
@@ -343,7 +345,7 @@ def _budget(chart: Chart) -> list[Block]:
             f"  beside the best, #{best.number} {best.label}: expected {100 * up.expected:+.2f} points, test "
             f"{100 * up.accuracy:+.2f} points, {', '.join(costs)}"
         )
-    table = Table(_head(chart.chosen_by), [_cells(chart.chosen_by, point)], "The point that was picked")
+    table = _table([point], chart.chosen_by, "The point that was picked", None)
     return [Section("Your budget", [Text("\n".join(lines)), table, Text(beside), *_commands([point])])]
 
 
@@ -352,12 +354,6 @@ def _missed(what: str, found: float, limit: float) -> str:
         return f"{what}: expected are {100 * found:.2f} %, wanted {100 * limit:g} %"
     unit = next(iter(UNITS[what]))
     return f"{what}: it takes {si(found, unit)}, allowed {si(limit, unit)}"
-
-
-def _points(chart: Chart) -> list[Block]:
-    rows = [_cells(chart.chosen_by, point) for point in chart.points]
-    table = Table(_head(chart.chosen_by), rows, f"{len(rows)} points", most=0)
-    return [table, Details("Commands of every point", _commands(chart.points))]
 
 
 def _refused(chart: Chart) -> list[Block]:

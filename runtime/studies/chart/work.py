@@ -23,7 +23,7 @@ from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.types import FloatArray, JsonObject
 from spikeloom.models.recordings.events import joined_bins
-from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.models.recordings.windows import WHOLE, first_part, steps_of
 from spikeloom.runtime.equivalence.reference import votes_so_far
 from spikeloom.runtime.inputs import repeat
@@ -196,8 +196,6 @@ def measure(work: Work) -> Any:
 @lru_cache(maxsize=1)
 def both_splits(data: Data, taxels: int, classes: int) -> dict[str, Recordings]:
     """Training and test recordings by split; refused if they are others than those of who asks for the work."""
-    from spikeloom.models.training.protocols import data_digest
-
     shared: dict[str, Any] = {"classes": classes, "taxels": taxels, "bin_s": data.bin_s, "labels_for": "chart"}
     splits = {split: recordings(data.path, split, **shared) for split in SPLITS}
     if data.sha256 not in (None, data_digest(splits["train"], splits["test"])):

@@ -58,14 +58,6 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Samples:
-    """Recordings of each split."""
-
-    training: int
-    test: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class LayerUse:
     """Neurons of a layer: of the model, on the chip, and of these the ones that never fired in training."""
 
@@ -88,12 +80,12 @@ class TaxelUse:
 class Lean:
     """What a network can do without.
 
-    `taken` is the row of least energy in training among those that change few enough decisions; `overflowing` were not
-    tried, since a register could overflow.
+    `samples` counts recordings of ``training`` and ``test``. `taken` is the row of least energy in training among those
+    that change few enough decisions; `overflowing` were not tried, since a register could overflow.
     """
 
     taken: int
-    samples: Samples
+    samples: Mapping[str, int]
     layers: tuple[LayerUse, ...]
     taxels: tuple[TaxelUse, ...]
     rows: tuple[Row, ...]
@@ -109,7 +101,8 @@ class Lean:
 
 def sections(result: Lean) -> list[Section]:
     """Use of layers and taxels, every row, and what is taken."""
-    samples, whole, taken = result.samples, result.rows[0], result.rows[result.taken]
+    trained, tested = result.samples["training"], result.samples["test"]
+    whole, taken = result.rows[0], result.rows[result.taken]
     layers = [[e.name, *(f"{n:,}" for n in (e.neurons, e.on_chip, e.never_fired))] for e in result.layers]
     lines = [f"without {name}: not tried, what is left could leave a register" for name in result.overflowing]
     last = [f"least energy in training: {taken.name}", *_removed(taken.removed)]
@@ -118,8 +111,8 @@ def sections(result: Lean) -> list[Section]:
             "Accuracy",
             [
                 Text(
-                    f"chip accuracy: {percent(whole.test.right, samples.test)} on {result.split}, "
-                    f"{whole.training.right} of {samples.training} in training"
+                    f"chip accuracy: {percent(whole.test.right, tested)} on {result.split}, "
+                    f"{whole.training.right} of {trained} in training"
                 )
             ],
         ),
@@ -152,7 +145,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _rows(result: Lean) -> Table:
-    samples, whole = result.samples, result.rows[0].costs
+    trained, tested, whole = result.samples["training"], result.samples["test"], result.rows[0].costs
     head = ["without", "differ in training", "differ", "right", "operations", "saved"]
     head += [word for name in whole.energy_j for word in (name, "saved")]
     head += [*(f"time, {name}" for name in whole.time_s), "neurons", "cores"]
@@ -160,7 +153,7 @@ def _rows(result: Lean) -> Table:
     for index, row in enumerate(result.rows):
         costs = row.costs
         cells = ["nothing" if index == 0 else row.name]
-        cells += [f"{row.training.differ} of {samples.training}", f"{row.test.differ} of {samples.test}"]
+        cells += [f"{row.training.differ} of {trained}", f"{row.test.differ} of {tested}"]
         cells += [str(row.test.right), f"{costs.operations:,.0f}", _saved(costs.operations, whole.operations)]
         for name, joules in costs.energy_j.items():
             cells += [si(joules, "J"), _saved(joules, whole.energy_j[name])]

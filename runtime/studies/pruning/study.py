@@ -19,7 +19,6 @@ from spikeloom.runtime.studies.pruning.results import (
     Lean,
     Removed,
     Row,
-    Samples,
     TaxelUse,
 )
 from spikeloom.runtime.studies.pruning.trials import (
@@ -49,7 +48,7 @@ def study(
     taken = min(kept, key=lambda each: priced(each.netlist, training)[1].least)
     return Lean(
         taken=left.index(taken),
-        samples=Samples(training=len(training), test=len(test)),
+        samples={"training": len(training), "test": len(test)},
         layers=whole.layers(),
         taxels=whole.taxels(),
         rows=tuple(each.row for each in left),

@@ -21,8 +21,7 @@ from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.studies.stress import damages, disturbances
-from spikeloom.runtime.studies.stress.pair import Inputs, Pair
-from spikeloom.runtime.studies.stress.perturbation import Events, Perturbation, Sensor, perturbation
+from spikeloom.runtime.studies.stress.pair import Events, Inputs, Pair, Perturbation, Sensor, perturbation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -32,8 +32,7 @@ from spikeloom.compiler.systems import GRAPH_SYSTEMS, TITLES
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.systems import propagation_of
-from spikeloom.runtime.studies.stress.pair import Pair
-from spikeloom.runtime.studies.stress.perturbation import Sensor, perturbation
+from spikeloom.runtime.studies.stress.pair import Pair, Sensor, perturbation
 
 Mask = npt.NDArray[np.bool_]
 

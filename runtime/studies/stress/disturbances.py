@@ -11,8 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from spikeloom.compiler.types import FloatArray, IntArray
-from spikeloom.runtime.studies.stress.pair import Pair
-from spikeloom.runtime.studies.stress.perturbation import TAXELS, Events, Sensor, perturbation
+from spikeloom.runtime.studies.stress.pair import TAXELS, Events, Pair, Sensor, perturbation
 
 COUNTS = (1, 3, 5, 10, 20)
 STEPS = (2, 5, 10, 25, 50)
@@ -44,39 +43,32 @@ def neighbours(distance: FloatArray, count: int, rng: np.random.Generator) -> In
 @perturbation(TAXELS, COUNTS, most=np.inf)
 def taxels_dead(events: Events, count: int, sensor: Sensor, rng: np.random.Generator) -> Events:
     """Random taxels send nothing."""
-    return silence(events, chosen(sensor.taxels, count, rng))
+    return held(events, chosen(sensor.taxels, count, rng), 0)
 
 
 @perturbation(TAXELS, COUNTS, most=np.inf)
 def taxels_dead_adjacent(events: Events, count: int, sensor: Sensor, rng: np.random.Generator) -> Events:
     """A taxel and its nearest ones send nothing."""
-    return silence(events, neighbours(sensor.distance, count, rng))
+    return held(events, neighbours(sensor.distance, count, rng), 0)
 
 
 @perturbation(TAXELS, COUNTS, most=np.inf)
 def taxels_stuck(events: Events, count: int, sensor: Sensor, rng: np.random.Generator) -> Events:
     """Random taxels send both polarities in every step."""
-    return stick(events, chosen(sensor.taxels, count, rng))
+    return held(events, chosen(sensor.taxels, count, rng), 1)
 
 
 @perturbation(TAXELS, COUNTS, most=np.inf)
 def taxels_stuck_adjacent(events: Events, count: int, sensor: Sensor, rng: np.random.Generator) -> Events:
     """A taxel and its nearest ones send both polarities in every step."""
-    return stick(events, neighbours(sensor.distance, count, rng))
+    return held(events, neighbours(sensor.distance, count, rng), 1)
 
 
-def silence(events: Events, taxels: IntArray) -> Events:
-    """Dead taxels: no events."""
-    silent = events.copy()
-    silent[:, taxels] = 0
-    return silent
-
-
-def stick(events: Events, taxels: IntArray) -> Events:
-    """Stuck taxels: an event of either polarity in every step."""
-    stuck = events.copy()
-    stuck[:, taxels] = 1
-    return stuck
+def held(events: Events, taxels: IntArray, value: int) -> Events:
+    """Some taxels are dead (0: no events) or stuck (1: an event of either polarity in every step)."""
+    changed = events.copy()
+    changed[:, taxels] = value
+    return changed
 
 
 # -- events ------------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from spikeloom.compiler.errors import DataError
 from spikeloom.runtime.report.encode import OPTIONAL, key, read_json
-from spikeloom.runtime.studies.stress.perturbation import Level
+from spikeloom.runtime.studies.stress.pair import Level
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

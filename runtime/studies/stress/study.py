@@ -19,8 +19,7 @@ from spikeloom.runtime.equivalence.breakdowns import undecided
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.stress.bench import NAMES, Bench, bench_of, by_length, whole
-from spikeloom.runtime.studies.stress.pair import SIDES, Inputs, Outcome, evaluate
-from spikeloom.runtime.studies.stress.perturbation import TAXELS, Level, Perturbation
+from spikeloom.runtime.studies.stress.pair import SIDES, TAXELS, Inputs, Level, Outcome, Perturbation, evaluate
 from spikeloom.runtime.studies.stress.results import Provenance, Run, Stress
 from spikeloom.runtime.studies.stress.verdicts import Requirement, curve, unmet
 

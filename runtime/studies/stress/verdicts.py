@@ -18,8 +18,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.equivalence.breakdowns import OFTEN
 from spikeloom.runtime.report.numbers import of_mean, wilson
 from spikeloom.runtime.studies.stress.bench import NAMES
-from spikeloom.runtime.studies.stress.pair import SIDES
-from spikeloom.runtime.studies.stress.perturbation import Level
+from spikeloom.runtime.studies.stress.pair import SIDES, Level
 from spikeloom.runtime.studies.stress.results import Breaks, Curve, Point, Run, Spread, shown
 
 ROBUST, DEGRADES, BREAKS = "robust", "degrades", "breaks"

@@ -1,21 +1,28 @@
-"""One seed of a training: trained by both protocols and written, or found finished."""
+"""Seeds of a training side by side, one process each, all ended together, each continued from where it was ended."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.files import sha256_of
+from spikeloom.compiler.files import remove_leftovers, sha256_of
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.events import joined_bins
-from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.models.training.kinds import Plan, kind_of, seen_by
 from spikeloom.models.training.recipes import RELEASED
+from spikeloom.runtime.studies import jobs as processes
+from spikeloom.runtime.studies.jobs import ProcessDied, ended_by_signal, only_one
 from spikeloom.runtime.studies.training.report import Finished
+
+Result = tuple[Finished, IntArray | None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,15 +62,15 @@ def output_of(output: str, seed: int, seeds: int) -> Path:
 
 def state_of(job: Job) -> tuple[Path, Path]:
     """Files that hold the states of its two trainings."""
-    from spikeloom.models.training.protocols import state_files
+    from spikeloom.models.training.train import state_files
 
     return state_files(job.state)
 
 
 def run_job(job: Job) -> tuple[Finished, IntArray | None]:
     """Train one seed by both protocols and write its checkpoint; gives the decisions of the last epoch if drawn."""
-    from spikeloom.models.training.protocols import train_both
     from spikeloom.models.training.record import training_record
+    from spikeloom.models.training.train import train_both
 
     plan, kind = job.plan, kind_of(job.plan.system)
     reported = train_both(
@@ -100,14 +107,7 @@ def run_job(job: Job) -> tuple[Finished, IntArray | None]:
 
 
 def recall(job: Job) -> tuple[Finished, IntArray | None]:
-    """What `run_job` returned when it wrote the checkpoint that is there.
-
-    Raises
-    ------
-    ModelError, OptionError
-        If the file is no checkpoint, of another training, or lacks the epoch that a picture or ``--keep`` needs.
-    """
-    from spikeloom.models.training.protocols import data_digest
+    """What `run_job` returned when it wrote the checkpoint that is there; refused if that is of another training."""
     from spikeloom.models.training.record import read_record
 
     kind = kind_of(job.plan.system)
@@ -139,3 +139,96 @@ def recall(job: Job) -> tuple[Finished, IntArray | None]:
 def _finished(job: Job, record: Any) -> Finished:
     values = {each.name: getattr(record, each.name) for each in fields(record)}
     return Finished(**values, file=job.output.name, sha256=sha256_of(job.output))
+
+
+# -- all seeds ---------------------------------------------------------------------------------------------------------
+
+
+def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
+    """Train several seeds, side by side on the cores where there are several; results are those of `run_job`.
+
+    With `resume`, finished seeds are left alone, interrupted ones go on, and the rest is started; OptionError if there
+    is something to resume and `resume` is false, or the reverse. The text of a KeyboardInterrupt says what is kept.
+    """
+    with ExitStack() as locks:
+        for job in jobs:
+            locks.enter_context(only_one(job.output))
+        return _train(jobs, resume=resume)
+
+
+def _train(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
+    results: dict[int, Result] = {}
+    for index, job in enumerate(jobs):
+        if resume and finished(job):
+            results[index] = recall(job)
+    _require_right_start(jobs, resume=resume, some_finished=bool(results))
+    for index, job in enumerate(jobs):
+        clear(job)
+        if index in results:
+            sys.stderr.write(f"spikeloom: {job.output}: is finished, not trained again\n")
+        elif resume and not states(job):
+            sys.stderr.write(f"spikeloom: {job.output}: was not begun, trained from the start\n")
+    waiting = [index for index in range(len(jobs)) if index not in results]
+    try:
+        with ended_by_signal():
+            _side_by_side(jobs, waiting, results)
+    except KeyboardInterrupt as interrupt:
+        for job in jobs:
+            clear(job)
+        done = [jobs[index] for index in waiting if index in results]
+        raise KeyboardInterrupt(_kept(done, jobs)) from interrupt
+    return [results[index] for index in range(len(jobs))]
+
+
+def finished(job: Job) -> bool:
+    """Whether its checkpoint is there and nothing is left to go on with."""
+    return not states(job) and job.output.exists()
+
+
+def clear(job: Job) -> None:
+    """Remove what a killed process left half-written."""
+    for file in (job.output, *state_of(job)):
+        remove_leftovers(file)
+
+
+def states(job: Job) -> list[Path]:
+    """Files of an interrupted training, as far as they are there."""
+    return [file for file in state_of(job) if file.exists()]
+
+
+def _require_right_start(jobs: Sequence[Job], *, resume: bool, some_finished: bool) -> None:
+    """Neither lose an interrupted training nor begin anew in silence."""
+    kept = [file for job in jobs for file in states(job)]
+    if kept and not resume:
+        raise OptionError(
+            f"{', '.join(map(str, kept))}: an interrupted training is kept here; go on with --resume, or delete "
+            f"{'it' if len(kept) == 1 else 'them'} to train anew"
+        )
+    if resume and not kept and not some_finished:
+        raise OptionError(
+            f"--resume: nothing was interrupted, neither {jobs[0].output} nor {state_of(jobs[0])[0]} exists; "
+            "omit --resume"
+        )
+
+
+def _kept(done: Sequence[Job], jobs: Sequence[Job]) -> str:
+    """What an interrupt left, and how to go on; empty if nothing."""
+    written = [str(job.output) for job in done]
+    kept = [str(file) for job in jobs for file in states(job)]
+    parts = [f"{', '.join(written)} {'is' if len(written) == 1 else 'are'} finished"] if written else []
+    if kept:
+        parts.append(f"the epochs so far are kept in {', '.join(kept)}")
+    return f"{' and '.join(parts)}; go on with the same command and --resume" if parts else ""
+
+
+def _side_by_side(jobs: Sequence[Job], waiting: Sequence[int], results: dict[int, Result]) -> None:
+    """Run jobs in processes of their own; whatever ends this ends them all."""
+    there = [jobs[index] for index in waiting]
+    if len(there) > 1:  # processes may be in another folder
+        there = [replace(job, output=job.output.absolute()) for job in there]
+    for place, found in processes.side_by_side(there, run_job):
+        if isinstance(found, ProcessDied):
+            raise OptionError(f"{found}; go on with --resume, and with fewer --seeds")
+        if isinstance(found, Exception):
+            raise found
+        results[waiting[place]] = found
