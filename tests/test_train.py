@@ -1,6 +1,5 @@
 """The training loop: the released protocol, repeatable to the byte."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from oracles import refused
 
 import spikeloom.models.training.train
-from spikeloom.compiler.archive import npy_bytes, stored_members, zip_bytes
+from spikeloom.compiler.archive import npy_bytes
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.networks import Architecture, SpikingNet
@@ -174,11 +173,7 @@ def test_resuming_with_other_options_or_data_is_refused(tmp_path):
     refused(OptionError, words, train, grasps(2), grasps(1), ADJACENCY, SMALL, epochs=2, state=state, resume=True)
 
 
-def with_header(header: str) -> Callable[[bytes], bytes]:
-    return lambda content: zip_bytes(stored_members(content) | {"header.npy": npy_bytes(np.array(header))})
-
-
-@pytest.mark.parametrize("change", [lambda content: content[:-100], with_header("[" * 9000), with_header("[]")])
+@pytest.mark.parametrize("change", [lambda content: content[:-100], lambda _: b"[", lambda _: npy_bytes(np.zeros(1))])
 def test_a_damaged_state_is_refused(tmp_path, change):
     state = tmp_path / "x.state"
     train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
