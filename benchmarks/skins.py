@@ -28,7 +28,7 @@ from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
+from spikeloom.compiler.targets.loihi1.layout.place import chip_count
 from spikeloom.runtime.machines.loihi1 import engine
 
 TAXELS = (1000, 2000, 5000, 10000, 20000)

@@ -36,7 +36,7 @@ BATCH = 8
 """Recordings that run together: one layer's membranes then stay in cache."""
 
 DENORMAL = 1e-30
-"""Membranes below this are flushed to zero; beside a threshold they are nothing."""
+"""Membranes and currents below this are flushed to zero; beside a threshold they are nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,23 +62,6 @@ def integer_sums(weight: Sparse, spikes: BoolArray) -> Floating:
     return product(weight, spikes, np.float32 if largest < 2**24 else np.float64)
 
 
-def lasting_currents(sums: Floating, alpha: float) -> Floating:
-    """Synaptic currents (samples, steps, neurons) that keep the share `alpha` from step to step, in the type of `sums`.
-
-    Examples
-    --------
-    >>> lasting_currents(np.array([[[1.0], [0.0], [2.0]]]), 0.5).ravel().tolist()
-    [1.0, 0.5, 2.25]
-    """
-    current = sums.copy()
-    kept = current.dtype.type(alpha)
-    for step in range(1, current.shape[1]):
-        current[:, step] += kept * current[:, step - 1]
-        if step % 16 == 15:
-            current[:, step][np.abs(current[:, step]) < DENORMAL] = 0
-    return current
-
-
 def step_late(spikes: BoolArray) -> BoolArray:
     """Spikes (samples, steps, neurons) as their own population receives them: each in the step after.
 
@@ -101,19 +84,19 @@ def float_recurrence(
     population to each.
     """
     bias = population.bias.astype(sums.dtype)
-    current = lasting_currents(sums, population.alpha) if population.alpha and own is None else sums
-    if own is None:
+    alpha, beta, theta = (sums.dtype.type(value) for value in (population.alpha, population.beta, population.theta))
+    in_steps = own is not None or population.alpha > 0  # else all steps get their bias at once
+    current = sums
+    if not in_steps:
         current += bias
-    held = np.zeros_like(current[:, 0])
+    held, u = np.zeros((2, *current[:, 0].shape), current.dtype)
     spikes = np.empty(current.shape, np.bool_)
     kept = np.empty_like(current) if membranes else None
-    u = np.zeros_like(current[:, 0])
-    alpha, beta, theta = (current.dtype.type(value) for value in (population.alpha, population.beta, population.theta))
     for step in range(current.shape[1]):
-        if own is not None:
+        if in_steps:
             held *= alpha
             held += current[:, step]
-            if step:
+            if own is not None and step:
                 held += spikes[:, step - 1].astype(held.dtype) @ own
             np.add(held, bias, out=current[:, step])
         u *= beta
@@ -123,9 +106,9 @@ def float_recurrence(
             kept[:, step] = u
         u *= ~fired
         if step % 16 == 15:
-            # A decaying membrane ends in denormals, which cost a hundred times a normal operation.
+            # What decays ends in denormals, which cost a hundred times a normal operation.
             u[np.abs(u) < DENORMAL] = 0
-            if own is not None:
+            if in_steps:
                 held[np.abs(held) < DENORMAL] = 0
     return spikes, kept
 

@@ -117,13 +117,7 @@ _SHARED: tuple[Callable[[Network | IntegerNetwork], Faults], ...] = (
 
 
 def verify(network: Network | IntegerNetwork) -> None:
-    """Check every rule of the network's stage.
-
-    Raises
-    ------
-    VerifyError
-        Naming all broken rules.
-    """
+    """Check every rule of the network's stage; VerifyError names all that are broken."""
     faults = [fault for rule in _SHARED for fault in rule(network)]
     if isinstance(network, Network):
         faults += _values_are_finite(network)

@@ -92,17 +92,16 @@ def grid_from_json(values: Mapping[str, Any]) -> Grid:
     return Grid(rows=sizes[0], columns=sizes[1], stride=sizes[2], padding=sizes[3], cells=frozen(cells))
 
 
-def grid_over(cells: IntArray, *, stride: int, padding: int) -> Grid:
-    """The smallest grid that holds the cells of all taxels."""
-    rows, columns = (int(most) + 1 for most in cells.max(axis=0))
-    return Grid(rows=rows, columns=columns, stride=stride, padding=padding, cells=cells)
-
-
 def window_forms(cells: IntArray, kernel: int) -> dict[str, Grid]:
-    """The two forms of the grid-based CNN: a window that moves by 2 without padding, and one that keeps the size."""
+    """The two forms of the grid-based CNN: a window that moves by 2 without padding, and one that keeps the size.
+
+    The grid is the smallest that holds the cells of all taxels.
+    """
+    rows, columns = (int(most) + 1 for most in cells.max(axis=0))
+    forms = {"none": (2, 0), "same": (1, kernel // 2)}
     return {
-        "none": grid_over(cells, stride=2, padding=0),
-        "same": grid_over(cells, stride=1, padding=kernel // 2),
+        name: Grid(rows=rows, columns=columns, stride=stride, padding=padding, cells=cells)
+        for name, (stride, padding) in forms.items()
     }
 
 

@@ -276,7 +276,7 @@ def compiled(network, target=LOIHI, provenance=None):
 
 def seated(network, parts, target=LOIHI, provenance=None):
     """Netlist of a partition, with core k on tile k."""
-    return emit(network, parts, tuple(range(len(parts.cores))), target, provenance or {})
+    return emit(network, parts, tuple(range(len(parts))), target, provenance or {})
 
 
 def words_of_list(entries, weight_bits, index):

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import networkx as nx
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,12 +12,12 @@ from random_networks import LOIHI, integer_chain, small_target
 from spikeloom.compiler.errors import CapacityError, OptionError
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.targets.loihi1.emit import emit
-from spikeloom.compiler.targets.loihi1.layout.chips import chip_count, chip_of_core, place_on_chips, share
 from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
-from spikeloom.compiler.targets.loihi1.layout.core_graph import core_map
+from spikeloom.compiler.targets.loihi1.layout.place import chip_count, chip_of_core, place_on_chips, share
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, require_legal
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.runtime.machines.loihi1 import engine, spec, timing
+from spikeloom.runtime.machines.loihi1.costs import page
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.report.encode import encode
@@ -37,7 +36,7 @@ def net():
 @pytest.fixture(scope="module")
 def netlist():
     layout, _ = lay_out(net(), SMALL, chips=3)
-    made = emit(net(), layout.parts, layout.placement.tiles, SMALL, {})
+    made = emit(net(), layout.cores, layout.placement.tiles, SMALL, {})
     require_legal(made, SMALL)
     return made
 
@@ -91,7 +90,7 @@ def test_a_placement_counts_what_stays_and_what_leaves(cores, seed):
 def test_chips_do_not_change_a_spike(netlist, recordings, stepwise):
     trace = engine.simulate(engine.prepare(netlist, stepwise=stepwise), recordings, spikes=True)
     one, _ = lay_out(net(), LOIHI)
-    alone = emit(net(), one.parts, one.placement.tiles, LOIHI, {})
+    alone = emit(net(), one.cores, one.placement.tiles, LOIHI, {})
     other = engine.simulate(alone, recordings, spikes=True)
     for index in range(3):
         np.testing.assert_array_equal(
@@ -143,18 +142,16 @@ def test_what_is_refused_of_several_chips(netlist, recordings):
         refused(OptionError, f"{what}|takes 3 chips|links between chips|--detail counts", call)
 
 
-def test_the_map_of_cores_has_the_axons_that_the_limits_count_and_the_hops_of_the_placement():
+def test_the_traffic_of_the_page_has_the_axons_that_the_limits_count_and_the_hops_of_the_placement():
     target = small_target(core_compartments=4, mesh_tile_cores=1)
     layout, _ = lay_out(net(), target)
-    made = emit(net(), layout.parts, layout.placement.tiles, target, {})
-    graph = core_map(made, target)
+    made = emit(net(), layout.cores, layout.placement.tiles, target, {})
+    ways = page._traffic(made, target, np.full(made.n_inputs + made.n_compartments, 2.0))
     used = {(use.name, use.core): use.used for use in measure(made, target)}
     for core in range(5):
-        assert graph.in_degree(core, weight="axons") == used["core.axons_in", core]
-        assert graph.out_degree(core, weight="axons") == used["core.axons_out", core]
-        assert graph.nodes[core]["compartments"] == used["core.compartments", core] == 4
+        assert sum(way.axons for way in ways if way.to == core) == used["core.axons_in", core]
+        assert sum(way.axons for way in ways if way.source == core) == used["core.axons_out", core]
+    assert all(way.packets == 2 * way.axons for way in ways)
     # without rates every neuron counts as one spike a step
-    edges = [edge for _, _, edge in graph.edges(data=True) if edge["hops"] is not None]
-    assert sum(edge["axons"] * edge["hops"] for edge in edges) == layout.placement.spike_hops > 0
-    assert nx.descendants(graph, "input") == set(range(5))
-    assert [graph.nodes[core]["layers"] for core in range(5)] == [("fc1",)] * 2 + [("fc2",)] * 2 + [("fc3",)]
+    assert sum(way.axons * way.hops for way in ways if way.hops is not None) == layout.placement.spike_hops > 0
+    assert [(way.source, way.to) for way in ways if way.source is None] == [(None, 0), (None, 1)]

@@ -127,7 +127,7 @@ def test_inspect_shows_what_a_released_file_leaves_open(as_json, tmp_path):
 
 
 def test_dumps_go_to_standard_error(spikeloom, tmp_path):
-    words = [word for step in load_target("loihi1").passes for word in ("--dump-after", step.name)]
+    words = [word for step in load_target("loihi1").passes for word in ("--dump-after", step)]
     code, out, err = spikeloom("compile", "net.pt", *words, "-o", tmp_path / "out.loom", "--json")
     assert code == 0
     json.loads(out)

@@ -121,7 +121,7 @@ def test_what_is_just_allowed():
     assert least_cores(full(6, 8), {"fc1": 6}, small_target(chip_cores=2), 3) == {0: 6}
     assert check_widths([8, 2, 8], 1, 4, LOIHI) == (2, 8)
     assert check_widths([2, 3, 4, 5, 6, 8], 1, 4, LOIHI) == (2, 3, 4, 5, 6, 8)
-    assert len(partition(full(4096, 1), LOIHI).cores) == 1
-    assert len(partition(full(1, 128 * 8), small_target(core_compartments=8)).cores) == 128
-    assert len(cutting((1, 1, 5), core_axons_out=5, core_compartments=1)().cores) == 6
-    assert len(partition(full(1, 4, 9), small_target(core_axons_out=7), cores_for={1: 3}).cores) == 5
+    assert len(partition(full(4096, 1), LOIHI)) == 1
+    assert len(partition(full(1, 128 * 8), small_target(core_compartments=8))) == 128
+    assert len(cutting((1, 1, 5), core_axons_out=5, core_compartments=1)()) == 6
+    assert len(partition(full(1, 4, 9), small_target(core_axons_out=7), cores_for={1: 3})) == 5

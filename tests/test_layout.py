@@ -24,9 +24,8 @@ from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
-from spikeloom.compiler.targets.loihi1.layout.forecast import Forecast, sample
-from spikeloom.compiler.targets.loihi1.layout.latency_search import fastest
-from spikeloom.compiler.targets.loihi1.layout.partition import Partition, cut, partition
+from spikeloom.compiler.targets.loihi1.layout.forecast import Forecast, fastest, sample
+from spikeloom.compiler.targets.loihi1.layout.partition import core_bound, cut, partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.options import GOALS
 from spikeloom.runtime.machines.loihi1 import engine, timing
@@ -54,11 +53,11 @@ def busy(sizes, *, steps=60, seed=0, rates=None):
 
 
 def chunks_per_layer(layout, layers):
-    return [sum(chunk.population == i for core in layout.parts.cores for chunk in core) for i in range(layers)]
+    return [sum(chunk.population == i for core in layout.cores for chunk in core) for i in range(layers)]
 
 
 def netlist_of(network, layout, target=LOIHI):
-    return emit(network, layout.parts, layout.placement.tiles, target, {})
+    return emit(network, layout.cores, layout.placement.tiles, target, {})
 
 
 # --- what is expected is what the time model says
@@ -74,7 +73,7 @@ def test_expectations_are_the_simple_model_of_the_same_spikes(data):
     events = data.draw(recordings_for(network.input.size))
     calibration = spikes_for(network, events, rng)
     layout, _ = lay_out(network, target, calibration=calibration)
-    assert layout.parts.cores == parts.cores
+    assert layout.cores == parts
     netlist = netlist_of(network, layout, target)
     depth, length = netlist.max_depth, events.shape[1]
     spikes = np.zeros((len(events), length + depth, netlist.n_compartments), bool)
@@ -125,7 +124,7 @@ def forecast_of(network, calibration, target=LOIHI):
 def test_cores_asked_for_hold_no_other_layer():
     network = integer_chain(np.full((6, 3), 2), np.full((4, 6), 2), np.full((2, 4), 2))
     alone = partition(network, LOIHI, cores_for={0: 2, 1: 2})
-    assert sorted(sorted({chunk.population for chunk in core}) for core in alone.cores) == [[0], [0], [1], [1], [2]]
+    assert sorted(sorted({chunk.population for chunk in core}) for core in alone) == [[0], [0], [1], [1], [2]]
 
 
 def test_a_layer_gets_more_cores_than_asked_for_if_even_parts_do_not_fit():
@@ -133,7 +132,7 @@ def test_a_layer_gets_more_cores_than_asked_for_if_even_parts_do_not_fit():
     thresholds = [[*range(1, 10), *[1] * 9]]
     network = integer_chain(np.full((18, 1), 2), thresholds=thresholds)
     parts = partition(network, LOIHI, cores_for={0: 2})
-    assert [core[0].size for core in parts.cores] == [6, 6, 6]
+    assert [core[0].size for core in parts] == [6, 6, 6]
 
 
 @settings(deadline=None, max_examples=30)
@@ -149,19 +148,19 @@ def test_every_partition_is_legal_and_holds_every_neuron_once(network, target, d
         parts = partition(network, target, cores_for=asked)
     except (CapacityError, OptionError):
         assume(False)
-    chunks = [chunk for core in parts.cores for chunk in core]
+    chunks = [chunk for core in parts for chunk in core]
     neurons = [(chunk.population, neuron) for chunk in chunks for neuron in range(chunk.first, chunk.last)]
     assert sorted(neurons) == [(i, n) for i, p in enumerate(network.populations) for n in range(p.size)]
-    assert parts.bound <= len(parts.cores)
+    assert core_bound(network, target) <= len(parts)
     for population, cores in asked.items():
-        mine = [core for core in parts.cores if any(chunk.population == population for chunk in core)]
+        mine = [core for core in parts if any(chunk.population == population for chunk in core)]
         assert len(mine) >= cores
         assert all(len(core) == 1 for core in mine)
         sizes = [core[0].size for core in mine]
         assert max(sizes) - min(sizes) <= 1
     require_legal(seated(network, parts, target), target)
-    assert partition(network, target, cores_for=asked).cores == parts.cores
-    assert partition(network, target, cores_for={}).cores == partition(network, target).cores
+    assert partition(network, target, cores_for=asked) == parts
+    assert partition(network, target, cores_for={}) == partition(network, target)
 
 
 # --- goals
@@ -179,7 +178,7 @@ def test_a_network_that_does_little_stays_on_one_tile():
     """A second tile would lengthen the barrier by more than there is to gain."""
     network, calibration = busy([3, 60, 40], rates=[0.1, 0.1, 0.1])
     fast, usual = lay_out(network, LOIHI, goal="latency", calibration=calibration)
-    assert (len(usual.parts.cores), len(fast.parts.cores)) == (1, 4)
+    assert (len(usual.cores), len(fast.cores)) == (1, 4)
     assert len(set(fast.placement.tiles)) == 1
 
 
@@ -195,7 +194,7 @@ def test_the_search_comes_near_the_best_cut(seed):
 
     def expected(chunks):
         """On as few tiles as hold a core for each chunk."""
-        parts = Partition(cores=tuple((chunk,) for chunk in chunks), bound=1)
+        parts = tuple((chunk,) for chunk in chunks)
         return forecast.expect(parts, -(-len(chunks) // target.limit("mesh.tile_cores"))).step_ns
 
     every = []

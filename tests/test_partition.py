@@ -22,12 +22,12 @@ from random_networks import (
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerProjection, Readout
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, index_bits
-from spikeloom.compiler.targets.loihi1.layout.partition import Partition, partition
+from spikeloom.compiler.targets.loihi1.layout.partition import core_bound, partition
 from spikeloom.compiler.targets.loihi1.legalize import REMEDIES, LimitUse, list_words, measure, require_legal
 
 
 def sizes(parts):
-    return [[(chunk.population, chunk.first, chunk.last) for chunk in core] for core in parts.cores]
+    return [[(chunk.population, chunk.first, chunk.last) for chunk in core] for core in parts]
 
 
 # --- words
@@ -55,8 +55,8 @@ def test_a_sparse_index_is_as_narrow_as_it_can_be(highest, bits):
 # --- splitting
 @pytest.mark.parametrize(("neurons", "cores"), [(1024, 1), (1025, 2), (2048, 2), (2496, 3)])
 def test_a_layer_is_split_at_1024_compartments(neurons, cores):
-    parts = partition(integer_chain(np.full((neurons, 1), 2)), LOIHI)
-    assert len(parts.cores) == parts.bound == cores
+    network = integer_chain(np.full((neurons, 1), 2))
+    assert len(partition(network, LOIHI)) == core_bound(network, LOIHI) == cores
 
 
 def with_thresholds(count):
@@ -142,7 +142,7 @@ def groupings(items):
 @given(integer_networks(exponents=(0,), bits=(8,)), roomy_targets())
 def test_no_grouping_of_the_chunks_needs_fewer_cores(network, target):
     parts = legal_partition(network, target)
-    chunks = [chunk for core in parts.cores for chunk in core]
+    chunks = [chunk for core in parts for chunk in core]
     assume(2 <= len(chunks) <= 6)
     known = {}
 
@@ -150,13 +150,13 @@ def test_no_grouping_of_the_chunks_needs_fewer_cores(network, target):
         """Whether these chunks keep every limit on one core; each other chunk sits alone."""
         if frozenset(group) not in known:
             cores = (tuple(group), *((chunk,) for chunk in chunks if chunk not in group))
-            netlist = seated(network, Partition(cores=cores, bound=0), target)
+            netlist = seated(network, cores, target)
             used = counted(netlist)[0]
             known[frozenset(group)] = all(amount <= target.limit(rule) for rule, amount in used.items())
         return known[frozenset(group)]
 
     fewest = min(len(groups) for groups in groupings(chunks) if all(legal(group) for group in groups))
-    assert len(parts.cores) == fewest
+    assert len(parts) == fewest
 
 
 def test_among_equal_packings_the_one_with_least_traffic_is_taken():
@@ -204,7 +204,7 @@ def test_an_illegal_netlist_is_refused_with_every_violation():
 def test_a_dense_list_that_starts_too_high_is_refused():
     network = integer_chain(np.full((300, 1), 2), np.full((40, 300), 2))
     cores = ((Chunk(population=0, first=0, last=300), Chunk(population=1, first=0, last=40)),)
-    netlist = seated(network, Partition(cores=cores, bound=1), small_target(core_dense_base=400))
+    netlist = seated(network, cores, small_target(core_dense_base=400))
     words = "core 0 (fc1, fc2): 300 used, 256 allowed (loihi1.core.dense_base)"
     refused(CapacityError, words, require_legal, netlist, LOIHI)
 
@@ -212,5 +212,5 @@ def test_a_dense_list_that_starts_too_high_is_refused():
 @pytest.mark.parametrize(("layers", "cores"), [(10, 5), (12, 6)])
 def test_any_two_of_many_layers_fit_a_core_and_no_three_do(layers, cores):
     """The worst case of the exhaustive search; more chunks are packed by first fit."""
-    parts = partition(integer_chain(*[np.full((3, 3), 2)] * layers), small_target(core_compartments=6))
-    assert len(parts.cores) == parts.bound == cores
+    network, target = integer_chain(*[np.full((3, 3), 2)] * layers), small_target(core_compartments=6)
+    assert len(partition(network, target)) == core_bound(network, target) == cores

@@ -149,7 +149,7 @@ def test_a_layer_is_cut_so_that_its_axons_to_itself_are_enough():
     pairs = np.kron(np.eye(2, dtype=int), np.ones((2, 2), int))
     target = small_target(core_axons_out=3)
     parts = partition(in_pairs(pairs), target)
-    assert [[(chunk.first, chunk.last) for chunk in core] for core in parts.cores] == [[(0, 2)], [(2, 3)], [(3, 4)]]
+    assert [[(chunk.first, chunk.last) for chunk in core] for core in parts] == [[(0, 2)], [(2, 3)], [(3, 4)]]
     require_legal(emit(in_pairs(pairs), parts, (0, 1, 2), target, {}), target)
     words = "fc1 neuron 0: 4 used, 3 allowed (loihi1.core.axons_out)"
     refused(CapacityError, words, partition, in_pairs(np.ones((4, 4), int)), target)

@@ -79,9 +79,9 @@ class Target:
         return import_module(f"{targets.__name__}.{self.name}.passes")
 
     @property
-    def passes(self) -> Passes:
+    def passes(self) -> Passes[Any]:
         """From what is trained to a netlist."""
-        passes: Passes = self.module.PASSES
+        passes: Passes[Any] = self.module.PASSES
         return passes
 
     @property
@@ -153,10 +153,7 @@ def known_targets(cores: str | None = None) -> tuple[str, ...]:
 def load_target(name: str, cores: str | None = None) -> Target:
     """Read a target by name; its cores must be of the kind that the caller can handle, if that is given.
 
-    Raises
-    ------
-    OptionError
-        If there is no such target, or its cores are of the other kind.
+    OptionError if there is no such target, or its cores are of the other kind.
 
     Examples
     --------

@@ -16,7 +16,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
 from spikeloom.compiler.targets.base import known_targets
+from spikeloom.compiler.types import IntArray
 
 N = TypeVar("N")
 
@@ -35,6 +36,42 @@ COMMON: dict[str, Kind] = {
     **dict.fromkeys(("taxels", "polarities", "classes"), (1, 2**31)),
 }
 """Entries of every manifest."""
+
+
+class Netlist(Protocol):
+    """A placed network, whatever its chip."""
+
+    @property
+    def target(self) -> str:
+        """Name of the chip."""
+
+    @property
+    def taxels(self) -> int:
+        """Of the sensor."""
+
+    @property
+    def polarities(self) -> int:
+        """Input channels of a taxel."""
+
+    @property
+    def bins(self) -> int:
+        """Bins of the recordings that make a data step."""
+
+    @property
+    def classes(self) -> int:
+        """What it tells apart."""
+
+    @property
+    def readout_class(self) -> IntArray:
+        """Class that each neuron of the chip votes for, -1 for none."""
+
+    @property
+    def clocks(self) -> Clocks:
+        """Channels after those of the sensor."""
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """What it was compiled from."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,22 +110,15 @@ class NetlistFile(Generic[N]):
     def write(self, netlist: N, path: str | os.PathLike[str]) -> str:
         """Write a netlist, whole or not at all; return the sha256 of the file.
 
-        Raises
-        ------
-        OSError
-            If the file cannot be written; an older file is left as it was.
+        OSError if the file cannot be written; an older file is left as it was.
         """
         return write_archive(self.content(netlist), path)
 
     def read(self, path: str | os.PathLike[str]) -> N:
         """Read and check a netlist file.
 
-        Raises
-        ------
-        FormatError
-            If it is missing, truncated, altered, of another version or inconsistent.
-        OSError
-            If it cannot be read.
+        FormatError if it is missing, truncated, altered, of another version or inconsistent; OSError if it cannot be
+        read.
         """
         path = Path(path)
         manifest, members = read_archive(path, self.format, self.version, lambda _: self.arrays)

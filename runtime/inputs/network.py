@@ -24,7 +24,7 @@ from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
-from spikeloom.compiler.targets.netlist import Netlist
+from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.text import text
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.graphs import CHOICES, NEUTOUCH, Graph

@@ -6,7 +6,7 @@ import argparse
 from difflib import get_close_matches
 
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.targets.netlist import Netlist
+from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.models.recordings.counts import show_counts
 from spikeloom.models.recordings.events import BIN_S, MAX_STEPS, joined_bins, load_data, need_labels, require_events
 from spikeloom.models.recordings.evtouch import Recordings

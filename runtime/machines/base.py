@@ -25,7 +25,7 @@ from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
-from spikeloom.compiler.targets.netlist import Netlist
+from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime import machines
 from spikeloom.runtime.machines.export_format import Format

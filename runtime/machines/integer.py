@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import IntegerNetwork
-from spikeloom.compiler.targets.netlist import Netlist
+from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.base import EventArray, Machine, machine_for, machine_of
 from spikeloom.runtime.machines.page_parts import BatchParts

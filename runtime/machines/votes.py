@@ -6,7 +6,7 @@ import numpy as np
 
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.ir import Readout
-from spikeloom.compiler.targets.netlist import Netlist
+from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, IntArray
 
 

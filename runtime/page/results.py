@@ -17,7 +17,7 @@ from spikeloom import __version__
 from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.netlist import Netlist
+from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.evtouch import Recordings

@@ -23,7 +23,6 @@ from spikeloom.compiler.ir import (
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk
-from spikeloom.compiler.targets.loihi1.layout.partition import Partition
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, round_population
 
@@ -90,5 +89,4 @@ def unplaced(network: IntegerNetwork, like: Netlist) -> Netlist:
         for post, population in enumerate(network.populations)
         for first in range(0, population.size, most)
     )
-    partition = Partition(cores=cores, bound=len(cores))
-    return emit(network, partition, tuple(range(len(cores))), target, like.provenance)
+    return emit(network, cores, tuple(range(len(cores))), target, like.provenance)

@@ -18,13 +18,13 @@ from spikeloom.compiler.passes.prune import Masks, none_of
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import (
     Chunk,
+    Cores,
     Lists,
     Needs,
     choose_dense,
     index_bits,
     lists_into,
 )
-from spikeloom.compiler.targets.loihi1.layout.partition import Partition
 from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
 from spikeloom.compiler.types import IntArray
 
@@ -71,7 +71,7 @@ def _layers(network: IntegerNetwork, removed: Masks) -> tuple[Layer, ...]:
 
 def emit(
     network: IntegerNetwork,
-    partition: Partition,
+    cores: Cores,
     tiles: tuple[int, ...],
     target: Target,
     provenance: Mapping[str, Any],
@@ -80,7 +80,7 @@ def emit(
     identity: tuple[IntArray, ...] | None = None,
     unread: Masks | None = None,
 ) -> Netlist:
-    """Assemble the netlist of a partitioned network, with a tile for each core and JSON values to remember.
+    """Assemble the netlist of a network on cores, with a tile for each of them and JSON values to remember.
 
     Where neurons were left out, `origin` is the network with all of them, `identity` says for each population which of
     them are held, and `unread` which were removed although they fire, because their spikes reach no neuron.
@@ -89,7 +89,7 @@ def emit(
     compartment_id = [np.zeros(population.size, np.int64) for population in network.populations]
     placed: list[tuple[Chunk, int, int]] = []  # chunk, core, base on it
     counts: list[int] = []
-    for core, chunks in enumerate(partition.cores):
+    for core, chunks in enumerate(cores):
         base = 0
         for chunk in chunks:
             placed.append((chunk, core, base))
@@ -99,9 +99,9 @@ def emit(
         counts.append(base)
 
     formats: dict[tuple[int, int, int], int] = {}
-    axons_per_core = np.zeros(len(partition.cores), np.int64)
+    axons_per_core = np.zeros(len(cores), np.int64)
     parts: dict[str, list[npt.NDArray[Any]]] = {key: [] for key in ("source", "format", "length", "target", "weight")}
-    lean = [Needs(network, target).lean(chunks) for chunks in partition.cores]
+    lean = [Needs(network, target).lean(chunks) for chunks in cores]
     for chunk, core, base in placed:
         for lists in lists_into(network, chunk):
             projection = network.projections[lists.projection]

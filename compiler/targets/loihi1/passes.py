@@ -2,26 +2,117 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
+from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.interpret import channels_last
+from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes import calibrate as calibration
 from spikeloom.compiler.passes import expand, prune
-from spikeloom.compiler.pipeline import Pass, run
-from spikeloom.compiler.range_proof import prove_ranges
+from spikeloom.compiler.passes.calibrate import Calibration
+from spikeloom.compiler.passes.expand import Factored
+from spikeloom.compiler.passes.prune import Masks, Removal
+from spikeloom.compiler.pipeline import Passes, run
+from spikeloom.compiler.range_proof import RangeProof, prove_ranges
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.compilation import LATER, Compilation
 from spikeloom.compiler.targets.loihi1.emit import emit
-from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
-from spikeloom.compiler.targets.loihi1.legalize import require_legal
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.layout.choose import Layout, lay_out
+from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
+from spikeloom.compiler.targets.loihi1.layout.place import Placement
+from spikeloom.compiler.targets.loihi1.legalize import LimitUse, require_legal
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, netlist_text
+from spikeloom.compiler.targets.loihi1.netlist_file import inconsistencies
 from spikeloom.compiler.targets.loihi1.options import Options, Packing, check_packings, require_stored
-from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage, round_to_forms
-from spikeloom.compiler.targets.loihi1.storage.spike_exact import make_exact
-from spikeloom.compiler.types import FloatArray
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice, choose_storage, round_to_forms
+from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness, make_exact
+from spikeloom.compiler.text import text
+from spikeloom.compiler.types import FloatArray, IntArray
 
-__all__ = ["INTEGERS", "LAYOUT", "PASSES", "STORAGE", "Options", "lay_out_again", "start", "to_integers", "without"]
+__all__ = [
+    "INTEGERS",
+    "LATER",
+    "LAYOUT",
+    "PASSES",
+    "STORAGE",
+    "Compilation",
+    "Options",
+    "lay_out_again",
+    "start",
+    "to_integers",
+    "without",
+]
+
+
+LATER: Any = None
+"""Of a field that a pass fills in."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Compilation:
+    """Everything that one compilation was given and has made so far; the pass in brackets fills a field in."""
+
+    source: Factored | Network | IntegerNetwork  # What is compiled
+    options: Options  # What was asked for
+    target: Target  # Chip
+    network: Network = LATER  # Float network, a synapse for each pair of neurons (`expand`)
+    calibration: Calibration | None = None  # What it did on training recordings, where there are any (`calibrate`)
+    # Spikes per step by population, likewise; the placement weighs traffic by them
+    rates: tuple[FloatArray, ...] | None = None
+    connected: Network = LATER  # The same network without the weights of neurons that do nothing (`disconnect`)
+    quiet: Masks = ()  # Neurons that never fired in training and are to go for it, although some input makes them fire
+    integer: IntegerNetwork = LATER  # In the integers of the chip (`quantize`)
+    choices: tuple[Choice, ...] = ()  # Scale of each layer and why
+    exactness: tuple[Exactness, ...] = ()  # What is in the way of equal spikes, where these were asked for; else empty
+    proofs: tuple[RangeProof, ...] = ()  # Worst-case register values of each layer (`prove`)
+    held: IntegerNetwork = LATER  # What the chip holds of it (`remove`)
+    identity: tuple[IntArray, ...] = ()  # Which neurons these are, by population
+    # silent, unread: Neurons that it does not hold: they cannot fire, or their spikes reach no neuron
+    silent: Masks = ()
+    unread: Masks = ()
+    removals: tuple[Removal, ...] = ()  # The same in numbers, and why
+    # layout, usual: Cores and tiles, and those of the layout of fewest cores; often they are one (`place`)
+    layout: Layout = LATER
+    usual: Layout = LATER
+    netlist: Netlist = LATER  # The result (`emit`)
+    uses: tuple[LimitUse, ...] = ()  # Use of every limit by every core (`legalize`)
+
+    @property
+    def placement(self) -> Placement:
+        """Tiles and what they cost."""
+        return self.layout.placement
+
+    @property
+    def core_bound(self) -> int:
+        """Fewer cores cannot hold it, however it is cut."""
+        return core_bound(self.held, self.target)
+
+    @property
+    def newest(self) -> Network | IntegerNetwork | Netlist:
+        """The network as the last pass left it."""
+        stages = (self.netlist, self.held, self.integer, self.connected, self.network)
+        return next(stage for stage in stages if stage is not LATER)
+
+    def verify(self) -> None:
+        """Check every rule of the newest artefact; VerifyError if a pass broke one."""
+        newest = self.newest
+        if not isinstance(newest, Netlist):
+            verify(newest)
+        elif faults := inconsistencies(newest):
+            raise VerifyError("; ".join(faults))
+
+    def text(self) -> str:
+        """The newest artefact in print."""
+        newest = self.newest
+        if isinstance(newest, Netlist):
+            return netlist_text(newest)
+        lines = [text(newest)]
+        for core, chunks in enumerate(() if self.layout is LATER else self.layout.cores):
+            named = ((self.held.populations[chunk.population].name, chunk) for chunk in chunks)
+            names = ", ".join(f"{name} {chunk.first}…{chunk.last - 1}" for name, chunk in named)
+            lines.append(f"(core {core} (tile {self.placement.tiles[core]}) (neurons {names}))\n")
+        return "".join(lines)
 
 
 def _expand(done: Compilation) -> Compilation:
@@ -99,14 +190,13 @@ def _place(done: Compilation) -> Compilation:
 
 
 def _emit(done: Compilation) -> Compilation:
-    parts, tiles = done.layout.parts, done.layout.placement.tiles
     provenance = dict(done.options.provenance)
     if done.choices:
         provenance["compensated"] = [choice.layer for choice in done.choices if choice.compensated]
     made = emit(
         done.held,
-        parts,
-        tiles,
+        done.layout.cores,
+        done.placement.tiles,
         done.target,
         provenance,
         origin=done.integer,
@@ -120,78 +210,30 @@ def _legalize(done: Compilation) -> Compilation:
     return replace(done, uses=require_legal(done.netlist, done.target))
 
 
-FLOATS = (
-    Pass(
-        name="expand",
-        does="writes the graph convolution out as synapses, W = sum over hops k of A^k x W_k, in float64",
-        keeps="every spike, up to the rounding of a differently ordered sum",
-        apply=_expand,
-    ),
-    Pass(
-        name="calibrate",
-        does="runs the float network on training recordings, where there are any",
-        keeps="the network",
-        apply=_calibrate,
-    ),
-    Pass(
-        name="disconnect",
-        does="zeroes the weights of neurons that no input can make fire; with --prune-unused also of those that never "
-        "fired in training",
-        keeps="every spike on any input; with --prune-unused on any input on which these stay silent",
-        apply=_disconnect,
-    ),
-    Pass(
-        name="quantize",
-        does="chooses the scales of each layer and rounds weights, biases, thresholds and decays to registers",
-        keeps="the decisions, as well as the width allows; every training spike where --spike-exact succeeds",
-        apply=_quantize,
-    ),
-)
+FLOATS: Passes[Compilation] = {
+    "expand": _expand,
+    "calibrate": _calibrate,
+    "disconnect": _disconnect,
+    "quantize": _quantize,
+}
 """From floats to integers."""
 
-INTEGERS = (
-    Pass(name="prove", does="bounds every register by the weights alone", keeps="the network", apply=_prove),
-    Pass(
-        name="remove",
-        does="takes out the neurons that no input can make fire and those whose spikes reach no neuron",
-        keeps="every spike of the neurons that are left, on any input",
-        apply=_remove,
-    ),
-)
+INTEGERS: Passes[Compilation] = {"prove": _prove, "remove": _remove}
 """On integers, where they are no matter from."""
 
-LAYOUT = (
-    Pass(
-        name="place",
-        does="cuts the layers over as few cores as every limit allows and puts the cores on tiles with the fewest "
-        "spike-hops, or as --optimize asks",
-        keeps="every spike: where a neuron sits has no influence on any",
-        apply=_place,
-    ),
-    Pass(
-        name="emit",
-        does="writes cores, axons and synapse lists down as a netlist",
-        keeps="every synapse that is not zero, stored once",
-        apply=_emit,
-    ),
-    Pass(
-        name="legalize",
-        does="measures every limit again on the netlist and refuses one that breaks any",
-        keeps="the netlist",
-        apply=_legalize,
-    ),
-)
+LAYOUT: Passes[Compilation] = {"place": _place, "emit": _emit, "legalize": _legalize}
 """From integers to a netlist."""
 
-STORAGE = (*FLOATS, *INTEGERS)
+STORAGE: Passes[Compilation] = {**FLOATS, **INTEGERS}
 """The longest part of a compilation, which any number of layouts can share."""
 
-PASSES = (*STORAGE, *LAYOUT)
+PASSES: Passes[Compilation] = {**STORAGE, **LAYOUT}
+"""What each does, and what it keeps, is in docs/compile.md."""
 
 
 def start(
     source: expand.Factored | Network | IntegerNetwork, options: Options, target: Target
-) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
+) -> tuple[Compilation, Passes[Compilation]]:
     """What the passes begin with, and which of them are due: integers are rounded already.
 
     OptionError if the options contradict each other.
@@ -199,7 +241,7 @@ def start(
     options.require_consistent(calibrated=options.training_events is not None)
     work = Compilation(source=source, options=options, target=target)
     if isinstance(source, IntegerNetwork):
-        return replace(work, integer=source), (*INTEGERS, *LAYOUT)
+        return replace(work, integer=source), {**INTEGERS, **LAYOUT}
     return work, PASSES
 
 

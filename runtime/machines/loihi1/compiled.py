@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX
 from spikeloom.compiler.passes.prune import Removal
 from spikeloom.compiler.range_proof import RangeProof
-from spikeloom.compiler.targets.loihi1.compilation import Compilation
 from spikeloom.compiler.targets.loihi1.layout import choose
 from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
+from spikeloom.compiler.targets.loihi1.passes import Compilation
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
 from spikeloom.runtime.machines.loihi1 import description
@@ -75,7 +75,7 @@ def outcome(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> Outcom
 
 
 def _layout(layout: choose.Layout) -> LayoutFacts:
-    return LayoutFacts(cores=len(layout.parts.cores), expected=layout.expected)
+    return LayoutFacts(cores=len(layout.cores), expected=layout.expected)
 
 
 def sections(facts: CompilationFacts) -> Iterator[Section]:

@@ -11,7 +11,7 @@ import numpy as np
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.fixedpoint import kept_shares
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
+from spikeloom.compiler.targets.loihi1.layout.place import chip_count
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import FloatArray, IntArray

@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.targets.base import PICOSECONDS, Target, TimeTable
-from spikeloom.compiler.targets.loihi1.layout.chips import require_one_chip
+from spikeloom.compiler.targets.loihi1.layout.place import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1.engine import EventArray

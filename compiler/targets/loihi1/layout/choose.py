@@ -17,21 +17,19 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.base import PICOSECONDS, Target
-from spikeloom.compiler.targets.loihi1.layout.chips import place_on_chips
-from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
-from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation, Forecast, sample
-from spikeloom.compiler.targets.loihi1.layout.latency_search import fastest, tiles_for
-from spikeloom.compiler.targets.loihi1.layout.partition import Partition, arrange, partition
-from spikeloom.compiler.targets.loihi1.layout.place import Placement, core_traffic, place_within
+from spikeloom.compiler.targets.loihi1.layout.core_needs import Cores, Needs
+from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation, Forecast, fastest, sample, tiles_for
+from spikeloom.compiler.targets.loihi1.layout.partition import arrange, partition
+from spikeloom.compiler.targets.loihi1.layout.place import Placement, core_traffic, place_on_chips, place_within
 from spikeloom.compiler.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """A placed partition."""
+    """Which neuron sits on which core, and which core on which tile."""
 
-    parts: Partition  # Chunks of each core
-    placement: Placement  # Tiles
+    cores: Cores
+    placement: Placement
     expected: Expectation | None  # Time of a step, where it can be foretold
 
 
@@ -69,13 +67,7 @@ def lay_out(
 
     Layers in `cores_for` get so many cores at least, which hold no other layer. `rates` are spikes per step (neurons,)
     of each population; `identity` says which neurons of the calibration the network holds, all by default.
-
-    Raises
-    ------
-    CapacityError
-        If a limit cannot be kept.
-    OptionError
-        If the goal cannot be judged, or there are not so many cores.
+    CapacityError if a limit cannot be kept, OptionError if the goal cannot be judged or there are not so many cores.
     """
     least = least_cores(network, cores_for or {}, target, chips)
     forecast = None
@@ -84,13 +76,13 @@ def lay_out(
         activity = sample(network, calibration, identity or all_neurons)
         forecast = Forecast(Needs(network, target), activity, target.time[0])
 
-    def placed(parts: Partition, tiles: int | None = None) -> Layout:
-        traffic = core_traffic(network, parts, rates)
+    def placed(cores: Cores, tiles: int | None = None) -> Layout:
+        traffic = core_traffic(network, cores, rates)
         placement = place_on_chips(traffic, target) if tiles is None else place_within(traffic, target, tiles)
         expected = None
-        if forecast is not None and len(parts.cores) <= target.limit("chip.cores"):
-            expected = forecast.expect(parts, len(set(placement.tiles)))
-        return Layout(parts=parts, placement=placement, expected=expected)
+        if forecast is not None and len(cores) <= target.limit("chip.cores"):
+            expected = forecast.expect(cores, len(set(placement.tiles)))
+        return Layout(cores=cores, placement=placement, expected=expected)
 
     usual = placed(partition(network, target, rates, chips=chips))
     if least:

@@ -36,6 +36,13 @@ class Chunk:
         return self.last - self.first
 
 
+Core = tuple[Chunk, ...]
+"""Chunks of one core, in their order on it."""
+
+Cores = tuple[Core, ...]
+"""Every neuron of a network on a core, first core first."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Lists:
     """Synapse lists from one projection into one chunk, one per source neuron with a non-zero weight."""
@@ -99,7 +106,7 @@ class Needs:
         self.forget()
         self._lists: dict[Chunk, tuple[Lists, ...]] = {}
         self._stored: dict[tuple[Chunk, int, bool], tuple[int, frozenset[SynapseFormat]]] = {}
-        self._lean: dict[tuple[Chunk, ...], bool] = {}
+        self._lean: dict[Core, bool] = {}
 
     def lists(self, chunk: Chunk) -> tuple[Lists, ...]:
         """Synapse lists of a chunk."""
@@ -125,7 +132,7 @@ class Needs:
             self._stored[key] = words, frozenset(formats)
         return self._stored[key]
 
-    def uses(self, chunks: tuple[Chunk, ...], *, lean: bool = False) -> dict[str, int]:
+    def uses(self, chunks: Core, *, lean: bool = False) -> dict[str, int]:
         """Use of each limit by a core that holds these chunks in this order."""
         base = words = 0
         thresholds: set[int] = set()
@@ -149,13 +156,13 @@ class Needs:
             "core.compartment_configs": len(decays),
         }
 
-    def excess(self, chunks: tuple[Chunk, ...], *, lean: bool = False) -> list[LimitUse]:
+    def excess(self, chunks: Core, *, lean: bool = False) -> list[LimitUse]:
         """Limits that such a core breaks."""
         uses = self.uses(chunks, lean=lean).items()
         every = [LimitUse(name=rule, used=used, allowed=self.target.limit(rule), core=None) for rule, used in uses]
         return [use for use in every if use.used > use.allowed]
 
-    def lean(self, chunks: tuple[Chunk, ...]) -> bool:
+    def lean(self, chunks: Core) -> bool:
         """Whether such a core has room for lists of few visited synapses; its output axons do not matter."""
         if chunks not in self._lean:
             self._lean[chunks] = all(use.name == "core.axons_out" for use in self.excess(chunks, lean=True))

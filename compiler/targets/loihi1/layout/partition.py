@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -19,20 +18,12 @@ import numpy as np
 from spikeloom.compiler.errors import CapacityError, OptionError, Violation
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Needs
+from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Core, Cores, Needs
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, violation
 from spikeloom.compiler.types import FloatArray
 
 EXACT_CHUNKS = 10
 """Up to this many chunks the packing is searched exhaustively; above it, first fit."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Partition:
-    """Chunks of each core, in their order on it."""
-
-    cores: tuple[tuple[Chunk, ...], ...]  # First core first
-    bound: int  # No legal partition can use fewer cores than this
 
 
 def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:
@@ -109,7 +100,7 @@ def _worst(needs: Needs, population: int) -> list[Violation]:
     return [violation(use, f"{name} neuron {neuron}", needs.target) for use, neuron in found.values()]
 
 
-def order_on_core(needs: Needs, chunks: tuple[Chunk, ...]) -> tuple[Chunk, ...]:
+def order_on_core(needs: Needs, chunks: Core) -> Core:
     """Densest chunks first: a dense list must start low on its core, a sparse one need not."""
 
     def key(chunk: Chunk) -> tuple[float, Chunk]:
@@ -120,31 +111,27 @@ def order_on_core(needs: Needs, chunks: tuple[Chunk, ...]) -> tuple[Chunk, ...]:
     return tuple(sorted(chunks, key=key))
 
 
-def _core_bound(needs: Needs, chunks: list[Chunk]) -> int:
+def core_bound(network: IntegerNetwork, target: Target) -> int:
     """Cores that compartments and synaptic memory need at least, however the network is cut."""
-    compartments = sum(chunk.size for chunk in chunks)
+    compartments = sum(population.size for population in network.populations)
     # Cutting a list elsewhere moves header and index bits, so memory is bounded by the mantissas alone.
-    payload = sum(
-        int(lists.nonzero.sum()) * needs.network.projections[lists.projection].bits
-        for chunk in chunks
-        for lists in needs.lists(chunk)
-    )
-    memory = needs.target.limit("synapse.word_bits") * needs.target.limit("core.synapse_words")
-    return max(-(-compartments // needs.target.limit("core.compartments")), -(-payload // memory))
+    payload = sum(int(p.weight.count_nonzero()) * p.bits for p in network.projections)
+    memory = target.limit("synapse.word_bits") * target.limit("core.synapse_words")
+    return max(-(-compartments // target.limit("core.compartments")), -(-payload // memory))
 
 
-def _pack(needs: Needs, chunks: list[Chunk], traffic: Callable[[Chunk, Chunk], float]) -> list[tuple[Chunk, ...]]:
+def _pack(needs: Needs, chunks: list[Chunk], traffic: Callable[[Chunk, Chunk], float]) -> list[Core]:
     """Put chunks on the fewest cores; among equals, keep most traffic within a core."""
     known: dict[frozenset[Chunk], bool] = {}
 
-    def fits(group: tuple[Chunk, ...]) -> bool:
+    def fits(group: Core) -> bool:
         key = frozenset(group)
         if key not in known:
             known[key] = not needs.excess(order_on_core(needs, group))
         return known[key]
 
     if len(chunks) > EXACT_CHUNKS:
-        cores: list[tuple[Chunk, ...]] = []
+        cores: list[Core] = []
         for chunk in sorted(chunks, key=lambda c: (-needs.stored(c, 0)[0], c)):
             for i, core in enumerate(cores):
                 if fits((*core, chunk)):
@@ -154,10 +141,10 @@ def _pack(needs: Needs, chunks: list[Chunk], traffic: Callable[[Chunk, Chunk], f
                 cores.append((chunk,))
         return cores
 
-    best: list[tuple[Chunk, ...]] = [(chunk,) for chunk in chunks]
+    best: list[Core] = [(chunk,) for chunk in chunks]
     best_kept = 0.0
 
-    def search(index: int, cores: list[tuple[Chunk, ...]], kept: float) -> None:
+    def search(index: int, cores: list[Core], kept: float) -> None:
         nonlocal best, best_kept
         if len(cores) > len(best):
             return
@@ -217,14 +204,14 @@ def chunks_of(chunks: Iterable[Chunk]) -> dict[int, int]:
     return dict(sorted(Counter(chunk.population for chunk in chunks).items()))
 
 
-def arrange(needs: Needs, groups: Iterable[tuple[Chunk, ...]], chips: int = 1) -> Partition:
+def arrange(needs: Needs, groups: Iterable[Core], chips: int = 1) -> Cores:
     """Put groups of chunks on cores, in order; CapacityError if the chips have too few cores."""
     cores = sorted((order_on_core(needs, group) for group in groups), key=min)
     used = LimitUse(name="chip.cores", used=len(cores), allowed=chips * needs.target.limit("chip.cores"), core=None)
     if used.used > used.allowed:
         owner = "chip" if chips == 1 else f"{chips} chips"
         raise CapacityError((violation(used, owner, needs.target),))
-    return Partition(cores=tuple(cores), bound=_core_bound(needs, [chunk for core in cores for chunk in core]))
+    return tuple(cores)
 
 
 def partition(
@@ -234,20 +221,14 @@ def partition(
     *,
     cores_for: Mapping[int, int] | None = None,
     chips: int = 1,
-) -> Partition:
+) -> Cores:
     """Assign every neuron to a core, on as few as the cut into chunks allows if the densest of a core comes first.
 
     Populations in `cores_for` are cut as evenly as possible into so many chunks at least, each on a core of its own;
     the others into full ones. Among equal packings, searched exhaustively up to
     ``EXACT_CHUNKS`` chunks, the one that keeps most traffic within a core is taken; `rates` are spikes per step
-    (neurons,) of each population, all equal without.
-
-    Raises
-    ------
-    CapacityError
-        If a single neuron exceeds a limit or the chips have too few cores; lists every violation.
-    OptionError
-        If a population needs more cores than `cores_for` says.
+    (neurons,) of each population, all equal without. CapacityError, with every violation, if a single neuron exceeds a
+    limit or the chips have too few cores; OptionError if a population needs more cores than `cores_for` says.
     """
     needs = Needs(network, target)
     least = cores_for or {}

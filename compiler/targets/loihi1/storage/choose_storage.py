@@ -186,14 +186,8 @@ def choose_storage(
     """Choose the scales of each population and round weights, thresholds, biases and decays.
 
     ``calibrate.FEW`` recordings of the calibration choose, several planes use ``MANY``; without it scales come from the
-    weights and the proven bounds alone.
-
-    Raises
-    ------
-    OptionError
-        If there are no such packings.
-    ModelError
-        If populations have no usable scale; a line for each.
+    weights and the proven bounds alone. OptionError if there are no such packings; ModelError, with a line for each, if
+    populations have no usable scale.
     """
     packings = check_packings(packings, len(network.populations), target)
     exponents = target.choices["synapse.exponent"]

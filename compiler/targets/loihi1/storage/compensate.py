@@ -13,6 +13,8 @@ References
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import sparse
 from scipy.linalg import solve_triangular
@@ -20,8 +22,8 @@ from scipy.linalg import solve_triangular
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, reach, step_units
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import Calibration
-from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, flips
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import in_registers, loads, scales
+from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, flips, rounded
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, scales
 from spikeloom.compiler.types import FloatArray, IntArray
 
 DAMPING = 1e-3
@@ -64,13 +66,7 @@ def compensated(layer: FloatLayer, form: Form, calibration: Calibration) -> Roun
         steps[part] = np.clip(_round_in_turn(held[part], together[np.ix_(columns, columns)]), -limit, limit)
 
     def stored_as(steps: IntArray, errors: FloatArray) -> Rounded | None:
-        try:
-            bias = population.bias + errors
-            integer, planes = in_registers(population, projections, form, [steps[place] for place in places], bias)
-        except ValueError:
-            return None
-        reached = float(np.max(loads(integer, planes), initial=0))
-        return Rounded(form=form, population=integer, projections=planes, reached=reached, compensated=True)
+        return rounded(layer, form, [steps[place] for place in places], population.bias + errors)
 
     nearest = np.rint(held).astype(np.int64)
     plain = stored_as(nearest, np.zeros(population.size))
@@ -82,7 +78,8 @@ def compensated(layer: FloatLayer, form: Form, calibration: Calibration) -> Roun
     back = flips(found, post, calibration) > flips(plain, post, calibration)
     back |= loads(found.population, found.projections) > ONE_STEP_SUM_MAX
     steps[back], errors[back] = nearest[back], 0
-    return stored_as(steps, errors)
+    found = stored_as(steps, errors)
+    return None if found is None else replace(found, compensated=True)
 
 
 def _round_in_turn(weight: FloatArray, together: FloatArray) -> FloatArray:

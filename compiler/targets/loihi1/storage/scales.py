@@ -6,7 +6,7 @@ Nothing here looks at the rest of the network; :mod:`storage.choose_storage` cho
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
@@ -86,10 +86,15 @@ class Rounded:
         return self.flips or 0
 
 
-def rounded(layer: FloatLayer, form: Form) -> Rounded | None:
-    """Round one population, or None where a bias has no register value or a relay would miss its clock."""
+def rounded(
+    layer: FloatLayer, form: Form, steps: Sequence[IntArray] | None = None, bias: FloatArray | None = None
+) -> Rounded | None:
+    """Round one population, or None where a bias has no register value or a relay would miss its clock.
+
+    `steps` and `bias` as of :func:`round_population`.
+    """
     try:
-        integer, planes = round_population(layer.population, layer.projections, form)
+        integer, planes = round_population(layer.population, layer.projections, form, steps, bias)
     except ValueError:
         return None
     if layer.population.relays and not _relays_follow(layer.population, integer, planes):

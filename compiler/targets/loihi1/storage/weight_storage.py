@@ -73,16 +73,17 @@ def nearest_steps(population: Population, projection: Projection, form: Form) ->
     return steps
 
 
-def in_registers(
+def round_population(
     population: Population,
     projections: tuple[Projection, ...],
     form: Form,
-    steps: Sequence[IntArray],
+    steps: Sequence[IntArray] | None = None,
     bias: FloatArray | None = None,
 ) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
-    """Registers of one population and its synapses, whose weights are given in steps, an array for each projection.
+    """Registers of one population and its synapses, every weight rounded to the nearest.
 
-    A `bias` (neurons,), in model units, is taken instead of the population's. ValueError if one has no register value.
+    Where `steps` are given, an array for each projection, they are taken instead of the weights; a `bias` (neurons,),
+    in model units, instead of the population's. ValueError if one has no register value.
     """
     scale = scales(population, form)
     wanted = population.bias if bias is None else bias
@@ -100,15 +101,9 @@ def in_registers(
         bias_mantissa=mantissa,
         bias_exponent=exponent,
     )
+    steps = steps or [nearest_steps(population, p, form) for p in projections]
     pairs = zip(projections, steps, strict=True)
     return integer, tuple(plane for p, data in pairs for plane in store_steps(p, data, form))
-
-
-def round_population(
-    population: Population, projections: tuple[Projection, ...], form: Form
-) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
-    """The same with every weight rounded to the nearest."""
-    return in_registers(population, projections, form, [nearest_steps(population, p, form) for p in projections])
 
 
 def current_load(decay_u: int) -> float:

@@ -215,8 +215,8 @@ def _size(integer: IntegerNetwork, target: Target, rates: tuple[FloatArray, ...]
     """Words that a network needs and cores that it takes as the compiler lays it out; None if it does not fit."""
     held, kept = compact(integer, either(*removable(integer)))
     try:
-        parts = partition(held, target, tuple(rate[ids] for rate, ids in zip(rates, kept, strict=True)))
+        cores = partition(held, target, tuple(rate[ids] for rate, ids in zip(rates, kept, strict=True)))
     except CapacityError:
         return None
     needs = Needs(held, target)
-    return sum(needs.uses(core)["core.synapse_words"] for core in parts.cores), len(parts.cores)
+    return sum(needs.uses(core)["core.synapse_words"] for core in cores), len(cores)

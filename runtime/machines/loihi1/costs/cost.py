@@ -21,8 +21,7 @@ from typing import Literal
 import numpy as np
 
 from spikeloom.compiler.targets.base import EnergyTable, Target
-from spikeloom.compiler.targets.loihi1.layout.chips import chip_of_core
-from spikeloom.compiler.targets.loihi1.layout.place import hops
+from spikeloom.compiler.targets.loihi1.layout.place import chip_of_core, hops
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1.trace import Counts

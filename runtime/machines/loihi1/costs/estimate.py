@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.layout.chips import chip_count, require_one_chip
+from spikeloom.compiler.targets.loihi1.layout.place import chip_count, require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1 import engine, timing

@@ -8,8 +8,7 @@ from functools import partial
 import numpy as np
 
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.layout.chips import chip_of_core, chip_tiles
-from spikeloom.compiler.targets.loihi1.layout.core_graph import core_map
+from spikeloom.compiler.targets.loihi1.layout.place import chip_of_core, chip_tiles, hops
 from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import FloatArray, IntArray
@@ -25,6 +24,9 @@ from spikeloom.runtime.report.sections import Block, Figure, Outcome, Section, T
 
 FILLS = ("core.compartments", "core.synapse_words", "core.axons_in", "core.axons_out")
 """Limits of which the fullest says how full a core is: those that a larger network uses up."""
+
+AT_INPUT = -1
+"""In place of a core: the input, which has no place on the mesh."""
 
 
 def batch_parts(
@@ -54,9 +56,10 @@ def _cores(netlist: Netlist, target: Target, counts: Counts) -> Cores:
     for use in measure(netlist, target):
         if use.core is not None and use.allowed:
             fill[use.core][use.name] = Fill(used=use.used, allowed=use.allowed, share=use.used / use.allowed)
-    graph, placed = core_map(netlist, target), []
+    placed = []
     for core, tile in enumerate(netlist.core_tile.tolist()):
         y, x = divmod(tile % chip_tiles(target), width)
+        held = netlist.layer[slice(*netlist.core_compartments[core : core + 2])]
         placed.append(
             Core(
                 core=core,
@@ -64,37 +67,32 @@ def _cores(netlist: Netlist, target: Target, counts: Counts) -> Cores:
                 tile=tile,
                 x=x,
                 y=y,
-                layers=tuple(graph.nodes[core]["layers"]),
-                compartments=graph.nodes[core]["compartments"],
+                layers=tuple(netlist.layers[i].name for i in np.unique(held)),
+                compartments=len(held),
                 fullest=max(FILLS, key=lambda name: fill[core][name].share),
                 fill=fill[core],
             )
         )
-    packets = _packets(netlist, counts)
-    traffic = [
-        Way(
-            source=None if pre == "input" else pre,
-            to=post,
-            packets=float(packets[-1 if pre == "input" else pre, post]),
-            axons=edge["axons"],
-            hops=edge["hops"],
-        )
-        for pre, post, edge in graph.edges(data=True)
-    ]
     return Cores(
         mesh=Mesh(width=width, height=target.limit("mesh.height"), tile_cores=target.limit("mesh.tile_cores")),
         cores=tuple(placed),
-        traffic=tuple(sorted(traffic, key=lambda way: (-1 if way.source is None else way.source, way.to))),
+        traffic=_traffic(netlist, target, np.concatenate([counts.inputs, counts.spikes], axis=1).mean(axis=0)),
     )
 
 
-def _packets(netlist: Netlist, counts: Counts) -> FloatArray:
-    """Packets of a mean recording from each core, and in the last row from the input, to each core."""
-    fired = np.concatenate([counts.inputs, counts.spikes], axis=1).mean(axis=0)
-    home = np.append(np.full(netlist.n_inputs, netlist.n_cores), netlist.core_of_compartment())
-    packets = np.zeros((netlist.n_cores + 1, netlist.n_cores))
-    np.add.at(packets, (home[netlist.axon_source], netlist.core_of_axon()), fired[netlist.axon_source])
-    return packets
+def _traffic(netlist: Netlist, target: Target, fired: FloatArray) -> tuple[Way, ...]:
+    """Axons and packets from the input and from each core to each core, if each source id fires so often."""
+    home = np.append(np.full(netlist.n_inputs, AT_INPUT), netlist.core_of_compartment())
+    ends = np.stack([home[netlist.axon_source], netlist.core_of_axon()])
+    pairs, which, axons = np.unique(ends, axis=1, return_inverse=True, return_counts=True)
+    packets = np.bincount(which.ravel(), fired[netlist.axon_source])
+    tile, chip = netlist.core_tile.tolist(), chip_of_core(netlist.core_tile, target)
+    ways = []
+    for (pre, post), sent, count in zip(pairs.T.tolist(), packets.tolist(), axons.tolist(), strict=True):
+        near = pre != AT_INPUT and chip[pre] == chip[post]
+        distance = sum(hops(tile[pre], tile[post], target.limit("mesh.width"))) if near else None
+        ways.append(Way(source=None if pre == AT_INPUT else pre, to=post, packets=sent, axons=count, hops=distance))
+    return tuple(ways)
 
 
 def _figures(found: CostReport) -> list[Block]:

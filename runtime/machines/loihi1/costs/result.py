@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
+from spikeloom.compiler.targets.loihi1.layout.place import chip_count
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.machines.loihi1.costs.cost import NOT_PRICED, Costs, by_part
