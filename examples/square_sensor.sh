@@ -17,11 +17,11 @@ say spikeloom data convert synthetic --taxels coords.csv -o grasps
 say spikeloom data describe grasps --taxels coords.csv --picture grasps.png
 
 # 3. Train on a graph of the four nearest neighbours, on all cores if you give several --seeds.
-say spikeloom train --data grasps --taxels coords.csv --graph knn:4 --epochs 1 -o square.pt --picture training.png
+say spikeloom train --data grasps --taxels coords.csv --graph knn:4 --epochs 1 --features 16 -o square.pt --picture training.png
 
 # 4. Lower it to the chip, and see what that changes. The checkpoint knows its graph.
 say spikeloom compile square.pt --calibrate grasps -o square.loom
-say spikeloom verify square.loom --checkpoint square.pt --data grasps --min-agreement 0.9
+say spikeloom verify square.loom --checkpoint square.pt --data grasps --limit 36 --min-agreement 0.9
 
 # 5. One grasp as it would arrive from the sensor, line by line, and the decision while it runs.
 first="$(find grasps/test -name '*.npy' | sort | sed -n 1p)"

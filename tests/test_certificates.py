@@ -64,8 +64,6 @@ def shuffled(checkpoint, adjacency, recordings, seed):
 
 
 # -- soundness ---------------------------------------------------------------------------------------------------------
-
-
 def runs(checkpoint, adjacency, recordings, seed=0):
     """The float model in five arithmetics."""
     network, inputs = expand(checkpoint, adjacency), channels_last(recordings)
@@ -189,8 +187,6 @@ def test_roundings_and_magnitudes_of_the_released_operator_are_those_of_its_loop
 
 
 # -- against the chip --------------------------------------------------------------------------------------------------
-
-
 def by_hand(checkpoint, adjacency, recordings, chip, kept=None, lengths=None):
     """Equal and different entries per layer, entry by entry."""
     found = []
@@ -284,8 +280,6 @@ def test_registers_without_a_proof_are_named(tmp_path):
 
 
 # -- votes -------------------------------------------------------------------------------------------------------------
-
-
 @given(st.data())
 def test_wins_is_whether_every_vote_agrees(data):
     counts = st.lists(st.integers(0, 2), min_size=3, max_size=3)

@@ -80,8 +80,6 @@ def again(made, place):
 
 
 # -- points ------------------------------------------------------------------------------------------------------------
-
-
 def test_every_point_of_the_grid_is_there(made, place):
     found = [(p["bits"], p["cores"], p["window"]) for p in made["points"]]
     assert found == [(b, c, w) for b in ([4], [8]) for c in ("cores", "fc1:2") for w in (50, 100)]
@@ -134,8 +132,6 @@ def test_the_commands_of_a_point_give_its_netlist_and_its_figures(made, spikeloo
 
 
 # -- again -------------------------------------------------------------------------------------------------------------
-
-
 def test_once_more_nothing_is_measured_and_every_byte_is_the_same(made, spikeloom, place, monkeypatch):
     before = {file.name: file.read_bytes() for file in (place / "out").glob("chart.*")}
 
@@ -165,8 +161,6 @@ def test_one_more_window_compiles_only_what_is_gone_or_damaged(made, again, spik
 
 
 # -- choices -----------------------------------------------------------------------------------------------------------
-
-
 def read_as(*checkpoints):
     """Options of a command that names checkpoints only."""
     options = dict.fromkeys(("graph", "taxels", "edges", "system", "weights", "beta", "theta"))

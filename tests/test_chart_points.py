@@ -52,8 +52,6 @@ def points():
 
 
 # -- fronts and expectations -------------------------------------------------------------------------------------------
-
-
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), max_size=12))
 def test_the_front_is_what_no_other_point_beats(pairs):
     gains, costs = [float(gain) for gain, _ in pairs], [float(cost) for _, cost in pairs]
@@ -82,8 +80,6 @@ def test_where_one_checkpoint_knows_no_validation_training_figures_stand_for_all
 
 
 # -- choices -----------------------------------------------------------------------------------------------------------
-
-
 def chosen(points, expected=0.9, bins=1):
     return recommended(points, [made_network(expected=expected, bins=bins)], BY, bin_s=0.02)
 
@@ -126,8 +122,6 @@ def test_the_usual_mapping_is_the_manual_graph_at_eight_bits_on_whole_recordings
 
 
 # -- budgets -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("words", "limit"),
     [

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file, recordings_folder, released, state_dict
+from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file, recordings_folder, state_dict
 from made_files import weights as made_weights
 
 from spikeloom.__main__ import main as start
@@ -56,8 +56,6 @@ def as_json(spikeloom):
 
 
 # -- compile and inspect -----------------------------------------------------------------------------------------------
-
-
 def test_compile_counts_and_says_what_was_realised(as_json, tmp_path, place):
     report = as_json("compile", "net.pt", "--calibrate", "data", "-o", tmp_path / "out.loom")
     content = (tmp_path / "out.loom").read_bytes()
@@ -82,16 +80,6 @@ def test_compile_counts_and_says_what_was_realised(as_json, tmp_path, place):
     ]
 
 
-def test_a_layer_gets_the_cores_asked_for(as_json, tmp_path):
-    words = ["compile", "net.pt", "--calibrate", "data", "--cores-for", "conv1=3,fc1=2", "-o", tmp_path / "out.loom"]
-    report = as_json(*words)
-    assert [len(layer["cores"]) for layer in report["layers"]] == [3, 2, 1, 1]
-    assert report["provenance"]["cores_for"] == {"conv1": 3, "fc1": 2}
-    layout = report["layout"]
-    assert (layout["optimize"], layout["expected"]["cores"], layout["usual"]["cores"]) == ("cores", 6, 1)
-    assert read_netlist(tmp_path / "out.loom").n_cores == report["cores"] == 6
-
-
 def test_provenance_names_everything_that_decided(as_json, place):
     report = as_json("inspect", "net.loom")
     assert report["provenance"] == {
@@ -109,21 +97,6 @@ def test_provenance_names_everything_that_decided(as_json, place):
         "calibrated": True,
         "compensated": ["fc1"],
     }
-
-
-def test_inspect_shows_a_netlist_as_compile_did(as_json, tmp_path):
-    compiled = as_json("compile", "net.pt", "-o", tmp_path / "named.otherwise")  # it is known by its content
-    inspected = as_json("inspect", tmp_path / "named.otherwise")
-    assert inspected == {key: compiled[key] for key in inspected}
-
-
-def test_inspect_shows_what_a_released_file_leaves_open(as_json, tmp_path):
-    torch.save(released(state_dict(made_weights())), tmp_path / "net.t7")
-    report = as_json("inspect", tmp_path / "net.t7", "--theta", "0.25")
-    assert (report["beta"], report["theta"], report["assumed"]) == (0.2, 0.25, ["beta"])
-    assert (report["taxels"], report["classes"], report["hops"]) == (TAXELS, CLASSES, 3)
-    assert {layer["name"]: layer["neurons"] for layer in report["layers"]} == SIZES
-    assert (report["layout"], report["graph"]) == ("released", None)
 
 
 def test_dumps_go_to_standard_error(spikeloom, tmp_path):
@@ -147,25 +120,7 @@ def test_the_graph_of_a_released_file_comes_from_the_user(as_json, tmp_path):
     assert report["layers"][0]["synapses"] == structural
 
 
-def test_last_and_best_weights(as_json, tmp_path):
-    own_file(tmp_path / "both.pt", last=made_weights(1), best=made_weights(2))
-    own_file(tmp_path / "second.pt", last=made_weights(2))
-    found = {
-        name: as_json("compile", tmp_path / f"{file}.pt", *words, "-o", tmp_path / f"{name}.loom")
-        for name, file, words in (
-            ("last", "both", []),
-            ("best", "both", ["--weights", "best"]),
-            ("second", "second", []),
-        )
-    }
-    scales = {name: [layer["scale"] for layer in report["layers"]] for name, report in found.items()}
-    assert scales["best"] == scales["second"] != scales["last"]
-    assert found["best"]["provenance"]["weights"] == "best"
-
-
 # -- run ---------------------------------------------------------------------------------------------------------------
-
-
 def test_run_counts_right_decisions(as_json):
     report = as_json("run", "net.loom", "--data", "data")
     assert report["files"] == [f"sample_{i}_label_{i % CLASSES}.npy" for i in range(6)]
@@ -200,8 +155,6 @@ def test_spikes_are_written_aligned_with_the_data(as_json, tmp_path, place):
 
 
 # -- verify and estimate -----------------------------------------------------------------------------------------------
-
-
 def test_verify_fails_when_decisions_agree_too_rarely(spikeloom, tmp_path):
     coarse = tmp_path / "coarse.loom"
     assert spikeloom("compile", "net.pt", "--weight-bits", "3", "-o", coarse)[0] == 0
@@ -234,17 +187,6 @@ def test_the_epoch_is_that_of_the_netlist(spikeloom, tmp_path):
         assert json.loads(spikeloom(*words, *options)[1])["same_checkpoint"] is same
 
 
-def test_layers_add_up_to_an_inference(as_json):
-    report = as_json("estimate", "net.loom", "--data", "data")
-    assert [layer["name"] for layer in report["layers"]] == list(SIZES)
-    for key in ("synaptic_operations", "spikes", "neuron_updates"):
-        assert report["min"][key] <= report["per_inference"][key] <= report["max"][key]
-        assert sum(layer[key] for layer in report["layers"]) == pytest.approx(report["per_inference"][key], rel=1e-12)
-    for table in ("davies2018", "sanafe"):
-        low, mean, high = (report[part]["energy_j"][table] for part in ("min", "per_inference", "max"))
-        assert 0 < low <= mean <= high
-
-
 def test_a_table_of_ones_own_prices_alone(as_json, tmp_path):
     prices = [f'{event} = {{ value = 1000.0, unit = "pJ", source = "mine" }}' for event in EVENTS]
     (tmp_path / "mine.toml").write_text("\n".join(['[energy.mine]\ntitle = "Mine"', *prices]))
@@ -255,28 +197,7 @@ def test_a_table_of_ones_own_prices_alone(as_json, tmp_path):
     assert report["per_inference"]["energy_j"]["mine"] > known["per_inference"]["energy_j"]["davies2018"]
 
 
-def test_a_faulty_table_is_one_line(spikeloom, tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text('[energy.mine]\ntitle = "Mine"\nspike = { value = -1.0, unit = "pJ", source = "mine" }\n')
-    code, out, err = spikeloom("run", "net.loom", "--data", "data", "--detail", "counts", "--table", path)
-    assert (code, out) == (2, "")
-    assert err == f"spikeloom: {path}: energy.mine.spike: value is -1.0, a finite number from 0 is needed\n"
-
-
-def test_estimate_agrees_with_run(as_json, tmp_path):
-    as_json("run", "net.loom", "--data", "data", "--spikes", tmp_path / "out.npz")
-    with np.load(tmp_path / "out.npz") as archive:
-        spikes = {name: archive[name].sum(axis=(1, 2)) for name in archive.files}
-    report = as_json("estimate", "net.loom", "--data", "data")
-    assert {layer["name"]: layer["spikes"] for layer in report["layers"]} == {k: v.mean() for k, v in spikes.items()}
-    total = sum(spikes.values())
-    assert (report["min"]["spikes"], report["max"]["spikes"]) == (total.min(), total.max())
-    assert report["chip_steps"] == STEPS + 3
-
-
 # -- demo, and everything around a command -----------------------------------------------------------------------------
-
-
 @pytest.fixture
 def shipped_grasps(monkeypatch, tmp_path):
     """A made-up network in place of the shipped one, and few grasps."""
@@ -364,8 +285,6 @@ def test_a_terminal_without_greek_letters(spikeloom, monkeypatch):
 
 
 # -- recordings without a label ----------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """Four recordings, the last two without a label, and a network; the working folder holds both."""

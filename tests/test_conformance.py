@@ -320,8 +320,6 @@ def test_watch_decides_as_run(name, tmp_path, capsys):
 
 
 # --- shipped networks, held against what was recorded -----------------------------------------------------------------
-
-
 NETWORKS = {
     "grasps": {},
     "objects": {"planes": "2", "scale_groups": "4"},

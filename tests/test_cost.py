@@ -154,8 +154,6 @@ def test_counted_by_hand():
 
 
 # -- tables that do not know everything --------------------------------------------------------------------------------
-
-
 def table(name, **prices):
     return EnergyTable(
         name=name,
@@ -217,8 +215,6 @@ def test_one_price_for_both_forms_of_a_list():
 
 
 # -- the report --------------------------------------------------------------------------------------------------------
-
-
 def test_report_has_means_and_extremes_over_recordings(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     integer, _ = choose_storage(expand(checkpoint, adjacency), LOIHI)

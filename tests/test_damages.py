@@ -70,8 +70,6 @@ def moved(before, after):
 
 
 # -- weights -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("packing", [None, (Packing(bits=4),), (Packing(planes=2),)])
 def test_float_weights_move_as_the_stored_ones_do(packing):
     pair = made(packing=packing)
@@ -115,8 +113,6 @@ def test_fewer_bits_round_to_a_coarser_grid_and_hold_the_rest():
 
 
 # -- neurons -----------------------------------------------------------------------------------------------------------
-
-
 def both_spikes(pair, events):
     """Whether each neuron of each side fires in each step: of the chip, and of the float network by layer."""
     trace = engine.simulate(pair.netlist, events, spikes=True)
@@ -211,8 +207,6 @@ def test_windows_that_open_late_are_those_of_the_specification():
 
 
 # -- other networks ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("packing", [None, (Packing(planes=2),)])
 def test_an_unplaced_netlist_spikes_as_the_placed_one(packing):
     pair = made(packing=packing)

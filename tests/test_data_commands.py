@@ -2,8 +2,6 @@ import argparse
 import gc
 import hashlib
 import struct
-import subprocess
-import sys
 import threading
 import zipfile
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -16,8 +14,6 @@ from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings import fetch
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.fetch import DATA_SETS, DataSet, data_folder, fetch_data, find_data
-from spikeloom.models.recordings.grasps import synthetic_split
-from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime.commands.exchange.data import add_arguments
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import terminal
@@ -191,31 +187,6 @@ def test_fetch(monkeypatch, tmp_path):
 
 
 # For the other commands
-
-
-def test_matplotlib_is_loaded_for_pictures_only():
-    code = (
-        "import sys, spikeloom.runtime.commands.exchange.data\n"
-        "assert not {'matplotlib', 'torch'} & set(sys.modules), 'loaded early'"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
-
-
-def test_one_recording_becomes_event_lines_that_read_back_the_same(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    grasps = synthetic_split("test", limit=2)
-    write_released(tmp_path / "two", [grasps])
-    source = sorted((tmp_path / "two" / "test").iterdir())[1]
-    report, _, code = start("convert", str(source), "-o", "one.csv")
-    assert code == 0
-    assert report["splits"]["test"]["recordings"] == 1
-    lines = (tmp_path / "one.csv").read_text().splitlines()
-    assert lines[0] == "time_s,taxel,polarity"
-    assert len(lines) - 1 == int(grasps.events[1].sum())
-    back = load_data(tmp_path / "one.csv", taxels=39)
-    steps = back.steps
-    assert np.array_equal(back.events[0], grasps.events[1][:, :, :steps])
-    assert not grasps.events[1][:, :, steps:].any()
 
 
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # requests keeps a socket

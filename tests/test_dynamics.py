@@ -65,8 +65,6 @@ def neurons_step_by_step(drive, bias, alpha, beta, theta, surrogate):
 
 
 # --- one layer -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "surrogate", [RECTANGLE, SIGMOID, replace(SIGMOID, reset=True), replace(RECTANGLE, reset=False)]
 )

@@ -121,8 +121,6 @@ def test_a_network_of_zeros_has_cores_but_no_axons():
 
 
 # --- reading a netlist back -------------------------------------------------------------------------------------------
-
-
 MANY = settings(max_examples=30, deadline=None, derandomize=True)
 
 

@@ -22,7 +22,6 @@ from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import spec
 
 RIGHT = 127  # of 144, by the released code's own outputs
-SAMPLES = 3  # recordings that the specification runs too
 
 
 def command(*words) -> tuple[int, dict]:
@@ -67,8 +66,6 @@ def assert_twins_agree(netlist: Netlist, events: np.ndarray) -> np.ndarray:
 
 
 # -- the released checkpoint -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.recordings
 def test_the_netlist_has_the_published_size(compiled):
     path, report = compiled
@@ -175,8 +172,6 @@ def test_the_shipped_network_of_longer_bins(tmp_path, objects_zip):
 
 
 # -- Containers, for which no checkpoint was released ------------------------------------------------------------------
-
-
 @pytest.mark.recordings
 def test_specification_equals_engine_on_containers(tmp_path, containers):
     assert containers.shape == (60, 39, 2, 325)
@@ -216,12 +211,3 @@ def test_run_and_estimate_never_import_torch(place, words):
         [sys.executable, "-c", WITHOUT_TORCH, *words], cwd=place, capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_started_as_a_program(place):
-    words = [sys.executable, "-m", "spikeloom"]
-    done = subprocess.run([*words, "inspect", "nowhere.pt"], cwd=place, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == (
-        "spikeloom: nowhere.pt: no such file; give a file of spikeloom train or of the released layout\n"
-    )

@@ -174,8 +174,6 @@ def test_the_kernel_compiles_where_nothing_can_be_cached(monkeypatch):
 
 
 # --- the kernel of layers ---------------------------------------------------------------------------------------------
-
-
 def pipeline(
     seed: int,
     *,

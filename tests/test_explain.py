@@ -33,9 +33,8 @@ from spikeloom.runtime.equivalence.rounding import LayerRounding, Rounding
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
+
 # -- roots -------------------------------------------------------------------------------------------------------------
-
-
 def steps(*words):
     """Booleans (steps, neurons or channels) from one word a step."""
     return np.array([[letter == "x" for letter in word] for word in words])
@@ -120,8 +119,6 @@ def test_one_pass_finds_what_the_definition_says(graph):
 
 
 # -- causes: one neuron and one deviation at a time --------------------------------------------------------------------
-
-
 def stored_as(network, thresholds, exponents=(0,)):
     """Integer network with given thresholds, one for each population."""
     forms = [

@@ -151,8 +151,6 @@ def test_the_lowest_class_wins_a_tie():
 
 
 # --- the fast float engine --------------------------------------------------------------------------------------------
-
-
 REPEATABLE = settings(max_examples=30, deadline=None, derandomize=True)
 
 

@@ -74,8 +74,6 @@ def one_by_one(single_runs, wide, name, kind=bool):
 
 
 # --- files ---------------------------------------------------------------------------------------------------------
-
-
 @CASES
 def test_a_file_holds_its_towers_and_nothing_between_them(tmp_path, system, dynamics):
     singles, wide, _ = joined(tmp_path, system, dynamics)
@@ -129,8 +127,6 @@ def test_signed_but_wrong(tmp_path, change, expected):
 
 
 # --- the float network ---------------------------------------------------------------------------------------------
-
-
 @CASES
 def test_towers_spike_as_the_single_networks_bit_for_bit(tmp_path, system, dynamics):
     singles, wide, seen = joined(tmp_path, system, dynamics)
@@ -176,8 +172,6 @@ def test_the_expanded_network_is_sparse_in_blocks(tmp_path, system, dynamics):
 
 
 # --- the chip ------------------------------------------------------------------------------------------------------
-
-
 @CASES
 def test_towers_spike_on_the_chip_as_their_members_with_the_same_storage(tmp_path, system, dynamics):
     """Rounding looks at one neuron at a time, so that equal scales give equal integers."""
@@ -241,8 +235,6 @@ def test_yardsticks_count_no_weights_between_towers(tmp_path):
 
 
 # --- commands ------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     """Three networks with clocks and three without, each with a record and two sets of weights; joined."""

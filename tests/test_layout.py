@@ -61,8 +61,6 @@ def netlist_of(network, layout, target=LOIHI):
 
 
 # --- what is expected is what the time model says
-
-
 @settings(deadline=None, max_examples=20)
 @given(st.data())
 def test_expectations_are_the_simple_model_of_the_same_spikes(data):
@@ -119,8 +117,6 @@ def forecast_of(network, calibration, target=LOIHI):
 
 
 # --- cores asked for
-
-
 def test_cores_asked_for_hold_no_other_layer():
     network = integer_chain(np.full((6, 3), 2), np.full((4, 6), 2), np.full((2, 4), 2))
     alone = partition(network, LOIHI, cores_for={0: 2, 1: 2})

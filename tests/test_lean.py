@@ -205,15 +205,3 @@ def test_bisection_finds_the_longest_beginning():
     assert min(asked) > 4
     assert len(asked) <= 5
     assert trials.most_spared(order, 4, lambda _: False).tolist() == [10, 11, 12, 13]
-
-
-@pytest.mark.parametrize(
-    ("words", "telling"),
-    [
-        ("net.pt --differ 1.5", "--differ 1.5: not a share; give a number from 0 to below 1"),
-    ],
-)
-def test_mistakes(spikeloom, words, telling):
-    code, out, err = spikeloom("lean", *words.split(), "--data", "data")
-    assert (code, out) == (2, "")
-    assert telling in err

@@ -57,9 +57,6 @@ def test_spikes_and_membranes_equal_a_step_by_step_loop(kind, seed, steps, neuro
     assert spikes.dtype == membrane.dtype == kind
 
 
-# --- the convolution -----------------------------------------------------------------------------------------------
-
-
 # --- the dense layer -----------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("rate", [0.0, 0.2, 1.0])
 def test_spike_linear_equals_a_dense_product_and_its_gradient(rate):

@@ -223,8 +223,6 @@ def test_spikes_that_lava_dl_recorded():
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
-
-
 SETTINGS = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 

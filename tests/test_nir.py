@@ -285,8 +285,6 @@ def test_groups_of_neurons_vote_for_a_class():
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
-
-
 FEW = settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 

@@ -145,8 +145,6 @@ def test_verify_finds_an_engine_that_strays(verified, form, monkeypatch, capsys)
 
 
 # --- every recording --------------------------------------------------------------------------------------------------
-
-
 PART = 48
 SETS = {"objects_zip": ("objects", (576, 144)), "containers_zip": ("containers", (240, 60))}
 

@@ -80,8 +80,6 @@ def test_ranges_that_are_proven_are_not_checked():
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
-
-
 def test_the_reference_of_the_format_computes_the_same():
     netlist = three_neurons()
     given = np.random.default_rng(2).integers(0, 2, (2, 2, 12), np.uint8)
@@ -124,6 +122,3 @@ def test_the_float_graph_is_the_float_model(tmp_path):
     np.testing.assert_array_equal(found["votes"], expected["fc3"].sum(axis=1))
     np.testing.assert_array_equal(feed["votes"], found["votes"])
     np.testing.assert_array_equal(found["class"], found["votes"].argmax(axis=1))
-
-
-# -- the command -------------------------------------------------------------------------------------------------------

@@ -258,8 +258,6 @@ def test_a_checkpoint_becomes_a_chain_of_populations():
 
 
 # --- prune ------------------------------------------------------------------------------------------------------------
-
-
 @settings(deadline=None, max_examples=40)
 @given(float_networks(), st.data())
 def test_what_never_fires_never_fires(network, data):

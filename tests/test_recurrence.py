@@ -155,9 +155,6 @@ def test_a_layer_is_cut_so_that_its_axons_to_itself_are_enough():
     refused(CapacityError, words, partition, in_pairs(np.ones((4, 4), int)), target)
 
 
-# -- proofs and verdicts -----------------------------------------------------------------------------------------------
-
-
 # -- commands ----------------------------------------------------------------------------------------------------------
 def test_currents_biases_and_loops_together():
     """A recurrent CubaLIF, fed back through an Affine: its bias goes through the current, from a channel of its own."""

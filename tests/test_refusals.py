@@ -261,6 +261,7 @@ TABLE = [
     (VERIFY.format("--graph manual"), "trained on ring, --graph says manual"),
     ("explain net.loom --checkpoint other.pt --data data", "netlist and checkpoint disagree|fc2 8|fc2 7"),
     ("report net.loom --checkpoint same.pt --data data -o x.html", "compiled from a checkpoint of sha256"),
+    ("lean net.pt --data data --differ 1.5", "--differ 1.5: not a share; give a number from 0 to below 1"),
     # one recording
     (EXPLAIN.format("--top 0"), "--top 0|at least 1"),
     (EXPLAIN.format("--sample sample_9_label_1.npy"), "among 6 of split test|near are sample_5_label_1.npy"),
@@ -385,8 +386,6 @@ def test_every_violated_limit_is_listed(place, capsys, tmp_path, features, limit
 
 
 # -- unreadable files, interrupts and full disks -----------------------------------------------------------------------
-
-
 def test_unreadable_files(refusal, monkeypatch):
     as_ever = Path.open
 

@@ -60,8 +60,6 @@ def made(spikeloom, place):
 
 
 # -- the page ----------------------------------------------------------------------------------------------------------
-
-
 def drawings(page):
     return set(re.findall('<div class="drawing" id="([^"]+)"', page))
 
@@ -106,8 +104,6 @@ def test_the_raster_marks_every_difference(made):
 
 
 # -- its data ----------------------------------------------------------------------------------------------------------
-
-
 def test_spikes_and_membranes_are_those_of_both_sides(made, place):
     recording = made[1]["recording"]
     netlist, checkpoint = read_netlist(place / "net.loom"), read_checkpoint(place / "net.pt")
@@ -190,8 +186,6 @@ def test_where_no_spike_differs_the_widest_membranes_are_shown(spikeloom, place)
 
 
 # -- other networks ----------------------------------------------------------------------------------------------------
-
-
 def report_of(made, folder, capsys):
     """The page of a network of the zoo, and its data."""
     words = ("report", made.netlist, "--checkpoint", made.network, *made.reading, "--data", made.data)
@@ -200,9 +194,8 @@ def report_of(made, folder, capsys):
     return (folder / "x.html").read_text("utf-8"), json.loads(capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("name", ["onnx"])
-def test_networks_without_a_graph_show_their_taxels(name, tmp_path, capsys):
-    made = specimen(name)
+def test_networks_without_a_graph_show_their_taxels(tmp_path, capsys):
+    made = specimen("onnx")
     text, found = report_of(made, tmp_path, capsys)
     taxels, sensor = found["taxels"], made.machine.netlist.taxels
     assert (taxels["graph"], taxels["spikes"], taxels["edges"]) == (None, None, [])
@@ -255,12 +248,7 @@ def test_several_chips_are_drawn_one_below_the_other(spikeloom, place):
     assert figures == FIGURES - {"time-cores"}
 
 
-# -- what is refused ---------------------------------------------------------------------------------------------------
-
-
 # -- in a browser ------------------------------------------------------------------------------------------------------
-
-
 def test_a_browser_shows_every_figure_and_unfolds_one_raster_at_a_time(made, place):
     script = """
     const shown = () => [...document.querySelectorAll(".drawing")].filter((d) => d.checkVisibility()).map((d) => d.id);

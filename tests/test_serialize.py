@@ -287,12 +287,7 @@ def test_indices_that_point_nowhere(path, netlist, change, message):
     assert message in refused(path)
 
 
-# --- writing
-
-
 # --- files are written whole or not at all ----------------------------------------------------------------------------
-
-
 def interrupted_at(line: int, write):
     """Run `write`; an interrupt strikes at that line of all that it runs (0: none). How many lines there were."""
     seen = 0

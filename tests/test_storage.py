@@ -290,8 +290,6 @@ def test_spikes_that_the_decay_alone_moves_are_counted():
 
 
 # --- the search over widths -------------------------------------------------------------------------------------------
-
-
 WIDTHS = (2, 4, 8)
 
 

@@ -72,8 +72,6 @@ def stress(spikeloom):
 
 
 # -- both sides --------------------------------------------------------------------------------------------------------
-
-
 def test_clean_recordings_are_what_reference_and_engine_say(bench):
     found, counted = clean(bench)
     flat = with_clocks(bench.events, bench.pair.netlist.clocks)
@@ -167,8 +165,6 @@ def test_an_overflow_stops_its_recording_and_no_other(bench):
 
 
 # -- every perturbation ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_every_perturbation_runs_at_its_mildest_and_harshest_the_same_for_a_seed(bench, name):
     reference, undisturbed = clean(bench)
@@ -235,8 +231,6 @@ def test_all_systems_timed_and_joined(tmp_path, system):
 
 
 # -- rules -------------------------------------------------------------------------------------------------------------
-
-
 def run_of(right, *, equal=100, spikes=(1000, 1000, 100, 10000), signs=None, most=10, stopped=0, seed=0):
     model, chip = (right, right) if isinstance(right, int) else right
     return Run(
@@ -343,8 +337,6 @@ def test_spikes_in_common_and_requirements():
 
 
 # -- the command -------------------------------------------------------------------------------------------------------
-
-
 def test_any_number_of_threads_says_the_same(stress, place):
     code, out, err = stress(*FEW, "-o", "one.json")
     assert (code, err) == (0, "")

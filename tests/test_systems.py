@@ -251,6 +251,3 @@ def test_fine_tuned_on_the_chips_integers_they_are_the_chip(tmp_path, system):
     verdict = verify(netlist, Factored(again, seen), test.events[:4], test.labels[:4], test.files[:4])
     assert verdict.quantised_different == 0
     assert verdict.spikes["fc1"].chip > 0
-
-
-# --- the command line ------------------------------------------------------------------------------------------------

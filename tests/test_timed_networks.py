@@ -166,9 +166,6 @@ def test_relays_tick_with_their_clocks_however_weights_are_stored(timed, options
         assert_array_equal(sample[:, -3:][:, held], TIMING.clocks.events(14).T[:, held])
 
 
-# --- files ---------------------------------------------------------------------------------------------------------
-
-
 # --- what judges the chip ------------------------------------------------------------------------------------------
 @REPEATABLE
 @given(seed=st.integers(0, 10**6), alpha=st.sampled_from([0.3, 0.95, 0.999]), beta=st.sampled_from([0.0, 0.2, 0.9]))
@@ -224,9 +221,3 @@ def test_a_wrong_current_register_is_named(timed, compiled):
     assert check_rounding(integer_machine_of(wrong), network).layers["fc1"].faults == (
         "fc1 has decay registers 100 and 2867 instead of 204 and 2867",
     )
-
-
-# --- live ----------------------------------------------------------------------------------------------------------
-
-
-# --- commands ------------------------------------------------------------------------------------------------------

@@ -258,6 +258,3 @@ def test_sums_that_saturate_leave_nothing_for_the_next_step(sign):
     model, (sums,) = assert_equal(network, lower_in_time(network, CHIP), recording)
     assert sums.saturated == 8
     assert model["fc1"][0].any() == (sign > 0)
-
-
-# -- the commands ------------------------------------------------------------------------------------------------------

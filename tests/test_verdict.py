@@ -23,9 +23,8 @@ from spikeloom.runtime.equivalence.verdict import (
 )
 from spikeloom.runtime.equivalence.verify import verify
 
+
 # -- levels ------------------------------------------------------------------------------------------------------------
-
-
 def layer(float_: int, chip: int, different: int) -> LayerSpikes:
     return LayerSpikes(float=float_, chip=chip, different=different, ill_posed=0)
 

@@ -218,15 +218,6 @@ def test_origin(lively, lively_file, lines, objects):
     assert counts[0] != counts[1]
 
 
-def test_real_time_decides_alike(lively, lively_file, lines, objects):
-    events = random_events(2, 15)
-    path = lines(as_lines(events, inside=19_999) + "\n" + as_lines(events))
-    found = objects(lively_file, path, "--speed", "real")
-    assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(lively, events)] * 2
-    (end,) = found["end"]
-    assert end["late"] == 0
-
-
 def feed(descriptor: int, *parts: tuple[str, float]) -> threading.Thread:
     """Write parts to a pipe, each followed by a pause, and close it."""
 
