@@ -7,21 +7,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from made_files import TAXELS, own_file, recordings_folder
+from made_files import TAXELS
 from torch import nn
 
 import spikeloom as api
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.runtime import cli
 from spikeloom.runtime.report.encode import encode
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("api")
-    recordings_folder(folder / "data")
-    own_file(folder / "net.pt")
-    return folder
 
 
 @pytest.fixture(scope="module")

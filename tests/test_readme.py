@@ -67,10 +67,10 @@ def _each_verdict_once():
     """The README verifies one netlist on the same recordings twice, in its shell and in Python: it is done once."""
     made = {}
 
-    def once(netlist, checkpoint, adjacency, events, *given, **options):
+    def once(netlist, source, events, *given, **options):
         key = netlist_bytes(netlist), events.tobytes()
         if key not in made:
-            made[key] = verify(netlist, checkpoint, adjacency, events, *given, **options)
+            made[key] = verify(netlist, source, events, *given, **options)
         return made[key]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -212,14 +212,6 @@ def test_one_message(tiles, flight, barrier):
     assert detailed.peak_load[0, 0] == 1 / (hops + 2)
 
 
-def test_the_longest_of_sweep_and_receiving_is_critical():
-    netlist = pipe((0, 1), senders=40)
-    simple, detailed = both(netlist, fire(netlist, []), NOTHING)
-    assert simple.duration_ns[0, 0] == detailed.duration_ns[0, 0] == 1000 + 40 * 6
-    assert (simple.critical_core[0, 0], simple.receiving[0, 0]) == (0, False)
-    assert (detailed.critical_core[0, 0], detailed.receiving[0, 0]) == (0, False)
-
-
 def test_a_sender_waits_while_its_links_are_full():
     netlist = pipe((0, 1), targets=8, senders=40)
     trace = fire(netlist, range(40))

@@ -211,23 +211,15 @@ def test_resume_does_not_take_another_training_for_this_one(data, capsys):
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes under /proc")
-@pytest.mark.parametrize("sent", [pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGKILL])
-def test_no_worker_outlives_the_command(data, capsys, sent):
+def test_no_worker_outlives_the_command(data):
     process = started(
         "--epochs", "5000", "--seeds", "2", "-o", "x.pt", until=lambda: len(list(data.glob("x-seed?.pt.state.*"))) == 2
     )
     workers = children(process.pid)
     assert len(workers) >= 2
-    process.send_signal(sent)
-    _, err = process.communicate(timeout=60)
+    process.kill()
+    process.communicate(timeout=60)
     assert gone(workers)
-    if sent != signal.SIGKILL:
-        assert process.returncode == 2
-        # behind it Python may complain of a worker that had to be killed, on a busy machine
-        assert (
-            "spikeloom: interrupted; the epochs so far are kept in x-seed0.pt.state.validation, "
-            "x-seed1.pt.state.validation; go on with the same command and --resume"
-        ) in err.splitlines()
     assert not list(data.glob(".*")), "half-written files are left"
 
 
