@@ -1,9 +1,10 @@
-"""A compilation is a series of passes; which they are, every target says for itself."""
+"""A compilation is a list of passes; what the list is, every target says for itself."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol, TypeVar
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
 
 
 class Work(Protocol):
@@ -19,15 +20,24 @@ class Work(Protocol):
 W = TypeVar("W", bound=Work)
 
 
-Passes = Mapping[str, Callable[[W], W]]
-"""Passes by name, in their order; each makes new work of what it is given, which stays as it is."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pass(Generic[W]):
+    """One step of a compilation."""
+
+    name: str  # For ``--dump-after`` and the table in docs/compile.md
+    does: str  # Its contract in one sentence
+    keeps: str  # What is the same before and after it
+    apply: Callable[[W], W]  # Makes new work of what it is given, which stays as it is
 
 
-def run(passes: Passes[W], work: W, after: Callable[[str, W], Any] | None = None) -> W:
+def run(passes: Iterable[Pass[W]], work: W, after: Callable[[str, W], object] | None = None) -> W:
     """Apply passes in order and verify what each one made; `after` gets the name of each and its work."""
-    for name, apply in passes.items():
-        work = apply(work)
+    for step in passes:
+        work = step.apply(work)
         work.verify()
         if after is not None:
-            after(name, work)
+            after(step.name, work)
     return work
+
+
+Passes = tuple[Pass[Any], ...]

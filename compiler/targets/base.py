@@ -79,9 +79,9 @@ class Target:
         return import_module(f"{targets.__name__}.{self.name}.passes")
 
     @property
-    def passes(self) -> Passes[Any]:
+    def passes(self) -> Passes:
         """From what is trained to a netlist."""
-        passes: Passes[Any] = self.module.PASSES
+        passes: Passes = self.module.PASSES
         return passes
 
     @property

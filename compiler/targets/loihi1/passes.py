@@ -14,7 +14,7 @@ from spikeloom.compiler.passes import expand, prune
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.passes.prune import Masks, Removal
-from spikeloom.compiler.pipeline import Passes, run
+from spikeloom.compiler.pipeline import Pass, run
 from spikeloom.compiler.range_proof import RangeProof, prove_ranges
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.emit import emit
@@ -210,30 +210,78 @@ def _legalize(done: Compilation) -> Compilation:
     return replace(done, uses=require_legal(done.netlist, done.target))
 
 
-FLOATS: Passes[Compilation] = {
-    "expand": _expand,
-    "calibrate": _calibrate,
-    "disconnect": _disconnect,
-    "quantize": _quantize,
-}
+FLOATS = (
+    Pass(
+        name="expand",
+        does="writes the graph convolution out as synapses, W = sum over hops k of A^k x W_k, in float64",
+        keeps="every spike, up to the rounding of a differently ordered sum",
+        apply=_expand,
+    ),
+    Pass(
+        name="calibrate",
+        does="runs the float network on training recordings, where there are any",
+        keeps="the network",
+        apply=_calibrate,
+    ),
+    Pass(
+        name="disconnect",
+        does="zeroes the weights of neurons that no input can make fire; with --prune-unused also of those that never "
+        "fired in training",
+        keeps="every spike on any input; with --prune-unused on any input on which these stay silent",
+        apply=_disconnect,
+    ),
+    Pass(
+        name="quantize",
+        does="chooses the scales of each layer and rounds weights, biases, thresholds and decays to registers",
+        keeps="the decisions, as well as the width allows; every training spike where --spike-exact succeeds",
+        apply=_quantize,
+    ),
+)
 """From floats to integers."""
 
-INTEGERS: Passes[Compilation] = {"prove": _prove, "remove": _remove}
+INTEGERS = (
+    Pass(name="prove", does="bounds every register by the weights alone", keeps="the network", apply=_prove),
+    Pass(
+        name="remove",
+        does="takes out the neurons that no input can make fire and those whose spikes reach no neuron",
+        keeps="every spike of the neurons that are left, on any input",
+        apply=_remove,
+    ),
+)
 """On integers, where they are no matter from."""
 
-LAYOUT: Passes[Compilation] = {"place": _place, "emit": _emit, "legalize": _legalize}
+LAYOUT = (
+    Pass(
+        name="place",
+        does="cuts the layers over as few cores as every limit allows and puts the cores on tiles with the fewest "
+        "spike-hops, or as --optimize asks",
+        keeps="every spike: where a neuron sits has no influence on any",
+        apply=_place,
+    ),
+    Pass(
+        name="emit",
+        does="writes cores, axons and synapse lists down as a netlist",
+        keeps="every synapse that is not zero, stored once",
+        apply=_emit,
+    ),
+    Pass(
+        name="legalize",
+        does="measures every limit again on the netlist and refuses one that breaks any",
+        keeps="the netlist",
+        apply=_legalize,
+    ),
+)
 """From integers to a netlist."""
 
-STORAGE: Passes[Compilation] = {**FLOATS, **INTEGERS}
+STORAGE = (*FLOATS, *INTEGERS)
 """The longest part of a compilation, which any number of layouts can share."""
 
-PASSES: Passes[Compilation] = {**STORAGE, **LAYOUT}
-"""What each does, and what it keeps, is in docs/compile.md."""
+PASSES = (*STORAGE, *LAYOUT)
 
 
 def start(
     source: expand.Factored | Network | IntegerNetwork, options: Options, target: Target
-) -> tuple[Compilation, Passes[Compilation]]:
+) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
     """What the passes begin with, and which of them are due: integers are rounded already.
 
     OptionError if the options contradict each other.
@@ -241,7 +289,7 @@ def start(
     options.require_consistent(calibrated=options.training_events is not None)
     work = Compilation(source=source, options=options, target=target)
     if isinstance(source, IntegerNetwork):
-        return replace(work, integer=source), {**INTEGERS, **LAYOUT}
+        return replace(work, integer=source), (*INTEGERS, *LAYOUT)
     return work, PASSES
 
 

@@ -14,7 +14,7 @@ from spikeloom.compiler.errors import CapacityError, ModelError, OptionError, Ve
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes import expand
-from spikeloom.compiler.pipeline import Passes
+from spikeloom.compiler.pipeline import Pass
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.codebook import COPIES, LevelNetwork, in_levels
 from spikeloom.compiler.targets.truenorth.in_time import lower_in_time
@@ -110,15 +110,38 @@ def _legalize(done: Compilation) -> Compilation:
     return done
 
 
-NATIVE: Passes[Compilation] = {"place": _place, "legalize": _legalize}
-"""From whole numbers to a netlist."""
-
-PASSES: Passes[Compilation] = {"expand": _expand, "levels": _levels, **NATIVE}
+PASSES = (
+    Pass(
+        name="expand",
+        does="writes the graph convolution out as synapses, in float64; refuses what no layout could hold",
+        keeps="every spike, up to the rounding of a differently ordered sum",
+        apply=_expand,
+    ),
+    Pass(
+        name="levels",
+        does="rounds the weights of each neuron to a few levels of a step of its own",
+        keeps="the decisions, as well as the levels allow",
+        apply=_levels,
+    ),
+    Pass(
+        name="place",
+        does="puts neurons on cores, inputs on axons of the types that make their levels, and copies or relays where "
+        "a spike has several targets",
+        keeps="every spike; partial sums that travel in time saturate at 19",
+        apply=_place,
+    ),
+    Pass(
+        name="legalize",
+        does="holds the netlist against every rule and refuses one that breaks any",
+        keeps="the netlist",
+        apply=_legalize,
+    ),
+)
 
 
 def start(
     source: NativeNetwork | expand.Factored | Network, options: Options, target: Target
-) -> tuple[Compilation, Passes[Compilation]]:
+) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
     """What the passes begin with, and which of them are due; OptionError if whole numbers are to be rounded again."""
     native = isinstance(source, NativeNetwork)
     if native and options.in_time is not None:
@@ -126,4 +149,4 @@ def start(
     if options.in_time not in (None, *COPIES):
         raise OptionError(f"--in-time {options.in_time}: allowed are {', '.join(map(str, COPIES))} axons an input")
     work = Compilation(source=source, options=options, target=target)
-    return work, NATIVE if native else PASSES
+    return work, PASSES[2:] if native else PASSES

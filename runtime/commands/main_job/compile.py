@@ -97,8 +97,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     chip = load_target(arguments.target)
     if isinstance(arguments.checkpoint, str) and arguments.checkpoint.endswith(NETX):
         return _compile_integers(arguments)
-    if unknown := set(arguments.dump_after) - set(chip.passes):
-        names = ", ".join(chip.passes)
+    if unknown := set(arguments.dump_after) - {step.name for step in chip.passes}:
+        names = ", ".join(step.name for step in chip.passes)
         raise OptionError(f"--dump-after {', '.join(sorted(unknown))}: no such pass; allowed: {names}")
     own = trained_for(arguments.checkpoint) or chip_commands(arguments.target)
     if own is not None:
