@@ -80,8 +80,8 @@ def measured(network: Checkpoint, training: Recordings, test: Recordings, *, spi
     )
     netlist = compilation.netlist
     events = with_clocks(test.events, netlist.clocks)
-    counts, costs = estimate(netlist, load_target("loihi1"), events, lengths=test.lengths)
-    chip = predictions(netlist, counts.spikes)
+    trace, costs = estimate(netlist, load_target("loihi1"), events, lengths=test.lengths)
+    chip = predictions(netlist, trace.counts.spikes)
     return {
         "float": int(np.sum(decided == test.labels)),
         "chip": int(np.sum(chip == test.labels)),

@@ -37,10 +37,10 @@ def counts(netlist: Netlist) -> Run:
     """Events and energy of every recording, and the time of every step by the simple model."""
     chip = load_target(netlist.target)
     latencies, meter = timing.prepare(netlist, chip, chip.time[0]), cost.prepare(netlist, chip)
-    engine = prepare(netlist, charges=timing.charges(latencies))
+    engine, charges = prepare(netlist), timing.charges(latencies)
 
     def run(events: Any) -> Trace:
-        trace = simulate(engine, events, threads=1)
+        trace = simulate(engine, events, threads=1, charges=charges)
         assert trace.charged is not None
         steps = np.full(len(events), events.shape[2])
         timing.simple_times(latencies, trace.charged, steps + netlist.max_depth)
@@ -54,10 +54,10 @@ def cycle(netlist: Netlist) -> Run:
     """The same, and the time of every step with queues and mesh."""
     chip = load_target(netlist.target)
     latencies, meter = timing.prepare(netlist, chip, chip.time[0]), cost.prepare(netlist, chip)
-    engine = prepare(netlist, charges=timing.charges(latencies))
+    engine, charges = prepare(netlist), timing.charges(latencies)
 
     def run(events: Any) -> Trace:
-        trace = simulate(engine, events, threads=1, spikes=True, updated=True)
+        trace = simulate(engine, events, threads=1, spikes=True, updated=True, charges=charges)
         assert trace.spikes is not None
         assert trace.updated is not None
         assert trace.charged is not None

@@ -127,9 +127,9 @@ def test_recordings_of_different_length_end_on_their_own(place, monkeypatch):
     assert np.all(ends < lengths)
     for i, length in enumerate(lengths):
         flat = with_clocks(data.events[i : i + 1, ..., :length], netlist.clocks)
-        counts, alone = estimate.estimate(netlist, load_target("loihi1"), flat)
-        assert_array_equal(ran.votes[i, -1], class_counts(netlist, counts.spikes)[0])
-        assert at.leader[i, ends[i]] == predictions(netlist, counts.spikes)[0]
+        trace, alone = estimate.estimate(netlist, load_target("loihi1"), flat)
+        assert_array_equal(ran.votes[i, -1], class_counts(netlist, trace.counts.spikes)[0])
+        assert at.leader[i, ends[i]] == predictions(netlist, trace.counts.spikes)[0]
         assert ran.operations[i, -1] == alone.costs.synaptic_operations.sum()
         for name, each in alone.costs.energy.items():
             assert_allclose(ran.energy[name][i, -1], each.sum())

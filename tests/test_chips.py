@@ -102,14 +102,14 @@ def test_chips_do_not_change_a_spike(netlist, recordings, stepwise):
 
 
 def test_packets_that_leave_are_counted_and_their_way_is_not(netlist, recordings):
-    counts, found = estimate(netlist, SMALL, recordings)
+    trace, found = estimate(netlist, SMALL, recordings)
     chip = chip_of_core(netlist.core_tile, SMALL)
     core = netlist.core_of_compartment()
     left = hops = packets = 0
     for axon, source in enumerate(netlist.axon_source):
         if source >= netlist.n_inputs:
             start, end = core[source - netlist.n_inputs], netlist.core_of_axon()[axon]
-            spikes = counts.spikes[:, source - netlist.n_inputs].sum()
+            spikes = trace.counts.spikes[:, source - netlist.n_inputs].sum()
             packets += spikes
             if chip[start] != chip[end]:
                 left += spikes

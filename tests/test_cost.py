@@ -262,8 +262,9 @@ def test_sums_of_the_engine_give_the_simple_times(small, stepwise):
     netlist, recordings = small
     (times,) = LOIHI.time
     latencies = timing.prepare(netlist, LOIHI, times)
-    prepared = engine.prepare(netlist, stepwise=stepwise, charges=timing.charges(latencies))
-    trace = engine.simulate(prepared, recordings, lengths=LENGTHS, spikes=True, updated=True)
+    prepared = engine.prepare(netlist, stepwise=stepwise)
+    charges = timing.charges(latencies)
+    trace = engine.simulate(prepared, recordings, lengths=LENGTHS, spikes=True, updated=True, charges=charges)
     ran = LENGTHS + netlist.max_depth
     cut = recordings.copy()
     for recording, length in zip(cut, LENGTHS, strict=True):
@@ -278,9 +279,9 @@ def test_sums_of_the_engine_give_the_simple_times(small, stepwise):
 def test_all_details_have_the_same_spikes_and_events(small, found):
     netlist, recordings = small
     plain = engine.simulate(netlist, recordings, lengths=LENGTHS)
-    for counts, priced in found.values():
-        for field in dataclasses.fields(counts):
-            np.testing.assert_array_equal(getattr(counts, field.name), getattr(plain.counts, field.name))
+    for trace, priced in found.values():
+        for field in dataclasses.fields(trace.counts):
+            np.testing.assert_array_equal(getattr(trace.counts, field.name), getattr(plain.counts, field.name))
         for name, energy in found["counts"][1].costs.energy.items():
             np.testing.assert_array_equal(priced.costs.energy[name], energy)
 

@@ -226,17 +226,20 @@ def assert_kernels_agree(netlist: Netlist, events: np.ndarray) -> None:
     assert_equal(by_engine(netlist, events), expected)
     assert_equal(by_steps(netlist, events), expected)
     rng = np.random.default_rng(events.size)
-    rows = {"channels": netlist.n_inputs, "spikes": netlist.n_compartments, "updates": netlist.n_compartments}
+    rows = {"sources": netlist.n_inputs + netlist.n_compartments, "updates": netlist.n_compartments}
     sums = int(rng.choice([1, 16, 17]))
     largest = int(rng.choice([2**31, 2**20]))  # sums of the first leave 32 bits, those of the second never do
     charges = Charges(**{name: rng.integers(-largest, largest, (size, sums)) for name, size in rows.items()})
     if rng.random() < 0.5:
         charges.updates[:] = charges.updates[rng.integers(0, min(3, len(charges.updates)), len(charges.updates))]
-    wanted = expected.spikes.astype(np.int64) @ charges.spikes + expected.updated.astype(np.int64) @ charges.updates
-    wanted[: events.shape[1]] += events.T.astype(np.int64) @ charges.channels
+    wanted = (
+        expected.spikes.astype(np.int64) @ charges.sources[netlist.n_inputs :]
+        + expected.updated.astype(np.int64) @ charges.updates
+    )
+    wanted[: events.shape[1]] += events.T.astype(np.int64) @ charges.sources[: netlist.n_inputs]
     for stepwise in (False, True):
-        prepared = engine.prepare(netlist, stepwise=stepwise, charges=charges)
-        found = engine.simulate(prepared, events[None], packed=True)
+        prepared = engine.prepare(netlist, stepwise=stepwise)
+        found = engine.simulate(prepared, events[None], packed=True, charges=charges)
         np.testing.assert_array_equal(found.charged[0], wanted, strict=True)
         np.testing.assert_array_equal(found.packed[0], pack(expected.spikes), strict=True)
         np.testing.assert_array_equal(unpack(found.packed[0], netlist.n_compartments), expected.spikes, strict=True)
@@ -271,12 +274,12 @@ def test_the_random_pipelines_reach_every_way_of_storage():
     assert [blocks.dense.tolist() for blocks in found[:2]] == [[False, False, True], [True] * 3]
     assert any(blocks.restful.any() for blocks in found)
     whole = lay_out_blocks(build([Neuron()] * 70, [Axon(source=0, targets=((0, 1),))], n_inputs=1, depths=[0])).whole
-    assert whole.tolist() == [0, -1]
+    assert whole.tolist() == [0, 64]
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.3])
 def test_whole_blocks_beside_others(rate):
-    """Neurons 0 to 69 of each layer on one core: 64 that follow each other, and six."""
+    """Neurons 0 to 69 of each layer on one core: 64 and six that follow each other."""
     rng = np.random.default_rng(1)
     neurons = [Neuron(layer=i // 70, threshold=20, bias=int(rng.integers(-9, 9))) for i in range(140)]
     axons = [
@@ -285,7 +288,7 @@ def test_whole_blocks_beside_others(rate):
         for source in sources
     ]
     netlist = build(neurons, axons, n_inputs=5, depths=[0, 1])
-    assert lay_out_blocks(netlist).whole.tolist() == [0, -1, 70, -1]
+    assert lay_out_blocks(netlist).whole.tolist() == [0, 64, 70, 134]
     assert_kernels_agree(netlist, (rng.random((5, 20)) < rate).astype(np.uint8))
 
 
@@ -398,10 +401,10 @@ def test_layers_without_neurons_are_charged_nothing(layer):
         n_inputs=1,
         depths=[0, 1, 2],
     )
-    charges = Charges(channels=np.array([[1]]), spikes=np.array([[10], [20]]), updates=np.array([[300], [400]]))
+    charges = Charges(sources=np.array([[1], [10], [20]]), updates=np.array([[300], [400]]))
     events = np.ones((1, 1, 6), np.uint8)
     traces = [
-        engine.simulate(engine.prepare(netlist, stepwise=stepwise, charges=charges), events, threads=1)
+        engine.simulate(engine.prepare(netlist, stepwise=stepwise), events, threads=1, charges=charges)
         for stepwise in (False, True)
     ]
     assert isinstance(lay_out_blocks(netlist), Blocks)

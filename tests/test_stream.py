@@ -9,7 +9,7 @@ from random_netlists import Axon, Neuron, build, lively, netlists, recordings, v
 from spikeloom.compiler.errors import DataError, NumericRangeError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.stream import Step, Stream, open_stream
+from spikeloom.runtime.machines.loihi1.stream import Step, Stream
 from spikeloom.runtime.machines.votes import class_counts
 
 
@@ -46,7 +46,7 @@ def assert_is_run(netlist: Netlist, steps: list[Step], events: np.ndarray) -> No
 def test_any_network(data):
     netlist = voting(data.draw(netlists(weight_exponents=(-1, 0, 0, 3))), data.draw(st.integers(1, 3)))
     events = data.draw(recordings(netlist, max_length=12))
-    stream = open_stream(netlist)
+    stream = Stream(engine.prepare(netlist, stepwise=True))
     expected = None
     try:
         engine.simulate(netlist, events[None], threads=1)
@@ -76,7 +76,7 @@ FORMS = {
 def test_forms_of_events(form):
     netlist = lively()
     events = events_of(netlist, 4)
-    stream, steps = open_stream(netlist), []
+    stream, steps = Stream(engine.prepare(netlist, stepwise=True)), []
     for column in events.T:
         given_events = form(column)
         steps.append(stream.step(given_events))
@@ -96,7 +96,7 @@ def test_decision_and_margin(counts, decision, margin):
 
 def test_a_network_without_lag_is_final_at_once():
     netlist = voting(build([Neuron(), Neuron()], [Axon(source=0, targets=((1, 110),))], n_inputs=1, depths=[0]), 1)
-    stream = open_stream(netlist)
+    stream = Stream(engine.prepare(netlist, stepwise=True))
     assert stream.step([1]).counts.tolist() == [1]
     assert stream.finish() == ()
 
@@ -112,7 +112,7 @@ def test_a_network_without_lag_is_final_at_once():
 )
 def test_events_that_are_none(events, found):
     netlist = lively()
-    stream = open_stream(netlist)
+    stream = Stream(engine.prepare(netlist, stepwise=True))
     with pytest.raises(DataError, match=f"stream: a bin .*{found}"):
         stream.step(events)
     # nothing has happened: the grasp goes on
@@ -121,7 +121,7 @@ def test_events_that_are_none(events, found):
 
 
 def test_nothing_after_the_end():
-    stream = open_stream(lively())
+    stream = Stream(engine.prepare(lively(), stepwise=True))
     stream.finish()
     with pytest.raises(DataError, match=r"a step after the end found.*call reset\(\)"):
         stream.step(np.zeros(20))
@@ -132,7 +132,7 @@ def test_nothing_after_the_end():
 def test_an_overflow_ends_the_stream_until_reset():
     axons = [Axon(source=0, exponent=7, targets=((0, 254), (0, 254))), Axon(source=1, targets=((0, 110),))]
     netlist = build([Neuron()], axons, n_inputs=2, depths=[0])
-    stream = open_stream(netlist)
+    stream = Stream(engine.prepare(netlist, stepwise=True))
     with pytest.raises(NumericRangeError):
         stream.step([1, 0])
     for again in (lambda: stream.step([0, 0]), stream.finish):

@@ -256,7 +256,7 @@ def test_input_channels_spread_over_their_cores():
     netlist = replace(six_steps()[0], taxels=1500)
     latencies = timing.prepare(netlist, LOIHI, SANAFE, input_tiles=(3, 4))
     size = netlist.n_compartments
-    assert latencies.tables.start.tolist() == [0, 2, size, size + 1024, size + 1500]
+    assert latencies.start.tolist() == [0, 2, size, size + 1024, size + 1500]
     assert latencies.barrier == 1400 * PICO  # four tiles
 
 

@@ -16,7 +16,8 @@ from spikeloom.compiler.targets.base import Target, TimeTable
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray
 from spikeloom.runtime.machines.loihi1.engine import EventArray
-from spikeloom.runtime.machines.loihi1.timing import Latencies, SimpleTimes, simple_times
+from spikeloom.runtime.machines.loihi1.timing import SimpleTimes, simple_times
+from spikeloom.runtime.machines.loihi1.timing_kernel import Tables
 
 Link = tuple[int, int, str]
 
@@ -196,15 +197,13 @@ class Chip:
         return times
 
 
-def simple(
-    latencies: Latencies, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps=None
-) -> SimpleTimes:
+def simple(tables: Tables, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps=None) -> SimpleTimes:
     """Times of the simple model from spikes and updates (samples, chip steps, compartments), as matrix products."""
-    tables, n, length = latencies.tables, latencies.netlist.n_compartments, spikes.shape[1]
-    cores, slots = len(latencies.core_tile), len(tables.sender)
+    length, n = spikes.shape[1:]
+    cores, slots, channels = len(tables.access), len(tables.sender), len(tables.channel_first) - 1
     ran = np.full(len(spikes), length) if steps is None else steps
     within = np.arange(length) < ran[:, None]
-    seen = np.zeros((*spikes.shape[:2], latencies.netlist.n_inputs), np.int64)
+    seen = np.zeros((*spikes.shape[:2], channels), np.int64)
     fired, works = spikes.astype(np.int64), updated.astype(np.int64)
     if slots > n:  # channels on cores send in the step before
         ahead = (events[:, :, 1 : length + 1] != 0).transpose(0, 2, 1)
@@ -225,10 +224,10 @@ def simple(
     slot = np.repeat(own, np.diff(tables.first))
     processing = fired @ by(slot, tables.destination, tables.processing, slots)
     if slots == n:
-        channel = np.repeat(np.arange(latencies.netlist.n_inputs), np.diff(tables.channel_first))
+        channel = np.repeat(np.arange(channels), np.diff(tables.channel_first))
         processing += seen @ by(channel, tables.channel_destination, tables.channel_processing, seen.shape[2])
     sums = np.concatenate([generation, processing], axis=2) * within[..., None]
-    return simple_times(latencies, sums, ran)
+    return simple_times(tables, sums, ran)
 
 
 def dense_synapses(netlist):

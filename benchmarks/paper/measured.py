@@ -145,9 +145,9 @@ def _rates(compilation: Compilation, rates: FloatArray) -> tuple[FloatArray, ...
 
 def _costs(netlist: Netlist, target: Target, test: Recordings) -> tuple[IntArray, Json]:
     """Spikes of each compartment on the test recordings, and what an inference costs in the mean."""
-    counts, found = estimate(netlist, target, _flat(test), lengths=test.lengths)
+    trace, found = estimate(netlist, target, _flat(test), lengths=test.lengths)
     operations = found.costs.synaptic_operations
-    return counts.spikes, {
+    return trace.counts.spikes, {
         "synaptic_operations": float(operations.sum(axis=1).mean()),
         "first_layer_operations": float(operations[:, 0].mean()),
         "energy_j": _means(found.costs.energy),

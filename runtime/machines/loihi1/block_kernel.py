@@ -48,6 +48,9 @@ LANES = 64
 LISTED = 4
 """Bits of a word that are listed at a time."""
 
+CHARGES = 8
+"""Charges of a source are padded to a multiple of this."""
+
 UNROLLED = 4
 """Rows that are added up without a look at how many are left."""
 
@@ -85,7 +88,7 @@ class Blocks(NamedTuple):
     depth: IntArray
     layer: IntArray
     compartment: IntArray  # (blocks * 64,) int64; compartment of each position, -1 for none
-    # (blocks,) int64; compartment of the first position where the block holds 64 consecutive ones, else -1
+    # (blocks,) int64; compartment of the first position where those of the block are consecutive, else -1
     whole: IntArray
 
 
@@ -516,8 +519,9 @@ def _pack_compartments(blocks: Blocks, steps: int, words: AnyArray, out: AnyArra
                 if blocks.whole[block] >= 0:
                     to, by = row + (blocks.whole[block] >> 6), np.uint64(blocks.whole[block] & 63)
                     flat[to] |= left << by
-                    if by:
-                        flat[to + 1] |= left >> (np.uint64(LANES) - by)
+                    rest = left >> np.uint64(1) >> (np.uint64(LANES - 1) - by)  # a shift by 64 is not defined
+                    if rest:
+                        flat[to + 1] |= rest
                     continue
                 while left:
                     compartment = blocks.compartment[block * LANES + _lowest(left)]
@@ -606,9 +610,16 @@ def run_recordings(
 
 
 @compiled
-def _charge_row(rows: IntArray, source: int, sums: IntArray) -> None:
-    for i in range(sums.size):
-        sums[i] += rows[source, i]
+def _add_rows(rows: IntArray, words: AnyArray, totals: IntArray) -> None:
+    """Add the rows whose bits are set."""
+    for w in range(words.size):
+        left = words[w]
+        while left:
+            row = w * LANES + _lowest(left)
+            for part in range(0, totals.size, CHARGES):
+                for i in range(CHARGES):  # a fixed number of them, which become vectors
+                    totals[part + i] += rows[row, part + i]
+            left &= left - np.uint64(1)
 
 
 @compiled_and_cached
@@ -617,36 +628,31 @@ def add_charges(
     lengths: IntArray,
     fired: AnyArray,
     updated: AnyArray,
-    channels: IntArray,
-    spikes: IntArray,
+    sources: IntArray,
     kinds: IntArray,
     members: AnyArray,
     charged: IntArray,
 ) -> None:
     """Add what happened in some recordings to the sums of each chip step, `charged` (recordings, chip steps, sums).
 
-    `events`, `fired` and `updated` are as in :func:`run_recordings`; `channels` and `spikes` have the sums of each
-    source. An update adds one of few `kinds` (kinds, sums); bits of `members` (kinds, words) are compartments of each.
+    `events`, `fired` and `updated` are as in :func:`run_recordings`; `sources` those of :class:`trace.Charges`,
+    padded. An update adds one of few `kinds` (kinds, sums); bits of `members` (kinds, words) are compartments of each.
     """
-    sums = kinds.shape[1]
+    totals = np.empty(sources.shape[1], np.int64)
     for r in range(events.shape[0]):
         for channel in range(events.shape[1]):
             for t in range(lengths[r]):
                 if events[r, channel, t]:
-                    _charge_row(channels, channel, charged[r, t])
-        totals = np.empty(sums, np.int64)
+                    for i in range(kinds.shape[1]):
+                        charged[r, t, i] += sources[channel, i]
         for t in range(fired.shape[1]):
             totals[:] = 0
-            for w in range(fired.shape[2]):
-                left = fired[r, t, w]
-                while left:
-                    _charge_row(spikes, w * LANES + _lowest(left), totals)
-                    left &= left - np.uint64(1)
+            _add_rows(sources[events.shape[1] :], fired[r, t], totals)
             for kind in range(kinds.shape[0]):
                 count = 0
                 for w in range(updated.shape[2]):
                     count += _bits(updated[r, t, w] & members[kind, w])
-                for i in range(sums):
+                for i in range(kinds.shape[1]):
                     totals[i] += count * kinds[kind, i]
-            for i in range(sums):
+            for i in range(kinds.shape[1]):
                 charged[r, t, i] += totals[i]

@@ -43,12 +43,8 @@ def _in_range(netlist: Netlist) -> bool:
 def _is_pipeline(netlist: Netlist) -> bool:
     """Whether every layer receives from the depth before it only, so that none has to wait for another."""
     depth = np.array([layer.depth for layer in netlist.layers])[netlist.layer]
-    sent = np.append(np.full(netlist.n_inputs, -1), depth)
-    for core in range(netlist.n_cores):
-        source, compartment, _ = netlist.synapses_of(core)
-        if np.any(sent[source] != depth[compartment] - 1):
-            return False
-    return True
+    sent = np.append(np.full(netlist.n_inputs, -1), depth)[netlist.axon_source[netlist.axon_of_synapse()]]
+    return bool(np.all(sent == depth[netlist.synapse_compartment()] - 1))
 
 
 def lay_out_blocks(netlist: Netlist) -> Blocks | str:
@@ -64,24 +60,20 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
     number = np.append(np.arange(netlist.n_inputs), netlist.n_inputs + seats.position)
     width = LANES * max(-(-netlist.n_inputs // LANES), len(seats.layer))
 
-    def places(core: int) -> tuple[IntArray, IntArray, IntArray]:
-        """Row, by its pair, lane and weight of each synapse of a core."""
-        source, compartment, weight = netlist.synapses_of(core)
-        block, lane = np.divmod(seats.position[compartment], LANES)
-        local = number[source] - first_source[seats.depth[netlist.layer[compartment]]]
-        return block * width + local, lane, weight
-
-    rows, dense = _rows(netlist, seats, [np.unique(places(core)[0]) for core in range(netlist.n_cores)], width)
+    compartment = netlist.synapse_compartment()
+    block, lane = np.divmod(seats.position[compartment], LANES)
+    local = number[netlist.axon_source[netlist.axon_of_synapse()]]
+    local -= first_source[seats.depth[netlist.layer[compartment]]]
+    pair = block * width + local
+    rows, dense = _rows(netlist, seats, np.unique(pair), width)
     if len(rows) * LANES * 2 > SPARE + BYTES_A_SYNAPSE * netlist.n_synapses:
         return "synapses too scattered for rows of 64"
     row_block, row_source = np.divmod(rows, width)
     net, reached = np.zeros(len(rows) * LANES, np.int16), np.zeros(len(rows), np.uint64)
-    for core in range(netlist.n_cores):
-        pair, lane, units = places(core)
-        row = np.searchsorted(rows, pair)
-        # of several synapses of one entry, what leaves 16 bits on the way comes back into them
-        np.add.at(net, row * LANES + lane, units.astype(np.int16))
-        np.bitwise_or.at(reached, row, _bit(lane))
+    row = np.searchsorted(rows, pair)
+    # of several synapses of one entry, what leaves 16 bits on the way comes back into them
+    np.add.at(net, row * LANES + lane, netlist.effective_weight().astype(np.int16))
+    np.bitwise_or.at(reached, row, _bit(lane))
     shift, weight = _narrowed(net, row_block, len(seats.layer))
 
     # links: the rows of a block by words of sources
@@ -148,18 +140,17 @@ def _seats(netlist: Netlist) -> _Seats:
     return _Seats(position=position, layer=layer, keep=keep_of_block, keep_u=keep_u_of_block, stage=stage, depth=depth)
 
 
-def _rows(netlist: Netlist, seats: _Seats, pairs: list[IntArray], width: int) -> tuple[IntArray, BoolArray]:
+def _rows(netlist: Netlist, seats: _Seats, pairs: IntArray, width: int) -> tuple[IntArray, BoolArray]:
     """Pairs of block and source that get a row, sorted, and whether those of a stage are all that there can be."""
-    rows = np.unique(np.concatenate(pairs))
     blocks = np.diff(seats.stage)
     channels = np.append(netlist.n_inputs, np.bincount(seats.depth[netlist.layer], minlength=len(blocks))[:-1])
     places = np.append(netlist.n_inputs, blocks[:-1] * LANES)
-    dense = np.diff(np.searchsorted(rows, seats.stage * width)) >= DENSE * blocks * channels
+    dense = np.diff(np.searchsorted(pairs, seats.stage * width)) >= DENSE * blocks * channels
     filled = [
         (np.arange(seats.stage[s], seats.stage[s + 1])[:, None] * width + np.arange(places[s])).ravel()
         for s in np.flatnonzero(dense)
     ]
-    return np.unique(np.concatenate([rows, *filled])), dense
+    return np.unique(np.concatenate([pairs, *filled])), dense
 
 
 def _narrowed(
@@ -176,9 +167,9 @@ def _narrowed(
 
 
 def _whole(compartment: IntArray) -> IntArray:
-    """First compartment of each block (blocks, 64) that holds consecutive ones, -1 of the others."""
-    consecutive = (compartment[:, 0] >= 0) & np.all(np.diff(compartment, axis=1) == 1, axis=1)
-    return np.where(consecutive, compartment[:, 0], -1)
+    """First compartment of each block (blocks, 64) whose own are consecutive, -1 of the others."""
+    following = compartment[:, :1] + np.arange(LANES)
+    return np.where(np.all((compartment == following) | (compartment < 0), axis=1), compartment[:, 0], -1)
 
 
 def _bit(lane: IntArray) -> npt.NDArray[np.uint64]:

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, IntArray
-from spikeloom.runtime.machines.loihi1.block_kernel import Blocks, add_charges, run_recordings
+from spikeloom.runtime.machines.loihi1.block_kernel import CHARGES, Blocks, add_charges, run_recordings
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.kernel import State, Tables, chip_steps, state_of, tables_of
 from spikeloom.runtime.machines.loihi1.trace import (
@@ -47,26 +47,20 @@ PART = 4
 class Engine:
     """A netlist prepared for a kernel by :func:`prepare`; holds no state and can be shared by threads.
 
-    The kernel of layers reads `blocks`, that of steps `tables`; `charges` are what events add to the sums of each chip
-    step.
+    The kernel of layers reads `blocks`, that of steps `tables`.
     """
 
     netlist: Netlist
     blocks: Blocks | None
     tables: Tables | None
-    charges: Charges | None
 
 
-def prepare(netlist: Netlist, *, stepwise: bool = False, charges: Charges | None = None) -> Engine:
-    """Lay a netlist out for a kernel.
-
-    `stepwise` is for :func:`advance`: the kernel of steps even where that of layers would do. `charges` are what events
-    add to the sums of each chip step in a trace.
-    """
+def prepare(netlist: Netlist, *, stepwise: bool = False) -> Engine:
+    """Lay a netlist out; `stepwise` is for :func:`advance`: the kernel of steps even where that of layers would do."""
     blocks = None if stepwise else lay_out_blocks(netlist)
     if blocks is None or isinstance(blocks, str):
-        return Engine(netlist=netlist, blocks=None, tables=tables_of(netlist), charges=charges)
-    return Engine(netlist=netlist, blocks=blocks, tables=None, charges=charges)
+        return Engine(netlist=netlist, blocks=None, tables=tables_of(netlist))
+    return Engine(netlist=netlist, blocks=blocks, tables=None)
 
 
 def advance(
@@ -114,6 +108,7 @@ def simulate(
     membranes: bool = False,
     updated: bool = False,
     packed: bool = False,
+    charges: Charges | None = None,
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> Trace:
@@ -121,14 +116,15 @@ def simulate(
 
     `lengths` (recordings,) are the data steps of each where some are shorter: what comes after them is not run and
     zero in the trace. `spikes`, `membranes`, `updated` say what to keep per chip step (one, four and one bytes for each
-    compartment), `packed` keeps spikes at a bit each. Recordings run on `threads` at a time, by default one per
-    processor; `progress` is called with the number that is done.
+    compartment), `packed` keeps spikes at a bit each, `charges` are what events add to the sums
+    of each chip step. Recordings run on `threads` at a time, by default one per processor; `progress` is called with
+    the number that is done.
 
     Raises DataError for another number of channels, and NumericRangeError as :func:`spec.simulate` does, for the first
     recording that overflows; a note on the exception says which.
     """
     engine = netlist if isinstance(netlist, Engine) else prepare(netlist)
-    netlist, charges = engine.netlist, engine.charges
+    netlist = engine.netlist
     check_channels(netlist, events.shape[1])
     recordings, _, length = events.shape
     shape = (recordings, length + netlist.max_depth, netlist.n_compartments)
@@ -142,7 +138,7 @@ def simulate(
         spikes=np.zeros(shape, np.bool_) if spikes else None,
         membranes=np.zeros(shape, np.int32) if membranes else None,
         updated=np.zeros(shape, np.bool_) if updated else None,
-        charged=None if charges is None else np.zeros((*shape[:2], charges.spikes.shape[1]), np.int64),
+        charged=None if charges is None else np.zeros((*shape[:2], charges.sources.shape[1]), np.int64),
         packed=np.zeros((*shape[:2], -(-shape[2] // 64)), np.uint64) if packed else None,
     )
     ends = np.full(recordings, length) if lengths is None else np.asarray(lengths, np.int64)
@@ -150,14 +146,14 @@ def simulate(
     given = np.ascontiguousarray(events).view(np.uint8)
     given.flags.writeable = False  # or the kernels would be compiled twice, for either
     if charges is not None:
+        sources = np.pad(charges.sources, ((0, 0), (0, -charges.sources.shape[1] % CHARGES)))
         kinds, kind = np.unique(charges.updates, axis=0, return_inverse=True)
         members = pack(kind.reshape(-1) == np.arange(len(kinds))[:, None])
 
     def run(part: slice) -> None:
         fired, worked = run_part(engine, given[part], ends[part], trace, part)
         if charges is not None and trace.charged is not None:
-            source = charges.channels, charges.spikes
-            add_charges(given[part], ends[part], fired, worked, *source, kinds, members, trace.charged[part])
+            add_charges(given[part], ends[part], fired, worked, sources, kinds, members, trace.charged[part])
 
     parts = [slice(i, min(i + size, recordings)) for i in range(0, recordings, size)]
     workers = min(threads or os.cpu_count() or 1, len(parts))
@@ -177,7 +173,7 @@ def _run_layers(
     n = engine.netlist.n_compartments
     words = len(events), events.shape[2] + engine.netlist.max_depth, -(-n // 64)
     spikes, updated = (
-        np.zeros(words if engine.charges is not None or kept is not None else nothing, np.uint64)
+        np.zeros(words if trace.charged is not None or kept is not None else nothing, np.uint64)
         for kept in (trace.spikes, trace.updated)
     )
     if trace.packed is not None:

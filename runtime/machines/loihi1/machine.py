@@ -19,7 +19,7 @@ from spikeloom.compiler.targets.loihi1.legalize import measure, require_legal
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.base import Beside, EventArray, Price, Run, one_by_one
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import description, engine, spec
@@ -28,8 +28,8 @@ from spikeloom.runtime.machines.loihi1.costs import cumulative
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.machines.loihi1.costs.sections import sections
-from spikeloom.runtime.machines.loihi1.stream import Stream, open_stream
-from spikeloom.runtime.machines.loihi1.trace import MembraneArray, aligned, differences
+from spikeloom.runtime.machines.loihi1.stream import Stream
+from spikeloom.runtime.machines.loihi1.trace import Trace, aligned, differences
 from spikeloom.runtime.machines.page_parts import BatchParts
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
@@ -88,7 +88,7 @@ class Loihi(IntegerMachine):
         trace = engine.simulate(
             self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes, threads=threads
         )
-        return self._run(trace.counts.spikes, trace.spikes, trace.membranes)
+        return self._run(trace)
 
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Every spike, membrane, update and count, one recording after another."""
@@ -128,7 +128,7 @@ class Loihi(IntegerMachine):
     def cumulative(self, events: EventArray, lengths: IntArray) -> Cumulative:
         """Sums that the engine adds up itself: no spike is kept."""
         channels = with_clocks(events, self.netlist.clocks)
-        return cumulative.run(self.netlist, self.target, channels, lengths, lag=self.read_out_lag)
+        return cumulative.run(self._engine, self.target, channels, lengths, lag=self.read_out_lag)
 
     @property
     def least_intervals(self) -> IntArray:
@@ -146,7 +146,7 @@ class Loihi(IntegerMachine):
         from spikeloom.runtime.machines.loihi1.costs import page
 
         channels, step_s = with_clocks(events, self.netlist.clocks), bin_s * self.netlist.bins
-        return page.batch_parts(self.netlist, self.target, channels, lengths=lengths, bin_s=step_s)
+        return page.batch_parts(self._engine, self.target, channels, lengths=lengths, bin_s=step_s)
 
     def price(
         self,
@@ -162,20 +162,18 @@ class Loihi(IntegerMachine):
         """Decisions and costs, of the cores' tiles and times too."""
         self.require_detail(detail)
         chip = self.target if table is None else with_tables(self.target, table)
-        shape = len(events), events.shape[-1] + self.netlist.max_depth, self.netlist.n_compartments
-        kept = np.zeros(shape, np.bool_) if spikes else None
-        counts, found = estimate(
-            self.netlist,
+        trace, found = estimate(
+            self._engine,
             chip,
             with_clocks(events, self.netlist.clocks),
             lengths=lengths,
             detail=detail,
-            spikes=kept,
+            spikes=spikes,
             progress=progress,
         )
         report = cost_report(self.netlist, chip, found, bin_s=bin_s * self.netlist.bins)
         time_ns = {name: times.duration_ns.sum(axis=1) for name, times in found.simple.items()}
-        return self._run(counts.spikes, kept), Price(
+        return self._run(trace), Price(
             synaptic_operations=found.costs.synaptic_operations.sum(axis=1),
             energy_j={name: each.sum(axis=1) for name, each in found.costs.energy.items()},
             time_s={name: each * 1e-9 for name, each in time_ns.items()},
@@ -196,11 +194,16 @@ class Loihi(IntegerMachine):
 
     def stream(self) -> Stream:
         """One grasp, bin after bin."""
-        return open_stream(self._stepwise)
+        return Stream(self._stepwise)
 
-    def _run(self, counts: IntArray, spikes: BoolArray | None, membranes: MembraneArray | None = None) -> Run:
-        votes = class_counts(self.netlist, counts)
-        return Run(votes=votes, counts=counts, spikes=self._by_layer(spikes), membranes=self._by_layer(membranes))
+    def _run(self, trace: Trace) -> Run:
+        counts = trace.counts.spikes
+        return Run(
+            votes=class_counts(self.netlist, counts),
+            counts=counts,
+            spikes=self._by_layer(trace.spikes),
+            membranes=self._by_layer(trace.membranes),
+        )
 
     def _by_layer(self, array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]] | None:
         if array is None:

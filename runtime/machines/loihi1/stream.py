@@ -22,7 +22,7 @@ import numpy.typing as npt
 from spikeloom.compiler.errors import DataError, NumericRangeError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.base import Step
-from spikeloom.runtime.machines.loihi1.engine import Engine, advance, prepare
+from spikeloom.runtime.machines.loihi1.engine import Engine, advance
 from spikeloom.runtime.machines.loihi1.kernel import state_of
 from spikeloom.runtime.machines.votes import class_counts
 
@@ -31,7 +31,7 @@ NO_END = 2**62
 
 
 class Stream:
-    """State of one grasp on one sensor; made by :func:`open_stream`.
+    """State of one grasp on one sensor, of an engine that was prepared `stepwise`.
 
     Streams of one engine share nothing that changes: several may take turns, or run in a thread each.
     """
@@ -114,11 +114,6 @@ class Stream:
         counts = class_counts(netlist, state.spikes[None])[0]
         spikes.flags.writeable = counts.flags.writeable = False
         return Step(index=index, spikes=tuple([spikes[begin:end] for begin, end in self._bounds]), counts=counts)
-
-
-def open_stream(netlist: Netlist | Engine) -> Stream:
-    """Open a stream on a netlist in memory; :func:`engine.prepare` it once to open several."""
-    return Stream(netlist if isinstance(netlist, Engine) else prepare(netlist, stepwise=True))
 
 
 def _one_bin(netlist: Netlist, events: npt.ArrayLike) -> npt.NDArray[np.generic]:

@@ -24,6 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 from math import lcm
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -33,25 +34,11 @@ from spikeloom.compiler.targets.loihi1.layout.place import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1.engine import EventArray
-from spikeloom.runtime.machines.loihi1.timing_kernel import Steps, Tables, conclude, schedule
+from spikeloom.runtime.machines.loihi1.timing_kernel import Tables, schedule
 from spikeloom.runtime.machines.loihi1.trace import Charges
 
 EAST, WEST, NORTH, SOUTH, PORTS = range(5)
 """Links of a tile: one that messages enter by for each direction in which they travel, then its cores' own ports."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Latencies:
-    """A netlist prepared for the time models by :func:`prepare`.
-
-    `core_tile` has the tiles of the netlist's cores, then of those that hold input channels; `barrier` are the
-    picoseconds that end each step.
-    """
-
-    netlist: Netlist
-    tables: Tables
-    core_tile: IntArray
-    barrier: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -118,7 +105,7 @@ def prepare(
     *,
     input_tiles: tuple[int, ...] = (),
     dense: BoolArray | None = None,
-) -> Latencies:
+) -> Tables:
     """Lay a netlist out for the time models.
 
     `input_tiles` are tiles of cores that hold the input channels, as many on each as it has room for; empty if no core
@@ -161,7 +148,7 @@ def prepare(
     tiles = [[link // (PORTS + tile_cores) for link in way] for way in ways]
     hop = {True: latency["hop_east_west"], False: latency["hop_north_south"]}
     unit = lcm(*(len(way) + 1 for way in ways))
-    tables = Tables(
+    return Tables(
         start=start,
         access=np.where(inner, latency["neuron_access"], 0),
         update=np.where(inner, latency["neuron_update"], 0),
@@ -182,87 +169,85 @@ def prepare(
         route_share=np.array([unit // (len(way) + 1) for way in ways], np.int64),
         unit=unit,
         capacity=int(table.link_buffer.value),
+        barrier=table.barrier(len(np.unique(core_tile))),
     )
-    used = len(np.unique(core_tile))
-    return Latencies(netlist=netlist, tables=tables, core_tile=core_tile, barrier=table.barrier(used))
 
 
 def _slots(
-    latencies: Latencies, spikes: BoolArray, updated: BoolArray, events: EventArray
+    tables: Tables, spikes: BoolArray, updated: BoolArray, events: EventArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
     """Firing slots, working slots and events that nobody sends, as the kernels want them."""
     fired, worked, seen = (np.ascontiguousarray(bits).view(np.uint8) for bits in (spikes, updated, events != 0))
-    netlist = latencies.netlist
-    if len(latencies.core_tile) == netlist.n_cores:
+    if tables.sender.size == spikes.shape[2]:
         return fired, worked, seen
-    sent = np.zeros((*spikes.shape[:2], netlist.n_inputs), np.uint8)
+    sent = np.zeros((*spikes.shape[:2], seen.shape[1]), np.uint8)
     ahead = seen[:, :, 1 : spikes.shape[1] + 1]
     sent[:, : ahead.shape[2]] = ahead.transpose(0, 2, 1)
     return np.concatenate([fired, sent], 2), np.concatenate([worked, sent], 2), seen[:, :, :0]
 
 
-def charges(latencies: Latencies) -> Charges:
+def charges(tables: Tables) -> Charges:
     """What events add to each core's picoseconds of sweep and sending, then to those of receiving: ``2 * cores`` sums.
 
     The engine adds them up as it runs, without spike trains. The netlist's input channels are on no core.
     """
-    tables, netlist = latencies.tables, latencies.netlist
-    cores, core, every = netlist.n_cores, netlist.core_of_compartment(), np.arange(netlist.n_compartments)
-    spikes, updates = np.zeros((2, netlist.n_compartments, 2 * cores), np.int64)
-    messages = np.diff(tables.first)
-    spikes[every, core] = tables.spike[core] + messages * tables.axon_out
-    np.add.at(spikes, (np.repeat(every, messages), cores + tables.destination), tables.processing)
-    updates[every, core] = tables.update[core]
-    channels = np.zeros((netlist.n_inputs, 2 * cores), np.int64)
-    channel = np.repeat(np.arange(netlist.n_inputs), np.diff(tables.channel_first))
-    np.add.at(channels, (channel, cores + tables.channel_destination), tables.channel_processing)
-    return Charges(channels=channels, spikes=spikes, updates=updates)
+    cores, slots, channels = tables.access.size, tables.sender.size, tables.channel_first.size - 1
+    sources, updates = np.zeros((channels + slots, 2 * cores), np.int64), np.zeros((slots, 2 * cores), np.int64)
+    every = np.arange(slots)
+    sources[channels + every, tables.sender] = tables.sending
+    updates[every, tables.sender] = tables.update[tables.sender]
+    channel = np.repeat(np.arange(channels), np.diff(tables.channel_first))
+    np.add.at(sources, (channel, cores + tables.channel_destination), tables.channel_processing)
+    slot = np.repeat(channels + every, np.diff(tables.first))
+    np.add.at(sources, (slot, cores + tables.destination), tables.processing)
+    return Charges(sources=sources, updates=updates)
 
 
-def simple_times(latencies: Latencies, charged: IntArray, steps: IntArray) -> SimpleTimes:
+def _ends(spent: npt.NDArray[Any], steps: IntArray, barrier: int) -> dict[str, Any]:
+    """Fields of :class:`StepTimes`, of what cores take to send, then to receive, (samples, chip steps, 2 * cores)."""
+    runs, longest = np.arange(spent.shape[1]) < steps[:, None], spent.argmax(axis=2)
+    receives, core = np.divmod(longest, spent.shape[2] // 2)
+    return {
+        "duration_ns": np.where(runs, spent.max(axis=2) + barrier, 0) / PICOSECONDS,
+        "critical_core": np.where(runs, core, -1),
+        "receiving": runs & (receives == 1),
+    }
+
+
+def simple_times(tables: Tables, charged: IntArray, steps: IntArray) -> SimpleTimes:
     """Times of the simple model from what :func:`charges` added up to, (samples, chip steps, 2 * cores) int64.
 
     `steps` (samples,) are the chip steps of each recording.
     """
-    cores = len(latencies.core_tile)
-    samples, length = charged.shape[:2]
-    duration, critical = np.zeros((samples, length)), np.full((samples, length), -1)
-    each, receiving = np.zeros((samples, 2 * cores), np.int64), np.zeros((samples, length), np.bool_)
-    sweep = np.diff(latencies.tables.start) * latencies.tables.access
-    conclude(charged, sweep, steps, latencies.barrier, duration, each, critical, receiving)
+    cores = tables.access.size
+    spent = charged.copy()
+    spent[:, :, :cores] += np.diff(tables.start) * tables.access
+    spent *= (np.arange(charged.shape[1]) < steps[:, None])[:, :, None]
+    each = spent.sum(axis=1) / PICOSECONDS
     return SimpleTimes(
-        duration_ns=duration / PICOSECONDS,
-        generation_ns=each[:, :cores] / PICOSECONDS,
-        processing_ns=each[:, cores:] / PICOSECONDS,
-        critical_core=critical,
-        receiving=receiving,
+        **_ends(spent, steps, tables.barrier), generation_ns=each[:, :cores], processing_ns=each[:, cores:]
     )
 
 
 def detailed(
-    latencies: Latencies, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps: IntArray | None = None
+    tables: Tables, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps: IntArray | None = None
 ) -> DetailedTimes:
     """Time a batch of recordings by the detailed model.
 
     `spikes` and `updated` (samples, chip steps, compartments) are a simulator's, see :class:`trace.Trace`, for `events`
     (samples, n_inputs, T); `steps` (samples,) are the chip steps of each recording, by default all.
     """
-    fired, worked, events = _slots(latencies, spikes, updated, events)
-    samples, length = spikes.shape[:2]
+    fired, worked, events = _slots(tables, spikes, updated, events)
+    cores, (samples, length) = tables.access.size, spikes.shape[:2]
     own = np.full(samples, length) if steps is None else steps
-    sent, processed, blocked, peak = np.zeros((4, samples, length))
-    core = np.full((samples, length), -1)
-    receives = np.zeros((samples, length), np.bool_)
+    blocked, peak = np.zeros((2, samples, length))
+    spent = np.zeros((samples, length, 2 * cores))
     for i in range(samples):
-        found = Steps(sent[i], processed[i], blocked[i], core[i], receives[i], peak[i])
-        schedule(latencies.tables, fired[i], worked[i], events[i], int(own[i]), found)
-    runs = np.arange(length) < own[:, None]
+        schedule(tables, fired[i], worked[i], events[i], int(own[i]), spent[i], blocked[i], peak[i])
     return DetailedTimes(
-        duration_ns=np.where(runs, np.maximum(sent, processed) + latencies.barrier, 0) / PICOSECONDS,
-        sent_ns=sent / PICOSECONDS,
-        processed_ns=processed / PICOSECONDS,
+        **_ends(spent, own, tables.barrier),
+        sent_ns=spent[:, :, :cores].max(axis=2) / PICOSECONDS,
+        processed_ns=spent[:, :, cores:].max(axis=2) / PICOSECONDS,
         blocked_ns=blocked / PICOSECONDS,
-        critical_core=core,
-        receiving=receives,
         peak_load=peak,
     )

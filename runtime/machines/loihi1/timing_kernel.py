@@ -55,17 +55,7 @@ class Tables(NamedTuple):
     route_share: IntArray
     unit: int  # What a load of one message is counted as
     capacity: int  # Messages that a link holds
-
-
-class Steps(NamedTuple):
-    """What :func:`schedule` finds about each step of a recording; all arrays are (steps,), times in picoseconds."""
-
-    sent: FloatArray
-    processed: FloatArray
-    blocked: FloatArray
-    core: IntArray
-    receives: AnyArray
-    peak: FloatArray
+    barrier: int  # Picoseconds that end each step
 
 
 @compiled
@@ -76,38 +66,6 @@ def _inject(first: IntArray, destination: IntArray, cost: IntArray, events: AnyA
             if events[channel, t]:
                 for a in range(first[channel], first[channel + 1]):
                     busy[destination[a]] += cost[a]
-
-
-@compiled_and_cached
-def conclude(
-    sums: AnyArray,
-    sweep: IntArray,
-    steps: IntArray,
-    barrier: int,
-    duration: FloatArray,
-    each: IntArray,
-    critical: IntArray,
-    receiving: AnyArray,
-) -> None:
-    """Find the slowest core of each step, the sum of all steps, and how long each step takes; all in picoseconds.
-
-    `sums` (samples, chip steps, 2 * cores) is what events cost each core's sweep and sending, then its receiving;
-    `sweep` (cores,) what a sweep takes in any case; `steps` (samples,) where each recording ends; `barrier` what ends a
-    step. Filled are `duration`, `critical` and `receiving` (samples, chip steps) and, from zeros, `each` (samples, 2 *
-    cores), the sum of all steps.
-    """
-    cores = sweep.size
-    for r in range(sums.shape[0]):
-        for t in range(steps[r]):
-            longest, which = np.int64(-1), 0
-            for i in range(2 * cores):
-                spent = sums[r, t, i] + (sweep[i] if i < cores else 0)
-                each[r, i] += spent
-                if spent > longest:
-                    longest, which = spent, i
-            duration[r, t] = longest + barrier
-            critical[r, t] = which % cores
-            receiving[r, t] = which >= cores
 
 
 @compiled
@@ -245,26 +203,30 @@ def _send_all(  # noqa: PLR0915 - one loop over local state, which numba passes 
 
 
 @compiled_and_cached
-def schedule(tables: Tables, fired: AnyArray, updated: AnyArray, events: AnyArray, steps: int, found: Steps) -> None:
-    """Send the messages of each step in the order of time."""
+def schedule(
+    tables: Tables,
+    fired: AnyArray,
+    updated: AnyArray,
+    events: AnyArray,
+    steps: int,
+    spent: FloatArray,
+    blocked: FloatArray,
+    peak: FloatArray,
+) -> None:
+    """Send the messages of each step of a recording in the order of time.
+
+    Filled are `spent` (steps, 2 * cores), from zeros: when each core has sent everything, then when it has processed
+    everything; and as :func:`_send_all` says `blocked` and `peak` (steps,). Times are picoseconds.
+    """
     cores = tables.access.size
     most = tables.destination.size + cores
     delivery, generation, later = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
     received, queue = np.empty(most, np.float64), np.empty(cores + 1, np.int64)
     load = np.zeros(tables.route_link.max() + 1 if tables.route_link.size else 0, np.int64)
-    done, free = np.empty(cores, np.float64), np.empty(cores, np.float64)
     first, destination, cost = tables.channel_first, tables.channel_destination, tables.channel_processing
     for t in range(steps):
         load[:] = 0
-        done[:] = 0
-        free[:] = 0
+        done, free = spent[t, :cores], spent[t, cores:]
         _inject(first, destination, cost, events, t, free)
         _list_messages(tables, fired[t], updated[t], delivery, generation, queue)
-        found.blocked[t], found.peak[t] = _send_all(
-            tables, delivery, generation, queue, received, later, load, done, free
-        )
-        sender, receiver = np.argmax(done), np.argmax(free)
-        found.sent[t] = done[sender]
-        found.processed[t] = free[receiver]
-        found.receives[t] = free[receiver] > done[sender]
-        found.core[t] = receiver if free[receiver] > done[sender] else sender
+        blocked[t], peak[t] = _send_all(tables, delivery, generation, queue, received, later, load, done, free)

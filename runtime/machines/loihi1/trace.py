@@ -41,15 +41,14 @@ class Counts:
 class Charges:
     """What events add to some sums of each chip step: times, energies, anything that is linear in them."""
 
-    channels: IntArray  # (n_inputs, sums) int64; by an input event of each channel
-    spikes: IntArray  # (compartments, sums) int64; by a spike of each compartment
+    sources: IntArray  # (n_inputs + compartments, sums) int64; by an event of each channel, a spike of each compartment
     updates: IntArray  # (compartments, sums) int64; by an update of each compartment
 
 
 def side_by_side(parts: Sequence[Charges]) -> Charges:
     """Several charges as one: the sums of each after those before it."""
-    names = ("channels", "spikes", "updates")
-    return Charges(**{name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in names})
+    sources, updates = ([getattr(part, name) for part in parts] for name in Charges.__slots__)
+    return Charges(sources=np.concatenate(sources, axis=1), updates=np.concatenate(updates, axis=1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,7 +61,7 @@ class Trace:
     # what was compared with the threshold, before a spike resets it, in 1/64 of a weight unit; zero outside the window
     membranes: MembraneArray | None
     updated: BoolArray | None = None  # Whether a compartment had work to do, as ``Counts.updates`` counts it
-    charged: IntArray | None = None  # (…, chip steps, sums) int64; what events add up to under the engine's charges
+    charged: IntArray | None = None  # (…, chip steps, sums) int64; what events add up to under some charges
     # (…, chip steps, ceil(compartments / 64)) uint64; spike of compartment c at bit ``c % 64`` of word ``c // 64``
     packed: npt.NDArray[np.uint64] | None = None
 

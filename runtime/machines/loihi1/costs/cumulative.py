@@ -13,6 +13,7 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.runtime.machines.base import EventArray
 from spikeloom.runtime.machines.integer import LONGEST, Cumulative
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost
@@ -42,27 +43,25 @@ def least_intervals(netlist: Netlist) -> IntArray:
 
 def vote_charges(netlist: Netlist) -> Charges:
     """What a spike adds to the votes of each class."""
-    spikes = np.zeros((netlist.n_compartments, netlist.classes), np.int64)
+    sources = np.zeros((netlist.n_inputs + netlist.n_compartments, netlist.classes), np.int64)
     voters = np.flatnonzero(netlist.readout_class >= 0)
-    spikes[voters, netlist.readout_class[voters]] = 1
-    return Charges(
-        channels=np.zeros((netlist.n_inputs, netlist.classes), np.int64), spikes=spikes, updates=np.zeros_like(spikes)
-    )
+    sources[netlist.n_inputs + voters, netlist.readout_class[voters]] = 1
+    return Charges(sources=sources, updates=np.zeros((netlist.n_compartments, netlist.classes), np.int64))
 
 
-def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: IntArray, *, lag: int) -> Cumulative:
+def run(prepared: engine.Engine, target: Target, events: EventArray, lengths: IntArray, *, lag: int) -> Cumulative:
     """Run recordings (samples, n_inputs, T), each for its own length in data steps (samples,), once.
 
     `lag` are the chip steps by which the votes are behind the data.
     """
+    netlist = prepared.netlist
     timed = target.time if chip_count(netlist.core_tile, target) == 1 else ()
     latencies = [timing.prepare(netlist, target, table) for table in timed]
     meter = cost.prepare(netlist, target, "whole")
     parts = [vote_charges(netlist), _event_charges(netlist, meter), *map(timing.charges, latencies)]
-    prepared = engine.prepare(netlist, charges=side_by_side(parts))
-    trace = engine.simulate(prepared, events, lengths=lengths)
+    trace = engine.simulate(prepared, events, lengths=lengths, charges=side_by_side(parts))
     assert trace.charged is not None, "sums were wanted"
-    ends = np.cumsum([part.spikes.shape[1] for part in parts])[:-1]
+    ends = np.cumsum([part.sources.shape[1] for part in parts])[:-1]
     votes, happened, *times = np.split(trace.charged, ends, axis=2)
     chip_steps = lengths + netlist.max_depth
     runs = np.arange(trace.charged.shape[1]) < chip_steps[:, None]
@@ -85,10 +84,10 @@ def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: In
 
 def _event_charges(netlist: Netlist, meter: cost.Meter) -> Charges:
     """What events add to the amounts that a meter knows, and to neuron updates."""
-    caused = np.pad(meter.caused.astype(np.int64), ((0, 0), (0, 1)))
-    updates = np.zeros((netlist.n_compartments, caused.shape[1]), np.int64)
+    sources = np.pad(meter.caused.astype(np.int64), ((0, 0), (0, 1)))
+    updates = np.zeros((netlist.n_compartments, sources.shape[1]), np.int64)
     updates[:, -1] = 1
-    return Charges(channels=caused[: netlist.n_inputs], spikes=caused[netlist.n_inputs :], updates=updates)
+    return Charges(sources=sources, updates=updates)
 
 
 def _events(meter: cost.Meter, happened: IntArray, runs: BoolArray) -> dict[str, FloatArray]:

@@ -7,21 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
 
 import numpy as np
 
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count, require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.cost import Costs
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
-from spikeloom.runtime.machines.loihi1.trace import Counts, side_by_side
-
-T = TypeVar("T", Counts, SimpleTimes, DetailedTimes)
+from spikeloom.runtime.machines.loihi1.trace import Trace, side_by_side
 
 PART = 16
 """Recordings whose spikes are kept at a time in detail ``cycle``."""
@@ -43,19 +40,19 @@ class Estimate:
 
 
 def estimate(
-    netlist: Netlist,
+    netlist: Netlist | engine.Engine,
     target: Target,
     events: engine.EventArray,
     *,
     lengths: IntArray | None = None,
     detail: str = "counts",
-    spikes: BoolArray | None = None,
+    spikes: bool = False,
     progress: Callable[[int], object] | None = None,
-) -> tuple[Counts, Estimate]:
-    """Run recordings and say what they cost.
+) -> tuple[Trace, Estimate]:
+    """Run recordings, keep their spikes where wanted, and say what they cost.
 
     `events` are (samples, n_inputs, T), `lengths` (samples,) the data steps of each, `detail` is ``counts`` or
-    ``cycle``; `spikes` (samples, chip steps, compartments) bool is filled, `progress` called with the recordings done.
+    ``cycle``; for that `progress` is called with the number of recordings done.
 
     Raises
     ------
@@ -65,55 +62,47 @@ def estimate(
         If several chips shall be simulated by the cycle. Their events are counted and priced but not timed: links
         between chips have no public latency.
     """
-    deep = detail == "cycle"
+    prepared = netlist if isinstance(netlist, engine.Engine) else engine.prepare(netlist)
+    netlist, deep = prepared.netlist, detail == "cycle"
     if deep:
         require_one_chip(netlist.core_tile, target, "--detail cycle")
     timed = target.time if chip_count(netlist.core_tile, target) == 1 else ()
     latencies = {table.name: timing.prepare(netlist, target, table) for table in timed}
     charges = side_by_side([timing.charges(each) for each in latencies.values()]) if latencies else None
-    prepared = engine.prepare(netlist, charges=charges)
     steps = np.full(len(events), events.shape[2]) if lengths is None else np.asarray(lengths, np.int64)
-    size = PART if deep else max(1, len(events))
-    counts, updates = [], []
-    simple: dict[str, list[SimpleTimes]] = {name: [] for name in latencies}
+    chip_steps = steps + netlist.max_depth
+    whole = engine.simulate(prepared, events, lengths=steps, spikes=spikes, charges=charges)
+    sums = [] if whole.charged is None else np.split(whole.charged, len(latencies), axis=2)
     detailed: dict[str, list[DetailedTimes]] = {name: [] for name in latencies if deep}
-    for first in range(0, max(1, len(events)), size):
-        part = slice(first, first + size)
-        own = steps[part] + netlist.max_depth
-        trace = engine.simulate(
-            prepared, events[part], lengths=steps[part], spikes=deep or spikes is not None, updated=deep
-        )
-        counts.append(trace.counts)
-        sums = [] if trace.charged is None else np.split(trace.charged, len(latencies), axis=2)
-        for (name, latency), charged in zip(latencies.items(), sums, strict=True):
-            simple[name].append(timing.simple_times(latency, charged, own))
-        if spikes is not None:
-            spikes[part] = trace.spikes
-        if not deep:
-            continue
+    updates = []
+    for first in range(0, max(1, len(events)) if deep else 0, PART):
+        part = slice(first, first + PART)
+        trace = engine.simulate(prepared, events[part], lengths=steps[part], spikes=True, updated=True)
         assert trace.spikes is not None, "spikes were wanted"
         assert trace.updated is not None, "updates were wanted"
         updates.append(cost.updates_by_core(netlist, trace.updated))
         given = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after a recording's end
         for name, times in detailed.items():
-            times.append(timing.detailed(latencies[name], trace.spikes, trace.updated, given, steps=own))
+            times.append(timing.detailed(latencies[name], trace.spikes, trace.updated, given, steps=chip_steps[part]))
         if progress is not None:
             progress(min(first + PART, len(events)))
-    whole, chip_steps = _joined(Counts, counts), steps + netlist.max_depth
     cores: Mapping[str, FloatArray] = {}
     if deep:
-        by_core = replace(whole, updates=np.concatenate(updates))
+        by_core = replace(whole.counts, updates=np.concatenate(updates))
         cores = cost.estimate(cost.prepare(netlist, target, "core"), by_core, chip_steps).energy
     return whole, Estimate(
-        costs=cost.estimate(cost.prepare(netlist, target), whole, chip_steps),
+        costs=cost.estimate(cost.prepare(netlist, target), whole.counts, chip_steps),
         steps=steps,
-        simple={name: _joined(SimpleTimes, times) for name, times in simple.items()},
-        detailed={name: _joined(DetailedTimes, times) for name, times in detailed.items()},
+        simple={
+            name: timing.simple_times(each, charged, chip_steps)
+            for (name, each), charged in zip(latencies.items(), sums, strict=True)
+        },
+        detailed={name: _joined(times) for name, times in detailed.items()},
         cores=cores,
     )
 
 
-def _joined(kind: type[T], parts: Sequence[T]) -> T:
-    """One dataclass of arrays from those of some recordings each."""
-    names = [field.name for field in fields(kind)]
-    return kind(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+def _joined(parts: Sequence[DetailedTimes]) -> DetailedTimes:
+    """Times of all recordings from those of some each."""
+    names = [field.name for field in fields(DetailedTimes)]
+    return DetailedTimes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})

@@ -16,6 +16,7 @@ from spikeloom.runtime.machines.base import EventArray
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import CostReport, cost_report
 from spikeloom.runtime.machines.loihi1.costs.sections import sections
+from spikeloom.runtime.machines.loihi1.engine import Engine
 from spikeloom.runtime.machines.loihi1.trace import Counts
 from spikeloom.runtime.machines.page_parts import BatchParts, Core, Cores, Fill, Mesh, Way
 from spikeloom.runtime.report.drawing import bars
@@ -30,12 +31,13 @@ AT_INPUT = -1
 
 
 def batch_parts(
-    netlist: Netlist, target: Target, events: EventArray, *, lengths: IntArray | None, bin_s: float
+    prepared: Engine, target: Target, events: EventArray, *, lengths: IntArray | None, bin_s: float
 ) -> BatchParts:
     """Run recordings (samples, channels, steps), clocks among their channels; `bin_s` is the seconds of a data step."""
-    counts, found = estimate(netlist, target, events, lengths=lengths)
+    netlist = prepared.netlist
+    trace, found = estimate(prepared, target, events, lengths=lengths)
     report = cost_report(netlist, target, found, bin_s=bin_s)
-    fired, spikes = counts.spikes.mean(axis=0), dict[str, FloatArray]()
+    fired, spikes = trace.counts.spikes.mean(axis=0), dict[str, FloatArray]()
     for index, layer in enumerate(netlist.layers):
         ids = netlist.compartments_of(index)
         spikes[layer.name] = np.zeros(layer.neurons)
@@ -44,7 +46,7 @@ def batch_parts(
         costs=Outcome(report, lambda costs: [*sections(costs), Section("", _figures(costs))]),
         energy_j=report.per_inference.energy_j,
         time_s={each.table: each.inference_s["mean"] for each in report.time if each.model == "simple"},
-        cores=_cores(netlist, target, counts),
+        cores=_cores(netlist, target, trace.counts),
         spikes=spikes,
     )
 
