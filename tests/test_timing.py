@@ -312,5 +312,5 @@ def test_synapses_take_the_time_that_one_says(dense):
     said = timing.prepare(netlist, LOIHI, SANAFE, dense=np.full(netlist.n_synapses, dense))
     form = np.full(len(netlist.format_index_bits), 0 if dense else 10)
     stored = timing.prepare(replace(netlist, format_index_bits=read_only(form)), LOIHI, SANAFE)
-    for ours, theirs in zip(said.tables, stored.tables, strict=True):
+    for ours, theirs in zip(said, stored, strict=True):
         np.testing.assert_array_equal(ours, theirs)
