@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,7 +19,9 @@ from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.cost import Costs
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
-from spikeloom.runtime.machines.loihi1.trace import Trace, side_by_side
+from spikeloom.runtime.machines.loihi1.trace import Counts, Trace, side_by_side
+
+T = TypeVar("T", Counts, Trace, DetailedTimes)
 
 PART = 16
 """Recordings whose spikes are kept at a time in detail ``cycle``."""
@@ -71,13 +74,16 @@ def estimate(
     charges = side_by_side([timing.charges(each) for each in latencies.values()]) if latencies else None
     steps = np.full(len(events), events.shape[2]) if lengths is None else np.asarray(lengths, np.int64)
     chip_steps = steps + netlist.max_depth
-    whole = engine.simulate(prepared, events, lengths=steps, spikes=spikes, charges=charges)
-    sums = [] if whole.charged is None else np.split(whole.charged, len(latencies), axis=2)
     detailed: dict[str, list[DetailedTimes]] = {name: [] for name in latencies if deep}
-    updates = []
-    for first in range(0, max(1, len(events)) if deep else 0, PART):
-        part = slice(first, first + PART)
-        trace = engine.simulate(prepared, events[part], lengths=steps[part], spikes=True, updated=True)
+    traces, updates, size = [], [], PART if deep else max(1, len(events))
+    for first in range(0, max(1, len(events)), size):
+        part = slice(first, first + size)
+        trace = engine.simulate(
+            prepared, events[part], lengths=steps[part], spikes=deep or spikes, updated=deep, charges=charges
+        )
+        traces.append(replace(trace, spikes=trace.spikes if spikes else None, updated=None))
+        if not deep:
+            continue
         assert trace.spikes is not None, "spikes were wanted"
         assert trace.updated is not None, "updates were wanted"
         updates.append(cost.updates_by_core(netlist, trace.updated))
@@ -86,6 +92,8 @@ def estimate(
             times.append(timing.detailed(latencies[name], trace.spikes, trace.updated, given, steps=chip_steps[part]))
         if progress is not None:
             progress(min(first + PART, len(events)))
+    whole = traces[0] if len(traces) == 1 else _joined(Trace, traces)
+    sums = [] if whole.charged is None else np.split(whole.charged, len(latencies), axis=2)
     cores: Mapping[str, FloatArray] = {}
     if deep:
         by_core = replace(whole.counts, updates=np.concatenate(updates))
@@ -97,12 +105,17 @@ def estimate(
             name: timing.simple_times(each, charged, chip_steps)
             for (name, each), charged in zip(latencies.items(), sums, strict=True)
         },
-        detailed={name: _joined(times) for name, times in detailed.items()},
+        detailed={name: _joined(DetailedTimes, times) for name, times in detailed.items()},
         cores=cores,
     )
 
 
-def _joined(parts: Sequence[DetailedTimes]) -> DetailedTimes:
-    """Times of all recordings from those of some each."""
-    names = [field.name for field in fields(DetailedTimes)]
-    return DetailedTimes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+def _joined(kind: type[T], parts: Sequence[T]) -> T:
+    """One dataclass of arrays from those of some recordings each."""
+
+    def join(values: Sequence[Any]) -> Any:
+        if isinstance(values[0], Counts):
+            return _joined(Counts, values)
+        return None if values[0] is None else np.concatenate(values)
+
+    return kind(**{field.name: join([getattr(part, field.name) for part in parts]) for field in fields(kind)})
