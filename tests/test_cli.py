@@ -100,7 +100,7 @@ def test_provenance_names_everything_that_decided(as_json, place):
 
 
 def test_dumps_go_to_standard_error(spikeloom, tmp_path):
-    words = [word for step in load_target("loihi1").passes for word in ("--dump-after", step)]
+    words = [word for step in load_target("loihi1").passes for word in ("--dump-after", step.name)]
     code, out, err = spikeloom("compile", "net.pt", *words, "-o", tmp_path / "out.loom", "--json")
     assert code == 0
     json.loads(out)
