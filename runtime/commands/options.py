@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from spikeloom.compiler.checkpoint import WEIGHTS
-from spikeloom.compiler.formats.nir.steps import CONVENTIONS
+from spikeloom.compiler.formats.nir import CONVENTIONS
 from spikeloom.compiler.systems import SYSTEMS
 from spikeloom.models.graphs import CHOICES
 from spikeloom.models.recordings.events import BIN_S

@@ -16,11 +16,9 @@ from spikeloom.compiler.archive import FORMATS, TRAINED, stated
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.netx.reader import SUFFIX as NETX
-from spikeloom.compiler.formats.nir.reader import SUFFIX as NIR
-from spikeloom.compiler.formats.nir.reader import read_nir
-from spikeloom.compiler.formats.onnx.reader import SUFFIX as ONNX
-from spikeloom.compiler.formats.onnx.reader import read_onnx
+from spikeloom.compiler.formats.netx import SUFFIX as NETX
+from spikeloom.compiler.formats.nir import SUFFIX as NIR
+from spikeloom.compiler.formats.onnx import SUFFIX as ONNX
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
@@ -107,8 +105,12 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
     progress("reading the network")
     layout = {"polarities": arguments.polarities, "polarities_first": arguments.polarities_first}
     if suffix == ONNX:
+        from spikeloom.compiler.formats.onnx.reader import read_onnx
+
         found = read_onnx(path, **layout)
     else:
+        from spikeloom.compiler.formats.nir.reader import read_nir
+
         found = read_nir(path, dt=arguments.dt, convention=arguments.convention, **layout)
     return LoadedNetwork(
         network=found.network,

@@ -1,1 +1,3 @@
 """lava-dl's ``.net`` files: reader and writer."""
+
+SUFFIX = ".net"

@@ -42,8 +42,6 @@ from spikeloom.compiler.ir import (
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.types import IntArray
 
-SUFFIX = ".net"
-
 BIAS_EXPONENT = 6
 """Biases are in whole weight steps."""
 

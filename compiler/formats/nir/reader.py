@@ -16,16 +16,15 @@ from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble, class_of_each, in_order
 from spikeloom.compiler.formats.hdf5 import read_hdf5
 from spikeloom.compiler.formats.names import printable, unique_names
+from spikeloom.compiler.formats.nir import CONVENTIONS
 from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, graph_of, loops
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
 from spikeloom.compiler.formats.nir.neurons import Neurons, facts_of, neurons_of
 from spikeloom.compiler.formats.nir.stages import KNOWN, STAGES, Value, added, rows_of, scaled, spikes_of
-from spikeloom.compiler.formats.nir.steps import CONVENTIONS, Steps, require_step, stated_step, written_step
+from spikeloom.compiler.formats.nir.steps import Steps, require_step, stated_step, written_step
 from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.types import FloatArray, IntArray
-
-SUFFIX = ".nir"
 
 AXES, ELEMENTS = 8, 2**20
 """Of an input."""

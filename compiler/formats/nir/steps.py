@@ -20,8 +20,6 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.nir.file import SPIKING, Graph, Node
 from spikeloom.compiler.types import FloatArray
 
-CONVENTIONS = ("euler", "exponential")
-
 TOLERANCE = 1e-6
 """What float32 leaves of equal numbers."""
 

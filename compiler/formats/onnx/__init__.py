@@ -1,1 +1,3 @@
 """ONNX files: reader and writer."""
+
+SUFFIX = ".onnx"

@@ -26,8 +26,6 @@ from spikeloom.compiler.formats.onnx.steps import Unrolled, group, readout
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.sensor_layout import sensor_layout
 
-SUFFIX = ".onnx"
-
 OPEN_STEPS = 3
 """Steps that are run where a file leaves their number open: two show what carries on, a third that it goes on so."""
 

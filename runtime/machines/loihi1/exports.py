@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.formats.netx import writer as netx
+from spikeloom.compiler.formats.nir import CONVENTIONS
 from spikeloom.compiler.formats.nir import writer as nir
-from spikeloom.compiler.formats.nir.steps import CONVENTIONS
 from spikeloom.compiler.formats.onnx import writer as onnx
 from spikeloom.compiler.formats.onnx.builder import port_words
 from spikeloom.compiler.interpret import channels_last

@@ -12,7 +12,7 @@ from typing import Any
 from spikeloom.compiler import Packing, check_packings
 from spikeloom.compiler.archive import arrays_digest, is_netlist
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.onnx.reader import SUFFIX
+from spikeloom.compiler.formats.onnx import SUFFIX
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.types import JsonObject
