@@ -93,6 +93,10 @@ def _decisions(found: Decisions) -> list[Block]:
         for file, *decided in zip(found.files, found.labels, found.model, found.chip, strict=True)
         if decided[1] != decided[2]
     ]
+    tables = [
+        Table(["label decided as", "float", "chip"], wrong, "Wrong decisions", most=LISTED),
+        Table(["recording", "label", "float model", "chip"], moved, "Decided differently", most=LISTED),
+    ]
     title = "Confusion matrices of the float model and of the chip"
     return [
         Figure(
@@ -101,9 +105,8 @@ def _decisions(found: Decisions) -> list[Block]:
             "Rows are labels, columns decisions; right ones lie on the diagonal, the others are of another colour.",
             [Table(["class", "recordings", "float", "chip"], classes, "Right decisions by class", most=0)],
         ),
-        Table(["label decided as", "float", "chip"], wrong, "Wrong decisions", most=LISTED),
         Text(f"{len(wrong)} kinds of wrong decisions, {len(moved)} recordings that the two decide differently"),
-        Table(["recording", "label", "float model", "chip"], moved, "Decided differently", most=LISTED),
+        *(table for table in tables if table.rows),
     ]
 
 
@@ -167,7 +170,7 @@ def _taxels(found: Taxels) -> list[Block]:
     caption = "Discs grow with what a taxel sends, and with what its first-layer neurons fire where there is a graph."
     table = Table(head, rows, "Activity in a mean recording, the busiest first", most=LISTED)
     return [
-        Text(f"{found.sensor or 'sensor'}: {len(order)} taxels, {graph}{where}; the busiest:"),
+        Text(f"{found.sensor or 'sensor'}: {len(order)} taxels, {graph}{where}"),
         Figure("taxels-map", partial(pictures.fingertip, found), caption, [table]),
     ]
 
