@@ -259,7 +259,7 @@ def test_run_estimate_and_inspect_agree(name, capsys):
 
 
 @over(FLOAT)
-def test_explain_finds_causes(name, capsys):
+def test_explain_prints_the_keys_of_the_table(name, capsys):
     made = specimen(name)
     words = ("explain", made.netlist, "--checkpoint", made.network, *made.reading, "--data", made.data)
     found = as_json(capsys, *words, "--sample", "sample_1_label_1.npy")

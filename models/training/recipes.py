@@ -20,9 +20,9 @@ from spikeloom.models.systems import HOPS
 DECAY_EPOCHS = 40
 """There the learning rate falls to a tenth after so many epochs; the first of each such block still has the old one."""
 
-MSE, CROSS_ENTROPY = LOSSES = ("mse", "cross-entropy")
-ADAM, ADAMW = OPTIMIZERS = ("adam", "adamw")
-STEPS, COSINE = SCHEDULES = ("steps", "cosine")
+MSE, CROSS_ENTROPY = ("mse", "cross-entropy")
+ADAM, ADAMW = ("adam", "adamw")
+STEPS, COSINE = ("steps", "cosine")
 
 Decays = tuple[tuple[str, float], ...]
 """Pairs of a layer's name and its decay."""
