@@ -1,24 +1,23 @@
 """The meaning of the intermediate representation: layer by layer over all time steps.
 
-One matrix product per projection, then the recurrence. A recurrent population takes a further product in each
-step: what it fired in the step before arrives together with what others send. The integer stage is exact: products run
-in floating point only where every partial sum is an integer that the type holds (below 2**24 in float32, 2**53 in
-float64).
+What a step's spikes bring is summed, then the neurons integrate, compare and reset. A recurrent population also
+receives what it fired in the step before. The integer stage is exact.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks, with_clocks
-from spikeloom.compiler.fixedpoint import MEMBRANE_MAX, MEMBRANE_SHIFT
+from spikeloom.compiler.fixedpoint import DECAY_ONE, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.ir import (
     INPUT,
     IntegerNetwork,
@@ -26,17 +25,16 @@ from spikeloom.compiler.ir import (
     IntegerProjection,
     Network,
     Population,
+    Projection,
     Sparse,
 )
 from spikeloom.compiler.types import BoolArray, IntArray
 
-Floating = npt.NDArray[np.floating[Any]]
+if TYPE_CHECKING:
+    from spikeloom.compiler.layer_kernel import Raster, Synapses
 
 BATCH = 8
-"""Recordings that run together: one layer's membranes then stay in cache."""
-
-DENORMAL = 1e-30
-"""Membranes and currents below this are flushed to zero; beside a threshold they are nothing."""
+"""Recordings that run together, on one core."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,22 +42,172 @@ class Activity:
     """Spikes of each population, and the values that were compared with the threshold."""
 
     spikes: tuple[BoolArray, ...]  # One array per population, all aligned with the data
-    # Membrane before the reset; float64 in model units, or int64 register values
+    # Membrane before the reset; floats in model units, or int64 register values
     membranes: tuple[npt.NDArray[Any], ...] | None
 
 
-def product(weight: Sparse, spikes: BoolArray, dtype: npt.DTypeLike) -> Floating:
-    """Synaptic sums of every step, (samples, steps, post) of `dtype`, from (samples, steps, pre) spikes."""
-    samples, steps, n_pre = spikes.shape
-    dense = weight.toarray().astype(dtype)
-    sums: Floating = spikes.reshape(samples * steps, n_pre).astype(dtype) @ dense.T
-    return sums.reshape(samples, steps, -1)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Layer:
+    """A population ready to run: it receives from `pres`, and from itself if it is recurrent."""
+
+    pres: tuple[int, ...]
+    size: int
+    kernel: Callable[..., None]
+    fixed: tuple[Any, ...]  # What the kernel takes between the raster of `pres` and what it fills
+
+    def run(
+        self, sources: Sequence[BoolArray], *, membranes: bool = False
+    ) -> tuple[BoolArray, npt.NDArray[Any] | None]:
+        """Spikes, and membranes, of recordings from the spikes of `pres`, all (samples, steps, neurons)."""
+        shape = *sources[0].shape[:2], self.size
+        spikes, kept = np.empty(shape, np.bool_), np.empty(shape if membranes else _NONE, self._kind)
+        self.kernel(raster(sources), *self.fixed, spikes.view(np.uint8), kept, *_compared(None, self.size))
+        return spikes, kept if membranes else None
+
+    def moved(self, sources: Raster, wanted: BoolArray) -> IntArray:
+        """Entries of each neuron in which the spikes differ from those `wanted`, (samples, steps, neurons)."""
+        spikes, (theirs, moved) = np.empty(wanted.shape, np.uint8), _compared(wanted, self.size)
+        self.kernel(sources, *self.fixed, spikes, np.empty(_NONE, self._kind), theirs, moved)
+        return moved
+
+    @property
+    def _kind(self) -> np.dtype[Any]:
+        bias: npt.NDArray[Any] = self.fixed[2]
+        return bias.dtype
 
 
-def integer_sums(weight: Sparse, spikes: BoolArray) -> Floating:
-    """Exact synaptic sums of integer weights, in a floating type that holds each of them; (samples, steps, n_post)."""
-    largest = int(abs(weight).sum(axis=1).max(initial=0))
-    return product(weight, spikes, np.float32 if largest < 2**24 else np.float64)
+_NONE = (0, 0, 0)
+
+
+def _compared(wanted: BoolArray | None, size: int) -> tuple[npt.NDArray[np.uint8], IntArray]:
+    theirs = np.empty(_NONE, np.uint8) if wanted is None else np.ascontiguousarray(wanted).view(np.uint8)
+    return theirs, np.zeros(size, np.int64)
+
+
+def raster(sources: Sequence[BoolArray]) -> Raster:
+    """Spikes of several populations, (samples, steps, neurons) each, as a layer's kernel reads them."""
+    from spikeloom.compiler.layer_kernel import raster_of
+
+    return raster_of(sources[0] if len(sources) == 1 else np.concatenate(sources, axis=2))
+
+
+def float_layer(
+    population: Population, projections: Sequence[Projection], dtype: npt.DTypeLike = np.float64, *, loops: bool = True
+) -> Layer:
+    """A float population with all projections to it, in the arithmetic of `dtype`.
+
+    Without `loops` what it receives from itself comes from outside, too, as from other populations.
+    """
+    from spikeloom.compiler import layer_kernel
+
+    kind = np.dtype(dtype).type
+    constants = (kind(value) for value in (population.alpha, population.beta, population.theta))
+    pres, synapses = _synapses([(p, p.weight) for p in projections], dtype, loops=loops)
+    fixed = *synapses, population.bias.astype(dtype), *constants
+    return Layer(pres=pres, size=population.size, kernel=layer_kernel.float_layer, fixed=fixed)
+
+
+def integer_layer(
+    population: IntegerPopulation,
+    projections: Sequence[IntegerProjection],
+    *,
+    saturates: bool = True,
+    loops: bool = True,
+) -> Layer:
+    """A population on the chip with all projections to it; the machine's ``spec`` holds the definition.
+
+    With `saturates` off the membrane has no limits, which tells what saturation does; `loops` as of
+    :func:`float_layer`.
+    """
+    from spikeloom.compiler import layer_kernel
+
+    keep_u, keep_v = (round(kept * DECAY_ONE) for kept in (population.realised_alpha, population.realised_beta))
+    weights = [(p, p.effective()) for p in projections]
+    largest = sum(abs(weight).sum(axis=1).max(initial=0) for _, weight in weights) << MEMBRANE_SHIFT
+    largest += MEMBRANE_MAX + int(abs(population.bias).max(initial=0))
+    # 32 bits are as exact, and twice as fast, where membranes have limits and no current outlasts its step
+    dtype = np.int32 if saturates and not keep_u and largest < 2**31 else np.int64
+    limit = MEMBRANE_MAX if saturates else 2**62
+    pres, synapses = _synapses(weights, dtype, loops=loops)
+    threshold = (population.threshold << MEMBRANE_SHIFT).astype(dtype)
+    fixed = *synapses, population.bias.astype(dtype), threshold, *(dtype(value) for value in (keep_u, keep_v, limit))
+    return Layer(pres=pres, size=population.size, kernel=layer_kernel.integer_layer, fixed=fixed)
+
+
+def _synapses(
+    weights: Sequence[tuple[Any, Sparse]], dtype: npt.DTypeLike, *, loops: bool
+) -> tuple[tuple[int, ...], tuple[Synapses, Synapses]]:
+    """Presynaptic populations; weights from these, and from the population itself, all planes together."""
+    from spikeloom.compiler.layer_kernel import by_source, no_synapses
+
+    merged: dict[int, Sparse] = {}
+    for projection, weight in weights:
+        merged[projection.pre] = merged[projection.pre] + weight if projection.pre in merged else weight
+    own = merged.pop(weights[0][0].post, None) if loops and weights else None
+    itself = no_synapses(dtype) if own is None else by_source([own], dtype)
+    return tuple(merged), (by_source(list(merged.values()), dtype), itself)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Simulation:
+    """A network ready to run."""
+
+    layers: tuple[Layer, ...]
+
+    def run(self, events: BoolArray, *, membranes: bool = False) -> Activity:
+        """Run recordings (samples, steps, channels), each from rest, some at a time on all cores."""
+
+        def batch(start: int) -> list[tuple[BoolArray, npt.NDArray[Any] | None]]:
+            done: list[tuple[BoolArray, npt.NDArray[Any] | None]] = []
+            for layer in self.layers:
+                sources = [events[start : start + BATCH] if pre == INPUT else done[pre][0] for pre in layer.pres]
+                done.append(layer.run(sources, membranes=membranes))
+            return done
+
+        by_layer = list(zip(*threads().map(batch, range(0, len(events), BATCH)), strict=True))
+        spikes = tuple(np.concatenate([spikes for spikes, _ in layer]) for layer in by_layer)
+        kept = [np.concatenate([kept for _, kept in layer if kept is not None]) for layer in by_layer if membranes]
+        return Activity(spikes=spikes, membranes=tuple(kept) if membranes else None)
+
+
+@cache
+def threads() -> ThreadPoolExecutor:
+    """One for each core, started once."""
+    return ThreadPoolExecutor(os.cpu_count())
+
+
+def float_simulation(network: Network, dtype: npt.DTypeLike = np.float64) -> Simulation:
+    """The float stage, in the arithmetic of `dtype`."""
+    return Simulation(
+        layers=tuple(
+            float_layer(population, [p for p in network.projections if p.post == post], dtype)
+            for post, population in enumerate(network.populations)
+        )
+    )
+
+
+def integer_simulation(network: IntegerNetwork, *, saturates: bool = True) -> Simulation:
+    """The integer stage; `saturates` as of :func:`integer_layer`."""
+    return Simulation(
+        layers=tuple(
+            integer_layer(population, [p for p in network.projections if p.post == post], saturates=saturates)
+            for post, population in enumerate(network.populations)
+        )
+    )
+
+
+def run_float(
+    network: Network, events: BoolArray, *, dtype: npt.DTypeLike = np.float64, membranes: bool = False
+) -> Activity:
+    """Run the float stage on events (samples, steps, channels), in the arithmetic of `dtype`."""
+    return float_simulation(network, dtype).run(events, membranes=membranes)
+
+
+def run_integer(
+    network: IntegerNetwork, events: BoolArray, *, membranes: bool = False, saturates: bool = True
+) -> Activity:
+    """Run the integer stage, aligned with the data; membranes are register values."""
+    return integer_simulation(network, saturates=saturates).run(events, membranes=membranes)
 
 
 def step_late(spikes: BoolArray) -> BoolArray:
@@ -73,158 +221,6 @@ def step_late(spikes: BoolArray) -> BoolArray:
     late = np.zeros_like(spikes)
     late[:, 1:] = spikes[:, :-1]
     return late
-
-
-def float_recurrence(
-    population: Population, sums: Floating, *, own: Floating | None = None, membranes: bool = False
-) -> tuple[BoolArray, Floating | None]:
-    """LIF of the definition in :class:`ir.Population` on given synaptic sums, in their type.
-
-    `sums` is overwritten. `own` (neurons, neurons), of the same type, is from each neuron (row) of a recurrent
-    population to each.
-    """
-    bias = population.bias.astype(sums.dtype)
-    alpha, beta, theta = (sums.dtype.type(value) for value in (population.alpha, population.beta, population.theta))
-    in_steps = own is not None or population.alpha > 0  # else all steps get their bias at once
-    current = sums
-    if not in_steps:
-        current += bias
-    held, u = np.zeros((2, *current[:, 0].shape), current.dtype)
-    spikes = np.empty(current.shape, np.bool_)
-    kept = np.empty_like(current) if membranes else None
-    for step in range(current.shape[1]):
-        if in_steps:
-            held *= alpha
-            held += current[:, step]
-            if own is not None and step:
-                held += spikes[:, step - 1].astype(held.dtype) @ own
-            np.add(held, bias, out=current[:, step])
-        u *= beta
-        u += current[:, step]
-        fired = np.greater(u, theta, out=spikes[:, step])
-        if kept is not None:
-            kept[:, step] = u
-        u *= ~fired
-        if step % 16 == 15:
-            # What decays ends in denormals, which cost a hundred times a normal operation.
-            u[np.abs(u) < DENORMAL] = 0
-            if in_steps:
-                held[np.abs(held) < DENORMAL] = 0
-    return spikes, kept
-
-
-def integer_recurrence(
-    population: IntegerPopulation,
-    sums: Floating,
-    *,
-    own: Floating | None = None,
-    membranes: bool = False,
-    saturates: bool = True,
-) -> tuple[BoolArray, IntArray | None]:
-    """The chip's compartment on given synaptic sums (in weight units); the machine's ``spec`` holds the definition.
-
-    Runs in float64, exactly: registers times a 12-bit factor stay below 2**36, a product with 2**-12 only moves the
-    point, and truncation is the chip's rounding toward zero. With `saturates` off the membrane has no limits, which
-    tells what saturation does. `own` as in :func:`float_recurrence`, in weight units.
-    """
-    spikes = np.empty(sums.shape, np.bool_)
-    kept = np.empty(sums.shape, np.int64) if membranes else None
-    threshold = (population.threshold << MEMBRANE_SHIFT).astype(np.float64)
-    bias = population.bias.astype(np.float64)
-    keep_u, keep_v = population.realised_alpha, population.realised_beta
-    u = np.zeros(sums.shape[::2])
-    v = np.zeros_like(u)
-    inflow = np.empty_like(u)
-    for step in range(sums.shape[1]):
-        arrived = sums[:, step]
-        if own is not None and step:
-            arrived = arrived + spikes[:, step - 1].astype(own.dtype) @ own
-        np.multiply(arrived, 1 << MEMBRANE_SHIFT, out=inflow)
-        if keep_u:
-            u *= keep_u
-            np.trunc(u, out=u)
-            u += inflow
-        else:
-            u = inflow
-        v *= keep_v
-        np.trunc(v, out=v)
-        v += u
-        v += bias
-        if saturates:
-            np.clip(v, -MEMBRANE_MAX, MEMBRANE_MAX, out=v)
-        fired = np.greater(v, threshold, out=spikes[:, step])
-        if kept is not None:
-            kept[:, step] = v
-        v *= ~fired
-    return spikes, kept
-
-
-def run_float(
-    network: Network, events: BoolArray, *, dtype: npt.DTypeLike = np.float64, membranes: bool = False
-) -> Activity:
-    """Run the float stage on events (samples, steps, channels), in the arithmetic of `dtype`."""
-
-    def layer(post: int, sums: Floating, own: Floating | None) -> tuple[BoolArray, Floating | None]:
-        return float_recurrence(network.populations[post], sums, own=own, membranes=membranes)
-
-    own = _own_weights(network, lambda p: p.weight, dtype)
-    return _run(network, events, lambda p, spikes: product(p.weight, spikes, dtype), layer, own)
-
-
-def run_integer(
-    network: IntegerNetwork, events: BoolArray, *, membranes: bool = False, saturates: bool = True
-) -> Activity:
-    """Run the integer stage, aligned with the data; membranes are register values."""
-
-    def layer(post: int, sums: Floating, own: Floating | None) -> tuple[BoolArray, IntArray | None]:
-        return integer_recurrence(network.populations[post], sums, own=own, membranes=membranes, saturates=saturates)
-
-    own = _own_weights(network, IntegerProjection.effective, np.float64)
-    return _run(network, events, lambda p, spikes: integer_sums(p.effective(), spikes), layer, own)
-
-
-def _own_weights(
-    network: Network | IntegerNetwork, weight_of: Callable[[Any], Sparse], dtype: npt.DTypeLike
-) -> list[Floating | None]:
-    """Weights of each population to itself, (from, to), all planes together; None if it is not recurrent."""
-    found: list[Floating | None] = [None] * len(network.populations)
-    for p in network.projections:
-        if p.pre == p.post:
-            weight, before = np.ascontiguousarray(weight_of(p).toarray().astype(dtype).T), found[p.post]
-            found[p.post] = weight if before is None else before + weight
-    return found
-
-
-def _run(
-    network: Network | IntegerNetwork,
-    events: BoolArray,
-    sums_of: Callable[[Any, BoolArray], Floating],
-    layer: Callable[[int, Floating, Floating | None], tuple[BoolArray, npt.NDArray[Any] | None]],
-    own: list[Floating | None],
-) -> Activity:
-    """Run batch by batch on all cores, population by population."""
-
-    def batch(part: BoolArray) -> list[tuple[BoolArray, npt.NDArray[Any] | None]]:
-        done: list[tuple[BoolArray, npt.NDArray[Any] | None]] = []
-        for post in range(len(network.populations)):
-            sums: Floating | None = None
-            for projection in network.projections:
-                if projection.post == post != projection.pre:
-                    source = part if projection.pre == INPUT else done[projection.pre][0]
-                    more = sums_of(projection, source)
-                    sums = more if sums is None else sums + more
-            assert sums is not None, "verify: every population is reached"
-            done.append(layer(post, sums, own[post]))
-        return done
-
-    parts = [events[i : i + BATCH] for i in range(0, len(events), BATCH)]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        results = list(pool.map(batch, parts))
-    spikes = tuple(np.concatenate([result[i][0] for result in results]) for i in range(len(network.populations)))
-    if any(trace is None for _, trace in results[0]):
-        return Activity(spikes=spikes, membranes=None)
-    traces = [np.concatenate([np.asarray(r[i][1]) for r in results]) for i in range(len(network.populations))]
-    return Activity(spikes=spikes, membranes=tuple(traces))
 
 
 def channels_last(events: npt.NDArray[Any], clocks: Clocks = NO_CLOCKS) -> BoolArray:

@@ -27,8 +27,8 @@ from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import INPUT, depths, fan_in
 from spikeloom.compiler.passes.expand import Factored, expand, hop_powers, synapses
 from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, removable, removals
+from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.pipeline import run
-from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets import base
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds

@@ -39,7 +39,7 @@ from spikeloom.compiler.interpret import run_float, run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import Form, one_sided
 from spikeloom.compiler.passes.calibrate import calibrate, evenly_spaced
-from spikeloom.compiler.range_proof import prove_ranges
+from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.targets.loihi1.storage import choose_storage as choice_module
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import round_population

@@ -15,7 +15,7 @@ from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import Form, one_sided
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.range_proof import prove_ranges
+from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.compiler.targets.loihi1.storage.compensate import DAMPING, _round_in_turn, compensated

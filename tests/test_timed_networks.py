@@ -27,7 +27,7 @@ from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.ir import Input
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.passes.prune import never_fires
-from spikeloom.compiler.range_proof import prove_ranges
+from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.models.networks.reference import float_spikes

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.interpret import run_float, step_late
+from spikeloom.compiler.interpret import BATCH, Layer, raster, run_float, step_late, threads
 from spikeloom.compiler.ir import INPUT, Network
-from spikeloom.compiler.types import BoolArray
+from spikeloom.compiler.types import BoolArray, IntArray
 
 FEW = 32
 """Recordings on which storage is chosen, evenly spaced over the split: eight thousand steps a neuron."""
@@ -28,11 +28,20 @@ class Calibration:
     events: BoolArray  # (samples, steps, channels) bool; input events
     spikes: tuple[BoolArray, ...]  # Spikes of each population
 
-    def source(self, pre: int, post: int) -> BoolArray:
+    def source(self, pre: int, post: int, rows: slice = slice(None)) -> BoolArray:
         """What a projection brings in each step: spikes of its source population, its own a step late, or events."""
         if pre == INPUT:
-            return self.events
-        return step_late(self.spikes[pre]) if pre == post else self.spikes[pre]
+            return self.events[rows]
+        return step_late(self.spikes[pre][rows]) if pre == post else self.spikes[pre][rows]
+
+    def moved(self, layer: Layer, post: int) -> IntArray:
+        """Spikes of each neuron in which a layer without loops differs from population `post`, given its input."""
+
+        def part(start: int) -> IntArray:
+            rows = slice(start, start + BATCH)
+            return layer.moved(raster([self.source(pre, post, rows) for pre in layer.pres]), self.spikes[post][rows])
+
+        return np.sum(list(threads().map(part, range(0, len(self.events), BATCH))), axis=0)  # type: ignore[no-any-return]
 
 
 def evenly_spaced(events: BoolArray, count: int = FEW) -> BoolArray:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection, Network, Sparse, row_parts, with_data
 from spikeloom.compiler.passes.calibrate import Calibration
-from spikeloom.compiler.range_proof import settled
+from spikeloom.compiler.passes.range_proof import settled
 from spikeloom.compiler.types import FloatArray, IntArray
 
 Mask = npt.NDArray[np.bool_]

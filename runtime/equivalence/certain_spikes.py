@@ -20,8 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.interpret import BATCH, DENORMAL, channels_last
+from spikeloom.compiler.interpret import BATCH, channels_last
 from spikeloom.compiler.ir import INPUT, Network, Population
+from spikeloom.compiler.layer_kernel import DENORMAL
 from spikeloom.compiler.passes.expand import Factored, effective_weight, expand, stack_of
 from spikeloom.compiler.systems import TACTILESGNET, in_order
 from spikeloom.compiler.types import BoolArray, FloatArray

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from spikeloom.compiler.interpret import cut
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.expand import Factored
-from spikeloom.compiler.range_proof import prove_ranges
+from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.equivalence.certain_spikes import certain_spikes
 from spikeloom.runtime.machines.votes import readout_counts

@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler import Netlist
-from spikeloom.compiler.interpret import DENORMAL
 from spikeloom.compiler.ir import INPUT, Network, Projection
+from spikeloom.compiler.layer_kernel import DENORMAL
 from spikeloom.compiler.types import IntArray
 
 Floats = npt.NDArray[np.float32]

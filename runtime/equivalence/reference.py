@@ -25,7 +25,7 @@ from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.interpret import channels_last, cut, run_float, run_integer
 from spikeloom.compiler.ir import IntegerNetwork, Network, Projection, Readout, Sparse
 from spikeloom.compiler.passes.expand import Factored, expand
-from spikeloom.compiler.range_proof import prove_ranges
+from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings

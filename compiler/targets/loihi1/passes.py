@@ -14,8 +14,8 @@ from spikeloom.compiler.passes import expand, prune
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.passes.prune import Masks, Removal
+from spikeloom.compiler.passes.range_proof import RangeProof, prove_ranges
 from spikeloom.compiler.pipeline import Pass, run
-from spikeloom.compiler.range_proof import RangeProof, prove_ranges
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.choose import Layout, lay_out

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX
 from spikeloom.compiler.passes.prune import Removal
-from spikeloom.compiler.range_proof import RangeProof
+from spikeloom.compiler.passes.range_proof import RangeProof
 from spikeloom.compiler.targets.loihi1.layout import choose
 from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation
 from spikeloom.compiler.targets.loihi1.layout.place import Placement

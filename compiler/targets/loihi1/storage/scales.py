@@ -5,11 +5,8 @@ Nothing here looks at the rest of the network; :mod:`storage.choose_storage` cho
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 
@@ -24,8 +21,8 @@ from spikeloom.compiler.fixedpoint import (
     step_units,
     weight_step,
 )
-from spikeloom.compiler.interpret import BATCH, integer_recurrence, integer_sums
-from spikeloom.compiler.ir import Form, IntegerPopulation, IntegerProjection, Network, Population, Projection, Sparse
+from spikeloom.compiler.interpret import integer_layer
+from spikeloom.compiler.ir import Form, IntegerPopulation, IntegerProjection, Network, Population, Projection
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.options import Packing
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, round_population
@@ -110,30 +107,9 @@ def _relays_follow(population: Population, integer: IntegerPopulation, planes: t
     return bool(np.all(weight > integer.threshold[first:]))
 
 
-def in_batches(calibration: Calibration, measure: Callable[[slice], IntArray | FloatArray]) -> list[FloatArray]:
-    """Measure something on batches of calibration recordings, on all cores."""
-    parts = [slice(start, start + BATCH) for start in range(0, len(calibration.events), BATCH)]
-    return [np.asarray(part, np.float64) for part in _threads().map(measure, parts)]
-
-
-@cache
-def _threads() -> ThreadPoolExecutor:
-    """Started once: a layer is measured hundreds of times."""
-    return ThreadPoolExecutor(os.cpu_count())
-
-
 def flips(layer: Rounded, post: int, calibration: Calibration) -> IntArray:
     """Calibration spikes of each neuron that differ from float64, the layer given the float model's own input."""
-    merged: dict[int, Sparse] = {}  # planes of one source carry the same spikes
-    for p in layer.projections:
-        merged[p.pre] = merged[p.pre] + p.effective() if p.pre in merged else p.effective()
-
-    def moved(part: slice) -> IntArray:
-        sums = sum(integer_sums(weight, calibration.source(pre, post)[part]) for pre, weight in merged.items())
-        spikes, _ = integer_recurrence(layer.population, np.asarray(sums))
-        return np.asarray(np.count_nonzero(spikes != calibration.spikes[post][part], axis=(0, 1)))
-
-    return np.asarray(np.sum(in_batches(calibration, moved), axis=0), np.int64)
+    return calibration.moved(integer_layer(layer.population, layer.projections, loops=False), post)
 
 
 def planes_from(exponent: int, bits: int, planes: int, largest: int) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, decay_registers, kept_shares, reach, step_units
-from spikeloom.compiler.interpret import float_recurrence, product
+from spikeloom.compiler.interpret import float_layer
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.calibrate import Calibration, fewer
 from spikeloom.compiler.targets.base import Target
@@ -29,7 +29,6 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     Rounded,
     finest_thresholds,
     flips,
-    in_batches,
     layer_of,
 )
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
@@ -126,12 +125,4 @@ def _decay_flips(layer: FloatLayer, calibration: Calibration) -> int:
     """Spikes that move if nothing but the decays is rounded."""
     alpha, beta = kept_shares(*decay_registers(layer.population.beta, layer.population.alpha))
     realised = replace(layer.population, alpha=alpha, beta=beta)
-    wanted = calibration.spikes[layer.post]
-    sources = [(p.weight, calibration.source(p.pre, layer.post)) for p in layer.projections]
-
-    def moved(part: slice) -> IntArray:
-        sums = sum(product(weight, spikes[part], np.float64) for weight, spikes in sources)
-        spikes, _ = float_recurrence(realised, np.asarray(sums))
-        return np.asarray(np.count_nonzero(spikes != wanted[part]))
-
-    return int(np.sum(in_batches(calibration, moved)))
+    return int(calibration.moved(float_layer(realised, layer.projections, loops=False), layer.post).sum())

@@ -1,0 +1,244 @@
+"""A layer of neurons driven by its events: what :mod:`interpret` means, as machine code and without a dense product.
+
+A spike adds the weights that it has, source by source, those of the layer itself after all others. A step costs as much
+as the spikes that arrive in it, and a pass over the neurons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT
+from spikeloom.compiler.ir import Sparse
+from spikeloom.compiler.types import BoolArray, IntArray
+
+AnyArray = npt.NDArray[Any]
+
+DENORMAL = 1e-30
+"""Membranes and currents below this are flushed to zero; beside a threshold they are nothing."""
+
+
+GAP = 16
+"""Targets this near are joined in one run, with weights of zero in between: a vector costs no more than a weight."""
+
+
+class Synapses(NamedTuple):
+    """Weights by source: bounds of each source's runs of neighbouring targets; of each run the first target and weight.
+
+    Shapes: (sources + 1,), (runs,), (runs + 1,) and (synapses,).
+    """
+
+    run: IntArray
+    target: IntArray
+    offset: IntArray
+    weight: AnyArray
+
+
+class Raster(NamedTuple):
+    """Who spiked in each step of recordings that follow each other: sources, and their bounds, (all steps + 1,)."""
+
+    source: npt.NDArray[np.int32]
+    bounds: IntArray
+
+
+def by_source(weights: Sequence[Sparse], dtype: npt.DTypeLike) -> Synapses:
+    """Synapses of one population (rows) from the neurons of several (columns), which are numbered one after another."""
+    stacked = weights[0] if len(weights) == 1 else sparse.hstack(weights, format="csr")
+    columns = sparse.csc_array(stacked)
+    source = np.repeat(np.arange(columns.shape[1]), np.diff(columns.indptr))
+    distance = np.diff(columns.indices, prepend=0)
+    begins = (distance < 1) | (distance > GAP) | (np.diff(source, prepend=-1) != 0)
+    at = np.cumsum(np.where(begins, 1, distance)) - 1
+    weight = np.zeros(at[-1] + 1 if len(at) else 0, dtype)
+    weight[at] = columns.data
+    first = np.flatnonzero(begins)
+    run = np.searchsorted(first, columns.indptr)
+    return Synapses(run, columns.indices[first].astype(np.int64), np.append(at[first], len(weight)), weight)
+
+
+def no_synapses(dtype: npt.DTypeLike) -> Synapses:
+    """Of no source."""
+    none = np.zeros(0, np.int64)
+    return Synapses(none, none, none, np.zeros(0, dtype))
+
+
+def raster_of(spikes: BoolArray) -> Raster:
+    """List spikes (recordings, steps, sources)."""
+    recordings, steps, sources = spikes.shape
+    at, begins = np.flatnonzero(spikes), np.arange(recordings * steps + 1) * sources
+    bounds = np.searchsorted(at, begins)
+    return Raster((at - np.repeat(begins[:-1], np.diff(bounds))).astype(np.int32), bounds)
+
+
+# Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the loops.
+
+
+@numba.njit(nogil=True)
+def _add(total: Any, first: Any, weight: Any, begin: Any, length: Any) -> None:
+    # unsigned, so that no index may count from the end: only then is the loop vectorised
+    for i in range(np.uint64(length)):
+        total[np.uint64(first) + i] += weight[np.uint64(begin) + i]
+
+
+@numba.njit(nogil=True)
+def arrive(total: Any, synapses: Any, source: Any, begin: Any, end: Any) -> None:
+    """Add the weights of some sources to the sums of their targets."""
+    run, target, offset, weight = synapses  # an array taken out of a tuple costs as much as some synapses
+    for event in range(begin, end):
+        for r in range(run[source[event]], run[source[event] + 1]):
+            _add(total, target[r], weight, offset[r], offset[r + 1] - offset[r])
+
+
+@numba.njit(nogil=True)
+def _list(fired: Any, listed: Any) -> Any:
+    n = 0
+    for neuron in range(len(fired)):
+        if fired[neuron]:
+            listed[n] = neuron
+            n += 1
+    return n
+
+
+@numba.njit(nogil=True)
+def _keep(values: Any, factor: Any) -> None:
+    for i in range(len(values)):
+        values[i] *= factor
+
+
+@numba.njit(nogil=True)
+def flush(values: Any, least: Any) -> None:
+    """Set what is nearly zero to zero: decay ends in denormals, which cost a hundred times a normal operation."""
+    zero = values.dtype.type(0)
+    for i in range(len(values)):
+        values[i] = zero if abs(values[i]) < least else values[i]
+
+
+@numba.njit(nogil=True)
+def _differ(fired: Any, wanted: Any, moved: Any) -> None:
+    for i in range(len(moved)):
+        moved[i] += fired[i] != wanted[i]
+
+
+@numba.njit(nogil=True)
+def _integrate_float(membrane: Any, current: Any, bias: Any, beta: Any, theta: Any, fired: Any) -> None:
+    zero = membrane.dtype.type(0)
+    for i in range(len(bias)):
+        u = (zero if membrane[i] > theta else membrane[i] * beta) + (current[i] + bias[i])
+        membrane[i] = u
+        fired[i] = u > theta
+
+
+@numba.njit(nogil=True, cache=True)
+def float_layer(
+    raster: Any,
+    synapses: Any,
+    own: Any,
+    bias: Any,
+    alpha: Any,
+    beta: Any,
+    theta: Any,
+    fired: Any,
+    membranes: Any,
+    wanted: Any,
+    moved: Any,
+) -> None:
+    """Run the recordings of a raster in the float type of all arguments, each from rest.
+
+    `fired` (recordings, steps, neurons) uint8 is filled, and `membranes`, likewise and before the reset, unless it is
+    empty. Unless `wanted`, shaped as `fired`, is empty, the entries in which each neuron differs from it are added to
+    `moved` (neurons,).
+    """
+    recordings, steps, size = fired.shape
+    before = np.empty(size, np.int32)
+    membrane, current = np.zeros(size, bias.dtype), np.zeros(size, bias.dtype)
+    least = bias.dtype.type(DENORMAL)
+    for recording in range(recordings):
+        membrane[:] = 0
+        current[:] = 0
+        for t in range(steps):
+            if alpha:
+                _keep(current, alpha)
+            else:
+                current[:] = 0
+            at = recording * steps + t
+            arrive(current, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
+            if len(own.run) and t:
+                arrive(current, own, before, 0, _list(fired[recording, t - 1], before))
+            _integrate_float(membrane, current, bias, beta, theta, fired[recording, t])
+            if len(membranes):
+                membranes[recording, t] = membrane
+            if len(wanted):
+                _differ(fired[recording, t], wanted[recording, t], moved)
+            if t % 16 == 15:
+                flush(membrane, least)
+                flush(current, least)
+
+
+@numba.njit(nogil=True)
+def _integrate_integer(
+    membrane: Any, current: Any, sums: Any, bias: Any, threshold: Any, keep_u: Any, keep_v: Any, limit: Any, fired: Any
+) -> None:
+    # every result is cast: otherwise they are 64 bits wide, and half as many fit a vector
+    kind = membrane.dtype.type
+    zero, low = kind(0), kind(2**DECAY_BITS - 1)
+    for i in range(len(bias)):
+        arrived = kind(sums[i] << MEMBRANE_SHIFT)
+        if keep_u:
+            magnitude = kind(abs(current[i]))
+            high, rest = kind(magnitude >> DECAY_BITS), kind(magnitude & low)
+            kept = kind(kind(high * keep_u) + kind(kind(rest * keep_u) >> DECAY_BITS))
+            arrived = kind(arrived + (kind(-kept) if current[i] < zero else kept))
+            current[i] = arrived
+        magnitude = kind(abs(membrane[i]))
+        high, rest = kind(magnitude >> DECAY_BITS), kind(magnitude & low)
+        kept = kind(kind(high * keep_v) + kind(kind(rest * keep_v) >> DECAY_BITS))
+        kept = kind(-kept) if membrane[i] < zero else kept
+        v = kind(kind((zero if membrane[i] > threshold[i] else kept) + arrived) + bias[i])
+        v = kind(min(max(v, kind(-limit)), limit))
+        membrane[i] = v
+        fired[i] = v > threshold[i]
+
+
+@numba.njit(nogil=True, cache=True)
+def integer_layer(
+    raster: Any,
+    synapses: Any,
+    own: Any,
+    bias: Any,
+    threshold: Any,
+    keep_u: Any,
+    keep_v: Any,
+    limit: Any,
+    fired: Any,
+    membranes: Any,
+    wanted: Any,
+    moved: Any,
+) -> None:
+    """Run the recordings of a raster in registers of the integer type of all arguments, each from rest.
+
+    `bias` and `threshold` are in membrane units, `keep_u` and `keep_v` in 1/4096, and no membrane passes `limit`. What
+    is filled is as for :func:`float_layer`.
+    """
+    recordings, steps, size = fired.shape
+    before = np.empty(size, np.int32)
+    membrane, current, sums = np.zeros(size, bias.dtype), np.zeros(size, bias.dtype), np.zeros(size, bias.dtype)
+    for recording in range(recordings):
+        membrane[:] = 0
+        current[:] = 0
+        for t in range(steps):
+            sums[:] = 0
+            at = recording * steps + t
+            arrive(sums, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
+            if len(own.run) and t:
+                arrive(sums, own, before, 0, _list(fired[recording, t - 1], before))
+            _integrate_integer(membrane, current, sums, bias, threshold, keep_u, keep_v, limit, fired[recording, t])
+            if len(membranes):
+                membranes[recording, t] = membrane
+            if len(wanted):
+                _differ(fired[recording, t], wanted[recording, t], moved)
