@@ -64,8 +64,11 @@ class Layer:
         self.kernel(raster(sources), *self.fixed, spikes.view(np.uint8), kept, *_compared(None, self.size))
         return spikes, kept if membranes else None
 
-    def moved(self, sources: Raster, wanted: BoolArray) -> IntArray:
-        """Entries of each neuron in which the spikes differ from those `wanted`, (samples, steps, neurons)."""
+    def moved(self, sources: Raster, wanted: BoolArray) -> npt.NDArray[np.int32]:
+        """Entries of each neuron that differ from those `wanted`, (samples, steps, neurons), and spikes more than there.
+
+        The shape is (2, neurons).
+        """
         spikes, (theirs, moved) = np.empty(wanted.shape, np.uint8), _compared(wanted, self.size)
         self.kernel(sources, *self.fixed, spikes, np.empty(_NONE, self._kind), theirs, moved)
         return moved
@@ -79,9 +82,9 @@ class Layer:
 _NONE = (0, 0, 0)
 
 
-def _compared(wanted: BoolArray | None, size: int) -> tuple[npt.NDArray[np.uint8], IntArray]:
+def _compared(wanted: BoolArray | None, size: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int32]]:
     theirs = np.empty(_NONE, np.uint8) if wanted is None else np.ascontiguousarray(wanted).view(np.uint8)
-    return theirs, np.zeros(size, np.int64)
+    return theirs, np.zeros((2, size), np.int32)
 
 
 def raster(sources: Sequence[BoolArray]) -> Raster:

@@ -235,10 +235,12 @@ def one_sided(projections: Iterable[IntegerProjection], neurons: int) -> tuple[I
         for rows in row_parts(projection.weight):
             ends = projection.weight.indptr[rows.start : rows.stop + 1]
             units = in_units(projection.weight.data[ends[0] : ends[-1]], projection.exponent)
-            row = np.repeat(np.arange(rows.start, rows.stop), np.diff(ends))
-            # float64 sums of integers below 2**53 are exact, and much faster than those of sparse matrices
-            positive += np.bincount(row, np.maximum(units, 0), neurons).astype(np.int64)
-            negative -= np.bincount(row, np.minimum(units, 0), neurons).astype(np.int64)
+            held = np.flatnonzero(np.diff(ends))
+            if len(held):
+                begins = ends[held] - ends[0]
+                up = np.add.reduceat(np.maximum(units, 0), begins, dtype=np.int64)
+                positive[rows.start + held] += up
+                negative[rows.start + held] += up - np.add.reduceat(units, begins, dtype=np.int64)
     return positive, negative
 
 

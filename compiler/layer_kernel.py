@@ -120,9 +120,10 @@ def flush(values: Any, least: Any) -> None:
 
 
 @numba.njit(nogil=True)
-def _differ(fired: Any, wanted: Any, moved: Any) -> None:
+def _compare(fired: Any, wanted: Any, moved: Any, more: Any) -> None:
     for i in range(len(moved)):
         moved[i] += fired[i] != wanted[i]
+        more[i] += np.int32(fired[i]) - np.int32(wanted[i])
 
 
 @numba.njit(nogil=True)
@@ -151,8 +152,8 @@ def float_layer(
     """Run the recordings of a raster in the float type of all arguments, each from rest.
 
     `fired` (recordings, steps, neurons) uint8 is filled, and `membranes`, likewise and before the reset, unless it is
-    empty. Unless `wanted`, shaped as `fired`, is empty, the entries in which each neuron differs from it are added to
-    `moved` (neurons,).
+    empty. Unless `wanted`, shaped as `fired`, is empty, `moved` (2, neurons) int32 counts the entries in which each neuron
+    differs from it, and the spikes that it has more.
     """
     recordings, steps, size = fired.shape
     before = np.empty(size, np.int32)
@@ -174,7 +175,7 @@ def float_layer(
             if len(membranes):
                 membranes[recording, t] = membrane
             if len(wanted):
-                _differ(fired[recording, t], wanted[recording, t], moved)
+                _compare(fired[recording, t], wanted[recording, t], moved[0], moved[1])
             if t % 16 == 15:
                 flush(membrane, least)
                 flush(current, least)
@@ -241,4 +242,4 @@ def integer_layer(
             if len(membranes):
                 membranes[recording, t] = membrane
             if len(wanted):
-                _differ(fired[recording, t], wanted[recording, t], moved)
+                _compare(fired[recording, t], wanted[recording, t], moved[0], moved[1])

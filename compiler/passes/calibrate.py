@@ -5,7 +5,8 @@ The network is not changed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,27 +22,44 @@ MANY = 256
 """Recordings on which the errors of several planes are made to cancel (one plane gains too little from more)."""
 
 
+NUDGES = (0.08, 0.04, 0.02, 0.01)
+"""Shares of its threshold by which a neuron's bias is moved up or down, one after another, where that keeps spikes."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calibration:
     """Spikes of the float64 model on the calibration recordings."""
 
     events: BoolArray  # (samples, steps, channels) bool; input events
     spikes: tuple[BoolArray, ...]  # Spikes of each population
+    rounded: Mapping[int, BoolArray] = field(default_factory=dict)  # Those of populations that were rounded before
 
     def source(self, pre: int, post: int, rows: slice = slice(None)) -> BoolArray:
-        """What a projection brings in each step: spikes of its source population, its own a step late, or events."""
+        """What a projection brings in each step: events, spikes of its source population, its own a step late.
+
+        Of a population that was rounded already they are the chip's.
+        """
         if pre == INPUT:
             return self.events[rows]
-        return step_late(self.spikes[pre][rows]) if pre == post else self.spikes[pre][rows]
+        return step_late(self.spikes[pre][rows]) if pre == post else self.rounded.get(pre, self.spikes[pre])[rows]
 
     def moved(self, layer: Layer, post: int) -> IntArray:
-        """Spikes of each neuron in which a layer without loops differs from population `post`, given its input."""
+        """What a layer without loops does unlike population `post`, given its sources.
+
+        Of each neuron the entries in which its spikes differ, and how many more there are; (2, neurons).
+        """
 
         def part(start: int) -> IntArray:
             rows = slice(start, start + BATCH)
             return layer.moved(raster([self.source(pre, post, rows) for pre in layer.pres]), self.spikes[post][rows])
 
-        return np.sum(list(threads().map(part, range(0, len(self.events), BATCH))), axis=0)  # type: ignore[no-any-return]
+        return np.sum(list(threads().map(part, range(0, len(self.events), BATCH))), axis=0, dtype=np.int64)
+
+    def after(self, layer: Layer, post: int) -> Calibration:
+        """The same where the populations to come receive what population `post` sends as it was rounded."""
+        parts = (slice(start, start + BATCH) for start in range(0, len(self.events), BATCH))
+        ran = threads().map(lambda rows: layer.run([self.source(pre, post, rows) for pre in layer.pres])[0], parts)
+        return replace(self, rounded={**self.rounded, post: np.concatenate(list(ran))})
 
 
 def evenly_spaced(events: BoolArray, count: int = FEW) -> BoolArray:
@@ -53,8 +71,11 @@ def evenly_spaced(events: BoolArray, count: int = FEW) -> BoolArray:
 
 def fewer(calibration: Calibration, count: int = FEW) -> Calibration:
     """A calibration on at most `count` of its recordings, evenly spaced."""
-    spikes = tuple(evenly_spaced(spikes, count) for spikes in calibration.spikes)
-    return Calibration(events=evenly_spaced(calibration.events, count), spikes=spikes)
+    return Calibration(
+        events=evenly_spaced(calibration.events, count),
+        spikes=tuple(evenly_spaced(spikes, count) for spikes in calibration.spikes),
+        rounded={post: evenly_spaced(spikes, count) for post, spikes in calibration.rounded.items()},
+    )
 
 
 def calibrate(network: Network, events: BoolArray) -> Calibration:

@@ -10,7 +10,7 @@ All is judged at the netlist's own scale, threshold / theta of each neuron, so o
 The last two are not so in a layer that was rounded on recordings so that its errors cancel
 (:mod:`storage.compensate`). Which neighbours it took follows from those recordings, which the netlist does not carry.
 Of such a layer it is checked that most weights are the nearest, and that no bias makes up for more than its neuron's
-weights have lost.
+weights have lost, beside what calibration moves it by at most.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from spikeloom.compiler.fixedpoint import (
     step_units,
 )
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection, Network, Projection, Sparse
+from spikeloom.compiler.passes.calibrate import NUDGES
 from spikeloom.compiler.passes.prune import never_fires
 from spikeloom.compiler.types import BoolArray
 from spikeloom.runtime.machines.integer import IntegerMachine
@@ -192,7 +193,8 @@ def _check_layer(
     coarse = 0.5 * (1 << np.maximum(encode_bias(bias)[1], chip.bias_exponent)) * SLACK
     # where no weight was moved, the bias takes up what the nearest ones lose
     slack = compensates and wrong <= MOVED * weights
-    more, less = (lost * (1 << MEMBRANE_SHIFT) * SLACK) if slack else np.zeros((2, wanted.size))
+    nudged = sum(NUDGES) * wanted.theta * unit
+    more, less = (lost * (1 << MEMBRANE_SHIFT) * SLACK + nudged) if slack else np.zeros((2, wanted.size))
     off = chip.bias - bias
     bad = held & ((off > more + coarse) | (-off > less + coarse)) & ~(zeroed[post] & (chip.bias == 0))
     if bad.any():

@@ -1,9 +1,9 @@
 """Round a network to chip integers: choose width, planes and scales of every population.
 
-Spikes change. Which scale is best is decided on the calibration recordings: first by the spikes of a layer that differ
-from the float64 model's when it gets the float model's own input; among the few best by how far the class counts of
-the whole integer network move. Weights are then rounded so that their errors cancel, where that keeps more spikes.
-Without calibration the weights alone decide.
+Spikes change. Which scale is best is decided on the calibration recordings, by the spikes of a layer that differ from
+the float64 model's when it receives what the rounded layers before it send. Weights are then rounded so that their
+errors cancel, where that keeps more spikes, and biases, which are 64 times finer, take up what is left. Without
+calibration the weights alone decide.
 """
 
 from __future__ import annotations
@@ -14,10 +14,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, decay_registers, reach, step_units
-from spikeloom.compiler.interpret import run_integer
-from spikeloom.compiler.ir import Form, IntegerNetwork, Network, Population, row_parts
-from spikeloom.compiler.passes.calibrate import MANY, Calibration, fewer
+from spikeloom.compiler.fixedpoint import (
+    BIAS_EXPONENT_MAX,
+    BIAS_MANTISSA_MAX,
+    MEMBRANE_SHIFT,
+    ONE_STEP_SUM_MAX,
+    decay_registers,
+    encode_bias,
+    reach,
+    step_units,
+)
+from spikeloom.compiler.interpret import integer_layer
+from spikeloom.compiler.ir import Form, IntegerNetwork, IntegerPopulation, Network, Population, row_parts
+from spikeloom.compiler.passes.calibrate import MANY, NUDGES, Calibration, fewer
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.options import Packing, check_packings
 from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
@@ -30,13 +39,14 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     layer_of,
     rounded,
 )
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load, loads
+from spikeloom.compiler.types import FloatArray, IntArray
 
 CLIPPING = tuple(2 ** (k / 4) for k in range(21))
 """Factors by which a scale may exceed the one that just holds the largest weight; larger weights are clipped."""
 
-SHORTLIST, SHORTLIST_RATIO = 3, 1.25
-"""Scales of a layer that are compared within the whole network, and by how much they may exceed the fewest flips."""
+SAMPLE, FINALISTS = 8, 4
+"""Recordings on which all scales of a layer are compared, and how many of them are compared on all recordings."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,8 +83,8 @@ def _counted(stored: Rounded, layer: FloatLayer, *, tried: int) -> Rounded:
     return replace(stored, flips=moved, tried=tried)
 
 
-def shortlist(layer: FloatLayer, packing: Packing, exponents: tuple[int, ...], *, clip: bool = True) -> list[Rounded]:
-    """Scales of one population worth a closer look, best first; a single one without calibration, else ModelError.
+def best_scale(layer: FloatLayer, packing: Packing, exponents: tuple[int, ...], *, clip: bool = True) -> Rounded:
+    """Scale of one population that keeps most calibration spikes; ModelError if there is none.
 
     Without `clip` every weight must fit its planes.
     """
@@ -92,16 +102,19 @@ def shortlist(layer: FloatLayer, packing: Packing, exponents: tuple[int, ...], *
             "or smaller weights"
         )
     tried = len(found)
-    counted = sorted((_counted(stored, layer, tried=tried) for stored in found), key=lambda c: c.fewest)
+    if layer.calibration is not None and tried > FINALISTS:
+        sample = fewer(layer.calibration, SAMPLE)
+        found = sorted(found, key=lambda c: int(flips(c, layer.post, sample).sum()))[:FINALISTS]
+    best = min((_counted(stored, layer, tried=tried) for stored in found), key=lambda c: c.fewest)
     if packing.groups > 1:
-        several = grouped(layer, counted[0], packing.groups, factors[-1])
+        several = grouped(layer, best, packing.groups, factors[-1])
         if several is not None:
-            counted = [min(_counted(several, layer, tried=tried), counted[0], key=lambda c: c.fewest)]
+            best = min(_counted(several, layer, tried=tried), best, key=lambda c: c.fewest)
     if layer.calibration is not None:
-        other = compensated(layer, counted[0].form, layer.calibration)
-        if other is not None and (other := _counted(other, layer, tried=tried)).fewest < counted[0].fewest:
-            counted.insert(0, other)
-    return [c for c in counted[:SHORTLIST] if c.fewest <= SHORTLIST_RATIO * counted[0].fewest]
+        other = compensated(layer, best.form, layer.calibration)
+        if other is not None:
+            best = min(best, _counted(other, layer, tried=tried), key=lambda c: c.fewest)
+    return best
 
 
 def round_with_more(layer: FloatLayer, candidate: Rounded, calibration: Calibration) -> Rounded:
@@ -116,19 +129,30 @@ def round_with_more(layer: FloatLayer, candidate: Rounded, calibration: Calibrat
     return replace(stored, flips=int(flips(stored, layer.post, fewer(many)).sum()), tried=candidate.tried)
 
 
-def settle(network: Network, shortlists: list[list[Rounded]], calibration: Calibration) -> list[Rounded]:
-    """Pick one scale per population, in order, by how far the whole network's class counts move from float64."""
-    wanted = calibration.spikes[network.readout.population].sum(axis=1, dtype=np.int64)
-    chosen = [candidates[0] for candidates in shortlists]
-    for post, candidates in enumerate(shortlists):
-        if len(candidates) > 1:
-            distances = []
-            for trial in candidates:
-                layers = [trial if i == post else kept for i, kept in enumerate(chosen)]
-                spikes = run_integer(assemble(network, layers), calibration.events).spikes[network.readout.population]
-                distances.append(int(np.abs(spikes.sum(axis=1, dtype=np.int64) - wanted).sum()))
-            chosen[post] = candidates[distances.index(min(distances))]
-    return chosen
+def nudged(layer: FloatLayer, stored: Rounded, calibration: Calibration) -> Rounded:
+    """Move the bias of each neuron by what keeps most of its calibration spikes, and their number."""
+    before, relays = stored.population, layer.population.relays
+    unit, most = (before.threshold << MEMBRANE_SHIFT).astype(np.float64), BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX
+    unit[before.size - relays :] = 0  # a relay has no bias
+
+    def at(bias: FloatArray) -> IntegerPopulation:
+        mantissa, exponent = encode_bias(np.clip(bias, -most, most))
+        return replace(before, bias_mantissa=mantissa, bias_exponent=exponent)
+
+    def lost(population: IntegerPopulation) -> IntArray:
+        ready = integer_layer(population, stored.projections, loops=False)
+        differ, more = calibration.moved(ready, layer.post)
+        over = loads(population, stored.projections) > ONE_STEP_SUM_MAX
+        return np.where(over, np.iinfo(np.int64).max, differ + np.abs(more))
+
+    bias, fewest = before.bias.astype(np.float64), lost(before)
+    for share in (sign * nudge for nudge in NUDGES for sign in (1, -1)):
+        trial = bias + share * unit
+        found = lost(at(trial))
+        bias, fewest = np.where(found < fewest, trial, bias), np.minimum(found, fewest)
+    after = at(bias)
+    moved = bool(np.any(after.bias != before.bias))
+    return replace(stored, population=after, compensated=stored.compensated or moved)
 
 
 def assemble(network: Network, layers: Sequence[Rounded]) -> IntegerNetwork:
@@ -190,24 +214,25 @@ def choose_storage(
     populations have no usable scale.
     """
     packings = check_packings(packings, len(network.populations), target)
-    exponents = target.choices["synapse.exponent"]
-    few = None if calibration is None else fewer(calibration)
-    layers = [layer_of(network, post, few) for post in range(len(packings))]
-    shortlists, faults = [], []
-    for layer, packing in zip(layers, packings, strict=True):
+    layers, chosen, faults = [], [], []
+    known = None if calibration is None else fewer(calibration)
+    for post, packing in enumerate(packings):
+        layer = layer_of(network, post, known)
         try:
-            shortlists.append(shortlist(layer, packing, exponents))
+            best = best_scale(layer, packing, target.choices["synapse.exponent"])
         except ModelError as error:
             faults.append(str(error))
+            continue
+        if calibration is not None and known is not None:
+            if packing.planes > 1:
+                best = round_with_more(layer, best, calibration)
+            best = _counted(nudged(layer, best, known), layer, tried=best.tried)
+            known = known.after(integer_layer(best.population, best.projections), post)
+        layers.append(layer)
+        chosen.append(best)
     if faults:
         raise ModelError("\n".join(faults))
-    if calibration is None or few is None:
-        chosen = [candidates[0] for candidates in shortlists]
-    else:
-        settled = zip(layers, settle(network, shortlists, few), packings, strict=True)
-        chosen = [c if packing.planes == 1 else round_with_more(layer, c, calibration) for layer, c, packing in settled]
-    choices = tuple(map(explain_choice, layers, chosen))
-    return assemble(network, chosen), choices
+    return assemble(network, chosen), tuple(map(explain_choice, layers, chosen))
 
 
 def round_to_forms(

@@ -108,8 +108,9 @@ def _relays_follow(population: Population, integer: IntegerPopulation, planes: t
 
 
 def flips(layer: Rounded, post: int, calibration: Calibration) -> IntArray:
-    """Calibration spikes of each neuron that differ from float64, the layer given the float model's own input."""
-    return calibration.moved(integer_layer(layer.population, layer.projections, loops=False), post)
+    """Calibration spikes of each neuron that differ from float64, given what the layers before it send."""
+    moved: IntArray = calibration.moved(integer_layer(layer.population, layer.projections, loops=False), post)[0]
+    return moved
 
 
 def planes_from(exponent: int, bits: int, planes: int, largest: int) -> tuple[int, ...]:

@@ -20,9 +20,9 @@ from spikeloom.compiler.targets.loihi1.options import Packing
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import (
     Choice,
     assemble,
+    best_scale,
     explain_choice,
     round_with_more,
-    shortlist,
 )
 from spikeloom.compiler.targets.loihi1.storage.scales import (
     FloatLayer,
@@ -74,7 +74,7 @@ def make_exact(
         for packing in ladder:
             if packing.planes > 2 and best is not None and not _full_range(layer, best).any():
                 break  # the planes hold every weight already
-            candidate = shortlist(layer, packing, exponents, clip=False)[0]
+            candidate = best_scale(layer, packing, exponents, clip=False)
             moved = candidate.fewest
             tried.append((packing.planes, packing.groups, moved))
             if best is None or moved <= best.fewest:
@@ -125,4 +125,4 @@ def _decay_flips(layer: FloatLayer, calibration: Calibration) -> int:
     """Spikes that move if nothing but the decays is rounded."""
     alpha, beta = kept_shares(*decay_registers(layer.population.beta, layer.population.alpha))
     realised = replace(layer.population, alpha=alpha, beta=beta)
-    return int(calibration.moved(float_layer(realised, layer.projections, loops=False), layer.post).sum())
+    return int(calibration.moved(float_layer(realised, layer.projections, loops=False), layer.post)[0].sum())

@@ -22,15 +22,15 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.options import Packing, check_packings
-from spikeloom.compiler.targets.loihi1.storage.choose_storage import assemble, settle, shortlist
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import assemble, best_scale, choose_storage
 from spikeloom.compiler.targets.loihi1.storage.scales import Rounded, layer_of
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
 Widths = tuple[int, ...]
 """Storage width of each layer."""
 
-Offers = list[dict[int, list[Rounded]]]
-"""Scales worth a closer look of each layer, best first, by width; widest width first."""
+Offers = list[dict[int, Rounded]]
+"""Best scale of each layer by width, widest width first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,7 +150,7 @@ def search_widths(
     def attempt(bits: Widths) -> WidthPoint:
         if bits not in tried:
             tell(f"trying combination {len(tried) + 1}")
-            integer = assemble(network, [offers[post][width][0] for post, width in enumerate(bits)])
+            integer = assemble(network, [offers[post][width] for post, width in enumerate(bits)])
             weights = sum(p.bits * p.weight.count_nonzero() for p in integer.projections)
             tried[bits] = point(bits, integer, -(-int(weights) // target.limit("synapse.word_bits")))
         return tried[bits]
@@ -166,8 +166,8 @@ def search_widths(
     while best := {p.bits for figure in figures for p in widths_front(current.values(), figure)} - built.keys():
         tell(f"building the best of them: {len(built) + len(best)}")
         for bits in sorted(best):
-            scales = settle(network, [offers[post][width] for post, width in enumerate(bits)], calibration)
-            integer = assemble(network, scales)
+            packings = [Packing(bits=width, groups=groups) for width in bits]
+            integer, _ = choose_storage(network, target, packings=packings, calibration=calibration)
             size = _size(integer, target, rates)
             made = None if size is None else point(bits, integer, *size)
             built[bits] = made
@@ -188,12 +188,12 @@ def _offers(network: Network, target: Target, widths: Widths, groups: int, calib
     exponents = target.choices["synapse.exponent"]
     offers: Offers = []
     for post in range(len(network.populations)):
-        offer: dict[int, list[Rounded]] = {}
+        offer: dict[int, Rounded] = {}
         faults: list[ModelError] = []
         for bits in reversed(widths):
             try:
                 packing = Packing(bits=bits, groups=groups)
-                offer[bits] = shortlist(layer_of(network, post, calibration), packing, exponents)
+                offer[bits] = best_scale(layer_of(network, post, calibration), packing, exponents)
             except ModelError as error:
                 faults.append(error)
         if not offer:
