@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from made_nir import affine, cuba, graph_with, lif, lowered
 from numpy.testing import assert_array_equal
 from oracles import refused
 from random_networks import LOIHI, chain, compiled, integer_chain, small_target, stored
-from test_sanafe import interpreter  # noqa: F401
 
-from spikeloom.compiler import Options, Packing, compile_network, lift
+from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
-from spikeloom.compiler.ir import IntegerProjection, Projection, recurrent
+from spikeloom.compiler.ir import IntegerProjection, Projection
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.prune import never_fires, removable
 from spikeloom.compiler.targets.loihi1.emit import emit
@@ -153,26 +151,3 @@ def test_a_layer_is_cut_so_that_its_axons_to_itself_are_enough():
     require_legal(emit(in_pairs(pairs), parts, (0, 1, 2), target, {}), target)
     words = "fc1 neuron 0: 4 used, 3 allowed (loihi1.core.axons_out)"
     refused(CapacityError, words, partition, in_pairs(np.ones((4, 4), int)), target)
-
-
-# -- commands ----------------------------------------------------------------------------------------------------------
-def test_currents_biases_and_loops_together():
-    """A recurrent CubaLIF, fed back through an Affine: its bias goes through the current, from a channel of its own."""
-    rng = np.random.default_rng(16)
-    nodes = {
-        "a": affine(rng, 9, 6, 0.5),
-        "b": cuba(9, r=2.0, weight=2.0),
-        "w": affine(rng, 9, 9, 0.3),
-        "c": affine(rng, 4, 9),
-        "d": lif(4, r=2.0),
-    }
-    edges = [("a", "b"), ("b", "w"), ("w", "b"), ("b", "c"), ("c", "d")]
-    network = lowered(graph_with(nodes, edges, (6,), (4,))).network
-    assert recurrent(network) == ("b",)
-    assert network.input.clocks.channels == 1
-    events = (rng.random((2, 3, 2, 40)) < 0.3).astype(np.uint8)
-    netlist = compile_network(network).netlist
-    given_ = channels_last(events, network.input.clocks)
-    trace = engine.simulate(netlist, given_.transpose(0, 2, 1).astype(np.uint8), spikes=True)
-    for layer, spikes in enumerate(run_integer(lift(netlist), given_).spikes):
-        assert_array_equal(aligned(netlist, trace.spikes, layer), spikes)
