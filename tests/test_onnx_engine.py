@@ -1,4 +1,4 @@
-"""The ONNX files that are written, and onnxruntime on them: every spike and membrane of the specification."""
+"""onnxruntime on the integer graph: every spike and membrane of the specification; and what is in the files."""
 
 import json
 from dataclasses import replace
@@ -9,7 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from made_files import events, small_checkpoint
+from made_files import events as made_events
+from made_files import small_checkpoint
 from onnx.reference import ReferenceEvaluator
 from oracles import refused
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
@@ -113,30 +114,8 @@ def test_a_register_that_overflows(form, where):
     refused(NumericRangeError, f"{where}: a register overflows", by_onnx, netlist, events, form)
 
 
-# -- verify ------------------------------------------------------------------------------------------------------------
-@pytest.fixture
-def verified():
-    """Words of a verify command on a small network."""
-    made = specimen("mlp")
-    return [
-        "verify",
-        str(made.netlist),
-        "--checkpoint",
-        str(made.network),
-        "--data",
-        str(made.data),
-        "--min-agreement=0",
-    ]
-
-
-def as_json(capsys, words, code=0):
-    capsys.readouterr()
-    assert cli.main([*words, "--json"]) == code
-    return json.loads(capsys.readouterr().out)
-
-
 @pytest.mark.parametrize("form", FORMS)
-def test_verify_finds_an_engine_that_strays(verified, form, monkeypatch, capsys):
+def test_verify_finds_an_engine_that_strays(form, monkeypatch, capsys):
     plain = onnx_engine.simulate
 
     def stray(prepared, *words, **options):
@@ -146,7 +125,11 @@ def test_verify_finds_an_engine_that_strays(verified, form, monkeypatch, capsys)
         return trace
 
     monkeypatch.setattr(onnx_engine, "simulate", stray)
-    report = as_json(capsys, [*verified, "--engine", "onnx"], code=1)
+    made = specimen("mlp")
+    words = ["verify", made.netlist, "--checkpoint", made.network, "--data", made.data, "--min-agreement=0"]
+    capsys.readouterr()
+    assert cli.main([*map(str, words), "--engine", "onnx", "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
     assert not report["spec_equals_engine"]
     assert report["engine_different"] == (form == "scan")
 
@@ -154,22 +137,6 @@ def test_verify_finds_an_engine_that_strays(verified, form, monkeypatch, capsys)
 # --- every recording --------------------------------------------------------------------------------------------------
 PART = 48
 SETS = {"objects_zip": ("objects", (576, 144)), "containers_zip": ("containers", (240, 60))}
-
-
-def spikes_of(folder, recordings, *words):
-    """Compile a network and run recordings; spikes of our engine, none of which differs in either form."""
-    path = folder / "net.loom"
-    assert cli.main(["compile", *map(str, words), "-o", str(path)]) == 0
-    netlist = read_netlist(path)
-    engines = [onnx_engine.prepare(netlist, form=form) for form in ("step", "scan")]
-    total = 0
-    for start in range(0, len(recordings), PART):
-        part = recordings[start : start + PART].reshape(-1, netlist.n_inputs, recordings.shape[3])
-        expected = engine.simulate(netlist, part, spikes=True).spikes
-        total += int(np.count_nonzero(expected))
-        for prepared in engines:
-            assert np.array_equal(onnx_engine.simulate(prepared, part).spikes, expected), prepared.form
-    return total
 
 
 @pytest.mark.slow
@@ -182,14 +149,17 @@ def test_all_recordings(fixture, bits, request, tmp_path):
     for split, size in zip(("train", "test"), sizes, strict=True):
         events = load_data(archive, split).events
         assert len(events) == size
-        words = (f"pretrained:{name}", "--calibrate", archive, "--weight-bits", bits)
-        assert spikes_of(tmp_path, events, *words) > 1_000_000
-
-
-def model_of(content):
-    model = onnx.load_from_string(content)
-    onnx.checker.check_model(model, full_check=True)
-    return model
+        words = ["compile", f"pretrained:{name}", "--calibrate", archive, "--weight-bits", bits, "-o", tmp_path / "net"]
+        assert cli.main([*map(str, words)]) == 0
+        netlist = read_netlist(tmp_path / "net")
+        total = 0
+        for start in range(0, size, PART):
+            part = events[start : start + PART].reshape(-1, netlist.n_inputs, events.shape[3])
+            expected = engine.simulate(netlist, part, spikes=True).spikes
+            total += int(np.count_nonzero(expected))
+            for form in FORMS:
+                assert np.array_equal(by_onnx(netlist, part, form).spikes, expected), form
+        assert total > 1_000_000
 
 
 # -- digits and widths -------------------------------------------------------------------------------------------------
@@ -250,7 +220,9 @@ def test_the_reference_of_the_format_computes_the_same():
     netlist = three_neurons()
     given = np.random.default_rng(2).integers(0, 2, (2, 2, 12), np.uint8)
     expected = engine.simulate(netlist, given, spikes=True).spikes
-    model = ReferenceEvaluator(model_of(onnx_writer.export(netlist, "scan")))
+    content = onnx.load_from_string(onnx_writer.export(netlist, "scan"))
+    onnx.checker.check_model(content, full_check=True)
+    model = ReferenceEvaluator(content)
     found = dict(zip(model.output_names, model.run(None, {"events": given.transpose(2, 0, 1)}), strict=True))
     np.testing.assert_array_equal(found["layer0.spikes"].transpose(1, 0, 2), expected[:, :12, :2])
     np.testing.assert_array_equal(found["layer1.spikes"].transpose(1, 0, 2), expected[:, 1:13, 2:])
@@ -259,20 +231,20 @@ def test_the_reference_of_the_format_computes_the_same():
 
 
 # -- the float network -------------------------------------------------------------------------------------------------
-def by_name(session, given):
-    names = [port.name for port in session.get_outputs()]
-    return dict(zip(names, session.run(names, given), strict=True))
-
-
 def test_the_float_graph_is_the_float_model(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
-    recorded = events(4)
+    recorded = made_events(4)
     expected = float_spikes(checkpoint, adjacency, recorded)
     given = np.ascontiguousarray(recorded.reshape(len(recorded), -1, recorded.shape[3]).transpose(2, 0, 1))
     scan, step = (
         onnx_engine.open_session(onnx_float.export_float(checkpoint, adjacency, form, graph_name="ring"))
         for form in ("scan", "step")
     )
+
+    def by_name(session, feed):
+        names = [port.name for port in session.get_outputs()]
+        return dict(zip(names, session.run(names, feed), strict=True))
+
     found = by_name(scan, {"events": given})
     kinds = {"tensor(uint8)": np.uint8, "tensor(int32)": np.int32, "tensor(float)": np.float32}
     feed = {port.name: np.zeros((len(recorded), port.shape[1]), kinds[port.type]) for port in step.get_inputs()}

@@ -1,25 +1,20 @@
-"""Crossbar cores: the specification by hand, the engine against it, and RANC's simulator if ``RANC_SIM`` names it."""
+"""Crossbar cores: the specification against values worked out by hand, the engine against the specification; the
+smallest network that breaks each rule, what is said about it, and needs of float networks.
+"""
 
-import json
-import os
-import re
-import subprocess
-from dataclasses import fields
-from pathlib import Path
+from dataclasses import fields, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_files import recordings_folder
-from random_crossbars import CHIP, WEIGHTS, alone, assert_same, both, crossbars, events, recording_of, relays
+from random_crossbars import CHIP, alone, assert_same, both, crossbars, events, recording_of, relays, with_limit
+from random_networks import chain
 
-from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats import ranc
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
-from spikeloom.compiler.targets.truenorth.legalize import faults
-from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE, RESET_TO, write_crossbars
-from spikeloom.runtime import cli
+from spikeloom.compiler.targets.truenorth.legalize import faults, needs
+from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE, RESET_TO
 from spikeloom.runtime.machines.truenorth import engine, spec
 
 
@@ -165,139 +160,156 @@ def test_random_thresholds_depend_on_the_seed_alone():
     assert 200 < runs[0] < 330
 
 
-SHARED_WITH_RANC = st.builds(
-    Neuron,
-    weights=st.tuples(WEIGHTS, WEIGHTS, WEIGHTS, WEIGHTS),
-    leak=st.integers(-5, 5),
-    threshold=st.integers(0, 20),
-    reset_mode=st.integers(0, 1),
-    reset=st.integers(-4, 4),
-    negative_threshold=st.integers(0, 20),
-    initial=st.integers(-9, 9),
-)
+# -- rules -------------------------------------------------------------------------------------------------------------
+SOURCE = "core 0, neuron 0"
 
 
-def small(**changes):
-    """Two cores with a corner of the mesh at (5, 2); the second neuron votes, the third has no target."""
-    draft = Draft()
-    draft.core(5, 2)
-    draft.core(6, 3)
-    draft.neuron(0, Neuron(weights=(0, 4, 0, 0), threshold=3, negative_threshold=2, **changes), layer="layer0")
-    for number in range(2):
-        draft.neuron(1, Neuron(weights=(0, 0, 0, 1), reset_mode=RESET_LINEAR), layer="layer1", number=number)
-    draft.axon(0, 1, [0])
-    draft.axon(1, 3, [0, 1], line=2)
-    draft.feed(0, 0, 0, tick=1)
-    draft.clock(1, 2, period=3, phase=1)
-    draft.wire((0, 0), 1, 2, 15)
-    draft.vote((1, 0), 0, first=1)
-    return draft.netlist(taxels=1, polarities=1, classes=1, bin_ticks=2)
+def made(draft: Draft, **changes):
+    netlist = draft.netlist(taxels=1, polarities=1, classes=1)
+    return replace(netlist, **{name: np.array([value]) for name, value in changes.items()})
 
 
-def test_schema():
-    written = json.loads("\n".join(ranc.export(small(), np.array([[1, 0]], np.uint8))))
-    assert {key: value for key, value in written.items() if key.startswith(("num", "max", "neuron_r"))} == {
-        "num_neurons": 256,
-        "num_axons": 256,
-        "num_weights": 4,
-        "num_cores_x": 2,
-        "num_cores_y": 3,
-        "max_tick_offset": 16,
-        "neuron_reset_type": 0,
-    }
-    assert written["output_bus"] == {"coordinates": [0, 2], "num_outputs": 2}
-    packet = {"destination_core": [1, 1], "destination_axon": 2, "destination_tick": 0}
-    fed = {"destination_core": [0, 0], "destination_axon": 0, "destination_tick": 0}
-    assert written["packets"] == [[], [fed, packet], [], [], [packet]]
-    first, second = written["cores"]
-    assert first == {
-        "axons": [1],
-        "connections": [[1]],
-        "coordinates": [0, 0],
-        "neurons": [
-            {
-                "weights": [0, 4, 0, 0],
-                "leak": 0,
-                "positive_threshold": 3,
-                "negative_threshold": -2,
-                "reset_potential": 0,
-                "reset_mode": 0,
-                "current_potential": 0,
-                "destination_core_offset": [1, 1],
-                "destination_axon": 2,
-                "destination_tick": 14,
-            }
-        ],
-    }
-    assert second["axons"] == [0, 0, 3]
-    assert second["connections"] == [[0, 0, 1], [0, 0, 1]]
-    voter, lost = second["neurons"]
-    assert (voter["destination_core_offset"], voter["destination_axon"], voter["destination_tick"]) == ([-1, 1], 0, 0)
-    assert (lost["destination_core_offset"], lost["destination_axon"]) == ([-1, 1], 1)
+def broken(netlist, chip=CHIP) -> list[tuple[str, str, str]]:
+    """Owner, what was found, and the rule."""
+    return [(fault.owner, fault.used, fault.rule.removeprefix("truenorth.")) for fault in faults(netlist, chip)]
+
+
+def with_neuron(**changes) -> Draft:
+    draft = relays()
+    draft.cores[0].neurons[0] = (replace(Neuron(), **changes), 0, 0)
+    return draft
 
 
 @pytest.mark.parametrize(
-    ("changes", "what"),
+    ("name", "low", "high", "found", "rule"),
     [
-        ({"leak": -1, "leak_reversal": True}, "a leak with reversal (1 neurons)"),
-        ({"mask_bits": 1}, "a random threshold (1 neurons)"),
-        ({"reset_mode": RESET_NONE}, "a reset that does nothing (1 neurons)"),
-        ({"negative_saturates": True}, "a negative threshold that saturates (1 neurons)"),
+        ("leak", -256, 255, "leak", "leak_bits"),
+        ("threshold", 0, 2**18 - 1, "threshold", "threshold_bits"),
+        ("negative_threshold", 0, 2**18 - 1, "negative threshold", "threshold_bits"),
+        ("mask_bits", 0, 18, "random bits", "mask_bits"),
+        ("reset", -256, 255, "reset value", "reset_bits"),
+        ("initial", -(2**19), 2**19 - 1, "initial membrane", "membrane_bits"),
+        ("reset_mode", 0, 2, "reset mode", "reset_mode"),
+        ("leak_reversal", 0, 1, "leak reversal", "leak_reversal"),
+        ("negative_saturates", 0, 1, "saturation", "negative_saturates"),
+        ("weights", -256, 255, "weight of type 1", "weight_bits"),
     ],
 )
-def test_what_ranc_has_not(changes, what):
-    with pytest.raises(ModelError, match=f"RANC has no {re.escape(what)}"):
-        list(ranc.export(small(**changes)))
+def test_parameters_and_their_registers(name, low, high, found, rule):
+    for value in (low - 1, low, high, high + 1):
+        expected = [] if low <= value <= high else [(SOURCE, f"{found} {value}", f"neuron.{rule}")]
+        assert broken(made(with_neuron(**{name: (0, value) if name == "weights" else value}))) == expected
 
 
-def test_the_command(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    draft = alone(Neuron(), channels=0)
-    draft.feed(3, 0, 0)
-    draft.vote((0, 0), 0, first=2)
-    write_crossbars(draft.netlist(taxels=2, polarities=2, classes=2), "net.loom")
-    recordings = np.zeros((2, 2, 2, 5), np.uint8)
-    recordings[0, 1, 1, [0, 4]] = recordings[1, 1, 1, [1, 4]] = 1
-    recordings_folder(tmp_path / "data", train=recordings, test=recordings)
-    words = ["export", "net.loom", "--to", "ranc", "-o", "net.json"]
-    assert cli.main(words) == 0
-    assert json.loads(Path("net.json").read_text("utf-8"))["packets"] == [[]]
-    first, second = capsys.readouterr().out.splitlines()
-    assert "1 neurons and 1 synapses for ranc" in first
-    assert second.startswith("run: ranc_sim net.json net.out net.json TICKS")
-    words += ["--data", "data", "--json", "--recording"]
-    assert cli.main([*words, "1"]) == 0
-    assert json.loads(capsys.readouterr().out)["ticks"] == 5 + 2 + 1
-    packets = json.loads(Path("net.json").read_text("utf-8"))["packets"]
-    assert [len(tick) for tick in packets] == [0, 1, 0, 0, 1, 0, 0]
-    assert cli.main([*words, "2"]) == 2
-    assert "--recording 2: --data has recordings 0 to 1" in capsys.readouterr().err
+def more(change, times: int = 1):
+    draft = relays()
+    for _ in range(times):
+        change(draft)
+    return made(draft)
 
 
-@pytest.fixture(scope="module")
-def simulator():
-    path = os.environ.get("RANC_SIM")
-    if not path:
-        pytest.skip("RANC's simulator is not named by RANC_SIM")
-    return path
+@pytest.mark.parametrize(
+    ("netlist", "found"),
+    [
+        (made(relays()), []),
+        *((made(relays(), wire_delay=n), [(SOURCE, f"delay {n}", "neuron.delay")]) for n in (0, 16, -1)),
+        (made(relays(), wire_x=64), [(SOURCE, "target at (64, 0)", "mesh")]),
+        (made(relays(), wire_y=6), [(SOURCE, "target at (1, 6), where no core is", "target")]),
+        (made(relays(), wire_line=7), [(SOURCE, "target line 7 of core 1, which has no axon there", "target")]),
+        (more(lambda d: d.wire((0, 0), 1, d.axon(1))), [(SOURCE, "2 targets on one core", "neuron.targets")]),
+        (
+            more(lambda d: d.wire((0, 0), d.core(2, 0), d.axon(2))),
+            [(SOURCE, "targets on 2 cores without a splitter", "neuron.targets")],
+        ),
+        (
+            more(lambda d: d.wire((1, 0), 0, 0)),
+            [("core 1, neuron 0", "votes and has a target on the chip", "neuron.targets")],
+        ),
+        (more(lambda d: d.axon(0, 2, line=0)), [("core 0, axon 0", "types 0 and 2", "core.axon_types")]),
+        (more(lambda d: d.axon(0, 0, line=0)), [("core 0, axon 0", "there twice", "core.axons")]),
+        *((more(lambda d, n=n: d.axon(0, n)), [("core 0, axon 1", f"type {n}", "core.axon_types")]) for n in (4, -1)),
+        (
+            more(lambda d: d.axon(0), 256),
+            [("core 0", "257 axons", "core.axons"), ("core 0, axon 256", "line 256", "core.axons")],
+        ),
+        (more(lambda d: d.core(0, 0)), [("core 2", "at (0, 0) as core 0", "mesh")]),
+        (
+            more(lambda d: d.core(len(d.cores) % 64, len(d.cores) // 64), 4095),
+            [("core 4096", "at (0, 64)", "mesh"), ("chip", "4097 cores", "chip.cores")],
+        ),
+        (more(lambda d: d.clock(0, 0, period=0)), [("clock 0", "a period of 0 ticks", "clock")]),
+        (more(lambda d: d.clock(1, 9, period=1)), [("clock 0", "line 9 of core 1", "target")]),
+        (more(lambda d: d.feed(0, 0, 3)), [("input channel 0", "line 3 of core 0", "target")]),
+        (more(lambda d: d.feed(0, 0, 0, tick=-1)), [("input channel 0", "tick -1 of a data step", "feed")]),
+        (
+            more(lambda d: d.neuron(0, Neuron(leak=300)), 3),
+            [("core 0, neuron 1 (and 2 more on this core)", "leak 300", "neuron.leak_bits")],
+        ),
+    ],
+)
+def test_rules(netlist, found):
+    assert broken(netlist) == found
 
 
-def outputs_of(text, voters):
-    """Spikes of the voters, (ticks, voters), from RANC's output of a run of one tick more."""
-    rows = [[word == "1" for word in line.split()] for line in text.splitlines() if line.strip()]
-    assert {len(row) for row in rows} == {voters + 1}  # the last is the share of all others
-    return np.array(rows[1:], np.bool_).reshape(-1, voters + 1)[:, :voters]
+def test_limits_are_parameters():
+    assert broken(made(relays()), with_limit("mesh.reach", 0)) == [(SOURCE, "1 cores away", "mesh.reach")]
+    assert broken(made(with_neuron(leak=2047)), with_limit("neuron.leak_bits", 12)) == []
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(crossbars(SHARED_WITH_RANC), st.integers(0, 2**31))
-def test_ranc_spikes_the_same(simulator, tmp_path, netlist, seed):
-    recording = events(seed, 3, 20)
-    expected = spec.simulate(netlist, recording)
-    voters = np.flatnonzero(netlist.readout_class >= 0)
-    source, result = tmp_path / "in.json", tmp_path / "out.txt"
-    source.write_text("\n".join(ranc.export(netlist, recording)), "utf-8")
-    ticks = str(int(expected.counts.ticks) + 1)
-    done = subprocess.run([simulator, source, result, source, ticks], capture_output=True, text=True, check=True)
-    assert "ERROR" not in done.stdout
-    np.testing.assert_array_equal(outputs_of(result.read_text("utf-8"), len(voters)), expected.spikes[:, voters])
+# -- needs of float networks -------------------------------------------------------------------------------------------
+def wide(inputs: int, *sizes: int, beta=0.0):
+    """A chain of full layers of equal weights."""
+    return chain(*(np.ones((after, before)) for before, after in pairwise((inputs, *sizes))), beta=beta)
+
+
+def needed(network) -> list[tuple[str, str]]:
+    return [(need.used, need.rule.removeprefix("truenorth.")) for need in needs(network, CHIP)]
+
+
+def test_every_need_of_every_layer():
+    rng = np.random.default_rng(0)
+    network = chain(rng.normal(size=(5, 300)), rng.normal(size=(3, 5)), beta=0.2)
+    assert needed(network) == [
+        ("keep 0.2 of their membranes a step", "neuron.leak"),
+        ("300 inputs", "core.axons"),
+        ("300 different weights", "neuron.weight_bits"),
+        ("send spikes to 2 axons at least", "neuron.targets"),
+        ("keep 0.2 of their membranes a step", "neuron.leak"),
+    ]
+    worst = needs(network, CHIP)[2]
+    assert (worst.owner, worst.allowed) == ("fc1, neuron 0 (and 4 more)", "1 with 1 axon an input")
+
+
+@pytest.mark.parametrize(
+    ("network", "found"),
+    [
+        (wide(256, 3), []),
+        (wide(257, 3), [("257 inputs", "core.axons")]),
+        (wide(2, 2, 256), [("send spikes to 2 axons at least", "neuron.targets")]),
+        (wide(2, 2, 257), [("send spikes to 4 axons at least", "neuron.targets")]),
+    ],
+)
+def test_limits_of_inputs_and_targets(network, found):
+    assert needed(network) == found
+
+
+@pytest.mark.parametrize(
+    ("inputs", "distinct", "over"),
+    [(64, 15, False), (64, 16, True), (85, 7, False), (86, 7, True), (128, 3, False), (129, 1, False), (129, 2, True)],
+)
+def test_the_limit_of_levels_follows_the_axons_that_are_left(inputs, distinct, over):
+    weight = np.resize(np.arange(1, distinct + 1), inputs)[None].astype(float)
+    assert needed(chain(weight, beta=0.0)) == [(f"{distinct} different weights", "neuron.weight_bits")] * over
+
+
+def test_zeros_are_no_level_and_the_worst_neuron_is_named():
+    weight = np.zeros((3, 129))
+    weight[0, :2], weight[2, :5] = 1, [1, 2, 3, 0, 4]
+    (need,) = needs(chain(weight, beta=0.0), CHIP)
+    assert (need.owner, need.used) == ("fc1, neuron 2", "4 different weights")
+
+
+def test_a_lasting_current():
+    network = wide(4, 2)
+    lasting = replace(network, populations=(replace(network.populations[0], alpha=0.5),))
+    assert needed(lasting) == [("keep 0.5 of their currents a step", "neuron.leak")]
