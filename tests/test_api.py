@@ -12,7 +12,6 @@ from torch import nn
 
 import spikeloom as api
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.runtime import cli
 from spikeloom.runtime.report.encode import encode
 
 
@@ -26,8 +25,7 @@ def net(place, data):
     return api.compile(str(place / "net.pt"), calibrate=data.train, weight_bits="4")
 
 
-def test_results_are_those_of_the_commands(place, data, net, capsys, monkeypatch):
-    monkeypatch.chdir(place)
+def test_results_are_those_of_the_commands(data, net, as_json):
     words = {
         "compile": ["net.pt", "--calibrate", "data", "--weight-bits", "4", "-o", "net.loom"],
         "verify": ["net.loom", "--checkpoint", "net.pt", "--data", "data"],
@@ -36,9 +34,7 @@ def test_results_are_those_of_the_commands(place, data, net, capsys, monkeypatch
     }
     found = {name: getattr(net, name)(data.test) for name in ("verify", "estimate", "run")} | {"compile": net.result}
     for name, options in words.items():
-        capsys.readouterr()
-        assert cli.main([name, *options, "--json"]) in (0, 1)
-        assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(encode(found[name].value)))
+        assert as_json(name, *options, codes=(0, 1)) == json.loads(json.dumps(encode(found[name].value)))
     net.save("copy.loom")
     assert Path("copy.loom").read_bytes() == Path("net.loom").read_bytes()
     again = api.load("copy.loom", network="net.pt")

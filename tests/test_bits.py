@@ -33,10 +33,8 @@ def place(tmp_path_factory):
     return folder
 
 
-def test_the_recommended_widths_are_built_by_the_printed_command(spikeloom):
-    code, out, err = spikeloom(*COMMAND, "--agreement", "0.5", "-o", "found.loom", "--json")
-    assert (code, err) == (0, "")
-    report = json.loads(out)
+def test_the_recommended_widths_are_built_by_the_printed_command(as_json):
+    report = as_json(*COMMAND, "--agreement", "0.5", "-o", "found.loom")
     assert report["layers"] == ["conv1", "fc1", "fc2", "fc3"]
     assert (report["recordings"], report["of"]) == (9, 12)
     recommended = report["recommended"]
@@ -53,13 +51,11 @@ def test_the_recommended_widths_are_built_by_the_printed_command(spikeloom):
     assert Path("found.loom").read_bytes() == Path("again.loom").read_bytes()
 
 
-def test_its_figures_are_those_of_the_netlist(spikeloom):
+def test_its_figures_are_those_of_the_netlist(as_json):
     """All training recordings are decided, so run on the training split must count the same."""
-    code, out, _ = spikeloom(*WORDS, "--samples", 50, "--accuracy", "0.1", "-o", "found.loom", "--json")
-    assert code == 0
-    report = json.loads(out)
-    words = ("found.loom", "--checkpoint", "net.pt", "--data", "data", "--split", "train", "--json")
-    verdict = json.loads(spikeloom("verify", *words)[1])
+    report = as_json(*WORDS, "--samples", 50, "--accuracy", "0.1", "-o", "found.loom")
+    words = ("found.loom", "--checkpoint", "net.pt", "--data", "data", "--split", "train")
+    verdict = as_json("verify", *words, codes=(0, 1))
     assert verdict["accuracy"]["chip"] == report["recommended"]["accuracy"]
     assert verdict["decision_agreement"] == report["recommended"]["agreement"]
     assert verdict["accuracy"]["float"] == report["float_accuracy"]
@@ -91,9 +87,8 @@ def test_the_printed_command_repeats_every_option():
     )
 
 
-def test_agreement_needs_no_labels(spikeloom):
-    words = ("bits", "net.pt", "--calibrate", "plain", "--widths", "8", "--agreement", "0")
-    report = json.loads(spikeloom(*words, "--json")[1])
+def test_agreement_needs_no_labels(as_json):
+    report = as_json("bits", "net.pt", "--calibrate", "plain", "--widths", "8", "--agreement", "0")
     assert report["float_accuracy"] is None
     assert report["recommended"]["accuracy"] is None
 
@@ -109,7 +104,6 @@ def test_agreement_needs_no_labels(spikeloom):
         ("", "--accuracy --agreement is required"),
     ],
 )
-def test_mistakes(spikeloom, words, telling):
-    code, out, err = spikeloom(*COMMAND, *words.split())
-    assert (code, out) == (2, "")
-    assert all(word in err for word in telling.split("|"))
+def test_mistakes(refusal, words, telling):
+    line = refusal(*COMMAND, *words.split())
+    assert all(word in line for word in telling.split("|"))

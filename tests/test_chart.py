@@ -63,12 +63,10 @@ def nothing_kept():
 
 
 @pytest.fixture
-def made(spikeloom, place):
+def made(as_json, place):
     """A chart of one network, made once."""
     if not (place / "out" / "chart.json").exists():
-        code, out, err = spikeloom(*CHART, "-o", "out", "--json")
-        assert (code, err) == (0, "")
-        assert json.loads(out) == json.loads((place / "out" / "chart.json").read_text())
+        assert as_json(*CHART, "-o", "out") == json.loads((place / "out" / "chart.json").read_text())
     return json.loads((place / "out" / "chart.json").read_text())
 
 
@@ -110,14 +108,14 @@ def test_every_point_of_the_grid_is_there(made, place):
 
 
 @pytest.mark.parametrize("number", [4, 7])
-def test_the_commands_of_a_point_give_its_netlist_and_its_figures(made, spikeloom, place, number):
+def test_the_commands_of_a_point_give_its_netlist_and_its_figures(made, as_json, place, number):
     point = made["points"][number - 1]
     compiled, ran = (shlex.split(command) for command in point["commands"])
-    assert spikeloom(*compiled[1:])[0] == 0
+    as_json(*compiled[1:])
     netlist = (place / compiled[-1]).read_bytes()
     assert netlist == (place / "out" / point["netlist"]).read_bytes()
     assert hashlib.sha256(netlist).hexdigest() == point["netlist_sha256"]
-    found = json.loads(spikeloom(*ran[1:], "--json")[1])
+    found = as_json(*ran[1:])
     assert found["accuracy"] == point["test"]["accuracy"]
     mean = found["costs"]["per_inference"]
     assert mean["energy_j"] == pytest.approx(point["test"]["energy_j"], rel=1e-12)
@@ -126,7 +124,7 @@ def test_the_commands_of_a_point_give_its_netlist_and_its_figures(made, spikeloo
     assert {clock["table"]: clock["inference_s"]["mean"]} == pytest.approx(point["test"]["time_s"], rel=1e-12)
     assert found["costs"]["chip_steps"] == point["test"]["steps"] + read_netlist(place / compiled[-1]).max_depth
     words = ("--checkpoint", "ring.pt", "--data", "data", "--window", f"{point['window']}%", "--spec-samples", "1")
-    found = json.loads(spikeloom("verify", compiled[-1], *words, "--json")[1])
+    found = as_json("verify", compiled[-1], *words, codes=(0, 1))
     assert found["accuracy"]["float"] == point["test"]["float"]["accuracy"]
     assert found["decision_agreement"] == point["test"]["equal"] / 8
 
@@ -167,7 +165,7 @@ def read_as(*checkpoints):
     return argparse.Namespace(checkpoints=list(checkpoints), directed=False, run=0, **options)
 
 
-def test_what_the_chip_refuses_is_listed(spikeloom, place, monkeypatch):
+def test_what_the_chip_refuses_is_listed(as_json, refusal, place, monkeypatch):
     refused, to_integers = {4}, chart_work.to_integers
 
     def picky(network, options, target):
@@ -177,22 +175,17 @@ def test_what_the_chip_refuses_is_listed(spikeloom, place, monkeypatch):
 
     monkeypatch.setattr("spikeloom.runtime.studies.chart.work.to_integers", picky)
     words = ("chart", "ring.pt", "--data", "data", "--jobs", "1", "--grid")
-    code, out, _ = spikeloom(*words, "bits=4,3,window=100%", "-o", "refused")
-    assert code == 0
-    found = json.loads((place / "refused" / "chart.json").read_text())
+    found = as_json(*words, "bits=4,3,window=100%", "-o", "refused")
     assert [(each["bits"], each["why"]) for each in found["refused"]] == [([4], [str(VIOLATION)])]
     refused |= {5, 6}
-    code, out, err = spikeloom(*words, "bits=5-6,window=100%", "-o", "nothing")
-    assert (code, out) == (2, "")
-    assert f"refuses all 2 configurations; the first: {VIOLATION}\n" in err
+    line = refusal(*words, "bits=5-6,window=100%", "-o", "nothing")
+    assert line.endswith(f"refuses all 2 configurations; the first: {VIOLATION}")
     assert not (place / "nothing" / "chart.json").exists()
 
 
-def test_a_fine_tuned_network_keeps_its_storage(spikeloom):
-    words = ("chart", "tuned.pt", "--data", "data", "--jobs", "1", "-o", "tuned", "--json", "--grid")
-    code, out, _ = spikeloom(*words, "bits=2-6,8,window=50%,100%")
-    assert code == 0
-    points = json.loads(out)["points"]
+def test_a_fine_tuned_network_keeps_its_storage(as_json):
+    words = ("chart", "tuned.pt", "--data", "data", "--jobs", "1", "-o", "tuned", "--grid")
+    points = as_json(*words, "bits=2-6,8,window=50%,100%")["points"]
     found = [(tuple(point["bits"]), point["fine_tuned"], point["window"]) for point in points]
     widths = tuple(bits for bits, _ in STORAGE)
     assert found == [(widths, True, 50), (widths, True, 100)]
@@ -201,17 +194,12 @@ def test_a_fine_tuned_network_keeps_its_storage(spikeloom):
 
 # -- bad input ---------------------------------------------------------------------------------------------------------
 
-OUT = ("-o", "bad")
-
 
 @pytest.mark.parametrize(
     ("words", "told"),
     [
         ("ring.pt --data data --grid bits=8+4", r"bits=8\+4: 2 widths, ring.pt has 4 layers \(conv1, fc1, fc2, fc3\)"),
-        (
-            "ring.pt --data data --grid cores=fc9:2",
-            "fc9:2: ring.pt has no layer fc9; it has conv1, fc1, fc2, fc3",
-        ),
+        ("ring.pt --data data --grid cores=fc9:2", "fc9:2: ring.pt has no layer fc9; it has conv1, fc1, fc2, fc3"),
         ("ring.pt ring.pt --data data", "ring.pt: is given twice"),
         ("elsewhere.pt --data data", r"elsewhere.pt: was trained on other recordings \(Grasps.zip\) than data"),
         ("unknown.pt small.pt --data data", f"small.pt: has 4 taxels and {CLASSES} classes, unknown.pt has 6"),
@@ -219,11 +207,9 @@ OUT = ("-o", "bad")
         ("ring.pt --data data -o file", "-o file: is not a folder"),
     ],
 )
-def test_a_mistake_is_named(spikeloom, place, words, told):
-    words = shlex.split(words)
-    code, out, err = spikeloom("chart", *words, *(() if "-o" in words else OUT))
-    assert (code, out) == (2, "")
-    assert re.match(f"spikeloom: .*{told}", err), err
+def test_a_mistake_is_named(refusal, place, words, told):
+    line = refusal("chart", *(words if "-o" in words else f"{words} -o bad").split())
+    assert re.match(f".*{told}", line), line
     assert not (place / "bad").exists()
 
 

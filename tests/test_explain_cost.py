@@ -45,16 +45,8 @@ def test_every_recording_is_run_once(spikeloom, passes, words, part):
     assert passes == [6]
     entry, absent = json.loads(out)["explained_cost"]
     assert (entry.pop("seconds") > 0, bool(entry.pop("why"))) == (True, True)
-    kernel = "layer by layer, 64 neurons at a time"
-    assert entry == {
-        "part": part,
-        "ran": True,
-        "arithmetic": "chip integers",
-        "recordings": 6,
-        "data_steps": 6 * STEPS,
-        "layers": LAYERS,
-        "kernel": kernel,
-    }
+    known = {"part": part, "ran": True, "arithmetic": "chip integers", "recordings": 6, "data_steps": 6 * STEPS}
+    assert entry == known | {"layers": LAYERS, "kernel": "layer by layer, 64 neurons at a time"}
     assert (absent["ran"], absent["recordings"], absent["layers"]) == (False, 0, [])
     assert len(err.splitlines()) == 2
 
@@ -78,27 +70,23 @@ def test_parts_of_verify(spikeloom):
     assert len(err.splitlines()) == len(checks)
 
 
-def test_a_rung_that_is_proven_is_what_it_would_be(spikeloom, monkeypatch):
-    proven = json.loads(spikeloom(*VERIFY, "--json")[1])["ladder"]
+def test_a_rung_that_is_proven_is_what_it_would_be(as_json, monkeypatch):
+    proven = as_json(*VERIFY, codes=(0, 1))["ladder"]
     monkeypatch.setattr(reference, "prove_ranges", lambda _: [type("Proof", (), {"holds": False})()])
-    out = spikeloom(*VERIFY, "--explain-cost", "--json")[1]
-    report = json.loads(out)
+    report = as_json(*VERIFY, "--explain-cost", codes=(0, 1))
     assert report["ladder"] == proven
     assert "ladder: rounding" in [entry["part"] for entry in report["explained_cost"] if entry["ran"]]
 
 
 def test_why_a_netlist_runs_step_by_step(place):
     netlist = read_netlist(place / "net.loom")
-    assert not isinstance(blocks.lay_out_blocks(netlist), str)
-    assert (
-        blocks.lay_out_blocks(large_netlist(1, proved=True))
-        == "a layer is recurrent or receives from others than the one before it"
-    )
     axon = Axon(source=0, targets=((0, 254),), exponent=7)
-    assert not isinstance(blocks.lay_out_blocks(build([Neuron()], [axon], n_inputs=1, depths=[0])), str)
-    assert (
-        blocks.lay_out_blocks(build([Neuron()], [axon, axon], n_inputs=1, depths=[0]))
-        == "a sum may leave 16 bits, or a membrane or current its register"
-    )
+    one, two = (build([Neuron()], [axon] * axons, n_inputs=1, depths=[0]) for axons in (1, 2))
     slow = replace(netlist, decay_v=read_only(np.zeros(netlist.n_compartments)))
-    assert blocks.lay_out_blocks(slow) == "a sum may leave 16 bits, or a membrane or current its register"
+    wiring = "a layer is recurrent or receives from others than the one before it"
+    assert blocks.lay_out_blocks(large_netlist(1, proved=True)) == wiring
+    for each, large in ((netlist, False), (one, False), (two, True), (slow, True)):
+        why = blocks.lay_out_blocks(each)
+        assert (
+            (why == "a sum may leave 16 bits, or a membrane or current its register") == isinstance(why, str) == large
+        )

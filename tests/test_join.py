@@ -1,11 +1,11 @@
 """Joined networks: towers side by side, from files to the chip and through every command."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from commands import as_json, refusal
 from made_files import checkpoint_bytes, released, state_dict, weights
 from numpy.testing import assert_array_equal
 from test_checkpoint import rebuilt
@@ -253,38 +253,26 @@ def data(tmp_path_factory):
     return place
 
 
-def as_json(capsys, words):
-    assert main([*words.split(), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def refusal(capsys, words):
-    capsys.readouterr()
-    assert main(words.split()) == 2
-    return capsys.readouterr().err
-
-
-def test_the_record_tells_every_tower(data, capsys):
-    capsys.readouterr()
-    inspected = as_json(capsys, f"inspect {data}/timed.pt")
+def test_the_record_tells_every_tower(data):
+    inspected = as_json(*f"inspect {data}/timed.pt".split())
     assert inspected["towers"] == 3
     assert inspected["classes"] == 4
     record = inspected["training"]
     assert record["command"] == "spikeloom join timed1.pt timed2.pt timed3.pt --weights last"
     assert [tower["seed"] for tower in record["towers"]] == list(SEEDS)
     for seed, tower in zip(SEEDS, record["towers"], strict=True):
-        single = as_json(capsys, f"inspect {data}/timed{seed}.pt")
+        single = as_json(*f"inspect {data}/timed{seed}.pt".split())
         assert tower["file"] == f"timed{seed}.pt"
         assert (tower["sha256"], tower["weights"]) == (single["sha256"], "last")
         for key in ("command", "seed", "data_sha256", "last"):
             assert tower[key] == single["training"][key], key
 
 
-def test_equal_input_gives_equal_bytes_and_other_sets_other_ones(data, capsys):
+def test_equal_input_gives_equal_bytes_and_other_sets_other_ones(data):
     words = " ".join(f"{data}/timed{seed}.pt" for seed in SEEDS)
-    as_json(capsys, f"join {words} --weights last -o {data}/a.pt")
+    as_json(*f"join {words} --weights last -o {data}/a.pt".split())
     assert (data / "a.pt").read_bytes() == (data / "timed.pt").read_bytes()
-    report = as_json(capsys, f"join {words} --weights clean -o {data}/c.pt")
+    report = as_json(*f"join {words} --weights clean -o {data}/c.pt".split())
     assert [tower["weights"] for tower in report["towers"]] == ["clean"] * 3
     for seed, member in zip(SEEDS, members(read_checkpoint(data / "c.pt")), strict=True):
         clean = read_checkpoint(data / f"timed{seed}.pt", weights="clean")
@@ -292,10 +280,10 @@ def test_equal_input_gives_equal_bytes_and_other_sets_other_ones(data, capsys):
 
 
 @pytest.mark.parametrize("form", ["step", "scan"])
-def test_the_float_graph_sums_the_votes(tmp_path, capsys, form):
+def test_the_float_graph_sums_the_votes(tmp_path, form):
     onnxruntime = pytest.importorskip("onnxruntime")
     _, wide, seen = joined(tmp_path, dynamics=PLAIN)
-    report = as_json(capsys, f"export {tmp_path}/wide.pt --to onnx-float --form {form} -o {tmp_path}/x.onnx")
+    report = as_json(*f"export {tmp_path}/wide.pt --to onnx-float --form {form} -o {tmp_path}/x.onnx".split())
     assert report["neurons"] == sum(wide.neurons.values())
     session = onnxruntime.InferenceSession(f"{tmp_path}/x.onnx", providers=["CPUExecutionProvider"])
     events = events_of(12, samples=5, steps=20)
@@ -320,11 +308,11 @@ def test_the_float_graph_sums_the_votes(tmp_path, capsys, form):
         assert theirs.weight.count_nonzero() == projection.weight.count_nonzero()
 
 
-def test_what_disagrees_is_listed_in_one_line(tmp_path, capsys):
+def test_what_disagrees_is_listed_in_one_line(tmp_path):
     written(tmp_path / "a.pt")
     other = Dynamics(betas=(0.2, 0.3, 0.1, 0.4), alphas=(0.0, 0.9, 0.5, 0.0), clocks=Clocks(channels=2, steps=5))
     written(tmp_path / "b.pt", "gcn", other, classes=5, features=2, hidden=(8, 7))
-    said = refusal(capsys, f"join {tmp_path}/a.pt {tmp_path}/b.pt -o {tmp_path}/x.pt")
+    said = refusal(*f"join {tmp_path}/a.pt {tmp_path}/b.pt -o {tmp_path}/x.pt".split())
     for word in ("system", "classes", "layers", "membrane decays", "clocks"):
         assert f"{word} ({tmp_path}/b.pt)" in said
     assert not (tmp_path / "x.pt").exists()
@@ -341,7 +329,7 @@ def test_graphs_and_storage_must_agree(tmp_path):
             join([one, other], ["a", "b"])
 
 
-def test_what_cannot_be_joined_says_so(data, tmp_path, capsys):
+def test_what_cannot_be_joined_says_so(data, tmp_path):
     one, made, old = f"{data}/plain1.pt", specimen("joined"), tmp_path / "old.t7"
     torch.save(released(state_dict(weights())), old)
     for words, reason in (
@@ -352,5 +340,5 @@ def test_what_cannot_be_joined_says_so(data, tmp_path, capsys):
         (f"join {one} {old} -o {tmp_path}/x.pt", f"{old}: does not say its graph and constants"),
         (f"finetune {made.network} --data {made.data} --weight-bits 4 -o {tmp_path}/x.pt", "has 3 towers"),
     ):
-        assert reason in refusal(capsys, words)
+        assert reason in refusal(*words.split())
     assert not (tmp_path / "x.pt").exists()

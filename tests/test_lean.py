@@ -68,15 +68,14 @@ def counts(netlist, seen):
     return engine.simulate(netlist, seen.events.reshape(len(seen.events), -1, STEPS)).counts.spikes
 
 
-def test_what_is_written_decides_and_costs_as_reported(spikeloom):
-    code, _, err = spikeloom(*WORDS, "--differ", "0.1", "-o", "lean.loom", "--report", "lean.json")
-    assert (code, err) == (0, "")
-    report = json.loads(Path("lean.json").read_text("utf-8"))
+def test_what_is_written_decides_and_costs_as_reported(as_json):
+    report = as_json(*WORDS, "--differ", "0.1", "-o", "lean.loom", "--report", "lean.json")
+    assert report == json.loads(Path("lean.json").read_text("utf-8"))
     row = report["rows"][report["taken"]]
     assert row["training"]["differ"] <= 2
     netlist = read_netlist("lean.loom")
     assert netlist.provenance["lean"] == {"differ": 0.1} | row["removed"]
-    assert spikeloom("compile", "net.pt", "--calibrate", "data", "-o", "whole.loom")[0] == 0
+    as_json("compile", "net.pt", "--calibrate", "data", "-o", "whole.loom")
     whole = read_netlist("whole.loom")
     for split, key in (("train", "training"), ("test", "test")):
         data = load_data("data", split)
@@ -86,7 +85,7 @@ def test_what_is_written_decides_and_costs_as_reported(spikeloom):
         assert row[key]["right"] == np.count_nonzero(after == data.labels)
         lost = np.count_nonzero((before == data.labels) & (after != data.labels))
         assert row["test"]["lost"] == lost or split == "train"
-    costs = json.loads(spikeloom("estimate", "lean.loom", "--data", "data", "--json")[1])["per_inference"]
+    costs = as_json("estimate", "lean.loom", "--data", "data")["per_inference"]
     assert costs["synaptic_operations"] == pytest.approx(row["operations"])
     assert costs["energy_j"] == pytest.approx(row["energy_j"])
     first, *others = report["rows"]

@@ -1,11 +1,11 @@
 """Recordings of different length, and networks whose steps join bins: each decides as on what was cut or joined."""
 
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from commands import as_json, refusal
 from made_files import CLASSES, TAXELS, own_file, weights
 from numpy.testing import assert_array_equal
 from test_checkpoint import rebuilt
@@ -50,12 +50,6 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "data"
 
 
-def as_json(capsys, *words):
-    capsys.readouterr()
-    assert main([*words, "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
 def files(folder):
     return sorted((folder / "test").iterdir())
 
@@ -72,11 +66,11 @@ def test_silence_after_the_end_would_move_votes(folder):
     assert whole[0, STEPS[0] :].any(), "the network is silent in silence, so nothing is tested here"
 
 
-def test_verify_compares_each_recording_at_its_own_length(folder, capsys):
+def test_verify_compares_each_recording_at_its_own_length(folder):
     words = ("verify", "x.loom", "--checkpoint", "x.pt", "--spec-samples", "1", "--min-agreement", "0")
-    together = as_json(capsys, *words, "--data", "data")
+    together = as_json(*words, "--data", "data")
     assert together["spec_equals_engine"]
-    parts = [as_json(capsys, *words, "--data", str(file)) for file in files(folder)]
+    parts = [as_json(*words, "--data", str(file)) for file in files(folder)]
     for layer, found in together["spikes"].items():
         for key in found:
             assert found[key] == sum(part["spikes"][layer][key] for part in parts), (layer, key)
@@ -86,9 +80,9 @@ def test_verify_compares_each_recording_at_its_own_length(folder, capsys):
     assert together["decision_agreement"] == pytest.approx(np.mean([part["decision_agreement"] for part in parts]))
 
 
-def test_estimate_prices_each_recording_at_its_own_length(folder, capsys):
-    together = as_json(capsys, "estimate", "x.loom", "--data", "data")
-    parts = [as_json(capsys, "estimate", "x.loom", "--data", str(file)) for file in files(folder)]
+def test_estimate_prices_each_recording_at_its_own_length(folder):
+    together = as_json("estimate", "x.loom", "--data", "data")
+    parts = [as_json("estimate", "x.loom", "--data", str(file)) for file in files(folder)]
     assert together["chip_steps"] == max(part["chip_steps"] for part in parts)
     for key in ("neuron_accesses", "neuron_updates", "spikes", "synaptic_operations"):
         alone = [part["per_inference"][key] for part in parts]
@@ -151,30 +145,6 @@ def place(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def report(spikeloom):
-    """Run a command in the folder: its result."""
-
-    def run(*words):
-        code, out, _ = spikeloom(*words, "--json")
-        assert code == 0
-        return json.loads(out)
-
-    return run
-
-
-@pytest.fixture
-def refusal(spikeloom):
-    """Run a command in the folder that refuses: its line."""
-
-    def run(*words):
-        code, out, err = spikeloom(*words)
-        assert (code, out) == (2, "")
-        return err.strip()
-
-    return run
-
-
 # --- training and files -----------------------------------------------------------------------------------------------
 def test_it_is_the_network_of_recordings_in_longer_bins(place):
     own, plain = (read_checkpoint(place / f"{name}.pt") for name in ("x", "plain"))
@@ -204,12 +174,14 @@ def test_unusable_bins_are_refused(place, tmp_path, bins):
         read_checkpoint(tmp_path / "y.pt")
 
 
-def test_a_finished_training_of_other_bins_is_another(refusal):
+@pytest.mark.usefixtures("spikeloom")
+def test_a_finished_training_of_other_bins_is_another():
     line = refusal("train", "--data", "fine", "--join", "2", *TRAINED, "--resume", "-o", "x.pt")
-    assert line == "spikeloom: x.pt: holds another training (other bins); give its options, or another -o"
+    assert line == "x.pt: holds another training (other bins); give its options, or another -o"
 
 
-def test_networks_for_truenorth_take_bins_as_they_are(refusal):
+@pytest.mark.usefixtures("spikeloom")
+def test_networks_for_truenorth_take_bins_as_they_are():
     words = ("train", "--system", NATIVE, "--graph", "manual", "--data", "fine", "--join", "2", "-o", "y.pt")
     told = refusal(*words)
     assert f"--join 2: a network of system {NATIVE} takes bins as they are" in told
@@ -217,9 +189,10 @@ def test_networks_for_truenorth_take_bins_as_they_are(refusal):
 
 
 # --- every command that reads recordings ------------------------------------------------------------------------------
-def test_it_decides_on_the_recordings_what_the_other_does_on_longer_bins(report):
+@pytest.mark.usefixtures("spikeloom")
+def test_it_decides_on_the_recordings_what_the_other_does_on_longer_bins():
     ours, theirs = (
-        report("run", f"{name}.loom", "--data", data, "--detail", "counts")
+        as_json("run", f"{name}.loom", "--data", data, "--detail", "counts")
         for name, data in (("x", "fine"), ("plain", "long"))
     )
     assert ours["counts"] == theirs["counts"]
@@ -233,16 +206,18 @@ def test_it_decides_on_the_recordings_what_the_other_does_on_longer_bins(report)
         assert watt == pytest.approx(others["real_time_w"][table] / BINS)
 
 
-def test_verify_and_explain(report):
+@pytest.mark.usefixtures("spikeloom")
+def test_verify_and_explain():
     found = [
-        report("verify", f"{name}.loom", "--checkpoint", f"{name}.pt", "--data", data, "--require", "E0")
+        as_json("verify", f"{name}.loom", "--checkpoint", f"{name}.pt", "--data", data, "--require", "E0")
         for name, data in (("x", "fine"), ("plain", "long"))
     ]
     assert found[0] == found[1]
-    assert report("explain", "x.loom", "--checkpoint", "x.pt", "--data", "fine")["steps"] == 7
+    assert as_json("explain", "x.loom", "--checkpoint", "x.pt", "--data", "fine")["steps"] == 7
 
 
-def test_a_netlist_of_other_bins_is_not_from_this_network(refusal):
+@pytest.mark.usefixtures("spikeloom")
+def test_a_netlist_of_other_bins_is_not_from_this_network():
     line = refusal("verify", "plain.loom", "--checkpoint", "x.pt", "--data", "fine")
     assert "netlist and checkpoint disagree" in line
     assert f"bins of a step {BINS}" in line
@@ -256,11 +231,12 @@ def test_a_netlist_of_other_bins_is_not_from_this_network(refusal):
         "stress NET --checkpoint CKPT --data DATA --seeds 1 --only taxels_dead,warm_state,longer,ties_fire",
     ],
 )
-def test_other_commands_find_what_they_find_on_longer_bins(report, words, place):
+@pytest.mark.usefixtures("spikeloom")
+def test_other_commands_find_what_they_find_on_longer_bins(words, place):
     found = []
     for name, data in (("x", "fine"), ("plain", "long")):
         names = {"NET": f"{name}.loom", "CKPT": f"{name}.pt", "DATA": data}
-        found.append(_without_names(report(*(names.get(word, word) for word in words.split()))))
+        found.append(_without_names(as_json(*(names.get(word, word) for word in words.split()))))
     assert found[0] == found[1]
 
 
@@ -283,11 +259,12 @@ def test_what_is_done_to_recordings_is_done_before_they_are_joined():
 
 
 # --- what else is made of them ----------------------------------------------------------------------------------------
-def test_joined_networks_and_fine_tuned_ones_keep_them(report, refusal, place):
-    report("join", "x.pt", "x.pt", "-o", "both.pt")
+@pytest.mark.usefixtures("spikeloom")
+def test_joined_networks_and_fine_tuned_ones_keep_them(place):
+    as_json("join", "x.pt", "x.pt", "-o", "both.pt")
     assert (read_checkpoint(place / "both.pt").bins, read_checkpoint(place / "both.pt").towers) == (BINS, 2)
-    report("finetune", "x.pt", "--data", "fine", "--weight-bits", "4", "--epochs", "1", "-o", "tuned.pt")
-    report("finetune", "plain.pt", "--data", "long", "--weight-bits", "4", "--epochs", "1", "-o", "plain-tuned.pt")
+    as_json("finetune", "x.pt", "--data", "fine", "--weight-bits", "4", "--epochs", "1", "-o", "tuned.pt")
+    as_json("finetune", "plain.pt", "--data", "long", "--weight-bits", "4", "--epochs", "1", "-o", "plain-tuned.pt")
     tuned, plain = (read_checkpoint(place / f"{name}.pt") for name in ("tuned", "plain-tuned"))
     assert (tuned.bins, plain.bins, len(tuned.forms)) == (BINS, 1, 4)
     assert_array_equal(tuned.dense[0].weight, plain.dense[0].weight)
