@@ -1,29 +1,29 @@
 """The one interface of all chips: what it returns is the simulator's, and a further chip is a folder."""
 
 import sys
-from dataclasses import replace
 from importlib import resources
-from pathlib import Path
 
 import numpy as np
 import pytest
 from oracles import refused
-from random_netlists import lively
+from random_networks import random_checkpoint, ring
 from zoo import specimen
 
-from spikeloom.compiler import targets
+from spikeloom.compiler import compile_network, targets
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.interpret import channels_last, run_integer
+from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets import price_tables
 from spikeloom.compiler.targets.base import CROSSBARS, known_targets, load_target, read_target, shipped, with_tables
 from spikeloom.compiler.targets.loihi1.legalize import REMEDIES
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.runtime import machines
-from spikeloom.runtime.machines.base import machine_for, machine_of
+from spikeloom.runtime.machines.base import machine_for
 from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
-from spikeloom.runtime.machines.votes import class_counts
+from spikeloom.runtime.machines.votes import class_counts, readout_counts
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import terminal
 
@@ -94,7 +94,24 @@ def test_what_is_compared_with_a_float_model():
     np.testing.assert_array_equal(ran.operations[:, -1], price.synaptic_operations)
 
 
-TOY = """
+PASSES = """
+import numpy as np
+from dataclasses import replace
+from spikeloom.compiler.passes.prune import without_channels
+from spikeloom.compiler.pipeline import Pass
+from spikeloom.compiler.targets.loihi1 import passes
+from spikeloom.compiler.targets.loihi1.options import Options
+
+def unplug(done):
+    return replace(done, integer=without_channels(done.integer, np.arange(done.integer.input.size) == 0))
+
+PASSES = (*passes.FLOATS, Pass(name="unplug", does="ignores channel 0", keeps="the rest", apply=unplug),
+          *passes.INTEGERS, *passes.LAYOUT)
+
+def start(source, options, target):
+    return passes.start(source, options, target)[0], PASSES
+"""
+MACHINE = """
 from spikeloom.runtime.machines.loihi1.machine import Loihi
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 
@@ -109,27 +126,36 @@ def load(path):
 """
 
 
-def test_a_third_chip_is_a_folder(tmp_path, monkeypatch):
-    (tmp_path / "machines" / "toy").mkdir(parents=True)
-    (tmp_path / "machines" / "toy" / "machine.py").write_text(TOY)
-    (tmp_path / "targets" / "toy").mkdir(parents=True)
-    limits = (Path(targets.__path__[0]) / "loihi1" / "chip.toml").read_text("utf-8")
-    (tmp_path / "targets" / "toy" / "chip.toml").write_text(limits.replace('"loihi1"', '"toy"'))
-    monkeypatch.setattr(targets, "__path__", [*targets.__path__, str(tmp_path / "targets")])
-    monkeypatch.setattr(machines, "__path__", [*machines.__path__, str(tmp_path / "machines")])
+def test_a_third_chip_is_a_folder_of_the_compiler_and_one_of_the_machines(tmp_path, monkeypatch):
+    """With cores of eight neurons and one pass more."""
+    limits = (resources.files(targets) / "loihi1" / "chip.toml").read_text("utf-8").replace('"loihi1"', '"toy"')
+    limits = limits.replace("core.compartments = { value = 1024", "core.compartments = { value = 8")
+    for package, texts in ((targets, {"chip.toml": limits, "passes.py": PASSES}), (machines, {"machine.py": MACHINE})):
+        folder = tmp_path / package.__name__ / "toy"
+        folder.mkdir(parents=True)
+        for name, text in texts.items():
+            (folder / name).write_text(text)
+        monkeypatch.setattr(package, "__path__", [*package.__path__, str(folder.parent)])
     shipped.cache_clear()
     try:
-        write_netlist(replace(lively(), target="toy"), tmp_path / "net.loom")
+        done = compile_network(expand(random_checkpoint(), ring(5)), target="toy")
+        assert [step.name for step in load_target("toy").passes][4] == "unplug"
+        assert np.diff(done.netlist.core_compartments).max() <= 8
+        assert not (done.netlist.axon_source == 0).any()
+        write_netlist(done.netlist, tmp_path / "net.loom")
         machine = machine_for(tmp_path / "net.loom")
         assert (type(machine).__name__, machine.target.name) == ("Toy", "toy")
-        events = (np.random.default_rng(0).random((4, machine.netlist.taxels, 2, 12)) < 0.3).astype(np.uint8)
-        np.testing.assert_array_equal(machine.run(events).votes, machine_of(lively()).run(events).votes)
+        events = (np.random.default_rng(0).random((4, 5, 2, 12)) < 0.3).astype(np.uint8)
+        expected = run_integer(done.integer, channels_last(events)).spikes[-1]
+        votes = readout_counts(done.integer.readout, done.integer.classes, expected)
+        np.testing.assert_array_equal(machine.run(events).votes, votes)
+        assert votes.any()
         assert integer_machine(machine).check(events[:1]) == 0
         with pytest.raises(OptionError, match="toy has no such price model; allowed: counts"):
             machine.price(events, bin_s=0.02, detail="cycle")
     finally:
         shipped.cache_clear()
-        for name in [name for name in sys.modules if name.startswith("spikeloom.runtime.machines.toy")]:
+        for name in [name for name in sys.modules if ".toy" in name]:
             del sys.modules[name]
 
 
