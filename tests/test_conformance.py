@@ -83,8 +83,6 @@ export nir:
     bytes convention dt format neurons path sha256 synapses
 export onnx:
     bytes form format inputs neurons outputs path sha256 synapses
-export onnx-float:
-    bytes form format graph inputs neurons outputs path sha256
 export sanafe:
     bytes cores format groups input_cores neurons path sha256 synapses
 finetune:
@@ -356,13 +354,12 @@ COMMANDS = {
     "join": ("joined", "join {folder}/1.pt {folder}/2.pt -o {out}/x.pt"),
     "data": ("mlp", "data describe {data}"),
     **{
-        f"export {form}": (name, f"export {{{source}}} --to {form} -o {{out}}/x{suffix}")
-        for form, name, source, suffix in (
-            ("onnx", "timed", "net", ".onnx"),
-            ("onnx-float", "tactilesgnet", "file", ".onnx"),
-            ("nir", "recurrent", "net", ".nir"),
-            ("netx", "binned", "net", ".net"),
-            ("sanafe", "recurrent", "net", ".yaml"),
+        f"export {form}": (name, f"export {{net}} --to {form} -o {{out}}/x{suffix}")
+        for form, name, suffix in (
+            ("onnx", "timed", ".onnx"),
+            ("nir", "recurrent", ".nir"),
+            ("netx", "binned", ".net"),
+            ("sanafe", "recurrent", ".yaml"),
         )
     },
 }

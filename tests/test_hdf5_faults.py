@@ -17,7 +17,7 @@ from spikeloom.compiler.formats.hdf5 import tree_of
 from spikeloom.compiler.formats.netx.reader import integers_of
 from spikeloom.compiler.formats.nir.file import graph_of
 from spikeloom.compiler.formats.nir.reader import network_of
-from spikeloom.compiler.formats.nir.steps import Steps
+from spikeloom.compiler.formats.nir.stages import Steps
 from spikeloom.compiler.invariants import verify
 
 

@@ -17,9 +17,8 @@ from spikeloom.compiler.checkpoint import SHARED, towers_of
 from spikeloom.compiler.dynamics import PLAIN, Clocks, Dynamics, with_clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.formats.towers import arrays_of, join, members
-from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
+from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
@@ -277,35 +276,6 @@ def test_equal_input_gives_equal_bytes_and_other_sets_other_ones(data):
     for seed, member in zip(SEEDS, members(read_checkpoint(data / "c.pt")), strict=True):
         clean = read_checkpoint(data / f"timed{seed}.pt", weights="clean")
         assert_array_equal(member.dense[0].weight, clean.dense[0].weight)
-
-
-@pytest.mark.parametrize("form", ["step", "scan"])
-def test_the_float_graph_sums_the_votes(tmp_path, form):
-    onnxruntime = pytest.importorskip("onnxruntime")
-    _, wide, seen = joined(tmp_path, dynamics=PLAIN)
-    report = as_json(*f"export {tmp_path}/wide.pt --to onnx-float --form {form} -o {tmp_path}/x.onnx".split())
-    assert report["neurons"] == sum(wide.neurons.values())
-    session = onnxruntime.InferenceSession(f"{tmp_path}/x.onnx", providers=["CPUExecutionProvider"])
-    events = events_of(12, samples=5, steps=20)
-    counts = readout_counts(wide.readout, 4, float_spikes(wide, seen, events)["fc3"])
-    flat = np.ascontiguousarray(events.reshape(5, 78, -1).transpose(2, 0, 1))
-    if form == "scan":
-        votes, decided = session.run(["votes", "class"], {"events": flat})
-        assert_array_equal(decided, vote(counts))
-    else:
-        state = {port.name: np.zeros((5, port.shape[1]), np.float32) for port in session.get_inputs()}
-        state["votes"] = state["votes"].astype(np.int32)
-        names = [port.name for port in session.get_outputs()]
-        for step in flat:
-            out = dict(zip(names, session.run(None, state | {"events": step}), strict=True))
-            state = {name: out[f"{name}_next"] for name in state if name != "events"}
-        votes = state["votes"]
-    assert_array_equal(votes, counts)
-    assert len(np.unique(counts, axis=0)) > 1
-    back, ours = read_onnx(f"{tmp_path}/x.onnx").network, expand(wide, seen)  # classes of three neurons again
-    assert (back.classes, back.readout.label.tolist()) == (4, ours.readout.label.tolist())
-    for theirs, projection in zip(back.projections[1:], ours.projections[1:], strict=True):
-        assert theirs.weight.count_nonzero() == projection.weight.count_nonzero()
 
 
 def test_what_disagrees_is_listed_in_one_line(tmp_path):

@@ -258,7 +258,7 @@ def test_what_the_format_holds_comes_back_exactly(drawn):
     tree = hdf5.tree_of(file.getvalue())
     network, _ = integers_of(tree, 1)
     made = netx_export.blocks_for(network)
-    assert not any(block.rounded or block.threshold_rounded or block.shift for block in made)
+    assert not any(str(block.rounding) for block in made)
     written_ = hdf5.tree_of(netx_export.file_bytes(network, made))
     again, _ = integers_of(written_)
     for ours, back in zip(network.projections, again.projections, strict=True):
@@ -309,7 +309,11 @@ def test_the_command_counts_what_it_moves(tmp_path, capsys):
     assert (code, report["exact"], report["recordings"]) == (0, False, len(made.events))
     network = lift(made.machine.netlist)
     blocks = netx_export.blocks_for(network)
-    assert sum(layer["biases_rounded"] for layer in report["layers"]) == sum(block.rounded for block in blocks) > 0
+    assert (
+        sum(layer["biases_rounded"] for layer in report["layers"])
+        == sum(block.rounding.biases_rounded for block in blocks)
+        > 0
+    )
     assert any(layer["spikes_moved"] for layer in report["layers"])
     back = read_netx(out).network
     assert back.input == network.input

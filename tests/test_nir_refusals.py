@@ -14,7 +14,7 @@ from spikeloom.compiler import files
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.nir.file import graph_of
 from spikeloom.compiler.formats.nir.reader import network_of, read_nir
-from spikeloom.compiler.formats.nir.steps import Steps
+from spikeloom.compiler.formats.nir.stages import Steps
 
 pytestmark = pytest.mark.usefixtures("hdf5_in_one_process")
 

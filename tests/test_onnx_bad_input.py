@@ -12,7 +12,7 @@ from google.protobuf.message import Message
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from made_modules import NETS, example_of, exported, one_step
-from made_onnx import CONSTANTS, STAGE, STATE_IN, model, neuron, node, scanned, two_layers, written
+from made_onnx import CONSTANTS, STAGE, STATE_IN, model, neuron, node, two_layers, value, written
 from onnx import ModelProto, TensorProto, defs, helper
 
 from spikeloom.compiler import files
@@ -75,6 +75,13 @@ def changed(change):
     return proto.SerializeToString()
 
 
+def looped():
+    """The steps of a recording by a loop."""
+    body = helper.make_graph([node("Identity", "x", "y")], "step", [value("x", [4])], [value("y", None)])
+    scan = node("Scan", "events", "end0", body=body, num_scan_inputs=1)
+    return model([scan], [("events", [3, 4])], ["end0"])
+
+
 STAGES = [
     (f"node stage (Relu): {AFFINE}", "stage = Relu(current)"),
     (f"node stage (Mul): multiplies x by x, so it {AFFINE}", "stage = Mul(x, x)"),
@@ -120,7 +127,7 @@ REFUSED = [
     ("holds no spiking layer: no membrane is compared with a", model(STAGE, INPUTS[:1], ["current"])),
     ("layer layer1: keeps 1.5 of its membrane in a step, allowed", layer(GOOD, beta=np.array(1.5, np.float32))),
     ("node u0_new (Add): has coefficients that are not finite", layer(GOOD, w=np.full((4, 3), np.nan, np.float32))),
-    ("node end0 (Scan): runs backwards in time", scanned(scan_input_directions=[1])),
+    ("node end0 (Scan): holds a graph, which only an If may", looped()),
     # files
     ("holds no graph, so it is not an ONNX file", b""),
     ("is not an ONNX file, or is truncated", b"PK\x03\x04 not at all"),
@@ -240,15 +247,15 @@ def sources():
     """Good files of every form."""
     made = [two_layers(spelling) for spelling in ("product", "where", "truth", "after")]
     made += [one_step(NETS[name](), example_of(name)) for name in ("mlp", "tag", "grid", "gcn")]
-    return (*made, scanned())
+    return (*made, looped())
 
 
 def _messages(message):
     """A message and all below it."""
     yield message
-    for field, value in message.ListFields():
+    for field, part in message.ListFields():
         if field.message_type is not None:
-            for below in [value] if isinstance(value, Message) else value:
+            for below in [part] if isinstance(part, Message) else part:
                 yield from _messages(below)
 
 

@@ -9,8 +9,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from made_files import events as made_events
-from made_files import small_checkpoint
 from onnx.reference import ReferenceEvaluator
 from oracles import refused
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
@@ -20,10 +18,8 @@ from zoo import specimen
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
-from spikeloom.compiler.formats.onnx import writer_float as onnx_float
-from spikeloom.compiler.formats.onnx.writer_layers import digits, plan
+from spikeloom.compiler.formats.onnx.writer import digits, plan
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine, spec
@@ -228,35 +224,3 @@ def test_the_reference_of_the_format_computes_the_same():
     np.testing.assert_array_equal(found["layer1.spikes"].transpose(1, 0, 2), expected[:, 1:13, 2:])
     assert found["votes"].tolist() == [[0, int(sample[:, 2].sum())] for sample in expected]
     assert found["class"].tolist() == [int(sample[:, 2].any()) for sample in expected]
-
-
-# -- the float network -------------------------------------------------------------------------------------------------
-def test_the_float_graph_is_the_float_model(tmp_path):
-    checkpoint, adjacency = small_checkpoint(tmp_path)
-    recorded = made_events(4)
-    expected = float_spikes(checkpoint, adjacency, recorded)
-    given = np.ascontiguousarray(recorded.reshape(len(recorded), -1, recorded.shape[3]).transpose(2, 0, 1))
-    scan, step = (
-        onnx_engine.open_session(onnx_float.export_float(checkpoint, adjacency, form, graph_name="ring"))
-        for form in ("scan", "step")
-    )
-
-    def by_name(session, feed):
-        names = [port.name for port in session.get_outputs()]
-        return dict(zip(names, session.run(names, feed), strict=True))
-
-    found = by_name(scan, {"events": given})
-    kinds = {"tensor(uint8)": np.uint8, "tensor(int32)": np.int32, "tensor(float)": np.float32}
-    feed = {port.name: np.zeros((len(recorded), port.shape[1]), kinds[port.type]) for port in step.get_inputs()}
-    for t, now in enumerate(given):
-        left = by_name(step, feed | {"events": now})
-        feed |= {name.removesuffix("_next"): array for name, array in left.items() if name.endswith("_next")}
-        for name, spikes in expected.items():
-            np.testing.assert_array_equal(left[f"{name}.spikes"], spikes[:, t])
-    for name, spikes in expected.items():
-        assert spikes.any()
-        np.testing.assert_array_equal(found[f"{name}.spikes"].transpose(1, 0, 2), spikes)
-        np.testing.assert_array_equal(found[f"{name}.counts"], spikes.sum(axis=1))
-    np.testing.assert_array_equal(found["votes"], expected["fc3"].sum(axis=1))
-    np.testing.assert_array_equal(feed["votes"], found["votes"])
-    np.testing.assert_array_equal(found["class"], found["votes"].argmax(axis=1))

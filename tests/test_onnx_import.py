@@ -21,7 +21,6 @@ from made_onnx import (
     model,
     neuron,
     node,
-    scanned,
     two_layers,
 )
 from onnx import helper
@@ -30,7 +29,8 @@ from oracles import refused, weight_differences
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.onnx.affine import INPUT_ATOM, Affine, Table
+from spikeloom.compiler.formats.affine import Affine
+from spikeloom.compiler.formats.onnx.atoms import INPUT_ATOM, Table
 from spikeloom.compiler.formats.onnx.file import Node
 from spikeloom.compiler.formats.onnx.operators import apply
 from spikeloom.compiler.formats.onnx.reader import read_onnx
@@ -91,13 +91,6 @@ def test_at_the_threshold_is_the_next_number_below(read):
     # in float32, the arithmetic of the file, every membrane is decided as the file decides it
     for membrane in (0.5, below, np.nextafter(np.float32(0.5), np.float32(1))):
         assert (np.float32(membrane) >= np.float32(0.5)) == (np.float32(membrane) > np.float32(population.theta))
-
-
-@pytest.mark.parametrize("content", [scanned(), scanned(1 + 2)])
-def test_loops_are_unrolled(read, content):
-    found = read(content)
-    require_the_two_layers(found.network)
-    assert "steps unrolled" in found.facts[0]
 
 
 @pytest.mark.parametrize(
@@ -168,15 +161,11 @@ def test_open_size_in_front_is_one_recording(read):
     assert not weight_differences(compile_module(net, example).integer, compile_network(found.network).integer)
 
 
-def test_open_time_of_a_loop_is_run_for_three_steps(read):
-    count = [node("Cast", "spikes", "whole", to=6), node("ReduceSum", "whole axes", "votes", keepdims=0)]
-    found = read(scanned("time", [*count, node("ArgMax", "votes", "class", axis=1)]))
-    require_the_two_layers(found.network)
-    assert "3 steps unrolled" in found.facts[2]
-    assert found.facts[:2] == (
-        "output class: the class of the largest of votes",
-        "the open size 'time' is time, read as 3 steps",
-    )
+def test_the_largest_of_the_votes_is_what_is_counted(read):
+    nodes = [*STAGE, *neuron(0, "current"), node("ArgMax", "s0_new", "class", axis=1)]
+    found = read(model(nodes, [("x", [1, 4]), *STATE_IN[:2]], ["class", "u0_new", "s0_new"]))
+    assert found.network.readout.label.tolist() == [0, 1, 2]
+    assert found.facts[0] == "output class: the class of the largest of s0_new"
 
 
 @pytest.mark.parametrize(

@@ -307,11 +307,9 @@ def test_a_current_that_lasts_is_a_float_there_and_that_is_said(tmp_path):
         ("onnx --recording 0", "--recording 0: is for ranc"),
         ("ranc --limit 1 --data x", "--limit 1: is for netx"),
         ("netx --limit 2", "--limit 2: says which recording of --data"),
-        ("nir --form step", "--form step: is for onnx and onnx-float"),
+        ("nir --form step", "--form step: is for onnx"),
         ("sanafe --dt 1", "--dt 1.0: is for nir"),
         ("sanafe --strict", "--strict: is for netx"),
-        ("onnx --directed", "--directed: is for checkpoints, --to onnx takes a netlist"),
-        ("onnx --beta 0.5", "--beta 0.5: is for checkpoints"),
     ],
 )
 def test_options_that_a_format_would_ignore(tmp_path, words, said):

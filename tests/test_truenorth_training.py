@@ -260,7 +260,6 @@ VERIFY = "verify net.loom --data data --checkpoint"
         ("compile net.pt -o z.loom", "--target loihi1: net.pt was trained for TrueNorth"),
         ("compile net.pt --target truenorth --planes 2 -o z.loom", "--planes 2: is not for"),
         ("inspect net.pt --beta 0.3", "--beta 0.3: net.pt is a network for TrueNorth and says that itself"),
-        ("export net.pt --to onnx-float -o x.onnx", "net.pt: is a network trained for TrueNorth"),
         (f"{VERIFY} net.pt --require E3=1", "--require E3=1: a network for TrueNorth has one model"),
         (f"{VERIFY} two.pt", "--checkpoint two.pt: net.loom was compiled from another file"),
         ("verify two.loom --data data --checkpoint two.pt", "--weights last: two.loom was compiled from best"),

@@ -33,14 +33,13 @@ class Request:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Export:
-    """Content of a file, a dataclass of facts about it with ``neurons``, and lines of them for people.
+    """Content of a file, a dataclass of facts about it with ``neurons`` and ``synapses``, and lines for people.
 
     `form` is which of several forms of the format it has.
     """
 
     content: Iterable[bytes]
     facts: Any
-    synapses: int | None
     form: str | None = None
     lines: tuple[str, ...] = ()
 
@@ -58,8 +57,3 @@ class Format:
     title: str
     write: Callable[[Request], Export]
     options: tuple[str, ...] = ()
-
-
-def port_lines(inputs: list[str], outputs: list[str]) -> tuple[str, ...]:
-    """Inputs and outputs of an ONNX graph, for people."""
-    return ("inputs:", *(f"  {port}" for port in inputs), "outputs:", *(f"  {p}" for p in outputs))

@@ -26,21 +26,39 @@ from spikeloom.compiler.types import BoolArray, IntArray
 MOST_SHIFT = 8
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rounding:
+    """What the format changes in a layer; empty as words if nothing."""
+
+    name: str  # Layer of the netlist
+    biases: int
+    biases_rounded: int
+    furthest_steps: float  # Largest change of a bias, in weight steps of the netlist
+    threshold_rounded: bool
+    rescaled_by: float  # Power of two that everything was multiplied by
+
+    def __str__(self) -> str:
+        words = []
+        if self.biases_rounded:
+            words.append(
+                f"{self.biases_rounded} of {self.biases} biases rounded, by {self.furthest_steps:.3g} steps at most"
+            )
+        words += ["threshold rounded"] if self.threshold_rounded else []
+        words += [f"rescaled by {self.rescaled_by:g}"] if self.rescaled_by != 1 else []
+        return f"{self.name}: {', '.join(words)}" if words else ""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DenseLayer:
     """One dense layer of the file, ``dense_rec`` if it is recurrent; weights and biases in whole weight steps."""
 
-    name: str  # Layer of the netlist
     weight: IntArray  # (neurons, inputs) int64
     own: IntArray | None  # (neurons, neurons) int64; from itself
     bias: IntArray  # (neurons,) int64, rounded
     threshold: int
     decay_u: int
     decay_v: int
-    shift: int  # Power of two that everything was multiplied by
-    rounded: int  # Biases that are no whole steps
-    threshold_rounded: bool
-    furthest: float  # Largest change of a bias, in weight steps of the netlist
+    rounding: Rounding
 
     @property
     def synapses(self) -> int:
@@ -93,17 +111,20 @@ def _block(population: IntegerPopulation, weight: IntArray, inputs: int, thresho
             "smaller biases"
         )
     return DenseLayer(
-        name=name,
         weight=shifted[:, :inputs],
         own=shifted[:, inputs:] if weight.shape[1] > inputs else None,
         bias=whole,
         threshold=max(1, int(np.rint(scaled))),
         decay_u=population.decay_u,
         decay_v=population.decay_v,
-        shift=shift,
-        rounded=int(np.count_nonzero(whole != steps)),
-        threshold_rounded=bool(scaled != np.rint(scaled)),
-        furthest=float(np.ldexp(np.abs(whole - steps).max(initial=0), -shift)),
+        rounding=Rounding(
+            name=name,
+            biases=len(whole),
+            biases_rounded=int(np.count_nonzero(whole != steps)),
+            furthest_steps=float(np.ldexp(np.abs(whole - steps).max(initial=0), -shift)),
+            threshold_rounded=bool(scaled != np.rint(scaled)),
+            rescaled_by=2.0**shift,
+        ),
     )
 
 
@@ -164,6 +185,6 @@ def moved_spikes(
     written, _ = integers_of(tree_of(file_bytes(network, blocks)))
     before, after = (run_integer(one, events).spikes for one in (network, written))
     return {
-        block.name: (int(np.count_nonzero(a != b)), int(np.count_nonzero(a)))
+        block.rounding.name: (int(np.count_nonzero(a != b)), int(np.count_nonzero(a)))
         for block, a, b in zip(blocks, before, after, strict=True)
     }

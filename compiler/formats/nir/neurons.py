@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from spikeloom.compiler.fixedpoint import decay_registers, kept_shares
+from spikeloom.compiler.formats.affine import shifted
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.nir.file import Graph, Node
-from spikeloom.compiler.formats.nir.stages import Value, filtered, scaled
-from spikeloom.compiler.formats.nir.steps import TOLERANCE, Steps, shared, spread, written_step
+from spikeloom.compiler.formats.nir.stages import TOLERANCE, Steps, Value, filtered, shared, spread, written_step
 from spikeloom.compiler.ir import Input
 from spikeloom.compiler.types import FloatArray, IntArray
 
@@ -71,7 +71,7 @@ def neurons_of(node: Node, value: Value, steps: Steps) -> Neurons:
     if np.any(theta <= 0):
         raise node.fail(f"fires {theta.min():g} above its reset, allowed are thresholds above it; train it again")
     with node.named():
-        own = filtered(value, alpha, gain, nothing) if alpha else scaled(value, gain)
+        own = shifted(filtered(value, alpha, gain, nothing), drive)  # a leak acts past the current
     decays = np.round(beta / TOLERANCE).astype(np.int64)
     different = np.unique(decays)
     if len(different) > MOST_DECAYS:
@@ -80,7 +80,6 @@ def neurons_of(node: Node, value: Value, steps: Steps) -> Neurons:
             "fewer"
         )
     groups = [np.flatnonzero(decays == decay) for decay in different]
-    own = replace(own, bias=own.bias + drive)
     return Neurons(node=node, value=own, beta=beta, gain=gain, theta=theta, reset=reset, groups=groups)
 
 

@@ -13,6 +13,7 @@ from scipy import sparse
 
 from spikeloom.compiler.dynamics import MOST_STEPS, RELAY_WEIGHT, Clocks
 from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.formats.affine import scaled
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble, class_of_each, in_order
 from spikeloom.compiler.formats.hdf5 import read_hdf5
 from spikeloom.compiler.formats.names import printable, unique_names
@@ -20,11 +21,21 @@ from spikeloom.compiler.formats.nir import CONVENTIONS
 from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, graph_of, loops
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
 from spikeloom.compiler.formats.nir.neurons import Neurons, facts_of, neurons_of
-from spikeloom.compiler.formats.nir.stages import KNOWN, STAGES, Value, added, rows_of, scaled, spikes_of
-from spikeloom.compiler.formats.nir.steps import Steps, require_step, stated_step, written_step
+from spikeloom.compiler.formats.nir.stages import (
+    ALWAYS,
+    KNOWN,
+    STAGES,
+    Steps,
+    Value,
+    added,
+    require_step,
+    spikes_of,
+    stated_step,
+    written_step,
+)
 from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import IntArray
 
 AXES, ELEMENTS = 8, 2**20
 """Of an input."""
@@ -40,7 +51,7 @@ def read_nir(
 ) -> ReadNetwork[Network]:
     """Read a network, in steps of `dt` seconds, by default those that the metadata of the file tell.
 
-    The `convention` (``euler`` by default) says how time constants become decays, see :mod:`nir.neurons`; polarities
+    The `convention` (``euler`` by default) says how time constants become decays, see :mod:`nir.stages`; polarities
     are those of :func:`sensor_layout.sensor_layout`.
 
     Raises ModelError if the file cannot be read, or holds something else than a network that spikes, feed-forward but
@@ -123,8 +134,8 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Neur
     return spiking, values[graph.one(OUTPUT_NODE).name]
 
 
-def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer], list[FloatArray]]:
-    """A layer for each decay of each node, and what flows into the currents of its neurons in every step."""
+def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer], list[Sparse | None]]:
+    """A layer for each decay of each node, and what flows into its currents in every step, (neurons, 1)."""
     first = np.cumsum([0, *(len(one.groups) for one in spiking)]).tolist()
     named = unique_names([one.node.name for one in spiking])
     layers: list[Layer] = []
@@ -133,9 +144,11 @@ def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer
         for number, rows in enumerate(one.groups, 1):
             # Neurons of other thresholds are those of one, with their weights and biases in its units.
             theta = float(one.theta[rows[0]])
-            value = scaled(rows_of(one.value, rows), theta / one.theta[rows])
+            value = scaled(one.value, theta / one.theta)
+            weights = {source: weight[rows] for source, weight in value.terms.items()}
+            always = weights.pop(ALWAYS, None)
             sources: dict[int, Sparse] = {}
-            for source, weight in value.terms.items():
+            for source, weight in weights.items():
                 weight.eliminate_zeros()
                 if source == INPUT:
                     sources[INPUT] = weight[:, positions]
@@ -148,44 +161,44 @@ def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer
                     name=name if len(one.groups) == 1 else f"{name}_{number}",
                     beta=float(one.beta[rows[0]]),
                     theta=theta,
-                    bias=value.bias,
+                    bias=value.bias[rows],
                     sources=reached if reached.keys() - {len(layers)} else sources,
                     alpha=value.alpha,
                 )
             )
-            held.append(value.held)
+            held.append(always if always is not None and always.nnz else None)
     return layers, held
 
 
-def _with_held(layers: list[Layer], held: list[FloatArray], sensor: Input) -> tuple[list[Layer], Input]:
+def _with_held(layers: list[Layer], held: list[Sparse | None], sensor: Input) -> tuple[list[Layer], Input]:
     """Let a channel that always has an event bring biases that go through a synaptic filter.
 
     The chip adds a bias past the current, where it acts in full from the first step on.
     """
-    lasting = [index for index, values in enumerate(held) if np.any(values)]
+    lasting = [index for index, channel in enumerate(held) if channel is not None]
     if not lasting:
         return layers, sensor
     depth: dict[int, int] = {INPUT: -1}
     for index in in_order(layers):
         depth[index] = max((depth[source] + 1 for source in layers[index].sources if source != index), default=0)
 
-    def with_channel(weight: Sparse | None, channel: FloatArray) -> Sparse:
-        """Weights of the input, if there are any, and beside them those of the channel."""
-        own = sparse.csr_array((len(channel), sensor.size)) if weight is None else weight
-        return sparse.hstack([own, sparse.csr_array(channel[:, None])], format="csr")
+    def with_channel(size: int, weight: Sparse | None, channel: Sparse | None) -> Sparse:
+        """Weights of the input into so many neurons, if there are any, and beside them those of the channel."""
+        own = sparse.csr_array((size, sensor.size)) if weight is None else weight
+        return sparse.hstack([own, sparse.csr_array((size, 1)) if channel is None else channel], format="csr")
 
     found = []
     for index, layer in enumerate(layers):
         sources, deep = dict(layer.sources), depth[index]
         if not deep or INPUT in sources:
-            sources[INPUT] = with_channel(sources.get(INPUT), held[index] * (not deep))
-        if deep and index in lasting:
-            sources[len(layers) + deep - 1] = sparse.csr_array(held[index][:, None])
+            sources[INPUT] = with_channel(layer.size, sources.get(INPUT), None if deep else held[index])
+        if deep and held[index] is not None:
+            sources[len(layers) + deep - 1] = held[index]
         found.append(replace(layer, sources=sources))
-    relay = np.array([RELAY_WEIGHT])
+    relay = sparse.csr_array([[RELAY_WEIGHT]])
     for step in range(max(depth[index] for index in lasting)):  # one a depth, on the way to the deepest
         source = len(layers) + step - 1 if step else INPUT
-        weight = sparse.csr_array(relay[:, None]) if step else with_channel(None, relay)
+        weight = relay if step else with_channel(1, None, relay)
         name = f"always{step + 1}"
         found.append(Layer(name=name, beta=0.0, theta=1.0, bias=np.zeros(1), sources={source: weight}, relays=1))
     return found, replace(sensor, clocks=Clocks(channels=1, steps=MOST_STEPS))

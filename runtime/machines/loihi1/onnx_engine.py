@@ -12,7 +12,7 @@ import numpy as np
 
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
-from spikeloom.compiler.formats.onnx.writer_layers import Layer, plan
+from spikeloom.compiler.formats.onnx.writer import Layer, plan
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.loihi1 import engine

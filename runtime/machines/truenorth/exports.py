@@ -35,7 +35,6 @@ def _ranc(request: Request) -> Export:
     return Export(
         content=(f"{line}\n".encode() for line in ranc.export(netlist, events)),
         facts=RancFacts(neurons=netlist.n_neurons, synapses=netlist.n_synapses, ticks=ticks),
-        synapses=netlist.n_synapses,
         lines=(f"run: ranc_sim {path} {out} {path} TICKS ({shown})",),
     )
 
