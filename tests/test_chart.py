@@ -1,29 +1,27 @@
 """The command ``chart`` on small networks: what it writes, that its commands give its figures, resuming, refusals."""
 
-import argparse
 import csv
 import hashlib
 import json
 import re
 import shlex
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from made_files import CLASSES, events, own_file, recordings_folder, ring, weights
+from random_crossbars import random_network
 from zoo import STORAGE, tuned
 
-from spikeloom.compiler.errors import CapacityError, SpikeloomError, Violation
+from spikeloom.compiler.errors import CapacityError, Violation
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.truenorth.native_file import write_trained
 from spikeloom.models.graphs import Graph
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import data_digest
 from spikeloom.runtime.studies.chart import work as chart_work
-from spikeloom.runtime.studies.chart.networks import Storage, given_networks
 
 GRID = "bits=4,8,window=50-100%:50,cores=cores/fc1:2"
 VIOLATION = Violation(owner="core 0", rule="loihi1.core.axons_in", used=5, allowed=4, remedy="use fewer inputs")
@@ -51,15 +49,11 @@ def place(tmp_path_factory):
     forms = tuned(read_checkpoint(folder / "ring.pt")).forms
     save_checkpoint(folder / "tuned.pt", {"last": weights()}, ring(), beta=0.2, theta=0.5, training=known, forms=forms)
     own_file(folder / "elsewhere.pt", training={"data_sha256": "0" * 64, "data": "Grasps.zip"})
+    network = random_network(4, taxels=6, classes=CLASSES, steps=24)
+    write_trained(folder / "native.pt", {"last": network}, graph="ring", edges=np.zeros((0, 2), int), training=known)
     own_file(folder / "small.pt", last=weights(taxels=4), graph=ring(4))
     (folder / "file").write_text("")
     return folder
-
-
-@pytest.fixture(autouse=True)
-def nothing_kept():
-    chart_work.both_splits.cache_clear()
-    chart_work._network.cache_clear()
 
 
 @pytest.fixture
@@ -141,30 +135,19 @@ def test_once_more_nothing_is_measured_and_every_byte_is_the_same(made, spikeloo
     assert {file.name: file.read_bytes() for file in (place / "out").glob("chart.*")} == before
 
 
-def test_one_more_window_compiles_only_what_is_gone_or_damaged(made, again, spikeloom, monkeypatch):
-    gone, damaged = (again / made["points"][at]["netlist"] for at in (0, -1))
-    kept = gone.read_bytes(), damaged.read_bytes()
-    gone.unlink()
-    damaged.write_bytes(kept[1][:100])
+def test_one_more_width_measures_nothing_else(made, again, spikeloom, monkeypatch):
     worked, measure = [], chart_work.measure
     monkeypatch.setattr(
         "spikeloom.runtime.studies.chart.work.measure", lambda work: worked.append(work) or measure(work)
     )
-    words = [word if word != GRID else GRID.replace("50-100%:50", "25%,50%,100%") for word in CHART]
+    words = [word.replace("bits=4,8", "bits=4,6,8") for word in CHART]
     assert spikeloom(*words, "-o", "again", "--json")[0] == 0
-    runs = [work for work in worked if isinstance(work, chart_work.Run)]
-    assert [work.window for work in runs] == [25] * 4
-    assert [type(work) for work in worked if work not in runs] == [chart_work.Decide]
-    assert (gone.read_bytes(), damaged.read_bytes()) == kept
+    assert [work.storage.bits for work in worked] == [(6,)]
+    points = json.loads((again / "chart.json").read_text())["points"]
+    assert [point["test"] for point in points if point["bits"] != [6]] == [point["test"] for point in made["points"]]
 
 
 # -- choices -----------------------------------------------------------------------------------------------------------
-def read_as(*checkpoints):
-    """Options of a command that names checkpoints only."""
-    options = dict.fromkeys(("graph", "taxels", "edges", "system", "weights", "beta", "theta"))
-    return argparse.Namespace(checkpoints=list(checkpoints), directed=False, run=0, **options)
-
-
 def test_what_the_chip_refuses_is_listed(as_json, refusal, place, monkeypatch):
     refused, to_integers = {4}, chart_work.to_integers
 
@@ -203,6 +186,7 @@ def test_a_fine_tuned_network_keeps_its_storage(as_json):
         ("ring.pt ring.pt --data data", "ring.pt: is given twice"),
         ("elsewhere.pt --data data", r"elsewhere.pt: was trained on other recordings \(Grasps.zip\) than data"),
         ("unknown.pt small.pt --data data", f"small.pt: has 4 taxels and {CLASSES} classes, unknown.pt has 6"),
+        ("ring.pt native.pt --data data", "native.pt: is for truenorth, ring.pt for loihi1; .* make a chart of each"),
         ("net.onnx --data data", "net.onnx: is an ONNX file"),
         ("ring.pt --data data -o file", "-o file: is not a folder"),
     ],
@@ -211,21 +195,3 @@ def test_a_mistake_is_named(refusal, place, words, told):
     line = refusal("chart", *(words if "-o" in words else f"{words} -o bad").split())
     assert re.match(f".*{told}", line), line
     assert not (place / "bad").exists()
-
-
-def test_a_worker_that_has_other_files_says_so(place, monkeypatch):
-    monkeypatch.chdir(place)
-    (network,) = given_networks(read_as("ring.pt"))
-    digest = data_digest(load_data("data", "train"), load_data("data", "test"))
-    data = chart_work.Data(path="data", bin_s=0.02, sha256=digest)
-    facts = chart_work.Facts(data=data, targets={"loihi1": load_target("loihi1")}, folder=place)
-    work = facts.build(network, Storage(bits=(6,), planes=1, groups=1, prune=False), ("cores",))
-    assert json.loads(json.dumps(chart_work.measure(work)))["cores"]["cores"] > 0
-    chart_work.both_splits.cache_clear()
-    source = replace(work.network.source, path="unknown.pt")
-    for changed, told in (
-        (replace(work, data=replace(work.data, path="other")), "other: holds other recordings than where"),
-        (replace(work, network=replace(work.network, source=source)), "unknown.pt: is another file than where"),
-    ):
-        with pytest.raises(SpikeloomError, match=f"^{told} the chart was asked for; copy th"):
-            chart_work.measure(changed)

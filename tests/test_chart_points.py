@@ -69,12 +69,12 @@ def test_fronts_are_of_test_accuracy_and_each_cost(points):
 
 
 def test_expected_is_validation_times_what_is_kept_on_training_recordings():
-    (reached,), (network,), words = with_expectations([point(1, 380, 50, 1, 1)], [made_network(float_training=0.99)])
+    (reached,), (network,), words = with_expectations([point(1, 380, 50, 1, 1)], [made_network(trained=396)])
     assert (reached.expected, network.expected, words) == (pytest.approx(0.9 * 0.95 / 0.99), 0.9, VALIDATION)
 
 
 def test_where_one_checkpoint_knows_no_validation_training_figures_stand_for_all():
-    networks = [made_network(float_training=0.99), made_network("other", validation=None)]
+    networks = [made_network(trained=396), made_network("other", validation=None)]
     (reached,), _, words = with_expectations([point(1, 380, 50, 1, 1)], networks)
     assert (reached.expected, words) == (pytest.approx(0.95), TRAINING)
 

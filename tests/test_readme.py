@@ -29,7 +29,7 @@ FENCED = re.compile(r"^```.*?^```$", flags=re.MULTILINE | re.DOTALL)
 SHOWN = re.compile(r"^\$ spikeloom (.+)$", flags=re.MULTILINE)
 IN_A_LINE = re.compile(r"`([^`]+)`")
 DOTTED = re.compile(r"`((?:compiler|runtime|models)\.[\w.]+)[(`]")
-OTHERS = {"python", "pip", "pytest", "dask", "helm"}
+OTHERS = {"python", "pip", "pytest", "helm"}
 """Programs that have options of their own."""
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 FILE = re.compile(r"\b(?:compiler|runtime|models|tests|benchmarks|examples)/[\w/.-]+\.(?:py|toml|sh|png|md)")

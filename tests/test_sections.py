@@ -13,7 +13,6 @@ from made_chart import made_chart
 from spikeloom.runtime.report import drawing, html
 from spikeloom.runtime.report.encode import OPTIONAL, decode, encode, key
 from spikeloom.runtime.report.sections import Code, Details, Facts, Figure, Section, Table, Text, terminal
-from spikeloom.runtime.studies.chart.results import Chart
 from spikeloom.runtime.studies.chart.sections import page, panels, printed, series_of
 
 NUMBERS = Table(["layer", "spikes"], [["conv1", "12"], ["fc1", "3 < 4"]], "Spikes by layer")
@@ -112,10 +111,6 @@ def told(chart):
 # -- terminal and files ------------------------------------------------------------------------------------------------
 def test_the_terminal_shows_choices_fronts_saving_and_budget(chart, golden):
     golden("chart.txt", told(chart))
-
-
-def test_a_chart_is_read_back_as_it_was(chart):
-    assert decode(Chart, json.loads(json.dumps(encode(chart)))) == chart
 
 
 # -- pictures ----------------------------------------------------------------------------------------------------------

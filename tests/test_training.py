@@ -17,8 +17,8 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime.cli import main
+from spikeloom.runtime.studies import training as trainings
 from spikeloom.runtime.studies.jobs import only_one
-from spikeloom.runtime.studies.training import training as trainings
 
 ROOT = Path(__file__).resolve().parents[1]
 WORDS = ("train", "--data", "data", "--graph", "manual")
@@ -98,6 +98,7 @@ def test_seeds_side_by_side_equal_single_ones_and_finished_ones_are_left_alone(d
         (["--seeds", "0"], "--seeds 0: at least 1 is needed"),
         (["--seed", str(10**22)], f"--seed {10**22}: allowed are 0 to {2**63 - 1}"),
         (["--picture", "x.jpg"], "--picture x.jpg: allowed are .png, .svg, .pdf"),
+        (["--picture", "x.png", "--keep", "clean"], "--picture x.png: draws the last epoch; add --keep last"),
         (["--picture", "none/x.png"], "--picture none/x.png: the folder does not exist"),
         (
             ["--picture", "./x-seed1.png", "--seeds", "2", "-o", "x.png"],
@@ -204,7 +205,7 @@ def test_resume_does_not_take_another_training_for_this_one(data, capsys):
         "x.pt: holds another training (other epochs, seed); give its options, or another -o"
     )
     assert refused(capsys, "--epochs", "1", "-o", "x.pt", "--resume", "--picture", "x.png") == (
-        "x.pt: was written without its last epoch, which --picture draws; omit --picture"
+        "x.pt: holds only what --keep best kept; give these, or another -o"
     )
     Path("x.pt").write_bytes(b"old")
     assert refused(capsys, "--epochs", "1", "-o", "x.pt", "--resume").startswith("x.pt: ")

@@ -73,11 +73,8 @@ class Kind(Protocol):
     def differing(self, found: Any, plan: Plan) -> list[str]:
         """In what a checkpoint is of another plan."""
 
-    def predict_stored(self, found: Any, plan: Plan, test: Recordings) -> IntArray:
+    def predict(self, found: Any, plan: Plan, test: Recordings) -> IntArray:
         """Decisions of the last epoch in a checkpoint."""
-
-    def predict(self, weights: Mapping[str, Any], plan: Plan, test: Recordings) -> IntArray:
-        """Decisions of weights that `train` returned."""
 
 
 def kinds() -> list[Kind]:

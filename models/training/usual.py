@@ -77,13 +77,8 @@ def differing(found: Checkpoint, plan: Plan) -> list[str]:
     return [name for name, equal in same.items() if not equal]
 
 
-def predict_stored(found: Checkpoint, plan: Plan, test: Recordings) -> IntArray:
+def predict(found: Checkpoint, plan: Plan, test: Recordings) -> IntArray:
     """Decisions of the last epoch in a checkpoint."""
-    return predict(arrays_of(found), plan, test)
-
-
-def predict(weights: Mapping[str, Any], plan: Plan, test: Recordings) -> IntArray:
-    """Decisions of some weights."""
     network = SpikingNet(architecture(plan), seen_by(plan))
-    network.load_weights(weights)
+    network.load_weights(arrays_of(found))
     return evaluate.predict(network, joined_bins(test, plan.bins))

@@ -81,11 +81,6 @@ def differing(found: Trained, plan: Plan) -> list[str]:
     return [name for name, equal in same.items() if not equal]
 
 
-def predict_stored(found: Trained, plan: Plan, test: Recordings) -> IntArray:  # noqa: ARG001 -- the file knows it all
+def predict(found: Trained, plan: Plan, test: Recordings) -> IntArray:  # noqa: ARG001 -- the file knows it all
     """Decisions of the last epoch in a file."""
     return network.predict(found.network, test)
-
-
-def predict(weights: Mapping[str, Any], plan: Plan, test: Recordings) -> IntArray:
-    """Decisions of some weights."""
-    return network.predict(network.native_network(architecture(plan), weights), test)

@@ -35,7 +35,15 @@ from spikeloom.runtime.inputs.network import load_graph, sensor_places
 from spikeloom.runtime.inputs.recordings import recordings, require_bins
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
-from spikeloom.runtime.studies.training.training import Job, output_of, train_seeds
+from spikeloom.runtime.studies.training import (
+    Job,
+    TrainingReport,
+    output_of,
+    picture,
+    summary,
+    train_seeds,
+    training_sections,
+)
 
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -100,8 +108,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Train every seed, write the checkpoints, report."""
-    from spikeloom.runtime.studies.training.report import TrainingReport, picture, summary, training_sections
-
     if arguments.seeds < 1:
         raise OptionError(f"--seeds {arguments.seeds}: at least 1 is needed; give a positive number")
     require_bins(arguments.join)
@@ -110,18 +116,19 @@ def run(arguments: argparse.Namespace) -> Outcome:
         require_place(arguments.picture, "--picture", arguments)
         if Path(arguments.picture).suffix not in PICTURES:
             raise OptionError(f"--picture {arguments.picture}: allowed are {', '.join(PICTURES)}; name one of these")
+        if "last" not in (arguments.keep or WEIGHTS):
+            raise OptionError(f"--picture {arguments.picture}: draws the last epoch; add --keep last, or omit it")
         for seed in range(arguments.seed, arguments.seed + arguments.seeds):
             if output_of(arguments.output, seed, arguments.seeds).absolute() == Path(arguments.picture).absolute():
                 raise OptionError(f"--picture {arguments.picture}: is a network that -o names; give another name")
     graph, _ = _sensor(arguments)
     training, test = both_splits(arguments.data, graph.n_taxels, arguments.bin)
-    results = train_seeds(plan_jobs(arguments, training, test), resume=arguments.resume)
-    records = [record for record, _ in results]
+    jobs = plan_jobs(arguments, training, test)
+    records = train_seeds(jobs, resume=arguments.resume)
     if arguments.picture is not None:
-        decided = [predicted for _, predicted in results if predicted is not None]
         kind = Path(arguments.picture).suffix.removeprefix(".")
         with write_atomically(arguments.picture) as file:
-            file.write(picture(records, test.labels, decided).file(kind))
+            file.write(picture(jobs, records).file(kind))
     return Outcome(TrainingReport(runs=records, protocols=summary(records)), training_sections)
 
 
@@ -172,7 +179,6 @@ def plan_jobs(arguments: argparse.Namespace, training: Recordings, test: Recordi
             output=output_of(arguments.output, seed, arguments.seeds),
             keep=tuple(dict.fromkeys(arguments.keep or WEIGHTS)),
             command=f"{command} --seed {seed}",
-            draws=arguments.picture is not None,
             position=position,
         )
         for position, seed in enumerate(range(arguments.seed, arguments.seed + arguments.seeds))

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.truenorth.native import SYSTEM, highest_level
 from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained
@@ -53,8 +52,8 @@ def facts(path: str, weights: str | None) -> JsonObject:
     }
 
 
-def decisions(path: str, weights: str | None, data: Recordings, windows: Sequence[int]) -> dict[str, list[int]]:
-    """Decisions of the model, in torch, when parts of each recording have passed, by window in per cent."""
+def votes(path: str, weights: str | None, data: Recordings, windows: Sequence[int]) -> dict[int, IntArray]:
+    """Votes of the model, in torch, when parts of each recording have passed, by window in per cent."""
     from spikeloom.models.truenorth.network import votes_by_step  # torch, so only here
 
     network, counts = trained(path, weights).network, {window: list[IntArray]() for window in windows}
@@ -63,12 +62,11 @@ def decisions(path: str, weights: str | None, data: Recordings, windows: Sequenc
         added = votes_by_step(network, data.events[index : index + 1, ..., :steps]).cumsum(axis=0)
         for window in windows:
             counts[window].append(added[int(steps_of(np.array([steps]), window)[0]) - 1])
-    return {str(window): vote(np.stack(each)).tolist() for window, each in counts.items()}
+    return {window: np.stack(each) for window, each in counts.items()}
 
 
 def build(path: str, weights: str | None, file: Path) -> tuple[CrossbarNetlist, int, str]:
     """Place a network and write it; the netlist, its neurons, the hash of its file; or CapacityError."""
     found, chip = trained(path, weights), load_target(NAME)
     netlist: CrossbarNetlist = chip.compile(found.network, Options(provenance=provenance(found))).netlist
-    file.parent.mkdir(parents=True, exist_ok=True)
     return netlist, netlist.n_neurons, write_crossbars(netlist, file)
