@@ -26,10 +26,10 @@ from spikeloom.models.graphs import build_graph
 from spikeloom.models.networks.quantised import quantised_spikes
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.costs import yardsticks
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.machines.votes import class_counts, readout_counts
+from spikeloom.runtime.studies import yardsticks
 
 CASES = pytest.mark.parametrize(
     ("system", "dynamics"),

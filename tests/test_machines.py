@@ -305,10 +305,10 @@ def test_tables_that_are_not_there_or_wrong(tmp_path):
 
 TRUENORTH = table("""
     core.axons 256  core.neurons 256  core.axon_types 4  chip.cores 4096  mesh.width 64  mesh.height 64  mesh.reach 255
-    neuron.weight_bits 9  neuron.leak_bits 9  neuron.threshold_bits 18  neuron.mask_bits 18  neuron.reset_bits 9
+    neuron.weight_bits 9  neuron.leak_bits 9  neuron.threshold_bits 18  neuron.reset_bits 9
     neuron.membrane_bits 20  neuron.targets 1  neuron.delay 15  tick.length 1000
 """)
-UNVERIFIED = {"neuron.leak_bits", "neuron.threshold_bits", "neuron.mask_bits", "neuron.reset_bits"}
+UNVERIFIED = {"neuron.leak_bits", "neuron.threshold_bits", "neuron.reset_bits"}
 
 
 def test_truenorth_limits_with_source_and_confidence():

@@ -267,7 +267,6 @@ def test_the_schema_of_ranc():
     ("changes", "what"),
     [
         ({"leak": -1, "leak_reversal": True}, "a leak with reversal (1 neurons)"),
-        ({"mask_bits": 1}, "a random threshold (1 neurons)"),
         ({"reset_mode": RESET_NONE}, "a reset that does nothing (1 neurons)"),
         ({"negative_saturates": True}, "a negative threshold that saturates (1 neurons)"),
     ],

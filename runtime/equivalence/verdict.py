@@ -15,10 +15,10 @@ import numpy as np
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.costs.simulated import Part
 from spikeloom.runtime.equivalence.breakdowns import Breakdown
 from spikeloom.runtime.equivalence.certificates import Certificate
 from spikeloom.runtime.equivalence.rounding import Rounding
+from spikeloom.runtime.machines.simulated import Part
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Block, Section, Table, Text

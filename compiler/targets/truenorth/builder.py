@@ -32,7 +32,6 @@ class Neuron:
     leak: int = 0
     leak_reversal: bool = False
     threshold: int = 1
-    mask_bits: int = 0
     reset_mode: int = RESET_TO
     reset: int = 0
     negative_threshold: int = 0

@@ -127,7 +127,6 @@ def _parameters(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
         ("leak", netlist.leak, signed["leak"], "leak_bits", "a smaller scale"),
         ("threshold", netlist.threshold, unsigned, "threshold_bits", "a smaller scale"),
         ("negative threshold", netlist.negative_threshold, unsigned, "threshold_bits", "a smaller scale"),
-        ("random bits", netlist.mask_bits, (0, chip.limit("neuron.mask_bits")), "mask_bits", "fewer bits"),
         ("reset value", netlist.reset, signed["reset"], "reset_bits", "reset nearer to zero"),
         ("initial membrane", netlist.initial, signed["membrane"], "membrane_bits", "start nearer to zero"),
         ("reset mode", netlist.reset_mode, (RESET_TO, RESET_NONE), "reset_mode", "use one of the modes"),

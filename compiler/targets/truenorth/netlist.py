@@ -40,7 +40,7 @@ AXON_TYPES = 4
 """Columns of ``CrossbarNetlist.weight``."""
 
 PER_NEURON = (
-    *("leak", "leak_reversal", "threshold", "mask_bits", "reset_mode", "reset", "negative_threshold"),
+    *("leak", "leak_reversal", "threshold", "reset_mode", "reset", "negative_threshold"),
     *("negative_saturates", "initial", "layer", "neuron", "readout_class", "readout_first"),
 )
 """Arrays with one entry a neuron, beside ``weight``."""
@@ -83,13 +83,11 @@ class CrossbarNetlist:
     # (neurons,) int64; 1 where the leak takes the sign of the membrane; a membrane that it would carry past zero is
     # then zero
     leak_reversal: IntArray
-    threshold: IntArray  # (neurons,) int64; A spike needs a membrane of at least this, and the masked random number
-    mask_bits: IntArray  # (neurons,) int64; random bits that are added to both thresholds in every tick; 0 for none
+    threshold: IntArray  # (neurons,) int64; a spike needs a membrane of at least this
     # reset_mode, reset: (neurons,) int64; ``RESET_TO``, ``RESET_LINEAR`` or ``RESET_NONE``, and the value of the first
     reset_mode: IntArray
     reset: IntArray
-    # (neurons,) int64; magnitude. A membrane below ``-negative_threshold`` (and the random number) is reset, too.
-    negative_threshold: IntArray
+    negative_threshold: IntArray  # (neurons,) int64; magnitude; a membrane below ``-negative_threshold`` is reset, too
     negative_saturates: IntArray  # (neurons,) int64; 1 where it stays at ``-negative_threshold`` instead of being reset
     initial: IntArray  # (neurons,) int64; membrane before the first tick
     # layer, neuron: (neurons,) int64; which neuron of which layer it is; copies of one share the numbers

@@ -8,11 +8,11 @@ from dataclasses import replace
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import ModelError
 from spikeloom.runtime.commands.options import add_checkpoint, add_recordings
-from spikeloom.runtime.costs import yardsticks
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.studies import yardsticks
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

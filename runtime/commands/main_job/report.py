@@ -8,13 +8,13 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_explain_cost, add_netlist_and_model, add_recordings
-from spikeloom.runtime.costs.simulated import Account
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
+from spikeloom.runtime.machines.simulated import Account
 from spikeloom.runtime.page.recording import recording
 from spikeloom.runtime.page.results import Decisions, Report, provenance, taxels
 from spikeloom.runtime.page.sections import about, sections

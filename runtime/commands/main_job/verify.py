@@ -8,12 +8,12 @@ from dataclasses import replace
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_explain_cost, add_netlist_and_model, add_recordings
-from spikeloom.runtime.costs.simulated import Account
 from spikeloom.runtime.equivalence.verdict import parse_requirements, sections
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.base import ENGINES, chip_commands, machine_for
+from spikeloom.runtime.machines.simulated import Account
 from spikeloom.runtime.report.sections import Outcome
 
 
