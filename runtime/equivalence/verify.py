@@ -112,7 +112,7 @@ def verify(
     begin("specification")
     checked = min(spec_samples, len(events))
     equal = machine.check(events[:checked], lengths=lengths) == 0
-    beside = None if engine_name == ENGINES[0] else machine.beside(events, lengths=lengths, samples=checked)
+    beside = None if engine_name == ENGINES[0] else machine.beside(events, lengths=lengths)
 
     def rung(stage: str, spikes: list[BoolArray]) -> Rung:
         differ = {name: int(np.count_nonzero(a != b)) for name, a, b in zip(names, reference, spikes, strict=True)}
@@ -146,7 +146,7 @@ def verify(
             for i, name in enumerate(names)
         },
         spec_samples=checked,
-        spec_equals_engine=equal and (beside is None or beside.equal),
+        spec_equals_engine=equal and not beside,
         weights=weights,
         first_divergence=divergence,
         ladder=tuple(ladder),
@@ -155,7 +155,7 @@ def verify(
         not_compared={name: int(out.sum()) for name, out in zip(names, machine.unread, strict=True) if out.any()},
         certificate=certificate,
         engine=engine_name,
-        engine_different=None if beside is None else beside.different,
+        engine_different=beside,
         required={} if required is None else required,
     )
 

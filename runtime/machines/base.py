@@ -70,14 +70,6 @@ class Price:
     time_ns: Mapping[str, FloatArray] = field(default_factory=dict)  # Not rounded to seconds, where counted
 
 
-@dataclass(frozen=True, slots=True)
-class Beside:
-    """Another program against our simulator: spikes that differ, and whether all that was compared is equal."""
-
-    different: int
-    equal: bool
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Step:
     """What one chip step brought."""
@@ -203,8 +195,8 @@ class Machine(ABC):
         if engine != ENGINES[0]:
             raise OptionError(f"--engine {engine}: is not for {self.target.title}; omit it")
 
-    def beside(self, events: EventArray, *, lengths: IntArray | None = None, samples: int) -> Beside:
-        """Run the other program that is ready; all it keeps is compared on the first `samples` recordings."""
+    def beside(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
+        """Run the other program that is ready; spikes and votes in which it and our simulator differ."""
         raise NotImplementedError
 
     def require_sensor(self, events: EventArray) -> None:

@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -20,7 +19,7 @@ from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.machines.base import Beside, EventArray, Price, Run, one_by_one
+from spikeloom.runtime.machines.base import EventArray, Price, Run, one_by_one
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import description, engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
@@ -99,26 +98,21 @@ class Loihi(IntegerMachine):
         return found
 
     @cached_property
-    def _onnx(self) -> tuple[OnnxEngine, OnnxEngine]:
-        """The integer graph in both forms."""
+    def _onnx(self) -> OnnxEngine:
         from spikeloom.runtime.machines.loihi1 import onnx_engine
 
-        return onnx_engine.prepare(self.netlist, form="scan"), onnx_engine.prepare(self.netlist, form="step")
+        return onnx_engine.prepare(self.netlist)
 
     def require_engine(self, name: str) -> None:
         """Load the integer graph for onnxruntime."""
         if name == "onnx":
             _ = self._onnx
 
-    def beside(self, events: EventArray, *, lengths: IntArray | None = None, samples: int) -> Beside:
-        """Spikes of all recordings in the form ``scan``; of the first all that ``step`` has."""
-        from spikeloom.runtime.machines.loihi1.onnx_engine import different_spikes, same_state
+    def beside(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
+        """Of the integer graph."""
+        from spikeloom.runtime.machines.loihi1 import onnx_engine
 
-        scan, step = self._onnx
-        channels = with_clocks(events, self.netlist.clocks)
-        different = different_spikes(scan, self._engine, channels, lengths)
-        few = islice(one_by_one(channels, lengths), samples)
-        return Beside(different, different == 0 and all(same_state(step, self._engine, each) for each in few))
+        return onnx_engine.differences(self._onnx, self._engine, with_clocks(events, self.netlist.clocks), lengths)
 
     @cached_property
     def integer(self) -> IntegerNetwork:
