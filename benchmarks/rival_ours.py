@@ -44,7 +44,7 @@ def counts(netlist: Netlist) -> Run:
         assert trace.charged is not None
         steps = np.full(len(events), events.shape[2])
         timing.simple_times(latencies, trace.charged, steps + netlist.max_depth)
-        cost.estimate(meter, trace.counts, steps + netlist.max_depth)
+        cost.price(meter, trace.counts, steps + netlist.max_depth)
         return trace
 
     return run
@@ -64,7 +64,7 @@ def cycle(netlist: Netlist) -> Run:
         steps = np.full(len(events), events.shape[2])
         timing.simple_times(latencies, trace.charged, steps + netlist.max_depth)
         timing.detailed(latencies, trace.spikes, trace.updated, events)
-        cost.estimate(meter, trace.counts, steps + netlist.max_depth)
+        cost.price(meter, trace.counts, steps + netlist.max_depth)
         return trace
 
     return run

@@ -83,7 +83,7 @@ def brute_force(netlist, recording, trace=None):
 def check(netlist, recordings, traces=None):
     """Hold the counts and energies of a batch against the brute force; returns the costs."""
     trace = engine.simulate(netlist, recordings)
-    costs = cost.estimate(cost.prepare(netlist, LOIHI), trace.counts, recordings.shape[2] + netlist.max_depth)
+    costs = cost.price(cost.prepare(netlist, LOIHI), trace.counts, recordings.shape[2] + netlist.max_depth)
     for sample, recording in enumerate(recordings):
         expected = brute_force(netlist, recording, traces and traces[sample])
         for name in cost.EVENTS:

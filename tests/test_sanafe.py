@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import timing_oracle
 from random_netlists import Axon, Neuron, build, large_netlist, ungated
-from test_timing import DETAILED, ENERGY_PJ, LOIHI, SANAFE, SIMPLE, six_steps
+from test_timing import DETAILED, ENERGY_PJ, LOIHI, PICO, SANAFE, SIMPLE, six_steps
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import read_only
@@ -26,7 +26,7 @@ from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.runtime.commands.exchange import export
-from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import terminal
@@ -101,13 +101,11 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
     shifted[:, :, 1 : events.shape[2] + 1] = events
     trace = engine.simulate(ungated(netlist), shifted, spikes=True, membranes=True)
     updated = timing_oracle.updates(netlist, shifted, trace.spikes, trace.membranes)
-    as_priced = {"input_tiles": sanafe.input_tiles(netlist, LOIHI), "dense": timing_oracle.dense_synapses(netlist)}
-    latencies = timing.prepare(netlist, LOIHI, SANAFE, **as_priced)
-    batch = trace.spikes, updated, shifted
-    simple, detailed = timing_oracle.simple(latencies, *batch), timing.detailed(latencies, *batch)
-    counts = replace(trace.counts, updates=cost.updates_by_core(netlist, updated))
-    meter = cost.prepare(netlist, LOIHI, "core", **as_priced)
-    parts = cost.by_part(LOIHI, cost.count(meter, counts, steps))["sanafe"]
+    tiles, dense = sanafe.input_tiles(netlist, LOIHI), timing_oracle.dense_synapses(netlist)
+    chip = timing_oracle.Chip(netlist, LOIHI, SANAFE, tiles, dense)
+    times = [chip.run(*each) for each in zip(trace.spikes, updated, shifted, strict=True)]
+    worked = updated.sum(axis=(1, 2))
+    parts = timing_oracle.parts_of_energy(netlist, LOIHI, trace.counts, worked, steps, tiles, dense)
 
     names, number = sanafe.group_names(netlist), netlist.number_in_layer()
     compartment = {(names[netlist.layer[c]], int(number[c])): c for c in range(netlist.n_compartments)}
@@ -125,8 +123,8 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
                 detailed=1e9 * np.array(second["trace"]["sim_time"]),
                 energy={part: first["energy"][part] for part in cost.PARTS},
                 steps_energy={part: np.array(first["trace"][f"{part}_energy"]) for part in cost.PARTS},
-                ours_simple=simple.duration_ns[i],
-                ours_detailed=detailed.duration_ns[i],
+                ours_simple=np.array([step.simple for step in times[i]]) / PICO,
+                ours_detailed=np.array([step.detailed for step in times[i]]) / PICO,
                 ours_energy={part: float(joules[i].sum()) for part, joules in parts.items()},
             )
         )
