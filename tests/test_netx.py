@@ -1,7 +1,6 @@
 """lava-dl's ``.net`` files: read as the integers that they are, written within their limits, refused."""
 
 import io
-import json
 import os
 from itertools import pairwise
 from pathlib import Path
@@ -10,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from commands import as_json, refusal, run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from made_netx import conv, dense, even, events, flatten, given_input, neuron, write
@@ -27,7 +27,6 @@ from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.loihi1 import engine
 
 pytestmark = pytest.mark.usefixtures("hdf5_in_one_process")
@@ -294,19 +293,11 @@ def test_written_files_are_laid_out_as_documented(tmp_path):
     assert path.read_bytes() == netx_export.file_bytes(network, blocks)
 
 
-def run(capsys, *words):
-    capsys.readouterr()
-    code = main([str(word) for word in words])
-    said = capsys.readouterr()
-    return code, said.out, said.err
-
-
-def test_the_command_counts_what_it_moves(tmp_path, capsys):
+def test_the_command_counts_what_it_moves(tmp_path):
     made, out = specimen("timed"), tmp_path / "g.net"
     net = made.netlist
-    code, text, _ = run(capsys, "export", net, "--to", "netx", "-o", out, "--data", made.data, "--json")
-    report = json.loads(text)
-    assert (code, report["exact"], report["recordings"]) == (0, False, len(made.events))
+    report = as_json("export", net, "--to", "netx", "-o", out, "--data", made.data)
+    assert (report["exact"], report["recordings"]) == (False, len(made.events))
     network = lift(made.machine.netlist)
     blocks = netx_export.blocks_for(network)
     assert (
@@ -320,20 +311,19 @@ def test_the_command_counts_what_it_moves(tmp_path, capsys):
     assert [population.decay_u for population in back.populations] == [p.decay_u for p in network.populations]
     assert_array_equal(back.readout.label, network.readout.label)
     before = out.read_bytes()
-    code, _, said = run(capsys, "export", net, "--to", "netx", "-o", out, "--strict")
-    assert code == 2
-    assert said.startswith(f"spikeloom: --strict: netx cannot hold {net} as it is (conv1: ")
+    said = refusal("export", net, "--to", "netx", "-o", out, "--strict")
+    assert said.startswith(f"--strict: netx cannot hold {net} as it is (conv1: ")
     assert out.read_bytes() == before
 
 
-def test_strict_writes_what_is_exact(tmp_path, capsys):
+def test_strict_writes_what_is_exact(tmp_path):
     rng = np.random.default_rng(6)
     path = write(tmp_path / "a.net", dense(even(rng, 12, 6), bias=even(rng, 12, most=8)), dense(even(rng, 5, 12)))
-    assert run(capsys, "compile", path, "--keep-all", "-o", tmp_path / "a.loom")[0] == 0
-    code, text, _ = run(capsys, "export", tmp_path / "a.loom", "--to", "netx", "--strict", "-o", tmp_path / "b.net")
+    assert run("compile", path, "--keep-all", "-o", tmp_path / "a.loom")[0] == 0
+    code, text, _ = run("export", tmp_path / "a.loom", "--to", "netx", "--strict", "-o", tmp_path / "b.net")
     assert code == 0
     assert text.splitlines()[1] == "biases, thresholds and weights are the netlist's"
-    assert run(capsys, "compile", tmp_path / "b.net", "--keep-all", "-o", tmp_path / "b.loom")[0] == 0
+    assert run("compile", tmp_path / "b.net", "--keep-all", "-o", tmp_path / "b.loom")[0] == 0
     ours, back = (lift(read_netlist(tmp_path / name)) for name in ("a.loom", "b.loom"))
     for one, other in zip(ours.projections, back.projections, strict=True):
         assert_array_equal(one.effective().toarray(), other.effective().toarray())

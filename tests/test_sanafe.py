@@ -3,7 +3,6 @@
 SANA-FE is run in an interpreter of its own: the one that SPIKELOOM_SANAFE_PYTHON names, or this one if it has it.
 """
 
-import argparse
 import hashlib
 import importlib.util
 import json
@@ -11,25 +10,23 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import timing_oracle
+from commands import as_json, refusal
 from random_netlists import Axon, Neuron, build, large_netlist, ungated
 from test_timing import DETAILED, ENERGY_PJ, LOIHI, PICO, SANAFE, SIMPLE, six_steps
 
-from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
-from spikeloom.runtime.commands.exchange import export
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost
-from spikeloom.runtime.report.encode import encode
-from spikeloom.runtime.report.sections import terminal
 
 PROGRAM = """
 import json, sys
@@ -69,23 +66,9 @@ def interpreter() -> str:
     return named or sys.executable
 
 
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """One recording in both programs; times in ns per step, energies in joules per part."""
-
-    spikes: np.ndarray
-    expected_spikes: np.ndarray
-    simple: np.ndarray
-    detailed: np.ndarray
-    energy: dict[str, float]
-    steps_energy: dict[str, np.ndarray]
-    ours_simple: np.ndarray
-    ours_detailed: np.ndarray
-    ours_energy: dict[str, float]
-
-
-def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> list[Run]:
-    """Run recordings, (recordings, n_inputs, T), in SANA-FE and here, under its conventions.
+def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> list[SimpleNamespace]:
+    """Run recordings, (recordings, n_inputs, T), in SANA-FE and here, under its conventions: spikes, times in ns per
+    step, energies in joules per part.
 
     Its channels fire one step before they act, and every layer integrates in each of T + depth + 1 steps.
     """
@@ -116,7 +99,7 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
         for step, group, k in first["spikes"]:
             fired[step, compartment[group, k]] = True
         runs.append(
-            Run(
+            SimpleNamespace(
                 spikes=fired,
                 expected_spikes=trace.spikes[i],
                 simple=1e9 * np.array(first["trace"]["sim_time"]),
@@ -212,15 +195,6 @@ mappings:
 """
 
 
-def run(*words):
-    """What the command reports and prints."""
-    parser = argparse.ArgumentParser()
-    export.add_arguments(parser)
-    found = export.run(parser.parse_args([str(word) for word in words]))
-    assert found.code == 0
-    return encode(found.result), terminal(found.sections(found.result))
-
-
 def lines(netlist):
     return list(sanafe.export(netlist, LOIHI))
 
@@ -229,7 +203,7 @@ def test_the_whole_file(tmp_path):
     netlist, _, _ = six_steps()
     write_netlist(netlist, tmp_path / "net.loom")
     path = tmp_path / "net.yaml"
-    report, _ = run(tmp_path / "net.loom", "--to", "sanafe", "-o", path)
+    report = as_json("export", tmp_path / "net.loom", "--to", "sanafe", "-o", path)
     assert path.read_text("utf-8") == SIX_STEPS
     assert (report["bytes"], report["sha256"]) == (len(SIX_STEPS), hashlib.sha256(SIX_STEPS.encode()).hexdigest())
     assert (report["neurons"], report["synapses"], report["groups"]) == (3, 6, ["input", "layer0", "layer1"])
@@ -290,7 +264,7 @@ def test_a_current_that_lasts_is_a_float_there_and_that_is_said(tmp_path):
     netlist, _, _ = six_steps()
     netlist = replace(netlist, decay_u=read_only([4095, 4095, 2047]))
     write_netlist(netlist, tmp_path / "net.loom")
-    report, _ = run(tmp_path / "net.loom", "--to", "sanafe", "-o", tmp_path / "net.yaml")
+    report = as_json("export", tmp_path / "net.loom", "--to", "sanafe", "-o", tmp_path / "net.yaml")
     assert report["floating_currents"] == ["layer1"]
     written = (tmp_path / "net.yaml").read_text("utf-8")
     assert written.count("input_decay: 0.5, ") == 1
@@ -311,6 +285,4 @@ def test_a_current_that_lasts_is_a_float_there_and_that_is_said(tmp_path):
     ],
 )
 def test_options_that_a_format_would_ignore(tmp_path, words, said):
-    with pytest.raises(OptionError) as caught:
-        run("x.loom", "-o", tmp_path / "x", "--to", *words.split())
-    assert str(caught.value).startswith(said)
+    assert refusal("export", "x.loom", "-o", tmp_path / "x", "--to", *words.split()).startswith(said)

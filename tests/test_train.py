@@ -166,20 +166,18 @@ def test_a_killed_training_resumes_to_the_same_weights(tmp_path):
     assert resumed.best_epoch == whole.best_epoch
 
 
-def test_resuming_with_other_options_or_data_is_refused(tmp_path):
+def test_a_state_of_another_training_or_a_damaged_one_is_refused(tmp_path):
     state = tmp_path / "x.state"
     train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
-    words = f"{state}: belongs to a training with other epochs, training data; "
-    refused(OptionError, words, train, grasps(2), grasps(1), ADJACENCY, SMALL, epochs=2, state=state, resume=True)
 
+    def refused_for(words, error, data, epochs):
+        options = {"epochs": epochs, "state": state, "resume": True}
+        refused(error, f"{state}: {words}; ", train, data, grasps(1), ADJACENCY, SMALL, **options)
 
-@pytest.mark.parametrize("change", [lambda content: content[:-100], lambda _: b"[", lambda _: npy_bytes(np.zeros(1))])
-def test_a_damaged_state_is_refused(tmp_path, change):
-    state = tmp_path / "x.state"
-    train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
-    state.write_bytes(change(state.read_bytes()))
-    words = f"{state}: is not a training state or is damaged; "
-    refused(ModelError, words, train, grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state, resume=True)
+    refused_for("belongs to a training with other epochs, training data", OptionError, grasps(2), 2)
+    for content in (state.read_bytes()[:-100], b"[", npy_bytes(np.zeros(1))):
+        state.write_bytes(content)
+        refused_for("is not a training state or is damaged", ModelError, grasps(0), 1)
 
 
 def test_a_loss_that_is_no_number_stops_and_keeps_the_state(tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from commands import as_json, refusal
 from made_files import CLASSES, TAXELS, own_file
 from random_crossbars import random_network
 from zoo import specimen
@@ -31,7 +32,6 @@ from spikeloom.models.truenorth.network import (
     sized,
 )
 from spikeloom.models.truenorth.neurons import block_sums, integrate
-from spikeloom.runtime.cli import main
 
 SMOOTH = Surrogate(shape=FAST_SIGMOID, width=0.5, reset=False)
 SIZES = NativeArchitecture(taxels=6, classes=3, features=4, groups=2, hidden=(6, 4), clocks=clocks_over(2, 9))
@@ -201,35 +201,25 @@ def test_files_that_are_refused(tmp_path, change, said):
 TRAIN = "train --system tactilesgnet-truenorth --data data --graph manual --features 2 --epochs 1"
 
 
-def as_json(capsys, words):
-    assert main([*words.split(), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def mistake(capsys, words):
-    assert main(words.split()) == 2
-    return capsys.readouterr().err.removeprefix("spikeloom: ").rstrip("\n")
-
-
-def test_from_recordings_to_the_chip(tmp_path, monkeypatch, capsys):
+def test_from_recordings_to_the_chip(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     seeds = (("train", 1), ("test", 2))
     grasps = [replace(synthetic_grasps(per_class=2, steps=12, seed=seed), split=split) for split, seed in seeds]
     write_released(tmp_path / "data", grasps)
-    (run,) = as_json(capsys, f"{TRAIN} -o x.pt")["runs"]
+    (run,) = as_json(*f"{TRAIN} -o x.pt".split())["runs"]
     assert run["command"].endswith("--system tactilesgnet-truenorth --graph manual --features 2 --epochs 1 --seed 0")
     assert run["recipe"] == CROSSBARS.to_json() | {"features": 2}
-    shown = as_json(capsys, "inspect x.pt")
+    shown = as_json("inspect", "x.pt")
     assert (shown["copies"], shown["levels"], shown["sets"]) == (3, 7, ["last", "best", "clean"])
-    made = as_json(capsys, "compile x.pt --target truenorth -o x.loom")
+    made = as_json("compile", "x.pt", "--target", "truenorth", "-o", "x.loom")
     assert made["provenance"]["checkpoint_sha256"] == shown["sha256"] == run["sha256"]
-    found = as_json(capsys, "verify x.loom --data data --checkpoint x.pt --spec-samples 1")
+    found = as_json("verify", "x.loom", "--data", "data", "--checkpoint", "x.pt", "--spec-samples", "1")
     assert found["exact"]
     assert found["correct"] == run["last"]["correct"] == predict_correct("x.pt", grasps[1])
     # what was finished is not trained again
-    (again,) = as_json(capsys, f"{TRAIN} -o x.pt --resume")["runs"]
+    (again,) = as_json(*f"{TRAIN} -o x.pt --resume".split())["runs"]
     assert again == run
-    assert "x.pt: holds another training (other seed)" in mistake(capsys, f"{TRAIN} --seed 1 --resume -o x.pt")
+    assert "x.pt: holds another training (other seed)" in refusal(*f"{TRAIN} --seed 1 --resume -o x.pt".split())
 
 
 def predict_correct(path, recordings):
@@ -264,22 +254,21 @@ VERIFY = "verify net.loom --data data --checkpoint"
         (f"{VERIFY} two.pt", "--checkpoint two.pt: net.loom was compiled from another file"),
         ("verify two.loom --data data --checkpoint two.pt", "--weights last: two.loom was compiled from best"),
         ("join net.pt own.pt -o z.pt", "net.pt: holds whole numbers of a chip"),
-        ("compile own.pt --target truenorth -o z.loom", "conv1, all 30 neurons: keep 0.2 of their membranes a step"),
+        ("compile own.pt --target truenorth -o z.loom", "fc3, all 4 neurons: keep 0.2 of their membranes a step"),
     ],
 )
 @pytest.mark.usefixtures("native")
-def test_mistakes(capsys, words, said):
-    as_json(capsys, "compile two.pt --weights best --target truenorth -o two.loom")
-    assert said in mistake(capsys, words)
+def test_mistakes(words, said):
+    as_json("compile", "two.pt", "--weights", "best", "--target", "truenorth", "-o", "two.loom")
+    assert said in refusal(*words.split())
     assert not list(Path().glob("z.*"))
 
 
 @pytest.mark.usefixtures("native")
-def test_a_spike_that_differs_fails(capsys):
+def test_a_spike_that_differs_fails():
     netlist = read_crossbars("net.loom")
     write_crossbars(replace(netlist, threshold=netlist.threshold + 9), "other.loom")
-    words = f"{VERIFY.replace('net.loom', 'other.loom')} net.pt --spec-samples 0 --json"
-    assert main(words.split()) == 1
-    report = json.loads(capsys.readouterr().out)
+    words = VERIFY.replace("net.loom", "other.loom").split()
+    report = as_json(*words, "net.pt", "--spec-samples", 0, codes=(1,))
     assert report["E1"]["differences"] > 0
     assert not report["exact"]

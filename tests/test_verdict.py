@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from made_files import CLASSES, TAXELS, events, own_file, recordings_folder, small_checkpoint, weights
+from made_files import CLASSES, TAXELS, events, own_file, small_checkpoint, weights
 from random_networks import chain
 
 from spikeloom.compiler import Options, Packing, compile_network
@@ -318,16 +318,8 @@ def test_another_checkpoint_graph_or_neuron_model(tmp_path, calibrated):
         assert not checked(netlist, network).holds
 
 
-@pytest.fixture
-def place(tmp_path):
-    own_file(tmp_path / "net.pt")
-    own_file(tmp_path / "other.pt", last=weights(7))
-    recordings_folder(tmp_path / "data")
-    return tmp_path
-
-
-def test_verify_fails_where_the_weights_are_not_the_checkpoints(spikeloom):
-    assert spikeloom("compile", "net.pt", "-o", "net.loom")[0] == 0
+def test_verify_fails_where_the_weights_are_not_the_checkpoints(spikeloom, place):
+    own_file(place / "other.pt", last=weights(7))
     words = ("verify", "net.loom", "--data", "data", "--min-agreement", "0", "--checkpoint", "other.pt")
     code, out, _ = spikeloom(*words)
     assert code == 1
