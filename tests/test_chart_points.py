@@ -71,9 +71,7 @@ def test_fronts_are_of_test_accuracy_and_each_cost(points):
 def test_expected_is_validation_times_what_is_kept_on_training_recordings():
     (reached,), (network,), words = with_expectations([point(1, 380, 50, 1, 1)], [made_network(trained=396)])
     assert (reached.expected, network.expected, words) == (pytest.approx(0.9 * 0.95 / 0.99), 0.9, VALIDATION)
-
-
-def test_where_one_checkpoint_knows_no_validation_training_figures_stand_for_all():
+    # where one checkpoint knows no validation, training figures stand for all
     networks = [made_network(trained=396), made_network("other", validation=None)]
     (reached,), _, words = with_expectations([point(1, 380, 50, 1, 1)], networks)
     assert (reached.expected, words) == (pytest.approx(0.95), TRAINING)
@@ -141,14 +139,9 @@ def test_a_budget_in_units(words, limit):
     "words",
     [
         "power=1W",
-        "energy",
-        "energy=0.1",
-        "energy=1ms",
-        "latency=",
-        "latency=-1ms",
-        "energy=0mJ",
-        "accuracy=101",
-        "accuracy=x",
+        *(f"energy{value}" for value in ("", "=0.1", "=1ms", "=0mJ")),
+        *(f"latency={value}" for value in ("", "-1ms")),
+        *(f"accuracy={value}" for value in ("101", "x")),
     ],
 )
 def test_a_budget_that_is_none(words):
@@ -156,10 +149,6 @@ def test_a_budget_that_is_none(words):
         parse_budgets([words])
     with pytest.raises(OptionError, match="--budget latency=2ms: latency is limited twice; give it once"):
         parse_budgets(["latency=1ms", "latency=2ms"])
-
-
-def picked(points, *words):
-    return pick(points, parse_budgets(words), BY)
 
 
 @pytest.mark.parametrize(
@@ -174,13 +163,13 @@ def picked(points, *words):
     ],
 )
 def test_the_point_that_fits_all_budgets(points, budgets, number, fitting):
-    found = picked(points, *budgets)
+    found = pick(points, parse_budgets(budgets), BY)
     assert (found.fits, found.point, found.fitting, found.misses) == (True, number, fitting, {})
 
 
 def test_what_is_given_up_beside_the_best(points):
-    assert picked(points) is None
-    found = picked(points, "energy=150uJ")
+    assert pick(points, (), BY) is None
+    found = pick(points, parse_budgets(["energy=150uJ"]), BY)
     assert found.best == 1
     assert found.given_up.expected == pytest.approx(-0.0045)
     assert found.given_up.accuracy == pytest.approx(0.02)
@@ -189,15 +178,12 @@ def test_what_is_given_up_beside_the_best(points):
 
 
 def test_the_nearest_point_of_a_budget_that_nothing_fits(points):
-    found = picked(points, "energy=20uJ")
+    found = pick(points, parse_budgets(["energy=20uJ"]), BY)
     assert (found.fits, found.fitting, found.point) == (False, 0, 4)
     (miss,) = found.misses.values()
     assert (miss["limit"], miss["found"]) == (pytest.approx(20 * UJ), pytest.approx(40 * UJ))
-    both = picked(points, "energy=50uJ", "latency=2ms")
+    both = pick(points, parse_budgets(["energy=50uJ", "latency=2ms"]), BY)
     assert (both.point, list(both.misses)) == (3, ["energy"])
-
-
-def test_time_cannot_be_limited_where_nothing_is_timed(points):
     with pytest.raises(OptionError, match=r"--budget latency: .*no time table"):
         pick(points, parse_budgets(["latency=1ms"]), ChosenBy(energy="one", time=None))
 
@@ -210,43 +196,34 @@ def parsed(text):
     return parse_grid(text, TARGET)
 
 
-def test_every_axis_of_the_whole_example():
-    found = parsed("bits=2-6,8,planes=1-2,window=25-100%,cores=latency/fc1:6+conv1:4,prune=0/1,groups=2")
-    assert found == Grid(
-        bits=((2,), (3,), (4,), (5,), (6,), (8,)),
-        planes=(1, 2),
-        window=(25, 50, 75, 100),
-        cores=("latency", "fc1:6+conv1:4"),
-        prune=(0, 1),
-        groups=(2,),
-    )
-
-
-def test_axes_that_are_not_named_keep_their_usual_value():
-    assert parsed("bits=4") == Grid(bits=((4,),))
-    assert Grid().bits == tuple((width,) for width in WIDTHS)
-    assert Grid().window == (25, 50, 75, 100)
-
-
-def test_values_stay_in_order_and_each_is_there_once():
-    assert parsed("bits=8,2-4,3,4+4+4+4").bits == ((8,), (2,), (3,), (4,))
-    assert parsed("bits=8+4+4+8/8").bits == ((8, 4, 4, 8), (8,))
-
-
 @pytest.mark.parametrize(
-    ("text", "windows"),
+    ("text", "axes"),
     [
-        ("50", (50,)),
-        ("50%", (50,)),
-        ("25-100%", (25, 50, 75, 100)),
-        ("25%-100%", (25, 50, 75, 100)),
-        ("40-100%:20", (40, 60, 80, 100)),
-        ("40-100%:50%", (40, 90, 100)),
-        ("100-100", (100,)),
+        (
+            "bits=2-6,8,planes=1-2,window=25-100%,cores=latency/fc1:6+conv1:4,prune=0/1,groups=2",
+            {
+                "bits": ((2,), (3,), (4,), (5,), (6,), (8,)),
+                "planes": (1, 2),
+                "window": (25, 50, 75, 100),
+                "cores": ("latency", "fc1:6+conv1:4"),
+                "prune": (0, 1),
+                "groups": (2,),
+            },
+        ),
+        # in their order, each once
+        ("bits=8,2-4,3,4+4+4+4", {"bits": ((8,), (2,), (3,), (4,))}),
+        ("bits=8+4+4+8/8", {"bits": ((8, 4, 4, 8), (8,))}),
+        *((f"window={text}", {"window": (50,)}) for text in ("50", "50%")),
+        *((f"window={text}", {"window": (25, 50, 75, 100)}) for text in ("25-100%", "25%-100%")),
+        ("window=40-100%:20", {"window": (40, 60, 80, 100)}),
+        ("window=40-100%:50%", {"window": (40, 90, 100)}),
+        ("window=100-100", {"window": (100,)}),
     ],
 )
-def test_windows(text, windows):
-    assert parsed(f"window={text}").window == windows
+def test_values_of_axes(text, axes):
+    assert parsed(text) == Grid(**axes)
+    assert Grid().bits == tuple((width,) for width in WIDTHS)
+    assert Grid().window == (25, 50, 75, 100)
 
 
 @pytest.mark.parametrize(

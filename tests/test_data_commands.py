@@ -1,14 +1,14 @@
 import argparse
-import gc
 import hashlib
+import io
 import struct
-import threading
 import zipfile
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import requests
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings import fetch
@@ -171,75 +171,47 @@ def test_convert_mistakes(own, words, error, told):
 # fetch
 
 
-def test_fetch(monkeypatch, tmp_path):
-    content = b"recordings"
-    made = DataSet(file="Ev-Objects.zip", url="http://localhost/x", size=10, sha256=hashlib.sha256(content).hexdigest())
-    monkeypatch.setitem(fetch.DATA_SETS, "objects", made)
-    monkeypatch.setenv("SPIKELOOM_DATA", str(tmp_path / "data"))
-    for folder in ("data", "other"):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "Ev-Objects.zip").write_bytes(content)
-    report, _, code = start("fetch", "objects")
-    path = tmp_path / "data" / "Ev-Objects.zip"
-    assert (code, report["new"], report["path"], report["data"]) == (0, False, str(path), "objects")
-    other = tmp_path / "other" / "Ev-Objects.zip"
-    assert start("fetch", "objects", "--dir", other.parent)[0]["path"] == str(other)
-
-
-# For the other commands
-
-
-pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # requests keeps a socket
-
 CONTENT = b"recordings" * 1000
 
 
 @pytest.fixture
 def server(monkeypatch, tmp_path):
     """Answers each request with the next status and body of its script, the last one for ever."""
+    running = SimpleNamespace(script=[(200, CONTENT)], requests=0)
 
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            running.requests += 1
-            status, body, announced = running.script.pop(0) if len(running.script) > 1 else running.script[0]
-            self.send_response(status)
-            self.send_header("Content-Length", str(announced))
-            self.end_headers()
-            self.wfile.write(body)
+    def get(url, **_options):
+        running.requests += 1
+        answer = requests.Response()
+        answer.url = url
+        answer.status_code, body = running.script.pop(0) if len(running.script) > 1 else running.script[0]
+        answer.raw = io.BytesIO(body)
+        return answer
 
-        def log_message(self, *words) -> None:
-            pass
-
-    monkeypatch.setenv("no_proxy", "127.0.0.1")
-    monkeypatch.setenv("SPIKELOOM_DATA", str(tmp_path / "data"))
+    monkeypatch.setattr("requests.get", get)
     monkeypatch.setattr("time.sleep", lambda _: None)
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as running:
-        running.script, running.requests = [(200, CONTENT, len(CONTENT))], 0
-        thread = threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        url = f"http://127.0.0.1:{running.server_address[1]}/x.zip"
-        sha256 = hashlib.sha256(CONTENT).hexdigest()
-        data = DataSet(file="Ev-Objects.zip", url=url, size=len(CONTENT), sha256=sha256)
-        monkeypatch.setitem(fetch.DATA_SETS, "objects", data)
-        yield running
-        running.shutdown()
-        thread.join()
-    gc.collect()  # else another test is told of the socket
+    monkeypatch.setenv("SPIKELOOM_DATA", str(tmp_path / "data"))
+    sha256 = hashlib.sha256(CONTENT).hexdigest()
+    data = DataSet(file="Ev-Objects.zip", url="http://localhost/x.zip", size=len(CONTENT), sha256=sha256)
+    monkeypatch.setitem(fetch.DATA_SETS, "objects", data)
+    return running
 
 
 def test_fetches_once_and_is_found(server, tmp_path):
     path = tmp_path / "data" / "Ev-Objects.zip"
     with pytest.raises(DataError, match=r"objects: not on this machine .*run 'spikeloom data fetch objects'"):
         find_data("objects")
-    fetched = fetch_data("objects")
-    assert (fetched.path, fetched.new, path.read_bytes()) == (path, True, CONTENT)
+    report, _, code = start("fetch", "objects")
+    assert (code, report["new"], report["path"], report["data"]) == (0, True, str(path), "objects")
+    assert path.read_bytes() == CONTENT
     assert (find_data("objects"), fetch_data("objects").new, server.requests) == (path, False, 1)
-    other = fetch_data("objects", folder=tmp_path / "a" / "b", url=DATA_SETS["objects"].url + "?mirror")
-    assert (other.path, other.path.read_bytes()) == (tmp_path / "a" / "b" / "Ev-Objects.zip", CONTENT)
+    other = tmp_path / "a" / "b" / "Ev-Objects.zip"
+    mirror = DATA_SETS["objects"].url + "?mirror"
+    assert start("fetch", "objects", "--dir", other.parent, "--url", mirror)[0]["path"] == str(other)
+    assert other.read_bytes() == CONTENT
 
 
 def test_tries_again(server):
-    server.script = [(503, b"later", 5), (200, CONTENT[:99], len(CONTENT)), (200, CONTENT, len(CONTENT))]
+    server.script = [(503, b"later"), (200, CONTENT[:99]), (200, CONTENT)]
     assert fetch_data("objects").path.read_bytes() == CONTENT
     assert server.requests == 3
 
@@ -253,7 +225,7 @@ def test_tries_again(server):
     ],
 )
 def test_other_content_is_never_kept(server, tmp_path, status, body, words):
-    server.script = [(status, body, len(body))]
+    server.script = [(status, body)]
     with pytest.raises(DataError) as caught:
         fetch_data("objects")
     assert all(word in str(caught.value) for word in [DATA_SETS["objects"].url, "--url", *words])

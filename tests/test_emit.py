@@ -18,7 +18,6 @@ from random_networks import (
     integer_networks,
     legal_partition,
     random_checkpoint,
-    recordings_for,
     ring,
     seated,
     small_target,
@@ -26,9 +25,8 @@ from random_networks import (
 )
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
-from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError, NumericRangeError, OptionError
+from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import read_only
-from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, fan_in
 from spikeloom.compiler.passes.calibrate import calibrate
@@ -39,8 +37,6 @@ from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.compiler.targets.loihi1.storage.width_search import check_widths
-from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.trace import aligned
 
 
 @settings(deadline=None, max_examples=25)
@@ -83,16 +79,12 @@ def test_the_netlist_holds_exactly_the_network(network, target):
 
 @settings(deadline=None, max_examples=25)
 @given(integer_networks(), tight_targets())
-def test_compartments_hold_the_registers_of_their_neurons(network, target):
+def test_layers_and_votes_are_those_of_the_network(network, target):
     parts = legal_partition(network, target)
     netlist = seated(network, parts, target, {"seed": 1})
     for index, population in enumerate(network.populations):
         ids = netlist.compartments_of(index)
         assert netlist.neuron[ids].tolist() == list(range(population.size))
-        for field in ("threshold", "bias_mantissa", "bias_exponent", "scale"):
-            np.testing.assert_array_equal(getattr(netlist, field)[ids], getattr(population, field))
-        assert set(netlist.decay_u[ids].tolist()) == {population.decay_u}
-        assert set(netlist.decay_v[ids].tolist()) == {population.decay_v}
         voting = index == network.readout.population
         expected = network.readout.label.tolist() if voting else [-1] * population.size
         assert netlist.readout_class[ids].tolist() == expected
@@ -174,22 +166,6 @@ def test_emit_and_back(network, compartments):
     assert kept == formats
 
 
-@MANY
-@given(st.data())
-def test_runs_like_the_chip(data):
-    network = data.draw(integer_networks(exponents=(-1, 0)))
-    netlist = lower(network, core_compartments=5)
-    events = data.draw(recordings_for(network.input.size))
-    try:
-        trace = engine.simulate(netlist, events.transpose(0, 2, 1), spikes=True, membranes=True)
-    except NumericRangeError:
-        assume(False)
-    activity = run_integer(lift(netlist), events, membranes=True)
-    for layer in range(len(netlist.layers)):
-        np.testing.assert_array_equal(activity.spikes[layer], aligned(netlist, trace.spikes, layer))
-        np.testing.assert_array_equal(activity.membranes[layer], aligned(netlist, trace.membranes, layer))
-
-
 @pytest.mark.parametrize("empty", [0, 1, 2])
 def test_a_layer_without_synapses_keeps_its_projection(empty):
     weights = [np.full((3, 4), 50), np.full((2, 3), 60), np.full((2, 2), 70)]
@@ -236,11 +212,6 @@ def calibrating(shape):
     return lambda: calibrate(chain([[1.0, 1.0]]), np.zeros(shape, bool))
 
 
-def goal(name, cores_for=None, *, calibrated=True, chips=1):
-    options = Options(optimize=name, cores_for=cores_for or {}, chips=chips)
-    return lambda: options.require_consistent(calibrated=calibrated)
-
-
 def full(*sizes):
     return integer_chain(*[np.full((post, pre), 2) for pre, post in itertools.pairwise(sizes)])
 
@@ -264,14 +235,11 @@ OPTIONS = [
     *((f"--scale-groups {n}|8 thresholds|1 to 8", rounding(packings=(Packing(groups=n),))) for n in (0, 9)),
     ("--weight-bits: 2 layers|the network has 1", rounding(packings=(Packing(), Packing()))),
     (f"--widths 7|{WIDTHS}", lambda: check_widths([7], 1, 4, LOIHI)),
-    ("--optimize speed|cores, latency", goal("speed")),
-    ("--optimize latency|--calibrate", goal("latency", calibrated=False)),
-    ("--optimize latency|--cores-for", goal("latency", {"fc1": 2})),
     ("--optimize latency|no time", lambda: lay_out(full(2, 2), dataclasses.replace(LOIHI, time=()), goal="latency")),
-    ("--optimize latency|links between chips|--chips", goal("latency", chips=2)),
-    ("--chips 0|1 or more", goal("cores", chips=0)),
-    ("--cores-for fc9=2|fc1, fc2", laying_out((3, 200, 4), fc9=2)),
-    ("--cores-for fc1=129|128 cores|128 or fewer", laying_out((3, 200, 4), fc1=129)),
+    (
+        "--optimize latency|links between chips|--chips",
+        lambda: Options(optimize="latency", chips=2).require_consistent(calibrated=True),
+    ),
     ("--cores-for fc1=2|3 cores at least", laying_out((2496, 128), fc1=2)),
     # four neurons of seven output axons a core: three listening cores each let two of them sit together
     ("--cores-for fc1=1|2 cores at least", laying_out((1, 4, 9), small_target(core_axons_out=7), fc1=1, fc2=3)),

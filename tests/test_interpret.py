@@ -29,7 +29,6 @@ from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, f
 from spikeloom.compiler.targets.loihi1.netlist import netlist_text
 from spikeloom.compiler.text import text
 from spikeloom.runtime.equivalence import float_engine
-from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned, unpack
 from spikeloom.runtime.machines.votes import readout_counts
 
@@ -195,19 +194,6 @@ def test_any_wiring(drawn):
     )
     if not near:  # where no membrane is so near to its threshold that float32 may decide otherwise
         assert_array_equal(found.spikes, np.stack([s.sum(axis=(1, 2)) for s in wide.spikes], axis=1))
-
-
-def test_spikes_lie_where_the_chip_fires_them():
-    """A network of whole numbers that forgets at once spikes alike on both sides, word by word."""
-    matrices, thresholds = ([[3, -1, 2], [2, 2, -3]], [[2, 1], [-1, 3]]), (2, 3)
-    netlist = compiled(integer_chain(*(2 * np.array(m) for m in matrices), thresholds=[2 * t for t in thresholds]))
-    netlist = replace(netlist, decay_v=np.full_like(netlist.decay_v, 4095))  # what is left is below one unit
-    network = chain(*(np.array(m) / t for m, t in zip(matrices, thresholds, strict=True)), beta=0.0, theta=1.0)
-    inputs = random_inputs(3, 7, samples=5, steps=20)
-    found = float_engine.run(float_engine.prepare(network, netlist), inputs)
-    trace = engine.simulate(netlist, inputs, packed=True)
-    assert trace.counts.spikes.any()
-    assert_array_equal(found.packed, trace.packed)
 
 
 def test_neurons_that_the_chip_leaves_out_are_counted_elsewhere():
@@ -380,24 +366,16 @@ def test_mantissas_of_each_width(bits, good, bad):
     refused(VerifyError, "exponent -2|below -1", verify, integer_chain([[0]], exponent=-2))
 
 
-@given(st.one_of(float_networks(), integer_networks()))
-def test_random_networks_pass(network):
-    verify(network)
-
-
 # --- structure
 def test_fan_in_counts_stored_zeros():
     weight = stored([[1.0, 0.0, 2.0], [0.0, 0.0, 0.0]], np.array([[1, 1, 1], [0, 1, 0]]))
     network = with_projection(small(), 0, weight=weight)
     assert fan_in(network, 0).tolist() == [3, 1]
     assert fan_in(network, 1).tolist() == [2, 2]
-
-
-def test_fan_in_counts_a_synapse_once_whatever_its_planes():
-    network = small()
+    # and a synapse once, whatever its planes
     again = Projection(pre=INPUT, post=0, weight=stored(np.ones((2, 3)), np.array([[1, 0, 0], [1, 1, 0]])))
-    twice = replace(network, projections=(*network.projections, again))
-    assert fan_in(twice, 0).tolist() == fan_in(network, 0).tolist() == [3, 3]
+    twice = replace(small(), projections=(*small().projections, again))
+    assert fan_in(twice, 0).tolist() == [3, 3]
 
 
 # --- printed form

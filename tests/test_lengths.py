@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from commands import as_json, refusal
+from commands import as_json
 from made_files import CLASSES, TAXELS, own_file, weights
 from numpy.testing import assert_array_equal
 from test_checkpoint import rebuilt
@@ -174,18 +174,26 @@ def test_unusable_bins_are_refused(place, tmp_path, bins):
         read_checkpoint(tmp_path / "y.pt")
 
 
-@pytest.mark.usefixtures("spikeloom")
-def test_a_finished_training_of_other_bins_is_another():
-    line = refusal("train", "--data", "fine", "--join", "2", *TRAINED, "--resume", "-o", "x.pt")
-    assert line == "x.pt: holds another training (other bins); give its options, or another -o"
-
-
-@pytest.mark.usefixtures("spikeloom")
-def test_networks_for_truenorth_take_bins_as_they_are():
-    words = ("train", "--system", NATIVE, "--graph", "manual", "--data", "fine", "--join", "2", "-o", "y.pt")
-    told = refusal(*words)
-    assert f"--join 2: a network of system {NATIVE} takes bins as they are" in told
-    assert "spikeloom data convert --join" in told
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (
+            "train --data fine --join 2 --graph manual --epochs 1 --resume -o x.pt",
+            "x.pt: holds another training (other bins); give its options, or another -o",
+        ),
+        (
+            f"train --system {NATIVE} --graph manual --data fine --join 2 -o y.pt",
+            f"--join 2: a network of system {NATIVE} takes bins as they are|spikeloom data convert --join",
+        ),
+        (
+            "verify plain.loom --checkpoint x.pt --data fine",
+            f"netlist and checkpoint disagree|bins of a step {BINS}",
+        ),
+    ],
+)
+def test_other_bins_are_refused(refusal, words, told):
+    line = refusal(*words.split())
+    assert all(part in line for part in told.split("|"))
 
 
 # --- every command that reads recordings ------------------------------------------------------------------------------
@@ -206,27 +214,12 @@ def test_it_decides_on_the_recordings_what_the_other_does_on_longer_bins():
         assert watt == pytest.approx(others["real_time_w"][table] / BINS)
 
 
-@pytest.mark.usefixtures("spikeloom")
-def test_verify_and_explain():
-    found = [
-        as_json("verify", f"{name}.loom", "--checkpoint", f"{name}.pt", "--data", data, "--require", "E0")
-        for name, data in (("x", "fine"), ("plain", "long"))
-    ]
-    assert found[0] == found[1]
-    assert as_json("explain", "x.loom", "--checkpoint", "x.pt", "--data", "fine")["steps"] == 7
-
-
-@pytest.mark.usefixtures("spikeloom")
-def test_a_netlist_of_other_bins_is_not_from_this_network():
-    line = refusal("verify", "plain.loom", "--checkpoint", "x.pt", "--data", "fine")
-    assert "netlist and checkpoint disagree" in line
-    assert f"bins of a step {BINS}" in line
-
-
 @pytest.mark.parametrize(
     "words",
     # what reads recordings in the same way in many runs, bits and lean, is left out: they take long
     [
+        "verify NET --checkpoint CKPT --data DATA --require E0",
+        "explain NET --checkpoint CKPT --data DATA",
         "anytime NET --data DATA --calibrate DATA",
         "stress NET --checkpoint CKPT --data DATA --seeds 1 --only taxels_dead,warm_state,longer,ties_fire",
     ],
@@ -259,8 +252,7 @@ def test_what_is_done_to_recordings_is_done_before_they_are_joined():
 
 
 # --- what else is made of them ----------------------------------------------------------------------------------------
-@pytest.mark.usefixtures("spikeloom")
-def test_joined_networks_and_fine_tuned_ones_keep_them(place):
+def test_joined_networks_and_fine_tuned_ones_keep_them(refusal, place):
     as_json("join", "x.pt", "x.pt", "-o", "both.pt")
     assert (read_checkpoint(place / "both.pt").bins, read_checkpoint(place / "both.pt").towers) == (BINS, 2)
     as_json("finetune", "x.pt", "--data", "fine", "--weight-bits", "4", "--epochs", "1", "-o", "tuned.pt")
