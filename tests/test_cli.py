@@ -1,4 +1,4 @@
-"""The command line: what each command prints, where, under which keys, and with which exit code."""
+"""The command line: what each command prints, where, with which exit code, and what it says of its own cost."""
 
 import hashlib
 import io
@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ import pytest
 import torch
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file, state_dict
 from made_files import weights as made_weights
+from random_netlists import Axon, Neuron, build, large_netlist
 
 from spikeloom.__main__ import main as start
 from spikeloom.compiler import __version__, lift
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import netlist_text
@@ -25,8 +28,10 @@ from spikeloom.compiler.targets.price_tables import EVENTS
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.runtime import cli
+from spikeloom.runtime.equivalence import reference
 from spikeloom.runtime.inputs import network
 from spikeloom.runtime.inputs import recordings as recordings_input
+from spikeloom.runtime.machines.loihi1 import blocks, engine
 
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
 
@@ -266,3 +271,82 @@ def test_labelled_recordings_are_scored_and_a_table_scores_the_rest(as_json, tmp
     (tmp_path / "labels.csv").write_text("file,label\nc.csv,2\nd.csv,3\n")
     report = as_json("run", "net.loom", "--data", tmp_path)
     assert (report["labels"], report["labelled"]) == ([0, 1, 2, 3], 4)
+
+
+RUNNING = ("run", "net.loom", "--data", "data")
+VERIFYING = ("verify", "net.loom", "--checkpoint", "net.pt", "--data", "data")
+LAYERS = ["conv1", "fc1", "fc2", "fc3"]
+
+
+@pytest.fixture
+def passes(monkeypatch):
+    """Recordings of every pass of the engine."""
+    found, simulate = [], engine.simulate
+
+    def counted(netlist, events, **options):
+        found.append(len(events))
+        return simulate(netlist, events, **options)
+
+    monkeypatch.setattr(engine, "simulate", counted)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (RUNNING, "spikes"),
+        ((*RUNNING, "--spikes", "out.npz"), "spikes kept"),
+        ((*RUNNING, "--detail", "counts", "--spikes", "out.npz"), "counts"),
+        (("estimate", *RUNNING[1:], "--detail", "cycle"), "cycle"),
+    ],
+)
+def test_every_recording_is_run_once(spikeloom, passes, words, part):
+    _, out, err = spikeloom(*words, "--explain-cost", "--json")
+    assert passes == [6]
+    entry, absent = json.loads(out)["explained_cost"]
+    assert (entry.pop("seconds") > 0, bool(entry.pop("why"))) == (True, True)
+    known = {"part": part, "ran": True, "arithmetic": "chip integers", "recordings": 6, "data_steps": 6 * STEPS}
+    assert entry == known | {"layers": LAYERS, "kernel": "layer by layer, 64 neurons at a time"}
+    assert (absent["ran"], absent["recordings"], absent["layers"]) == (False, 0, [])
+    assert len(err.splitlines()) == 2
+
+
+def test_parts_of_verify(spikeloom):
+    checks = [
+        "float32 reference",
+        "float64 beside it",
+        "chip",
+        "specification",
+        *(f"ladder: {rung}" for rung in ("beta", "weights", "bias_threshold", "proven")),
+        "first divergence",
+        "certificate",
+    ]
+    _, out, err = spikeloom(*VERIFYING, "--spec-samples", 2, "--explain-cost", "--json")
+    entries = {entry["part"]: entry for entry in json.loads(out)["explained_cost"]}
+    assert list(entries) == checks
+    assert entries["specification"]["recordings"] == 2
+    assert not entries["ladder: proven"]["ran"]
+    assert entries["first divergence"]["data_steps"] == STEPS
+    assert len(err.splitlines()) == len(checks)
+
+
+def test_a_rung_that_is_proven_is_what_it_would_be(as_json, monkeypatch):
+    proven = as_json(*VERIFYING, codes=(0, 1))["ladder"]
+    monkeypatch.setattr(reference, "prove_ranges", lambda _: [type("Proof", (), {"holds": False})()])
+    report = as_json(*VERIFYING, "--explain-cost", codes=(0, 1))
+    assert report["ladder"] == proven
+    assert "ladder: rounding" in [entry["part"] for entry in report["explained_cost"] if entry["ran"]]
+
+
+def test_why_a_netlist_runs_step_by_step(place):
+    netlist = read_netlist(place / "net.loom")
+    axon = Axon(source=0, targets=((0, 254),), exponent=7)
+    one, two = (build([Neuron()], [axon] * axons, n_inputs=1, depths=[0]) for axons in (1, 2))
+    slow = replace(netlist, decay_v=read_only(np.zeros(netlist.n_compartments)))
+    wiring = "a layer is recurrent or receives from others than the one before it"
+    assert blocks.lay_out_blocks(large_netlist(1, proved=True)) == wiring
+    for each, large in ((netlist, False), (one, False), (two, True), (slow, True)):
+        why = blocks.lay_out_blocks(each)
+        assert (
+            (why == "a sum may leave 16 bits, or a membrane or current its register") == isinstance(why, str) == large
+        )

@@ -134,17 +134,6 @@ def test_what_was_written_is_read(tmp_path, events, method, dtype, order):
 
 
 # What is refused: the data set
-def test_what_is_no_data_set(tmp_path):
-    text = tmp_path / "text.zip"
-    text.write_text("hello")
-    cut = archive(tmp_path / "cut.zip", {f"test/{SAMPLE}": GOOD})
-    cut.write_bytes(cut.read_bytes()[:-30])
-    for path in (tmp_path / "none.zip", "/dev/null"):
-        assert message(path).startswith(f"{path}: no such folder or file")
-    assert message(text).startswith(f"{text}: not a recording")
-    assert message(cut).startswith(f"{cut}: neither a folder nor a whole zip")
-
-
 @pytest.mark.parametrize(
     ("names", "split", "words"),
     [
@@ -163,12 +152,6 @@ def test_data_sets_that_cannot_be(tmp_path, names, split, words):
     files = dict.fromkeys(names, GOOD)
     for path in (folder(tmp_path / "data", files), archive(tmp_path / "data.zip", files)):
         assert words in message(path, split, classes=36)
-
-
-def test_shapes_that_differ(tmp_path):
-    files = {f"test/{SAMPLE}": GOOD, "test/sample_1_label_1.npy": npy(EVENTS[:, :, :4])}
-    found = message(folder(tmp_path / "data", files))
-    assert "sample_1_label_1.npy: shape (3, 2, 4), the recordings before it have (3, 2, 5)" in found
 
 
 # What is refused: one recording

@@ -1,6 +1,7 @@
 import json
 from pathlib import Path
 
+import networkx as nx
 import numpy as np
 import pytest
 from hypothesis import given
@@ -106,21 +107,14 @@ def test_trees_agree_with_kruskal(layout, sigma):
     """Lower index pairs first: Kruskal over (length, low, high) has one answer."""
     n = len(layout)
     cells = np.rint(layout * 10).astype(int)
-    ranked = sorted((int(((cells[i] - cells[j]) ** 2).sum()), i, j) for i in range(n) for j in range(i + 1, n))
-    parts = list(range(n))
-    tree = set()
-    for _, i, j in ranked:
-        if parts[i] != parts[j]:
-            tree.add((i, j))
-            parts = [parts[i] if part == parts[j] else part for part in parts]
-    near = [
-        (i, j)
-        for _, i, j in sorted(ranked, key=lambda row: row[1:])
-        if np.hypot(*(layout[i] - layout[j])) < sigma - 1e-6
-    ]
+    pairs = [(i, j, int(((cells[i] - cells[j]) ** 2).sum())) for i in range(n) for j in range(i + 1, n)]
+    graph = nx.Graph()
+    graph.add_weighted_edges_from(pairs)  # and the sorting by length keeps this order
+    tree = set(nx.minimum_spanning_tree(graph, algorithm="kruskal").edges)
+    near = [[i, j] for i, j, _ in pairs if np.hypot(*(layout[i] - layout[j])) < sigma - 1e-6]
     edges = build_graph(f"released:mst:{sigma}", layout).edges.tolist()
     assert {tuple(sorted(row)) for row in edges[: 2 * (n - 1)]} == tree
-    assert edges[2 * (n - 1) :: 2] == [list(pair) for pair in near]
+    assert edges[2 * (n - 1) :: 2] == near
     assert edges[1::2] == [row[::-1] for row in edges[::2]]
 
 

@@ -25,7 +25,6 @@ from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_fo
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.networks.quantised import quantised_spikes
 from spikeloom.models.networks.reference import float_membranes, float_spikes
-from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.machines.votes import class_counts, readout_counts
@@ -231,19 +230,17 @@ def test_yardsticks_count_no_weights_between_towers(tmp_path):
 # --- commands ------------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """Three networks with clocks and three without, each with a record and two sets of weights; joined."""
+    """Three networks, each with a record and two sets of weights; joined."""
     place = tmp_path_factory.mktemp("joined-data")
-    for name, dynamics in (("timed", TIMING), ("plain", PLAIN)):
-        for seed in SEEDS:
-            path = place / f"{name}{seed}.pt"
-            network, _ = written(path, dynamics=dynamics, seed=seed)
-            last = network.export_weights()
-            record = {"command": f"spikeloom train --seed {seed}", "seed": seed, "data_sha256": f"{seed:064}"}
-            known = {"beta": 0.2, "theta": 0.5, "dynamics": dynamics, "training": record | {"last": {"correct": seed}}}
-            sets = {"last": last, "clean": {key: array / 2 for key, array in last.items()}}
-            path.write_bytes(checkpoint_bytes(sets, GRAPH, **known))
-        words = " ".join(f"{place}/{name}{seed}.pt" for seed in SEEDS)
-        assert main(f"join {words} -o {place}/{name}.pt --weights last".split()) == 0
+    for seed in SEEDS:
+        path = place / f"timed{seed}.pt"
+        network, _ = written(path, seed=seed)
+        last = network.export_weights()
+        record = {"command": f"spikeloom train --seed {seed}", "seed": seed, "data_sha256": f"{seed:064}"}
+        known = {"beta": 0.2, "theta": 0.5, "dynamics": TIMING, "training": record | {"last": {"correct": seed}}}
+        sets = {"last": last, "clean": {key: array / 2 for key, array in last.items()}}
+        path.write_bytes(checkpoint_bytes(sets, GRAPH, **known))
+    as_json("join", *(place / f"timed{seed}.pt" for seed in SEEDS), "-o", place / "timed.pt", "--weights", "last")
     return place
 
 
@@ -295,13 +292,13 @@ def test_graphs_and_storage_must_agree(tmp_path):
 
 
 def test_what_cannot_be_joined_says_so(data, tmp_path):
-    one, made, old = f"{data}/plain1.pt", specimen("joined"), tmp_path / "old.t7"
+    one, made, old = f"{data}/timed1.pt", specimen("joined"), tmp_path / "old.t7"
     torch.save(released(state_dict(weights())), old)
     for words, reason in (
         (f"join {one} -o {tmp_path}/x.pt", f"{one} is one network already; give two or more"),
         (f"join {one} {one} -o {one}", f"-o {one}: is an input of this command"),
         (f"join {one} {made.netlist} -o {tmp_path}/x.pt", f"{made.netlist}: "),
-        (f"join {one} {data}/plain.pt --weights best -o {tmp_path}/x.pt", "--weights best: the file holds last"),
+        (f"join {one} {data}/timed.pt --weights best -o {tmp_path}/x.pt", "--weights best: the file holds last"),
         (f"join {one} {old} -o {tmp_path}/x.pt", f"{old}: does not say its graph and constants"),
         (f"finetune {made.network} --data {made.data} --weight-bits 4 -o {tmp_path}/x.pt", "has 3 towers"),
     ):
