@@ -1,11 +1,11 @@
 """onnxruntime on the integer graph: every spike and membrane of the specification; and what is in the files."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import onnx
 import pytest
+from commands import as_json
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -131,7 +131,7 @@ def test_a_register_that_overflows(run, where):
     refused(NumericRangeError, f"{where}: a register overflows", run, netlist, events)
 
 
-def test_verify_finds_an_engine_that_strays(monkeypatch, capsys):
+def test_verify_finds_an_engine_that_strays(monkeypatch):
     plain = onnx_engine.simulate
 
     def stray(prepared, *words, **options):
@@ -143,9 +143,7 @@ def test_verify_finds_an_engine_that_strays(monkeypatch, capsys):
     monkeypatch.setattr(onnx_engine, "simulate", stray)
     made = specimen("mlp")
     words = ["verify", made.netlist, "--checkpoint", made.network, "--data", made.data, "--min-agreement=0"]
-    capsys.readouterr()
-    assert cli.main([*map(str, words), "--engine", "onnx", "--json"]) == 1
-    report = json.loads(capsys.readouterr().out)
+    report = as_json(*words, "--engine", "onnx", codes=(1,))
     assert not report["spec_equals_engine"]
     assert report["engine_different"] == 2
 

@@ -13,6 +13,7 @@ import shlex
 import zipfile
 from pathlib import Path
 
+import commands
 import numpy as np
 import pytest
 import torch
@@ -251,19 +252,15 @@ TABLE = [
 
 
 @pytest.fixture
-def refusal(capsys, place, monkeypatch):
+def refusal(place, monkeypatch):
     """Run a command in that folder that must fail; returns its only line."""
     monkeypatch.chdir(place)
     before = sorted(path.name for path in place.iterdir())
 
     def command(*words):
-        capsys.readouterr()
-        code = cli.main([str(word) for word in words])
-        out, err = capsys.readouterr()
-        assert (code, out) == (2, "")
-        assert err.startswith("spikeloom: ")
-        assert err.count("\n") == 1
-        return err.removeprefix("spikeloom: ").removesuffix("\n")
+        code, out, err = commands.run(*words)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        return err.removeprefix("spikeloom: ").rstrip("\n")
 
     yield command
     assert sorted(path.name for path in place.iterdir()) == before
@@ -299,13 +296,12 @@ def test_overflow_on_the_chip_names_neuron_step_and_recording(refusal, tmp_path)
 
 
 @pytest.mark.parametrize(("features", "limits"), [(128, ["axons_in"]), (424, ["axons_in", "synapse_words"])])
-def test_every_violated_limit_is_listed(place, capsys, tmp_path, features, limits):
+def test_every_violated_limit_is_listed(place, tmp_path, features, limits):
     arrays = made_weights(taxels=39, features=features, sizes=(2, 2, 2))
     signs = {name: np.where(array >= 0, 0.5, -0.5).astype(np.float32) for name, array in arrays.items()}
     torch.save(state_dict(signs), tmp_path / "wide.pt")
     words = ["compile", f"{tmp_path}/wide.pt", "--graph", "mst:0", "--keep-all", "-o", f"{tmp_path}/out.loom"]
-    assert cli.main(words) == 2
-    lines = capsys.readouterr().err.splitlines()
+    lines = commands.run(*words)[2].splitlines()
     assert len(lines) == len(limits)
     for line, limit in zip(lines, limits, strict=True):
         assert f"fc1 neuron 0: {39 * features} used" in line

@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 from browser import browsed
+from commands import as_json
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_folder, weights
 from numpy.testing import assert_allclose, assert_array_equal
 from zoo import specimen
@@ -186,17 +187,16 @@ def test_where_no_spike_differs_the_widest_membranes_are_shown(spikeloom, place)
 
 
 # -- other networks ----------------------------------------------------------------------------------------------------
-def report_of(made, folder, capsys):
+def report_of(made, folder):
     """The page of a network of the zoo, and its data."""
     words = ("report", made.netlist, "--checkpoint", made.network, *made.reading, "--data", made.data)
-    capsys.readouterr()
-    assert cli.main([*map(str, words), "-o", str(folder / "x.html"), "--json"]) == 0
-    return (folder / "x.html").read_text("utf-8"), json.loads(capsys.readouterr().out)
+    found = as_json(*words, "-o", folder / "x.html")
+    return (folder / "x.html").read_text("utf-8"), found
 
 
-def test_networks_without_a_graph_show_their_taxels(tmp_path, capsys):
+def test_networks_without_a_graph_show_their_taxels(tmp_path):
     made = specimen("onnx")
-    text, found = report_of(made, tmp_path, capsys)
+    text, found = report_of(made, tmp_path)
     taxels, sensor = found["taxels"], made.machine.netlist.taxels
     assert (taxels["graph"], taxels["spikes"], taxels["edges"]) == (None, None, [])
     assert (taxels["sensor"], len(taxels["positions_mm"] or ())) == (("NeuTouch", 39) if sensor == 39 else (None, 0))
@@ -204,9 +204,9 @@ def test_networks_without_a_graph_show_their_taxels(tmp_path, capsys):
     assert drawings(text) >= FIGURES - {f"raster-{name}" for name in LAYERS} - {"time-cores"}
 
 
-def test_clocks_and_lasting_currents_have_their_page(tmp_path, capsys):
+def test_clocks_and_lasting_currents_have_their_page(tmp_path):
     made = specimen("timed")
-    text, found = report_of(made, tmp_path, capsys)
+    text, found = report_of(made, tmp_path)
     assert found["provenance"]["checkpoint"]["dynamics"]["clocks"] == {"channels": 3, "steps": 4}
     assert "Decays by layer, and clocks" in text
     channels = {channel for _, channel in found["recording"]["input"]}

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import as_json, refusal, run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from made_files import recordings_folder
@@ -34,7 +35,6 @@ from spikeloom.compiler.targets.truenorth.netlist import (
     read_crossbars,
     write_crossbars,
 )
-from spikeloom.runtime import cli
 from spikeloom.runtime.machines.truenorth import engine, spec
 
 ARRAYS = FILE.arrays
@@ -140,22 +140,9 @@ def place(path, tmp_path):
     return tmp_path
 
 
-@pytest.fixture
-def command(place, capsys):
-    """Run a command on a netlist, with recordings where it takes them; its JSON object, or its error."""
-
-    def run(words: str, code: int = 0):
-        name, *options = words.split()
-        data = [] if name == "inspect" else ["--data", f"{place}/data"]
-        assert cli.main([name, f"{place}/net.loom", *data, *options, "--json"]) == code
-        out, err = capsys.readouterr()
-        return err if code else json.loads(out)
-
-    return run
-
-
-def test_four_touches_counted_by_hand(place, command, capsys):
-    report = command(f"run --spikes {place}/s.npz --detail counts")
+def test_four_touches_counted_by_hand(place):
+    words = (place / "net.loom", "--data", place / "data")
+    report = as_json("run", *words, "--spikes", place / "s.npz", "--detail", "counts")
     assert report["predictions"] == [0, 1, 1, 0]
     assert report["counts"] == [[2, 0], [0, 3], [0, 1], [0, 0]]
     assert report["accuracy"] == 0.5
@@ -164,7 +151,7 @@ def test_four_touches_counted_by_hand(place, command, capsys):
         assert spikes["out"].shape == (4, 6, 2)
         assert spikes["out"].sum(axis=1).tolist() == report["counts"]
 
-    report = command("estimate")
+    report = as_json("estimate", *words)
     # every arrival meets one crossing point: 2, 3, 1 and 0 of them, and one of two polarities is merged in each
     found = {name: report["per_inference"][name] for name in ("synaptic_events", "spikes", "merged_spikes", "ticks")}
     assert found == {"synaptic_events": 1.5, "spikes": 1.5, "merged_spikes": 0.75, "ticks": 6}
@@ -176,17 +163,17 @@ def test_four_touches_counted_by_hand(place, command, capsys):
     assert marginal["floor_of_used_cores_j"] == pytest.approx(0.0644 * 6e-3 / 4096)
     assert marginal["total_j"] == pytest.approx(0.0644 * 6e-3 + 1.5 * 2.3e-12)
     assert report["pace"]["real_time"] is True
-    assert cli.main(["estimate", f"{place}/net.loom", "--data", f"{place}/data"]) == 0
-    out = capsys.readouterr().out
+    out = run("estimate", *words)[1]
     assert "per inference on 1 of 4,096 cores, over 4 recordings:" in out
     assert "a data step takes 1 ms: keeps the sensor's pace of 20 ms a step" in out
 
 
 @pytest.mark.parametrize("name", ["inspect", "run", "estimate"])
-def test_every_broken_rule_is_named(place, command, name):
+def test_every_broken_rule_is_named(place, name):
     zero = dict.fromkeys(("clock_core", "clock_line", "clock_period", "clock_phase"), read_only([0]))
     write_crossbars(replace(network(), leak=read_only([300, 0]), **zero), place / "net.loom")
-    leak, clock = command(name, code=2).splitlines()
+    data = [] if name == "inspect" else ["--data", place / "data"]
+    leak, clock = run(name, place / "net.loom", *data)[2].splitlines()
     assert "core 0, neuron 0: leak 300, -256 … 255 allowed (truenorth.neuron.leak_bits)" in leak
     assert "clock 0: a period of 0 ticks, 1 or more allowed (truenorth.clock)" in clock
 
@@ -276,7 +263,7 @@ def test_what_ranc_has_not(changes, what):
         list(ranc.export(small(**changes)))
 
 
-def test_the_command_for_ranc(tmp_path, monkeypatch, capsys):
+def test_the_command_for_ranc(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     draft = alone(Neuron(), channels=0)
     draft.feed(3, 0, 0)
@@ -286,18 +273,15 @@ def test_the_command_for_ranc(tmp_path, monkeypatch, capsys):
     recordings[0, 1, 1, [0, 4]] = recordings[1, 1, 1, [1, 4]] = 1
     recordings_folder(tmp_path / "data", train=recordings, test=recordings)
     words = ["export", "net.loom", "--to", "ranc", "-o", "net.json"]
-    assert cli.main(words) == 0
+    first, second = run(*words)[1].splitlines()
     assert json.loads(Path("net.json").read_text("utf-8"))["packets"] == [[]]
-    first, second = capsys.readouterr().out.splitlines()
     assert "1 neurons and 1 synapses for ranc" in first
     assert second.startswith("run: ranc_sim net.json net.out net.json TICKS")
-    words += ["--data", "data", "--json", "--recording"]
-    assert cli.main([*words, "1"]) == 0
-    assert json.loads(capsys.readouterr().out)["ticks"] == 5 + 2 + 1
+    words += ["--data", "data", "--recording"]
+    assert as_json(*words, "1")["ticks"] == 5 + 2 + 1
     packets = json.loads(Path("net.json").read_text("utf-8"))["packets"]
     assert [len(tick) for tick in packets] == [0, 1, 0, 0, 1, 0, 0]
-    assert cli.main([*words, "2"]) == 2
-    assert "--recording 2: --data has recordings 0 to 1" in capsys.readouterr().err
+    assert "--recording 2: --data has recordings 0 to 1" in refusal(*words, "2")
 
 
 @pytest.fixture(scope="module")
