@@ -6,6 +6,7 @@ import json
 import re
 import shlex
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,6 @@ from spikeloom.compiler.errors import CapacityError, Violation
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.targets.truenorth.native_file import write_trained
-from spikeloom.models.graphs import Graph
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import data_digest
@@ -30,8 +30,8 @@ CHART = ("chart", "ring.pt", "--data", "data", "--grid", GRID, "--jobs", "1")
 
 
 def chain():
-    pairs = [(i, i + 1) for i in range(5)]
-    return Graph(name="knn:1", coordinates=np.arange(6.0)[:, None], edges=np.array(pairs + [(b, a) for a, b in pairs]))
+    pairs = ring().edges
+    return replace(ring(), name="knn:1", edges=pairs[abs(pairs[:, 0] - pairs[:, 1]) == 1])
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ from made_chart import BY, made_figures, made_network, made_point
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.options import GOALS
 from spikeloom.runtime.studies.chart.choices import (
     TRAINING,
     VALIDATION,
@@ -24,7 +23,7 @@ from spikeloom.runtime.studies.chart.choices import (
     with_expectations,
     with_fronts,
 )
-from spikeloom.runtime.studies.chart.grid import AXES, Grid, parse_grid
+from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
 from spikeloom.runtime.studies.chart.results import ChosenBy
 
 UJ = 1e-6
@@ -213,6 +212,10 @@ def parsed(text):
         # in their order, each once
         ("bits=8,2-4,3,4+4+4+4", {"bits": ((8,), (2,), (3,), (4,))}),
         ("bits=8+4+4+8/8", {"bits": ((8, 4, 4, 8), (8,))}),
+        (
+            "groups=2 / 1,planes=3/ 1 , cores=cores/fc1:3",
+            {"groups": (2, 1), "planes": (3, 1), "cores": ("cores", "fc1:3")},
+        ),
         *((f"window={text}", {"window": (50,)}) for text in ("50", "50%")),
         *((f"window={text}", {"window": (25, 50, 75, 100)}) for text in ("25-100%", "25%-100%")),
         ("window=40-100%:20", {"window": (40, 60, 80, 100)}),
@@ -254,46 +257,3 @@ def test_a_grid_that_is_too_large():
     every = "/".join("+".join(map(str, widths)) for widths in product(WIDTHS, repeat=4))
     with pytest.raises(OptionError, match="388,800 points a network, allowed are 100,000"):
         parsed(f"bits={every},planes=1-3,window=1-100%:1")
-
-
-GRIDS = st.builds(
-    Grid,
-    bits=st.lists(
-        st.one_of(
-            st.tuples(st.sampled_from(WIDTHS)),
-            st.tuples(*[st.sampled_from(WIDTHS)] * 3).filter(lambda widths: len(set(widths)) > 1),
-        ),
-        min_size=1,
-        max_size=4,
-        unique=True,
-    ).map(tuple),
-    planes=st.lists(st.integers(1, 3), min_size=1, max_size=3, unique=True).map(tuple),
-    groups=st.lists(st.integers(1, 8), min_size=1, max_size=4, unique=True).map(tuple),
-    prune=st.lists(st.integers(0, 1), min_size=1, max_size=2, unique=True).map(tuple),
-    cores=st.lists(
-        st.one_of(
-            st.sampled_from(GOALS),
-            st.dictionaries(st.sampled_from(["conv1", "fc1", "fc2"]), st.integers(1, 99), min_size=1).map(
-                lambda layers: "+".join(f"{layer}:{count}" for layer, count in layers.items())
-            ),
-        ),
-        min_size=1,
-        max_size=3,
-        unique=True,
-    ).map(tuple),
-    window=st.lists(st.integers(1, 100), min_size=1, max_size=4, unique=True).map(tuple),
-)
-
-
-@given(GRIDS, st.sampled_from([",", "/", " , ", "/ "]), st.permutations(AXES))
-def test_what_is_written_is_read(grid, between, order):
-    words = {
-        "bits": ["+".join(map(str, widths)) for widths in grid.bits],
-        "planes": grid.planes,
-        "groups": grid.groups,
-        "prune": grid.prune,
-        "cores": grid.cores,
-        "window": [f"{window}%" for window in grid.window],
-    }
-    text = ",".join(f"{axis}={between.join(map(str, words[axis]))}" for axis in order if words[axis])
-    assert parsed(text) == grid

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from made_files import checkpoint_bytes, state_dict
+from oracles import refused
 
 from spikeloom.compiler.archive import npy_bytes, read_npy
 from spikeloom.compiler.errors import ModelError
@@ -48,9 +49,7 @@ def released(*states: dict[str, torch.Tensor], **more: object) -> bytes:
 
 def refusal(path: Path, **options: object) -> str:
     """Message of the error, without the path that starts it; it is one line."""
-    with pytest.raises(ModelError) as caught:
-        read_checkpoint(path, **options)
-    message = str(caught.value)
+    message = refused(ModelError, str(path), read_checkpoint, path, **options)
     assert "\n" not in message
     return message.removeprefix(f"{path}: ")
 

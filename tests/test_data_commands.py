@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import requests
+from oracles import refused
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings import fetch
@@ -26,13 +27,6 @@ def start(*words):
     arguments = parser.parse_args(list(map(str, words)))
     outcome = arguments.action(arguments)
     return encode(outcome.result), terminal(outcome.sections(outcome.result)), outcome.code
-
-
-def message(*words, error=DataError) -> str:
-    with pytest.raises(error) as caught:
-        start(*words)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 @pytest.fixture
@@ -72,17 +66,11 @@ def test_describe_one_recording_without_a_label(own):
     assert (report["labels"], report["unlabelled"]) == ({}, 1)
 
 
-def png_size(path):
-    data = path.read_bytes()
-    assert data[:8] == b"\x89PNG\r\n\x1a\n"
-    return struct.unpack(">II", data[16:24])
-
-
-def test_pictures(own):
-    start("describe", "own", "--taxels", "coords.csv", "--picture", "own.png")
-    assert png_size(own / "own.png") == (1650, 810)
-    start("describe", "own", "--taxels", "4", "--picture", "plain.png")
-    assert png_size(own / "plain.png") == (1050, 810)
+@pytest.mark.parametrize(("taxels", "width"), [("coords.csv", 1650), ("4", 1050)])
+def test_pictures(own, taxels, width):
+    start("describe", "own", "--taxels", taxels, "--picture", "own.png")
+    content = (own / "own.png").read_bytes()
+    assert (content[:8], *struct.unpack(">II", content[16:24])) == (b"\x89PNG\r\n\x1a\n", width, 810)
 
 
 # convert
@@ -164,7 +152,7 @@ def test_convert_synthetic_grasps_on_the_sensor_that_is_given(own):
 def test_convert_mistakes(own, words, error, told):
     (own / "a.csv").write_text("0,0,1\n")
     (own / "own" / "train" / "c.csv").write_text("0,0,1\n0,0,up\n")
-    assert told in message("convert", *words, error=error)
+    refused(error, told, start, "convert", *words)
     assert sorted(path.name for path in own.iterdir()) == ["a.csv", "coords.csv", "own"]
 
 

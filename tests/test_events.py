@@ -1,9 +1,11 @@
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from oracles import refused
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings.counts import GAP_S
@@ -38,11 +40,7 @@ def save(tmp_path):
     return save
 
 
-def message(function, *arguments, error=DataError, **options) -> str:
-    with pytest.raises(error) as caught:
-        function(*arguments, **options)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+message = partial(refused, DataError, "")
 
 
 def made(events, **changes) -> Recordings:
@@ -99,11 +97,13 @@ def test_events_that_cannot_be(write, rows, words):
 
 
 def test_taxels_and_bins_have_limits(write):
-    assert "taxel 4096, allowed are whole numbers 0..4095" in message(load_data, write("a.csv", "0,4096,1\n"))
+    assert "taxel 4096, allowed are whole numbers 0..4095" in refused(
+        DataError, "", load_data, write("a.csv", "0,4096,1\n")
+    )
     path = write("a.csv", "1,0,1\n")
     assert "time 1 s is past 1000000 bins of 4.94066e-324 s" in message(load_data, path, bin_s=5e-324)
     for bin_s in (0.0, -0.02, float("nan"), float("inf")):
-        assert f"--bin {bin_s:g}: not a duration" in message(load_data, path, bin_s=bin_s, error=OptionError)
+        assert f"--bin {bin_s:g}: not a duration" in refused(OptionError, "", load_data, path, bin_s=bin_s)
 
 
 # Labels
@@ -234,8 +234,8 @@ def test_one_released_recording(tmp_path):
         assert np.array_equal(recordings.events, grasps.events[3:4])
         assert recordings.labels.tolist() == [label]
         assert (counts.events, counts.duplicates, recordings.steps) == (grasps.events[3].sum(), 0, 40)
-    refused = message(load_data, tmp_path / "grasp.npy", bin_s=0.05, error=OptionError)
-    assert refused == "--bin 0.05: grasp.npy holds bins, not times; omit --bin"
+    said = refused(OptionError, "", load_data, tmp_path / "grasp.npy", bin_s=0.05)
+    assert said == "--bin 0.05: grasp.npy holds bins, not times; omit --bin"
     np.save(tmp_path / "bad.npy", np.full((3, 2, 4), 0.5))
     assert message(load_data, tmp_path / "bad.npy") == (
         "bad.npy: value 0.5 at taxel 0, polarity 0, step 0, allowed are 0 and 1; recordings are events, not pressures"

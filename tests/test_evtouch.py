@@ -2,6 +2,7 @@ import contextlib
 import io
 import struct
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from made_files import events
+from oracles import refused
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings import evtouch
@@ -45,11 +47,7 @@ def archive(path: Path, files: dict[str, bytes], method: int = zipfile.ZIP_DEFLA
     return path
 
 
-def message(path, split="test", **options) -> str:
-    with pytest.raises(DataError) as caught:
-        load_data(path, split, **options)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+message = partial(refused, DataError, "", load_data)
 
 
 def refuse(tmp_path: Path, data: bytes, **options) -> str:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, weights
-from random_networks import chain, integer_chain
+from random_networks import chain, integer_chain, with_population
 
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
@@ -126,12 +126,6 @@ def stored_as(network, thresholds, exponents=(0,)):
         for population, threshold in zip(network.populations, thresholds, strict=True)
     ]
     return round_to_forms(network, forms)[0]
-
-
-def with_population(integer, post, **fields):
-    populations = list(integer.populations)
-    populations[post] = dataclasses.replace(populations[post], **fields)
-    return dataclasses.replace(integer, populations=tuple(populations))
 
 
 def explained(network, integer, events, **options):

@@ -18,6 +18,7 @@ from random_networks import (
     integer_networks,
     recordings_for,
     stored,
+    with_population,
 )
 from scipy import sparse
 
@@ -249,12 +250,6 @@ def test_a_window_that_opens_late_misses_the_first_steps():
 def small() -> Network:
     """Two layers, 3 -> 2 -> 2."""
     return chain([[1, 2, 3], [4, 5, 6]], [[1, 0], [0, 1]])
-
-
-def with_population(network, index, **changes):
-    populations = list(network.populations)
-    populations[index] = replace(populations[index], **changes)
-    return replace(network, populations=tuple(populations))
 
 
 def with_projection(network, index, **changes):

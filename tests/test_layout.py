@@ -122,11 +122,6 @@ def test_the_mean_of_the_longest_is_not_the_longest_of_the_means():
     assert expected.step_ns == pytest.approx((5 * max(work) + 6 * 40 * 9.7) / 11 + 600)
 
 
-def forecast_of(network, calibration, target=LOIHI):
-    everyone = tuple(np.arange(population.size) for population in network.populations)
-    return Forecast(Needs(network, target), sample(network, calibration, everyone), target.time[0])
-
-
 # --- cores asked for
 def test_cores_asked_for_hold_no_other_layer():
     network = integer_chain(np.full((6, 3), 2), np.full((4, 6), 2), np.full((2, 4), 2))
@@ -196,7 +191,8 @@ def test_the_search_comes_near_the_best_cut(seed):
     sizes = [30, int(rng.integers(20, 40)), int(rng.integers(10, 20))]
     network, calibration = busy(sizes, seed=seed, rates=rng.uniform(0.1, 0.9, 3))
     target = small_target(chip_cores=24)
-    forecast = forecast_of(network, calibration, target)
+    everyone = tuple(np.arange(population.size) for population in network.populations)
+    forecast = Forecast(Needs(network, target), sample(network, calibration, everyone), target.time[0])
     found = fastest(forecast)
 
     def expected(chunks):
