@@ -2,14 +2,14 @@
 
 A machine is found by the target that its netlist names: the module ``machines/NAME/machine.py`` of the target
 ``compiler/targets/NAME``. What only some chips do in their own way stands in modules beside it, see
-:func:`chip_commands`, :func:`chip_chart` and :func:`export_formats`.
+:func:`chip_module`.
 """
 
 from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
@@ -158,9 +158,8 @@ class Machine(ABC):
         lengths: IntArray | None = None,
         spikes: bool = False,
         membranes: bool = False,
-        threads: int | None = None,
     ) -> Run:
-        """Run recordings, each from rest, some `threads` at a time (by default one per processor).
+        """Run recordings, each from rest.
 
         `events` are (samples, taxels, polarities, steps), any value but zero an event; the network's clocks tick by
         themselves. `lengths` (samples,) are the data steps of each; `spikes` and `membranes` say what to keep. Raises
@@ -244,48 +243,31 @@ def machine_for(path: str | os.PathLike[str]) -> Machine:
     return machine
 
 
-def chip_commands(name: str) -> Any | None:
-    """What a chip does in its own way: its module ``commands``, if it has one.
+def chip_module(name: str, part: str) -> Any:
+    """What only some chips do in their own way: a module in the folder of a chip, or None if it has none of the name.
 
-    ``compile_network(arguments)`` and ``verify(arguments)`` for all networks; for checkpoints that were trained for the
-    chip, which ``takes(path)`` knows, ``inspect(arguments)``.
+    - ``commands``: ``compile_network(arguments)`` and ``verify(arguments)`` for all networks; for checkpoints that were
+      trained for the chip, which ``takes(path)`` knows, ``inspect(arguments)`` and what a chart needs of them.
+    - ``compiled``: ``outcome(compilation, sha256, facts)``, what the target's ``compile`` chose, proved and removed;
+      `sha256` is of the netlist's file, `facts` are what was read from a file of another format.
+    - ``exports``: ``FORMATS`` of other programs that can be written.
     """
-    return _own_module(name, "commands")
-
-
-def chip_chart(name: str) -> Any | None:
-    """What a chart asks of networks that were trained for a chip: its module ``charted``, if it has one."""
-    return _own_module(name, "charted")
-
-
-def _own_module(name: str, what: str) -> Any | None:
-    module = f"{__package__}.{name}.{what}"
+    module = f"{__package__}.{name}.{part}"
     return import_module(module) if has_machine(name) and find_spec(module) else None
 
 
-def trained_for(path: object) -> Any | None:
+def _chip_modules(part: str) -> list[Any]:
+    chips = [each.name for each in iter_modules(machines.__path__) if each.ispkg]
+    return [module for name in chips if (module := chip_module(name, part)) is not None]
+
+
+def trained_for(path: object) -> Any:
     """Commands of the chip that a checkpoint was trained for; None for any other network."""
     if not isinstance(path, str):
         return None
-    chips = map(chip_commands, _chips())
-    return next((chip for chip in chips if chip is not None and chip.takes(path)), None)
+    return next((chip for chip in _chip_modules("commands") if chip.takes(path)), None)
 
 
 def export_formats() -> list[Format]:
-    """Formats of other programs that the machines can write: ``FORMATS`` of each chip's module ``exports``."""
-    modules = [_own_module(name, "exports") for name in _chips()]
-    return [each for module in modules if module is not None for each in module.FORMATS]
-
-
-def _chips() -> list[str]:
-    return [each.name for each in iter_modules(machines.__path__) if each.ispkg]
-
-
-def compiled(compilation: Any, sha256: str, facts: Sequence[str]) -> Outcome:
-    """What the target's ``compile`` chose, proved and removed, as the chip's module ``compiled`` shows it.
-
-    `sha256` is of the netlist's file; `facts` are what was read from a file of another format.
-    """
-    own: Any = _own_module(compilation.netlist.target, "compiled")
-    outcome: Outcome = own.outcome(compilation, sha256, facts)
-    return outcome
+    """Formats of other programs that the machines can write."""
+    return [each for module in _chip_modules("exports") for each in module.FORMATS]

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from spikeloom.compiler.types import FloatArray
-from spikeloom.runtime.machines.page_parts import Core, Cores, Way
+from spikeloom.runtime.machines.core_map import Core, CoreMap, Way
 from spikeloom.runtime.page.recording import Trace
 from spikeloom.runtime.page.results import Taxels
 from spikeloom.runtime.report.drawing import CHIP, COLOURS, DASHES, FLOAT, GREY, Drawing, sheet, styled
@@ -28,7 +28,7 @@ Place = tuple[float, float]
 
 
 @styled
-def mesh(cores: Cores) -> Drawing:
+def mesh(cores: CoreMap) -> Drawing:
     """Used part of each chip's mesh: tiles, their cores, how full the fullest limit is, and who sends how much."""
     from matplotlib.patches import FancyArrowPatch, Rectangle
 
@@ -80,7 +80,7 @@ def mesh(cores: Cores) -> Drawing:
     return drawing
 
 
-def _places(cores: Cores) -> tuple[dict[int, Place], Place, dict[Place, int], dict[float, int]]:
+def _places(cores: CoreMap) -> tuple[dict[int, Place], Place, dict[Place, int], dict[float, int]]:
     """Place of each core, the size of all, tiles by place, and chips by their upper end, from top to bottom."""
     fullest = max(Counter(core.tile for core in cores.cores).values())
     columns = min(fullest, 2)

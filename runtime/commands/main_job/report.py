@@ -97,7 +97,7 @@ def _report(
     if chosen is None:
         chosen = 0 if verdict.first_divergence is None else data.files.index(verdict.first_divergence.file)
     account.begin("costs")
-    chip = machine.page_parts(data.events, lengths=data.lengths, bin_s=arguments.bin)
+    ran, price = machine.price(data.events, lengths=data.lengths, bin_s=arguments.bin)
     account.begin("the recording")
     origin = provenance(arguments, netlist, machine.target, loaded, data, data.files[chosen])
     described = machine.describe(origin.netlist.sha256)
@@ -111,14 +111,15 @@ def _report(
             chip=verdict.chip_predictions,
         ),
         netlist=described.result,
-        cores=chip.cores,
-        taxels=taxels(netlist, loaded, data, chip.spikes, arguments.taxels),
+        cores=machine.core_map(data.events, data.step_counts, ran.counts),
+        taxels=taxels(machine, loaded, data, ran.counts, arguments.taxels),
         recording=recording(machine, loaded, data, chosen),
-        costs=chip.costs.result,
+        costs=price.outcome.result,
         provenance=origin,
         output=arguments.output,
         described=described,
-        chip=chip,
+        price=price,
+        figures=machine.figures(price),
         stress=stress,
         explained_cost=account.explained(arguments.explain_cost),
     )

@@ -12,7 +12,7 @@ from spikeloom.runtime.equivalence.verdict import parse_requirements, sections
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
-from spikeloom.runtime.machines.base import ENGINES, chip_commands, machine_for
+from spikeloom.runtime.machines.base import ENGINES, chip_module, machine_for
 from spikeloom.runtime.machines.simulated import Account
 from spikeloom.runtime.report.sections import Outcome
 
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     machine = machine_for(arguments.netlist)
-    if (own := chip_commands(machine.netlist.target)) is not None:
+    if (own := chip_module(machine.netlist.target, "commands")) is not None:
         return own.verify(arguments)  # type: ignore[no-any-return]
     agreement = MIN_AGREEMENT if arguments.min_agreement is None else arguments.min_agreement
     if not 0 <= agreement <= 1:

@@ -20,6 +20,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.base import EventArray, Price, Run, one_by_one
+from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import description, engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
@@ -29,9 +30,8 @@ from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.machines.loihi1.costs.sections import sections
 from spikeloom.runtime.machines.loihi1.stream import Stream
 from spikeloom.runtime.machines.loihi1.trace import Trace, aligned, differences
-from spikeloom.runtime.machines.page_parts import BatchParts
 from spikeloom.runtime.machines.votes import class_counts
-from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.report.sections import Block, Outcome
 
 if TYPE_CHECKING:
     from spikeloom.runtime.machines.loihi1.onnx_engine import OnnxEngine
@@ -80,14 +80,10 @@ class Loihi(IntegerMachine):
         lengths: IntArray | None = None,
         spikes: bool = False,
         membranes: bool = False,
-        threads: int | None = None,
     ) -> Run:
         """Decisions, and spikes as the float model counts time."""
         channels = with_clocks(events, self.netlist.clocks)
-        trace = engine.simulate(
-            self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes, threads=threads
-        )
-        return self._run(trace)
+        return self._run(engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes))
 
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Every spike, membrane, update and count, one recording after another."""
@@ -135,12 +131,19 @@ class Loihi(IntegerMachine):
         assert trace.packed is not None, "packed spikes were wanted"
         return trace.packed, trace.counts.saturations.sum(axis=1)
 
-    def page_parts(self, events: EventArray, *, lengths: IntArray | None, bin_s: float) -> BatchParts:
-        """Costs with figures, and cores on the mesh."""
+    def core_map(self, events: EventArray, lengths: IntArray, counts: IntArray) -> CoreMap:
+        """Cores on the mesh."""
         from spikeloom.runtime.machines.loihi1.costs import page
 
-        channels, step_s = with_clocks(events, self.netlist.clocks), bin_s * self.netlist.bins
-        return page.batch_parts(self._engine, self.target, channels, lengths=lengths, bin_s=step_s)
+        within = np.arange(events.shape[-1]) < lengths[:, None, None]
+        inputs = ((with_clocks(events, self.netlist.clocks) != 0) & within).sum(axis=2)
+        return page.core_map(self.netlist, self.target, np.concatenate([inputs, counts], axis=1).mean(axis=0))
+
+    def figures(self, price: Price) -> list[Block]:
+        """Energy by layer and part, time by core."""
+        from spikeloom.runtime.machines.loihi1.costs import page
+
+        return page.figures(price.outcome.result)
 
     def price(
         self,

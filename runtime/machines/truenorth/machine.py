@@ -55,9 +55,8 @@ class TrueNorth(Machine):
         lengths: IntArray | None = None,
         spikes: bool = False,
         membranes: bool = False,
-        threads: int | None = None,
     ) -> Run:
-        """Decisions, and spikes by tick; one recording runs at a time, whatever `threads` says."""
+        """Decisions, and spikes by tick."""
         return self._run(self.simulate(events, lengths, spikes=spikes, membranes=membranes))
 
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:

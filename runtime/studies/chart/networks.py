@@ -20,7 +20,7 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import PRETRAINED, shipped
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
-from spikeloom.runtime.machines.base import DEFAULT, chip_chart, trained_for
+from spikeloom.runtime.machines.base import DEFAULT, trained_for
 from spikeloom.runtime.report.encode import HIDDEN
 from spikeloom.runtime.studies.chart.grid import Grid
 
@@ -156,8 +156,7 @@ def _read(path: str, arguments: argparse.Namespace) -> NetworkFile:
     if path.endswith(SUFFIX):
         raise ModelError(f"{path}: is an ONNX file, a chart takes checkpoints; give the checkpoint that it was made of")
     file = shipped(path)
-    chip = trained_for(file) if Path(file).is_file() else None
-    chart = None if chip is None else chip_chart(chip.__package__.rpartition(".")[2])
+    chart = trained_for(file) if Path(file).is_file() else None
     name = Path(path.removeprefix(PRETRAINED)).stem
     if chart is not None:
         known = chart.facts(path, arguments.weights)

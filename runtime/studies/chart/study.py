@@ -9,7 +9,7 @@ from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.types import JsonObject
-from spikeloom.runtime.machines.base import chip_chart
+from spikeloom.runtime.machines.base import chip_module
 from spikeloom.runtime.report.encode import decode
 from spikeloom.runtime.studies.chart import choices, work
 from spikeloom.runtime.studies.chart.choices import Budget
@@ -72,7 +72,7 @@ def chart(
         raise OptionError(
             f"--grid: {target.name} refuses all {len(refused)} configurations; the first: {refused[0].why[0]}"
         )
-    own = chip_chart(target.name)
+    own = chip_module(target.name, "commands")
     times = {table.name: table.title for table in target.time} if own is None else own.times(target)
     by = ChosenBy(energy=energy, time=next(iter(times), None))
     models = {each.network.name: result.model for each, result in measured}

@@ -28,7 +28,7 @@ from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
-from spikeloom.runtime.machines.base import DEFAULT, Machine, Price, chip_chart, machine_of
+from spikeloom.runtime.machines.base import DEFAULT, Machine, Price, chip_module, machine_of
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
 from spikeloom.runtime.studies.chart.results import FORMAT, SPLITS, Data, Figures, Share, share
@@ -150,7 +150,7 @@ def _loaded(network: NetworkFile) -> LoadedNetwork:
 @lru_cache(maxsize=8)
 def _decided(network: NetworkFile, data: Data, windows: tuple[int, ...]) -> dict[int, dict[str, IntArray]]:
     """Decisions of the float32 model by window and split; one run each, since what comes later changes nothing."""
-    chart, decided = chip_chart(network.target), {window: dict[str, IntArray]() for window in windows}
+    chart, decided = chip_module(network.target, "commands"), {window: dict[str, IntArray]() for window in windows}
     for split, part in _in_steps(data, network).items():
         if chart is not None:
             at = chart.votes(network.path, dict(network.options)["weights"], part, windows)
@@ -214,7 +214,7 @@ def _built(work: Measurement, write: Callable[[str, Path], Written], layout: str
 
 def _rounded(work: Measurement) -> Callable[[str, Path], Written]:
     """Round a network; what writes it in a layout, or raises CapacityError."""
-    network, chart = work.network, chip_chart(work.network.target)
+    network, chart = work.network, chip_module(work.network.target, "commands")
     if chart is not None:
         return lambda _layout, file: chart.build(network.path, dict(network.options)["weights"], file)
     loaded, options = _loaded(network), {layout: _compile_options(work, layout) for layout in work.files}
