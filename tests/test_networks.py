@@ -15,7 +15,7 @@ from oracles import probed
 from scipy import sparse
 from test_dynamics import surrogate_spike
 
-from spikeloom.compiler import Options, compile_network
+from spikeloom.compiler import Options, compile_network, lift
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, TACTILESGNET, Grid, in_order
@@ -24,6 +24,7 @@ from spikeloom.models.graphs import NEUTOUCH, build_graph, normalised_adjacency
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.networks.layers import filter_places, lif, spike_linear
 from spikeloom.models.networks.networks import Architecture, SpikingNet
+from spikeloom.models.networks.quantised import quantised_spikes
 from spikeloom.models.networks.reference import BATCH, float_membranes, float_spikes
 from spikeloom.models.networks.surrogate import RECTANGLE
 from spikeloom.models.recordings.events import load_data
@@ -362,15 +363,22 @@ def test_expansion_equals_probing_the_layer(tmp_path, system):
     assert expanded.projections[0].weight.nnz == np.count_nonzero(weight)
 
 
-@pytest.mark.parametrize("system", NEW)
-def test_fine_tuned_on_the_chips_integers_they_are_the_chip(tmp_path, system):
+@pytest.mark.parametrize(("system", "bits"), [(TACTILESGNET, 2), (TACTILESGNET, 4), *((system, 4) for system in NEW)])
+def test_fine_tuned_on_the_chips_integers_they_are_the_chip(tmp_path, system, bits):
     network, seen = network_of(system), seen_by(system)
     checkpoint = saved(tmp_path, network)
     data = [synthetic_grasps(per_class=2, steps=12, seed=seed) for seed in (1, 2)]
     training, test = (grasps.part(grasps.labels < 4) for grasps in data)
-    tuned = finetune(checkpoint, seen, training, training, load_target("loihi1"), bits=[4], epochs=1)
+    tuned = finetune(checkpoint, seen, training, test, load_target("loihi1"), bits=[bits], epochs=2)
+    assert system != TACTILESGNET or bits == 2 or tuned.history[-1].loss < tuned.history[0].loss
     again = saved(tmp_path, network, weights=tuned.weights, forms=tuned.forms)
+    for ours, theirs in zip(again.forms, tuned.forms, strict=True):
+        assert (ours.bits, ours.exponents) == (theirs.bits, theirs.exponents) == (bits, theirs.exponents)
+        assert_array_equal(ours.threshold, theirs.threshold)
     netlist = compile_network(expand(again, seen), Options(forms=again.forms)).netlist
-    verdict = verify(netlist, Factored(again, seen), test.events[:4], test.labels[:4], test.files[:4])
+    assert {projection.bits for projection in lift(netlist).projections} == {bits}
+    verdict = verify(netlist, Factored(again, seen), test.events, test.labels, test.files)
     assert verdict.quantised_different == 0
     assert verdict.spikes["fc1"].chip > 0
+    model = list(quantised_spikes(again, seen, test.events).values())[-1]
+    assert np.count_nonzero(model.sum(axis=1).argmax(axis=1) == test.labels) == tuned.after
