@@ -190,18 +190,6 @@ def test_a_leaky_integrator_is_the_filter_of_what_follows():
     assert network.populations[0].alpha == pytest.approx(1 - 0.02 / 0.06)
 
 
-def test_a_node_of_several_decays_is_several_layers():
-    rng = np.random.default_rng(6)
-    mixed = lif(9, tau=np.array([0.05, 0.2, 0.05] * 3), r=2.5)
-    graph = chain(affine(rng, 9, 6, 1.5), mixed, affine(rng, 4, 9, 1.5), lif(4, r=2.0))
-    network = lowered(graph).network
-    assert [(p.name, p.size) for p in network.populations] == [("n1_1", 6), ("n1_2", 3), ("n3", 4)]
-    events = bits(1, 6)
-    ours, theirs = float_spikes(network, events), simulate(graph, events, 0.02)
-    assert_array_equal(ours["n3"], theirs["n3"])
-    assert_array_equal(ours["n1_2"], theirs["n1"][:, 1::3])
-
-
 def test_branches_and_nested_graphs():
     rng = np.random.default_rng(10)
     inner = chain(affine(rng, 8, 6, 2.0), lif(8, r=2.0))

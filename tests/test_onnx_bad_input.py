@@ -124,7 +124,7 @@ REFUSED = [
     ("holds no spiking layer: no membrane is compared with a", model(STAGE, INPUTS[:1], ["current"])),
     ("layer layer1: keeps 1.5 of its membrane in a step, allowed", layer(GOOD, beta=np.array(1.5, np.float32))),
     ("node u0_new (Add): has coefficients that are not finite", layer(GOOD, w=np.full((4, 3), np.nan, np.float32))),
-    ("node end0 (Scan): holds a graph, which only an If may", looped()),
+    ("node end0 (Scan): holds a graph, a loop or a choice", looped()),
     # files
     ("holds no graph, so it is not an ONNX file", b""),
     ("is not an ONNX file, or is truncated", b"PK\x03\x04 not at all"),

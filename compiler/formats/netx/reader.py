@@ -51,6 +51,15 @@ LAYER_LIMIT = 1000
 
 NEURONS = ("CUBA", "LOIHI")
 
+REGISTERS = {
+    "iDecay": (1, 4096),
+    "vDecay": (0, 4095),
+    "vThMant": (0, THRESHOLD_MANTISSA_MAX),
+    "refDelay": (1, 1),
+    "wgtExp": (0, 0),
+}
+"""Least and largest value of an entry of a neuron; it may lack the last two."""
+
 ALLOWED = "input, flatten, dense, dense_rec and conv"
 
 OWN = "spikeloom"
@@ -259,17 +268,10 @@ def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopul
     bits = entries.get("messageBits")
     if any(isinstance(value, np.ndarray) and np.any(value) for value in (graded, bits)):
         raise block.fail("sends graded spikes, which Loihi 1 does not have; train without")
-    for key, allowed in (("refDelay", 1), ("wgtExp", 0)):
-        if key in entries and neuron.few(key)[0] != allowed:
-            raise block.fail(f"{key} is {neuron.few(key)[0]}, allowed is {allowed}; train it so")
-    decay_u, decay_v = neuron.few("iDecay")[0] - 1, neuron.few("vDecay")[0]
-    if not (0 <= decay_u <= 4095 and 0 <= decay_v <= 4095):
-        raise block.fail(
-            f"has iDecay {decay_u + 1} and vDecay {decay_v}, allowed are 1 to 4096 and 0 to 4095; train it again"
-        )
-    threshold = neuron.few("vThMant")[0]
-    if not 0 <= threshold <= THRESHOLD_MANTISSA_MAX:
-        raise block.fail(f"vThMant is {threshold}, allowed are 0 to {THRESHOLD_MANTISSA_MAX}; train it again")
+    for key, (least, most) in REGISTERS.items():
+        if (key in entries or key not in ("refDelay", "wgtExp")) and not least <= neuron.few(key)[0] <= most:
+            raise block.fail(f"{key} is {neuron.few(key)[0]}, allowed are {least} to {most}; train it so")
+    decay_u, decay_v, threshold = neuron.few("iDecay")[0] - 1, neuron.few("vDecay")[0], neuron.few("vThMant")[0]
     bias = _bias(block, size, shape)
     alpha, beta = kept_shares(decay_u, decay_v)
     return IntegerPopulation(

@@ -122,9 +122,7 @@ def spread(node: Node, key: str, size: int, shape: tuple[int, ...]) -> FloatArra
 def shared(node: Node, key: str, decay: FloatArray) -> float:
     """The decay that all neurons of a node share; ModelError if they have several."""
     if np.ptp(decay) > TOLERANCE:
-        raise node.fail(
-            f"{key} is different from neuron to neuron, allowed is one for a layer's currents; use one node for each"
-        )
+        raise node.fail(f"{key} is different from neuron to neuron, allowed is one for a layer; use one node for each")
     return float(decay[0]) if decay.size else 0.0
 
 

@@ -17,7 +17,7 @@ from scipy import sparse
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.affine import Affine, added, scaled
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.formats.onnx.file import Array, Node
+from spikeloom.compiler.formats.onnx.file import Array
 from spikeloom.compiler.ir import Sparse
 from spikeloom.compiler.types import FloatArray, IntArray
 
@@ -64,15 +64,14 @@ class Atom:
 class Table:
     """What is met while a graph runs: atoms, and the work done so far.
 
-    Matrices of linear operators are kept with the constants that they were made from, and operators with their nodes,
-    so that nothing else can come to lie at the same address.
+    Matrices of linear operators are kept with the constants that they were made from, so that nothing else can come to
+    lie at the same address.
     """
 
     opset: int = 20
     atoms: list[Atom] = field(default_factory=list)
     known: dict[tuple[object, ...], int] = field(default_factory=dict)
     matrices: dict[tuple[object, ...], tuple[Sparse, tuple[int, ...], list[Value]]] = field(default_factory=dict)
-    operators: dict[int, tuple[Node, Any]] = field(default_factory=dict)
     done: int = 0
 
     def room(self, shape: Sequence[int], limit: int = VALUE_LIMIT) -> tuple[int, ...]:

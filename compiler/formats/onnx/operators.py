@@ -53,20 +53,18 @@ CONSTANT = "is computed from constants by an operator that is not known here; fo
 
 
 def run(graph: Graph, given: Mapping[str, Value], table: Table) -> list[Value]:
-    """Values of a graph's outputs from those `given`: for its inputs, or around it.
+    """Values of a graph's outputs from those `given` for its inputs.
 
     Raises ModelError naming the operator that cannot be evaluated, or is not affine, and why.
     """
     values: dict[str, Value] = {**given, **graph.constants}
     order = needed(graph)
-    held = membranes(
-        order, graph.outputs, {name for name, value in values.items() if not isinstance(value, np.ndarray)}
-    )
+    held = membranes(order, graph.outputs, set(given))
     last = {name: index for index, node in enumerate(order) for name in reads(node)}
     for index, node in enumerate(order):
         try:
             table.spend(NODE_WORK)
-            results = _evaluate(node, values, table)
+            results = apply(node, table, [values[name] if name else None for name in node.inputs])
             for name, result in zip(node.outputs, results, strict=False):
                 values[name] = _set_apart(node, name, result, table) if name in held else result
         except ModelError as error:
@@ -94,41 +92,9 @@ def _set_apart(node: Node, name: str, value: Value, table: Table) -> Value:
     return table.value(table.atom(MEMBRANE, name, len(value.bias), definition=value, node=str(node)), value.shape)
 
 
-def _evaluate(node: Node, values: Mapping[str, Value], table: Table) -> list[Value]:
-    operands = [values[name] if name else None for name in node.inputs]
-    match node.op:
-        case "Constant":
-            numbers = [value for value in node.attributes.values() if not isinstance(value, str | Graph)]
-            if not numbers:
-                raise ModelError("holds no number")
-            return [np.asarray(numbers[0])]
-        case "Shape" | "Size":
-            shape = np.array(as_affine(operands[0]).shape, np.int64)
-            cut = shape[node.attributes.get("start", 0) : node.attributes.get("end", len(shape))]
-            return [cut if node.op == "Shape" else np.array(np.prod(shape))]
-        case "If":
-            if not isinstance(operands[0], np.ndarray):
-                raise ModelError("depends on what varies; only a fixed choice can be read")
-            return run(node.attributes["then_branch" if operands[0].reshape(()) else "else_branch"], values, table)
-    if inner(node):
-        raise ModelError("holds a graph, which only an If may; export one step, or unroll all of them")
-    return apply(node, table, operands)
-
-
-def inner(node: Node) -> tuple[Graph, ...]:
-    """Graphs that are attributes of an operator."""
-    return tuple(value for value in node.attributes.values() if isinstance(value, Graph))
-
-
-def reads(node: Node) -> tuple[str, ...]:
-    """Values that an operator needs, those that its inner graphs take from outside among them."""
-    found = [name for name in node.inputs if name]
-    for graph in inner(node):
-        made = {value.name for value in graph.inputs} | set(graph.constants)
-        made |= {name for each in graph.nodes for name in each.outputs}
-        wanted = [name for each in graph.nodes for name in reads(each)]
-        found += [name for name in [*wanted, *graph.outputs] if name and name not in made]
-    return tuple(found)
+def reads(node: Node) -> list[str]:
+    """Values that an operator needs, without the operands that it omits."""
+    return [name for name in node.inputs if name]
 
 
 def needed(graph: Graph) -> list[Node]:
@@ -177,6 +143,15 @@ def apply(node: Node, table: Table, operands: Sequence[Value | None]) -> list[Va
     Raises ModelError if it is not known, or not affine in what varies; without its name.
     """
     op, varying = node.op, [place for place, operand in enumerate(operands) if isinstance(operand, Affine)]
+    if op == "Constant":
+        numbers = [value for value in node.attributes.values() if not isinstance(value, str)]
+        if not numbers:
+            raise ModelError("holds no number")
+        return [np.asarray(numbers[0])]
+    if op in ("Shape", "Size"):
+        shape = np.array(as_affine(operands[0]).shape, np.int64)
+        cut = shape[node.attributes.get("start", 0) : node.attributes.get("end", len(shape))]
+        return [cut if op == "Shape" else np.array(np.prod(shape))]
     if not varying:
         return _constant(node, table, operands)
     if op in MOVES and not (op == "Where" and 0 in varying) and node.attributes.get("reduction") != "add":
