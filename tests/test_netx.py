@@ -42,8 +42,6 @@ def of_type(kind):
     return [given_input(6), dense(W) | {"type": [kind]}]
 
 
-OWN = {"taxels": 3, "polarities": 2, "clocks": 0, "clock_steps": 1, "label": np.zeros(3, int)}
-
 REFUSED = [
     ("0 (dense): weight holds 0.5, allowed are whole numbers", [dense(W / 4)]),
     ("0 (dense): has weights from 300 to 300, allowed are -256", [dense(W * 150)]),
@@ -52,7 +50,7 @@ REFUSED = [
     ("0 (dense): has synaptic delays", [dense(W, delay=np.array([0, 0, 3, 0]))]),
     ("0 (dense): iDecay is 0, allowed are 1 to 4096", [dense(W, neuron=neuron(u=0))]),
     ("0 (dense): vThMant is 131072, allowed are 0 to 131071", [dense(W, neuron=neuron(threshold=2**17))]),
-    ("0 (dense): wgtExp is 1, allowed are 0 to 0", [dense(W, neuron=neuron(wgtExp=1))]),
+    ("0 (dense): wgtExp is 1, allowed is 0", [dense(W, neuron=neuron(wgtExp=1))]),
     ("0 (dense): has neurons of type 'SDNN', allowed are CUBA", [dense(W, neuron=neuron(kind="SDNN"))]),
     ("0 (dense_rec): weight_rec has the shape [4, 6], wanted [4, 4]", [recurrent(weight_rec=W)]),
     ("0 (conv): the shape of its input is nowhere", [{"type": ["conv"], "shape": [1, 2, 2]}]),
@@ -74,8 +72,6 @@ def test_layers_that_cannot_be_used(tmp_path, words, layers):
     [
         ("has no layers, so it is no netx file", [], {"other": {"a": 1}}),
         ("has no layer of neurons", [given_input(6)], {}),
-        ("group spikeloom is for 6 inputs and 3 voting neurons, the", [dense(W)], {"spikeloom": OWN}),
-        ("group spikeloom describes no sensor", [dense(W)], {"spikeloom": OWN | {"clock_steps": 0}}),
     ],
 )
 def test_structure(tmp_path, words, layers, more):
@@ -259,7 +255,7 @@ def test_what_the_format_holds_comes_back_exactly(drawn):
     made = netx_export.blocks_for(network)
     assert not any(str(block.rounding) for block in made)
     written_ = hdf5.tree_of(netx_export.file_bytes(network, made))
-    again, _ = integers_of(written_)
+    again, _ = integers_of(written_, 1)
     for ours, back in zip(network.projections, again.projections, strict=True):
         assert_array_equal(ours.effective().toarray(), back.effective().toarray())
     for ours, back in zip(network.populations, again.populations, strict=True):
@@ -306,10 +302,9 @@ def test_the_command_counts_what_it_moves(tmp_path):
         > 0
     )
     assert any(layer["spikes_moved"] for layer in report["layers"])
-    back = read_netx(out).network
-    assert back.input == network.input
+    back = read_netx(out, polarities=1).network
+    assert back.input.size == network.input.size
     assert [population.decay_u for population in back.populations] == [p.decay_u for p in network.populations]
-    assert_array_equal(back.readout.label, network.readout.label)
     before = out.read_bytes()
     said = refusal("export", net, "--to", "netx", "-o", out, "--strict")
     assert said.startswith(f"--strict: netx cannot hold {net} as it is (conv1: ")

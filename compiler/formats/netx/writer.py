@@ -4,8 +4,7 @@ The format keeps one threshold for a layer, weights of 8 bits without an exponen
 where the chip counts 64ths of them. Layers follow each other and may be recurrent; convolutions are written out as
 dense layers. A layer whose weights are stored with an exponent is rescaled by a power of two, its threshold with it.
 
-What netx does not read, but our own reader does, is in a group of its own: sensor, clocks and the classes that neurons
-vote for.
+It says nothing of the sensor, of clocks, which are inputs as others, and of classes for which several neurons vote.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import numpy as np
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, THRESHOLD_MANTISSA_MAX, round_half_even
 from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes, tree_of
-from spikeloom.compiler.formats.netx.reader import OWN, integers_of
+from spikeloom.compiler.formats.netx.reader import integers_of
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation
 from spikeloom.compiler.types import BoolArray, IntArray
@@ -167,22 +166,14 @@ def file_bytes(network: IntegerNetwork, blocks: Sequence[DenseLayer]) -> bytes:
                 "gradedSpike": np.array(False),
             },
         }
-    own = {
-        "taxels": np.array(network.input.taxels),
-        "polarities": np.array(network.input.polarities),
-        "clocks": np.array(network.input.clocks.channels),
-        "clock_steps": np.array(network.input.clocks.steps),
-        **({"bins": np.array(network.input.bins)} if network.input.bins > 1 else {}),
-        "label": network.readout.label,
-    }
-    return hdf5_bytes({"layer": layers, OWN: own})
+    return hdf5_bytes({"layer": layers})
 
 
 def moved_spikes(
     network: IntegerNetwork, blocks: Sequence[DenseLayer], events: BoolArray
 ) -> dict[str, tuple[int, int]]:
     """Spikes of each layer that the rounding moves, and how many the netlist has; events (samples, steps, channels)."""
-    written, _ = integers_of(tree_of(file_bytes(network, blocks)))
+    written, _ = integers_of(tree_of(file_bytes(network, blocks)), polarities=1)
     before, after = (run_integer(one, events).spikes for one in (network, written))
     return {
         block.rounding.name: (int(np.count_nonzero(a != b)), int(np.count_nonzero(a)))
