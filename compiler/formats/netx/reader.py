@@ -23,9 +23,9 @@ from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, kept_shares
+from spikeloom.compiler.formats.affine import convolution
 from spikeloom.compiler.formats.assemble import ReadNetwork
 from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, read_hdf5
-from spikeloom.compiler.formats.kernels import convolution
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.ir import (
     INPUT,

@@ -20,8 +20,7 @@ from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import affine
-from spikeloom.compiler.formats.affine import Affine, scaled, shifted, through
-from spikeloom.compiler.formats.kernels import Padding, block_diagonal, convolution
+from spikeloom.compiler.formats.affine import Affine, Padding, block_diagonal, convolution, scaled, shifted, through
 from spikeloom.compiler.formats.nir.file import SPIKING, Graph, Node
 from spikeloom.compiler.types import FloatArray
 

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.kernels import block_diagonal, convolution
+from spikeloom.compiler.formats.affine import block_diagonal, convolution
 from spikeloom.compiler.formats.onnx.atoms import COEFFICIENT_LIMIT, Table
 from spikeloom.compiler.formats.onnx.file import BOOL, Array, Node, decimal
 from spikeloom.compiler.ir import Sparse
