@@ -9,8 +9,7 @@ import numpy as np
 from worker import Job, Task, UnfitError, serve
 
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import BoolArray
 from spikeloom.runtime.machines.loihi1 import timing
 from spikeloom.runtime.machines.loihi1.costs import cost

@@ -16,7 +16,7 @@ from torch import nn
 
 import spikeloom as api
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.machines.loihi1 import spec
 from spikeloom.runtime.report.encode import encode

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from made_files import TAXELS, events, own_file, recordings_folder, weights
 
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.runtime import cli
 from spikeloom.runtime.commands.choose import bits
 

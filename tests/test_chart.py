@@ -16,7 +16,7 @@ from zoo import STORAGE, tuned
 
 from spikeloom.compiler.errors import CapacityError, Violation
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.truenorth.native_file import write_trained
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.recordings.events import load_data

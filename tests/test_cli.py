@@ -21,10 +21,9 @@ from spikeloom.__main__ import main as start
 from spikeloom.compiler import __version__, lift
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.interpret import channels_last, run_integer
-from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.netlist import netlist_text
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.targets.price_tables import EVENTS
+from spikeloom.compiler.targets.base import EVENTS, load_target
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
+from spikeloom.compiler.text import text
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.runtime import cli
@@ -84,9 +83,10 @@ def test_dumps_go_to_standard_error(spikeloom, tmp_path):
     words = [word for step in load_target("loihi1").passes for word in ("--dump-after", step.name)]
     code, out, err = spikeloom("compile", "net.pt", *words, "-o", tmp_path / "out.loom", "--json")
     assert (code, json.loads(out)["neurons"]) == (0, 51)
-    assert err.endswith(netlist_text(read_netlist(tmp_path / "out.loom")))
-    assert err.startswith("(float network (input 6 taxels x 2) (classes 4)\n")
-    assert "(integer network (input 6 taxels x 2) (classes 4)\n" in err
+    assert err.endswith(text(read_netlist(tmp_path / "out.loom")))
+    assert err.startswith("Network\n  input (taxels 6) (polarities 2)")
+    assert "\nIntegerNetwork\n" in err
+    assert "\nLayout\n" in err
 
 
 def test_the_graph_of_a_released_file_comes_from_the_user(as_json, tmp_path):

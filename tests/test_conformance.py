@@ -19,9 +19,9 @@ import spikeloom
 from spikeloom.compiler import lift
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
-from spikeloom.compiler.targets.loihi1.netlist import netlist_text
-from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes, read_netlist
 from spikeloom.compiler.targets.truenorth.netlist import crossbar_bytes
+from spikeloom.compiler.text import text
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.equivalence import float_engine
@@ -223,8 +223,8 @@ def test_a_file_holds_the_netlist_to_the_byte(name):
     content = made.netlist.read_bytes()
     assert (crossbar_bytes if name in CROSSBARS else netlist_bytes)(made.machine.netlist) == content
     if name in LAYERED:
-        lines = netlist_text(made.machine.netlist).splitlines()
-        assert lines == netlist_text(read_netlist(made.netlist)).splitlines()
+        lines = text(made.machine.netlist).splitlines()
+        assert lines == text(read_netlist(made.netlist)).splitlines()
 
 
 @over(MAKERS)

@@ -27,7 +27,6 @@ from spikeloom.compiler.errors import SpikeloomError, VerifyError
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent
-from spikeloom.compiler.targets.loihi1.netlist import netlist_text
 from spikeloom.compiler.text import text
 from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.machines.loihi1.trace import aligned, unpack
@@ -378,7 +377,7 @@ def test_texts_are_as_recorded(golden):
     golden("float.txt", text(chain([[0.5, -0.25, 0.0]], [[1.0], [-1.0]], biases=[[0.125], [0.0, 0.5]])))
     layers = [[2, -4, 0], [6, 8, 254]], [[2, 4]]
     golden("integer.txt", text(integer_chain(*layers, thresholds=[[3, 5], 7], exponent=1)))
-    golden("netlist.txt", netlist_text(compiled(integer_chain(*layers, thresholds=[[3, 5], 7]))))
+    golden("netlist.txt", text(compiled(integer_chain(*layers, thresholds=[[3, 5], 7]))))
 
 
 @given(integer_networks())

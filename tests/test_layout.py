@@ -33,7 +33,7 @@ from spikeloom.compiler.targets.loihi1.layout.forecast import Forecast, fastest,
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound, cut, partition
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count, chip_of_core, place_on_chips, share
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, require_legal
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist, write_netlist
 from spikeloom.compiler.targets.loihi1.options import GOALS
 from spikeloom.runtime.machines.loihi1 import engine, spec, timing
 from spikeloom.runtime.machines.loihi1.costs import page

@@ -15,7 +15,7 @@ from spikeloom.compiler.dynamics import NO_CLOCKS
 from spikeloom.compiler.errors import FormatError, ModelError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import run_integer
-from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist, write_netlist
+from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes, read_netlist, write_netlist
 from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.recordings.events import BIN_S, load_data

@@ -14,10 +14,17 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets import price_tables
-from spikeloom.compiler.targets.base import CROSSBARS, known_targets, load_target, read_target, shipped, with_tables
+from spikeloom.compiler.targets.base import (
+    CROSSBARS,
+    LATENCIES,
+    known_targets,
+    load_target,
+    read_target,
+    shipped,
+    with_tables,
+)
 from spikeloom.compiler.targets.loihi1.legalize import REMEDIES
-from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.compiler.targets.loihi1.netlist import write_netlist
 from spikeloom.runtime import machines
 from spikeloom.runtime.machines.base import machine_for
 from spikeloom.runtime.machines.integer import integer_machine
@@ -113,7 +120,7 @@ def start(source, options, target):
 """
 MACHINE = """
 from spikeloom.runtime.machines.loihi1.machine import Loihi
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 
 class Toy(Loihi):
     details = ("counts",)
@@ -217,7 +224,7 @@ def test_energies_are_the_published_ones(table, prices):
 def test_latencies_are_the_published_ones():
     (table,) = load_target("loihi1").time
     assert table.name == "sanafe"
-    assert set(TIME) == set(price_tables.LATENCIES)
+    assert set(TIME) == set(LATENCIES)
     assert {event: entry.value for event, entry in table.latencies.items()} == TIME
     assert {least: entry.value for least, entry in table.barriers.items()} == BARRIERS
     assert {entry.unit for entry in (*table.latencies.values(), *table.barriers.values())} == {"ns"}

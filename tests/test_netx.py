@@ -26,7 +26,7 @@ from spikeloom.compiler.formats.netx.reader import integers_of, read_netx
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.sensor_layout import sensor_layout
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.runtime.machines.loihi1 import engine
 
 pytestmark = pytest.mark.usefixtures("hdf5_in_one_process")

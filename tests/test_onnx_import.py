@@ -35,7 +35,7 @@ from spikeloom.compiler.formats.onnx.file import Node
 from spikeloom.compiler.formats.onnx.operators import apply
 from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.sensor_layout import sensor_layout
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.models.networks.module import compile_module, module_network
 from spikeloom.runtime import cli
 
@@ -200,7 +200,7 @@ def test_shapes_of_inputs(shape, options, expected):
         ([39, 5], {}, "the input [39, 5]: no axis is the polarities"),
         ([2, 2], {}, "the input [2, 2]: both axes could be the polarities"),
         ([77], {}, "the input [77] is no whole number of taxels with 2 polarities"),
-        ([3, 4, 5], {}, "the input [3, 4, 5] has no axis of 2 polarities"),
+        ([3, 4, 5], {}, "the input [3, 4, 5]: no axis is the polarities"),
         ([2, 3, 4, 5], {}, "the input [2, 3, 4, 5] is none of [taxels, polarities]"),
         ([39, 2], {"polarities": 0}, "--polarities 0: allowed are numbers from 1"),
     ],

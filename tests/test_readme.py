@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes
+from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence.verify import verify
 

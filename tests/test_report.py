@@ -15,7 +15,7 @@ from zoo import specimen
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist, write_netlist
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.models.recordings.events import load_data

@@ -23,8 +23,7 @@ from test_timing import DETAILED, ENERGY_PJ, LOIHI, PICO, SANAFE, SIMPLE, six_st
 
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import sanafe
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, write_netlist
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost
 

@@ -20,9 +20,9 @@ from spikeloom.compiler import archive
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import CapacityError, FormatError
 from spikeloom.compiler.files import remove_leftovers, write_atomically
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import (
+from spikeloom.compiler.targets.loihi1.netlist import (
     FILE,
+    Netlist,
     inconsistencies,
     netlist_bytes,
     read_netlist,

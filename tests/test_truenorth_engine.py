@@ -14,7 +14,7 @@ from random_networks import chain
 
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
 from spikeloom.compiler.targets.truenorth.legalize import faults, needs
-from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE, RESET_TO
+from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE, RESET_TO, inconsistencies
 from spikeloom.runtime.machines.truenorth import engine, spec
 
 
@@ -178,9 +178,6 @@ def with_neuron(**changes) -> Draft:
         ("negative_threshold", 0, 2**18 - 1, "negative threshold", "threshold_bits"),
         ("reset", -256, 255, "reset value", "reset_bits"),
         ("initial", -(2**19), 2**19 - 1, "initial membrane", "membrane_bits"),
-        ("reset_mode", 0, 2, "reset mode", "reset_mode"),
-        ("leak_reversal", 0, 1, "leak reversal", "leak_reversal"),
-        ("negative_saturates", 0, 1, "saturation", "negative_saturates"),
         ("weights", -256, 255, "weight of type 1", "weight_bits"),
     ],
 )
@@ -202,9 +199,6 @@ def more(change, times: int = 1):
     [
         (made(relays()), []),
         *((made(relays(), wire_delay=n), [(SOURCE, f"delay {n}", "neuron.delay")]) for n in (0, 16, -1)),
-        (made(relays(), wire_x=64), [(SOURCE, "target at (64, 0)", "mesh")]),
-        (made(relays(), wire_y=6), [(SOURCE, "target at (1, 6), where no core is", "target")]),
-        (made(relays(), wire_line=7), [(SOURCE, "target line 7 of core 1, which has no axon there", "target")]),
         (more(lambda d: d.wire((0, 0), 1, d.axon(1))), [(SOURCE, "2 targets on one core", "neuron.targets")]),
         (
             more(lambda d: d.wire((0, 0), d.core(2, 0), d.axon(2))),
@@ -214,22 +208,15 @@ def more(change, times: int = 1):
             more(lambda d: d.wire((1, 0), 0, 0)),
             [("core 1, neuron 0", "votes and has a target on the chip", "neuron.targets")],
         ),
-        (more(lambda d: d.axon(0, 2, line=0)), [("core 0, axon 0", "types 0 and 2", "core.axon_types")]),
-        (more(lambda d: d.axon(0, 0, line=0)), [("core 0, axon 0", "there twice", "core.axons")]),
         *((more(lambda d, n=n: d.axon(0, n)), [("core 0, axon 1", f"type {n}", "core.axon_types")]) for n in (4, -1)),
         (
             more(lambda d: d.axon(0), 256),
             [("core 0", "257 axons", "core.axons"), ("core 0, axon 256", "line 256", "core.axons")],
         ),
-        (more(lambda d: d.core(0, 0)), [("core 2", "at (0, 0) as core 0", "mesh")]),
         (
             more(lambda d: d.core(len(d.cores) % 64, len(d.cores) // 64), 4095),
-            [("core 4096", "at (0, 64)", "mesh"), ("chip", "4097 cores", "chip.cores")],
+            [("core 4096", "at (0, 64)", "mesh"), ("chip", 4097, "chip.cores")],
         ),
-        (more(lambda d: d.clock(0, 0, period=0)), [("clock 0", "a period of 0 ticks", "clock")]),
-        (more(lambda d: d.clock(1, 9, period=1)), [("clock 0", "line 9 of core 1", "target")]),
-        (more(lambda d: d.feed(0, 0, 3)), [("input channel 0", "line 3 of core 0", "target")]),
-        (more(lambda d: d.feed(0, 0, 0, tick=-1)), [("input channel 0", "tick -1 of a data step", "feed")]),
         (
             more(lambda d: d.neuron(0, Neuron(leak=300)), 3),
             [("core 0, neuron 1 (and 2 more on this core)", "leak 300", "neuron.leak_bits")],
@@ -238,6 +225,28 @@ def more(change, times: int = 1):
 )
 def test_rules(netlist, found):
     assert broken(netlist) == found
+
+
+@pytest.mark.parametrize(
+    ("netlist", "words"),
+    [
+        *((made(with_neuron(reset_mode=n)), "reset_mode has values outside 0 … 2") for n in (-1, 3)),
+        *((made(with_neuron(leak_reversal=n)), "leak_reversal has values outside 0 … 1") for n in (-1, 2)),
+        *((made(with_neuron(negative_saturates=n)), "negative_saturates has values outside 0 … 1") for n in (-1, 2)),
+        *((made(relays(), **change), "wire 0 leads to no axon") for change in ({"wire_y": 6}, {"wire_line": 7})),
+        *((more(lambda d, n=n: d.axon(0, n, line=0)), "two axons are on one line of a core") for n in (0, 2)),
+        (more(lambda d: d.core(0, 0)), "two cores are at one place"),
+        (more(lambda d: d.clock(0, 0, period=0)), "clock_period has values outside 1"),
+        (more(lambda d: d.clock(0, 0, period=1, phase=-1)), "clock_phase has values outside 0"),
+        (more(lambda d: d.clock(1, 9, period=1)), "clock 0 leads to no axon"),
+        (more(lambda d: d.feed(0, 0, 3)), "feed 1 leads to no axon"),
+        (more(lambda d: d.feed(0, 0, 0, tick=-1)), "feed_tick has values outside 0"),
+    ],
+)
+def test_what_no_network_of_cores_is(netlist, words):
+    (fault,) = inconsistencies(netlist)
+    assert fault.startswith(words)
+    assert inconsistencies(made(relays())) == []
 
 
 def test_limits_are_parameters():

@@ -22,7 +22,7 @@ from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import FormatError, ModelError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import ranc
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
 from spikeloom.compiler.targets.truenorth.legalize import faults
 from spikeloom.compiler.targets.truenorth.netlist import (
@@ -170,12 +170,11 @@ def test_four_touches_counted_by_hand(place):
 
 @pytest.mark.parametrize("name", ["inspect", "run", "estimate"])
 def test_every_broken_rule_is_named(place, name):
-    zero = dict.fromkeys(("clock_core", "clock_line", "clock_period", "clock_phase"), read_only([0]))
-    write_crossbars(replace(network(), leak=read_only([300, 0]), **zero), place / "net.loom")
+    write_crossbars(replace(network(), leak=read_only([300, 0]), reset=read_only([0, 300])), place / "net.loom")
     data = [] if name == "inspect" else ["--data", place / "data"]
-    leak, clock = run(name, place / "net.loom", *data)[2].splitlines()
+    leak, reset = run(name, place / "net.loom", *data)[2].splitlines()
     assert "core 0, neuron 0: leak 300, -256 … 255 allowed (truenorth.neuron.leak_bits)" in leak
-    assert "clock 0: a period of 0 ticks, 1 or more allowed (truenorth.clock)" in clock
+    assert "core 0, neuron 1: reset value 300, -256 … 255 allowed (truenorth.neuron.reset_bits)" in reset
 
 
 # -- RANC --------------------------------------------------------------------------------------------------------------

@@ -17,8 +17,7 @@ import pytest
 from random_netlists import Axon, Neuron, build, lively
 
 from spikeloom.compiler.fixedpoint import read_only
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, write_netlist
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.commands.exchange import watch

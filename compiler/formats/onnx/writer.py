@@ -57,8 +57,7 @@ from spikeloom.compiler.formats.onnx.builder import (
     whole_recordings,
 )
 from spikeloom.compiler.ir import INPUT
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, Reach, reach
-from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, Reach, netlist_bytes, reach
 from spikeloom.compiler.types import IntArray
 
 FORMS = ("step", "scan")

@@ -22,6 +22,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.netx import SUFFIX as NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.text import text
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_bin_option, add_network, group
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.files import require_place
@@ -130,7 +131,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
     def dump(name: str, done: Compilation) -> None:
         if name in arguments.dump_after:
-            sys.stderr.write(done.text())
+            sys.stderr.write(text(done.newest))
 
     compilation = compile_network(
         asked.model,

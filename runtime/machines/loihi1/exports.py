@@ -14,7 +14,7 @@ from spikeloom.compiler.formats.onnx.builder import port_words
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.runtime.machines.export_format import Export, Format, Request
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL

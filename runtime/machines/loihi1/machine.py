@@ -16,8 +16,7 @@ from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import with_tables
 from spikeloom.compiler.targets.loihi1.legalize import measure, require_legal
 from spikeloom.compiler.targets.loihi1.lift import lift
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.base import EventArray, Price, Run, one_by_one
 from spikeloom.runtime.machines.core_map import CoreMap
@@ -212,5 +211,5 @@ machine_of = Loihi
 
 
 def load(path: str | os.PathLike[str]) -> Loihi:
-    """Read a netlist file; raises as :func:`netlist_file.read_netlist` does."""
+    """Read a netlist file; raises as :func:`netlist.read_netlist` does."""
     return Loihi(read_netlist(path))

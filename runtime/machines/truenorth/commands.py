@@ -25,6 +25,7 @@ from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork, h
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Compilation, Options
+from spikeloom.compiler.text import text
 from spikeloom.compiler.types import BoolArray, IntArray, JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import steps_of
@@ -86,7 +87,7 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
 
     def dump(name: str, done: Compilation) -> None:
         if name in arguments.dump_after:
-            sys.stderr.write(done.text())
+            sys.stderr.write(text(done.newest))
 
     try:
         netlist = chip.compile(source, Options(in_time=arguments.in_time, provenance=origin), after=dump).netlist
