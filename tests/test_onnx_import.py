@@ -10,19 +10,7 @@ import numpy as np
 import pytest
 import torch
 from made_modules import NETS, AllSteps, example_of, exported, one_step
-from made_onnx import (
-    BIAS,
-    FIRES,
-    SECOND,
-    STAGE,
-    STATE_IN,
-    WEIGHTS,
-    fire,
-    model,
-    neuron,
-    node,
-    two_layers,
-)
+from made_onnx import BIAS, FIRES, SECOND, STAGE, STATE_IN, WEIGHTS, fire, model, neuron, node, two_layers
 from onnx import helper
 from onnx.reference import ReferenceEvaluator
 from oracles import refused, weight_differences

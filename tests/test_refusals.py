@@ -193,11 +193,7 @@ TABLE = [
     # places to write
     *(
         (f"{command} {where!r}", f"{command.split()[-1]} {where}: {why}")
-        for command in (
-            "compile net.pt -o",
-            "run net.loom --data data --spikes",
-            "train --data data --graph manual -o",
-        )
+        for command in ("compile net.pt -o", "run net.loom --data data --spikes", "train --data data --graph manual -o")
         for where, why in (
             ("nowhere/out", "the folder does not exist"),
             ("data", "is not a regular file"),
@@ -346,10 +342,7 @@ def almost_full(path, mode="r", *options, whole=Path.open, **more):
 
 @pytest.mark.parametrize(
     ("old", "words"),
-    [
-        (b"an older result", ["compile", "net.pt", "-o"]),
-        (None, ["run", "net.loom", "--data", "data", "--spikes"]),
-    ],
+    [(b"an older result", ["compile", "net.pt", "-o"]), (None, ["run", "net.loom", "--data", "data", "--spikes"])],
 )
 @pytest.mark.parametrize(
     ("patched", "replacement", "line"),

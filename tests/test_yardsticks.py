@@ -58,12 +58,7 @@ def test_a_network_counted_by_hand():
 
 
 def test_prices_are_the_published_ones():
-    assert HOROWITZ == {
-        "float32_add": 0.9,
-        "float32_multiply": 3.7,
-        "int8_multiply": 0.2,
-        "int32_add": 0.1,
-    }
+    assert HOROWITZ == {"float32_add": 0.9, "float32_multiply": 3.7, "int8_multiply": 0.2, "int32_add": 0.1}
 
 
 def test_steps_with_other_inputs_than_ones_are_multiplications():
