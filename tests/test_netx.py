@@ -79,7 +79,7 @@ def test_structure(tmp_path, words, layers, more):
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
-def lif(weight, bias, spikes, *, u, v, threshold, own=None):
+def lif(weight, bias, spikes, *, u=4096, v=1024, threshold=25, own=None):
     """A second reading of a block: spikes of (steps, inputs) integers, in plain Python arithmetic."""
     rows = [np.zeros(len(weight), bool)]
     current, membrane = np.zeros(len(weight), np.int64), np.zeros(len(weight), np.int64)
@@ -92,21 +92,23 @@ def lif(weight, bias, spikes, *, u, v, threshold, own=None):
     return np.stack(rows[1:])
 
 
+def require(network, given_, *layers):
+    """The spikes of each layer of a network are these."""
+    verify(network)
+    for ours, wanted in zip(run_integer(network, given_[None]).spikes, layers, strict=True):
+        assert wanted.sum() > 10
+        assert_array_equal(ours[0], wanted)
+
+
 def test_dense_blocks(tmp_path):
     rng = np.random.default_rng(0)
     first, last, bias = even(rng, 12, 6), even(rng, 5, 12), even(rng, 12, most=20)
     block = dense(last, neuron=neuron(u=1024, v=128, threshold=80, kind="LOIHI", wgtExp=0, theta=1600))
     path = write(tmp_path / "a.net", dense(first, bias=bias), block, simulation={"Ts": 1, "tSample": 64})
     found = read_netx(path)
-    verify(found.network)
     given_ = events(rng, 6)
-    ours = run_integer(found.network, given_[None]).spikes
-    hidden = lif(first, bias, given_, u=4096, v=1024, threshold=25)
-    out = lif(last, np.zeros(5, int), hidden, u=1024, v=128, threshold=80)
-    assert hidden.sum() > 20
-    assert out.sum() > 20
-    assert_array_equal(ours[0][0], hidden)
-    assert_array_equal(ours[1][0], out)
+    hidden = lif(first, bias, given_)
+    require(found.network, given_, hidden, lif(last, 0, hidden, u=1024, v=128, threshold=80))
     assert found.facts[0] == "netx, 2 layers, read as they stand"
     assert found.facts[3:] == (
         "dense1: 5 neurons, decay_u 1023, decay_v 128, fires at v > 64 * 80",
@@ -133,14 +135,9 @@ def test_convolutions_are_those_of_torch(tmp_path, groups):
     ]
     found = read_netx(write(tmp_path / "a.net", *blocks)).network
     _, positions, _ = sensor_layout((2, 5, 6))
-    ours = run_integer(found, given_[None][:, :, positions]).spikes
     flat = sums.reshape(len(sums), -1).astype(np.int64)
-    hidden = lif(
-        np.eye(flat.shape[1], dtype=int), np.repeat(bias, np.prod(shape[1:])), flat, u=4096, v=1024, threshold=25
-    )
-    assert hidden.sum() > 20
-    assert_array_equal(ours[0][0], hidden)
-    assert_array_equal(ours[1][0], lif(last, np.zeros(3, int), hidden, u=4096, v=1024, threshold=25))
+    hidden = lif(np.eye(flat.shape[1], dtype=int), np.repeat(bias, np.prod(shape[1:])), flat)
+    require(found, given_[:, positions], hidden, lif(last, 0, hidden))
 
 
 def test_an_input_block_with_neurons_is_a_layer(tmp_path):
@@ -150,8 +147,8 @@ def test_an_input_block_with_neurons_is_a_layer(tmp_path):
     found = read_netx(write(tmp_path / "a.net", block, dense(weight)))
     assert "it turns events into currents" in found.facts[2]
     given_ = events(rng, 6)
-    hidden = lif(36 * np.eye(6, dtype=int), np.full(6, 4), given_, u=4096, v=1024, threshold=25)
-    assert_array_equal(run_integer(found.network, given_[None]).spikes[0][0], hidden)
+    hidden = lif(36 * np.eye(6, dtype=int), 4, given_)
+    require(found.network, given_, hidden, lif(weight, 0, hidden))
 
 
 @pytest.mark.parametrize(("most", "exponents"), [(60, [-1]), (200, [0, -1])])
@@ -178,13 +175,10 @@ def test_a_recurrent_block(tmp_path, most):
     first, own, last = even(rng, 12, 6), rng.integers(-most, most + 1, (12, 12)), even(rng, 5, 12)
     block = dense(first) | {"type": ["dense_rec"], "weight_rec": own.astype(np.float32)}
     found = read_netx(write(tmp_path / "a.net", block, dense(last)))
-    verify(found.network)
     given_ = events(rng, 6)
-    ours = run_integer(found.network, given_[None]).spikes
-    hidden = lif(first, 0, given_, u=4096, v=1024, threshold=25, own=own)
-    assert np.count_nonzero(hidden != lif(first, 0, given_, u=4096, v=1024, threshold=25)) > 20
-    assert_array_equal(ours[0][0], hidden)
-    assert_array_equal(ours[1][0], lif(last, 0, hidden, u=4096, v=1024, threshold=25))
+    hidden = lif(first, 0, given_, own=own)
+    assert np.count_nonzero(hidden != lif(first, 0, given_)) > 20
+    require(found.network, given_, hidden, lif(last, 0, hidden))
     assert found.facts[2].split("; ")[1] == "it is recurrent, fed by its own spikes of the step before"
     placed = compile_network(found.network).netlist
     fast = engine.simulate(placed, given_.T[None].astype(np.uint8), spikes=True)

@@ -273,10 +273,7 @@ def test_groups_of_neurons_vote_for_a_class():
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
-FEW = settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-
-
-@FEW
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(float_networks(betas=(0.0, 0.2, 0.9)))
 def test_the_nir_file_alone_has_the_integers_and_the_decays(tmp_path_factory, network):
     path = tmp_path_factory.mktemp("nir") / "net.nir"
@@ -297,16 +294,9 @@ def test_the_nir_file_alone_has_the_integers_and_the_decays(tmp_path_factory, ne
     assert_array_equal(found.readout.label, integer.readout.label)
 
 
-@pytest.fixture(scope="module")
-def timed(tmp_path_factory):
-    """A netlist with currents and clocks, and its file."""
-    netlist, path = specimen("timed").machine.netlist, tmp_path_factory.mktemp("timed") / "net.nir"
+def test_another_program_that_follows_nir_makes_nearly_the_same_spikes(tmp_path):
+    netlist, path = specimen("timed").machine.netlist, tmp_path / "net.nir"
     path.write_bytes(nir_export.export(netlist, 0.02))
-    return netlist, path
-
-
-def test_another_program_that_follows_nir_makes_nearly_the_same_spikes(timed):
-    netlist, path = timed
     graph = nir.read(path)
     events = with_clocks(events_of(5, samples=1, steps=60), netlist.clocks)
     chip = engine.simulate(netlist, events, spikes=True)

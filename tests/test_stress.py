@@ -46,13 +46,6 @@ def bench_of(network, netlist, recordings, *, checkpoint=None, edges=None, place
     )
 
 
-def timed_bench(folder):
-    """A network with clocks and lasting currents."""
-    _, seen = written(folder / "net.pt")
-    network = expand(read_checkpoint(folder / "net.pt"), seen)
-    return bench_of(network, compile_network(network).netlist, events_of(3))
-
-
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
     """A small TactileSGNet, labelled as its float model decides."""
@@ -112,8 +105,10 @@ def test_ten_times_as_long_is_ten_recordings_of_which_the_last_counts(bench):
 
 def test_clocks_are_no_taxels(tmp_path):
     """Whatever happens to taxels, clocks tick: again with each recording, and to their end in a longer one."""
-    made = timed_bench(tmp_path)
-    netlist = made.pair.netlist
+    _, seen = written(tmp_path / "net.pt")
+    network = expand(read_checkpoint(tmp_path / "net.pt"), seen)
+    netlist = compile_network(network).netlist
+    made = bench_of(network, netlist, events_of(3))
     ticks = netlist.clocks.events(15)
     sensor = netlist.taxels * netlist.polarities
     silent = NAMES["taxels_dead"](made.events, 39, made.sensor, generator("taxels_dead", 0))

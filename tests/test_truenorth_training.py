@@ -218,15 +218,12 @@ def test_from_recordings_to_the_chip(tmp_path, monkeypatch):
     assert made["provenance"]["checkpoint_sha256"] == shown["sha256"] == run["sha256"]
     found = as_json("verify", "x.loom", "--data", "data", "--checkpoint", "x.pt", "--spec-samples", "1")
     assert found["exact"]
-    assert found["correct"] == run["last"]["correct"] == predict_correct("x.pt", grasps[1])
+    right = np.count_nonzero(predict(read_trained("x.pt").network, grasps[1]) == grasps[1].labels)
+    assert found["correct"] == run["last"]["correct"] == right
     # what was finished is not trained again
     (again,) = as_json(*f"{TRAIN} -o x.pt --resume".split())["runs"]
     assert again == run
     assert "x.pt: holds another training (other seed)" in refusal(*f"{TRAIN} --seed 1 --resume -o x.pt".split())
-
-
-def predict_correct(path, recordings):
-    return int(np.count_nonzero(predict(read_trained(path).network, recordings) == recordings.labels))
 
 
 @pytest.fixture
