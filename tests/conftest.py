@@ -71,6 +71,19 @@ def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
 
 
 @pytest.fixture
+def write(tmp_path) -> Callable[[str, str], Path]:
+    """Write a file of text, as it is, under a name."""
+
+    def write(name: str, text: str) -> Path:
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, newline="")
+        return path
+
+    return write
+
+
+@pytest.fixture
 def hdf5_in_one_process(monkeypatch):
     """Read HDF5 files at once: those of most tests make no library spin."""
     monkeypatch.setattr(hdf5, "try_reading", len)

@@ -20,17 +20,6 @@ HEADER = "time_s,taxel,polarity\n"
 
 
 @pytest.fixture
-def write(tmp_path):
-    def write(name: str, text: str) -> Path:
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-        return path
-
-    return write
-
-
-@pytest.fixture
 def save(tmp_path):
     def save(name: str, **arrays) -> Path:
         path = tmp_path / name

@@ -29,11 +29,6 @@ LEAN = ("lean", "net.pt", "--data", "data")
 STEPS = 40
 
 
-def recordings_of(made, labels):
-    files = tuple(map(str, range(len(made))))
-    return Recordings(events=made, labels=labels, files=files, split="train", source="made")
-
-
 def made(seed, samples):
     found = events(seed, samples=samples, steps=STEPS, rate=0.3)
     found[:, 3] = 0  # a taxel that nothing touches
@@ -45,7 +40,8 @@ def compiled(tmp_path_factory):
     """A small network, what it was compiled to, and training recordings."""
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"), last=weights(3, gain=2.5))
     compilation = compile_network(expand(checkpoint, adjacency), Options(training_events=made(1, 24)))
-    seen = recordings_of(made(1, 24), np.arange(24) % CLASSES)
+    labels, names = np.arange(24) % CLASSES, tuple(map(str, range(24)))
+    seen = Recordings(events=made(1, 24), labels=labels, files=names, split="train", source="made")
     return checkpoint, adjacency, compilation, seen
 
 
