@@ -126,21 +126,12 @@ def test_recordings_do_not_influence_each_other(tmp_path):
 
 
 # -- the released checkpoint -------------------------------------------------------------------------------------------
-@pytest.fixture(scope="module")
-def released_run(released_checkpoint, objects_zip, shared_dir):
-    """Checkpoint, propagation matrix, recordings, float32 spikes and the published outputs."""
-    from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-
-    checkpoint, graph = read_checkpoint(released_checkpoint), build_graph("manual")
-    adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
+@pytest.mark.recordings
+def test_every_released_spike_count(released_checkpoint, objects_zip, shared_dir):
+    checkpoint = read_checkpoint(released_checkpoint)
     data = load_data(objects_zip, "test", classes=checkpoint.classes, taxels=checkpoint.taxels)
     expected = json.loads((shared_dir / "checkpoints" / "objects_manual.expected.json").read_text())
-    return checkpoint, adjacency, data, float_spikes(checkpoint, adjacency, data.events), expected
-
-
-@pytest.mark.recordings
-def test_every_released_spike_count(released_run):
-    _, _, data, spikes, expected = released_run
+    spikes = float_spikes(checkpoint, adjacency_of(), data.events)
     assert list(data.files) == expected["files"]
     assert data.labels.tolist() == expected["labels"]
     counts = spikes["fc3"].sum(axis=1)
