@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,11 +27,14 @@ from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime import machines
-from spikeloom.runtime.machines.export_format import Format
+from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
 
 EventArray = npt.NDArray[np.uint8 | np.bool_]
+
+T = TypeVar("T", bound=np.generic)
 
 DEFAULT = "loihi1"
 """Whose reader says what is wrong with a file that names no target."""
@@ -151,6 +154,25 @@ class Machine(ABC):
         """Hold the netlist against every limit of the chip; the SpikeloomError names each that it breaks."""
 
     @abstractmethod
+    def of_layer(self, array: npt.NDArray[T], index: int) -> npt.NDArray[T]:
+        """Cut one layer out of spikes or membranes of a trace, (samples, steps, neurons)."""
+
+    def _run(self, trace: Any, voting: IntArray) -> Run:
+        """What a trace comes to; `voting` are the spikes of each neuron that count as votes."""
+
+        def by_layer(array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]] | None:
+            if array is None:
+                return None
+            return {name: self.of_layer(array, index) for index, name in enumerate(self.layers)}
+
+        return Run(
+            votes=class_counts(self.netlist, voting),
+            counts=trace.counts.spikes,
+            spikes=by_layer(trace.spikes),
+            membranes=by_layer(trace.membranes),
+        )
+
+    @abstractmethod
     def run(
         self,
         events: EventArray,
@@ -189,14 +211,14 @@ class Machine(ABC):
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Spikes, membranes and counts in which simulator and specification differ; events and lengths as for `run`."""
 
-    def require_engine(self, engine: str) -> None:
-        """Make ready what :meth:`beside` will run; OptionError or ModelError if it cannot."""
+    def beside(self, engine: str) -> Callable[[EventArray, IntArray | None], int] | None:
+        """Make one of ``ENGINES`` ready to run recordings of some lengths; None for our own.
+
+        It gives the spikes and votes in which it and our simulator differ. OptionError or ModelError if there is none.
+        """
         if engine != ENGINES[0]:
             raise OptionError(f"--engine {engine}: is not for {self.target.title}; omit it")
-
-    def beside(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
-        """Run the other program that is ready; spikes and votes in which it and our simulator differ."""
-        raise NotImplementedError
+        return None
 
     def require_sensor(self, events: EventArray) -> None:
         """Refuse recordings with another number of input channels: a DataError."""
@@ -218,6 +240,62 @@ class Machine(ABC):
     @abstractmethod
     def stream(self) -> Stream:
         """State of one grasp that runs bin after bin; OptionError if the simulator runs whole recordings only."""
+
+
+# -- formats of other programs -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Request:
+    """What a format is written from; options that were not given are None.
+
+    source, output: file of the network, and the one to be written.
+    recordings: reads recordings for a network of some classes, taxels and bins of a step, where a format has a use
+        for them.
+    recording: which of them.
+    form: which form of the format.
+    dt: seconds of a step.
+    strict: whether to write nothing that had to be rounded.
+    """
+
+    source: str
+    output: str
+    recordings: Callable[[int, int, int], Recordings] | None = None
+    recording: int | None = None
+    form: str | None = None
+    dt: float | None = None
+    strict: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Export:
+    """Content of a file, a dataclass of facts about it with ``neurons`` and ``synapses``, and lines for people.
+
+    `form` is which of several forms of the format it has.
+    """
+
+    content: Iterable[bytes]
+    facts: Any
+    form: str | None = None
+    lines: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Format:
+    """A format by its name on the command line.
+
+    name, title: value of ``--to``, and what it is.
+    write: raises OptionError and ModelError where the format cannot hold the network.
+    options: options that it takes beside the network.
+    """
+
+    name: str
+    title: str
+    write: Callable[[Request], Export]
+    options: tuple[str, ...] = ()
+
+
+# -- where chips are found ---------------------------------------------------------------------------------------------
 
 
 def _module(name: str) -> Any:

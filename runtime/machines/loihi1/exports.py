@@ -16,7 +16,7 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.models.recordings.events import BIN_S
-from spikeloom.runtime.machines.export_format import Export, Format, Request
+from spikeloom.runtime.machines.base import Export, Format, Request
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 
 

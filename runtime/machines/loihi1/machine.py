@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +17,7 @@ from spikeloom.compiler.targets.loihi1.legalize import measure, require_legal
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.machines.base import EventArray, Price, Run, one_by_one
+from spikeloom.runtime.machines.base import EventArray, Price, Run, T, one_by_one
 from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import description, engine, spec
@@ -28,14 +27,8 @@ from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.machines.loihi1.costs.sections import sections
 from spikeloom.runtime.machines.loihi1.stream import Stream
-from spikeloom.runtime.machines.loihi1.trace import Trace, aligned, differences
-from spikeloom.runtime.machines.votes import class_counts
+from spikeloom.runtime.machines.loihi1.trace import aligned, differences
 from spikeloom.runtime.report.sections import Block, Outcome
-
-if TYPE_CHECKING:
-    from spikeloom.runtime.machines.loihi1.onnx_engine import OnnxEngine
-
-T = TypeVar("T", bound=np.generic)
 
 SUMS = 1 << 24
 """Sums of the time model that are held at a time: 128 MiB."""
@@ -68,6 +61,10 @@ class Loihi(IntegerMachine):
         found = lay_out_blocks(self.netlist)
         return f"step by step: {found}" if isinstance(found, str) else "layer by layer, 64 neurons at a time"
 
+    def of_layer(self, array: npt.NDArray[T], index: int) -> npt.NDArray[T]:
+        """As the float model counts time."""
+        return aligned(self.netlist, array, index)
+
     def legal(self) -> None:
         """Refuse a netlist that uses too much of a limit."""
         require_legal(self.netlist, self.target)
@@ -82,7 +79,8 @@ class Loihi(IntegerMachine):
     ) -> Run:
         """Decisions, and spikes as the float model counts time."""
         channels = with_clocks(events, self.netlist.clocks)
-        return self._run(engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes))
+        trace = engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
+        return self._run(trace, trace.counts.spikes)
 
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Every spike, membrane, update and count, one recording after another."""
@@ -92,22 +90,16 @@ class Loihi(IntegerMachine):
             found += differences(spec.simulate(self.netlist, sample), fast)
         return found
 
-    @cached_property
-    def _onnx(self) -> OnnxEngine:
+    def beside(self, engine: str) -> Callable[[EventArray, IntArray | None], int] | None:
+        """The integer graph in onnxruntime."""
+        if engine != "onnx":
+            return super().beside(engine)
         from spikeloom.runtime.machines.loihi1 import onnx_engine
 
-        return onnx_engine.prepare(self.netlist)
-
-    def require_engine(self, name: str) -> None:
-        """Load the integer graph for onnxruntime."""
-        if name == "onnx":
-            _ = self._onnx
-
-    def beside(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
-        """Of the integer graph."""
-        from spikeloom.runtime.machines.loihi1 import onnx_engine
-
-        return onnx_engine.differences(self._onnx, self._engine, with_clocks(events, self.netlist.clocks), lengths)
+        prepared = onnx_engine.prepare(self.netlist)
+        return lambda events, lengths: onnx_engine.differences(
+            prepared, self._engine, with_clocks(events, self.netlist.clocks), lengths
+        )
 
     @cached_property
     def integer(self) -> IntegerNetwork:
@@ -169,7 +161,7 @@ class Loihi(IntegerMachine):
         )
         report = cost_report(self.netlist, chip, found, bin_s=bin_s * self.netlist.bins)
         time_ns = {name: times.duration_ns.sum(axis=1) for name, times in found.simple.items()}
-        return self._run(trace), Price(
+        return self._run(trace, trace.counts.spikes), Price(
             synaptic_operations=found.costs.synaptic_operations.sum(axis=1),
             energy_j={name: each.sum(axis=1) for name, each in found.costs.energy.items()},
             time_s={name: each * 1e-9 for name, each in time_ns.items()},
@@ -191,20 +183,6 @@ class Loihi(IntegerMachine):
     def stream(self) -> Stream:
         """One grasp, bin after bin."""
         return Stream(self._stepwise)
-
-    def _run(self, trace: Trace) -> Run:
-        counts = trace.counts.spikes
-        return Run(
-            votes=class_counts(self.netlist, counts),
-            counts=counts,
-            spikes=self._by_layer(trace.spikes),
-            membranes=self._by_layer(trace.membranes),
-        )
-
-    def _by_layer(self, array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]] | None:
-        if array is None:
-            return None
-        return {name: aligned(self.netlist, array, index) for index, name in enumerate(self.layers)}
 
 
 machine_of = Loihi

@@ -20,10 +20,7 @@ from spikeloom.runtime.machines.loihi1.engine import Engine, EventArray
 from spikeloom.runtime.machines.loihi1.trace import check_channels
 from spikeloom.runtime.machines.votes import class_counts
 
-PART = 64
-"""Recordings whose spikes are held at a time."""
-
-BATCH = 16
+PART = 16
 """Recordings that run together: few enough for the caches."""
 
 
@@ -68,19 +65,16 @@ def simulate(
     names = [port.name for port in prepared.session.get_outputs()]
     ends = np.full(recordings, length) if lengths is None else np.asarray(lengths)
     for end in np.unique(ends[ends > 0]).tolist():
-        group = np.flatnonzero(ends == end)
-        for which in np.split(group, range(BATCH, len(group), BATCH)):
-            given = np.ascontiguousarray((events[which, :, :end] != 0).transpose(2, 0, 1)).view(np.uint8)
-            found = dict(zip(names, prepared.session.run(names, {"events": given}), strict=True))
-            if "overflow" in found and found["overflow"].any():
-                raise NumericRangeError(
-                    f"onnx: recording {which[found['overflow']][0]}: a register overflows, where the chip is not "
-                    "defined"
-                )
-            for layer in prepared.layers:
-                window = np.arange(layer.depth, layer.depth + end)
-                spikes[np.ix_(which, window, layer.ids)] = found[f"{layer.name}.spikes"].transpose(1, 0, 2)
-            votes[which] = found.get("votes", 0)
+        which = np.flatnonzero(ends == end)
+        given = np.ascontiguousarray((events[which, :, :end] != 0).transpose(2, 0, 1)).view(np.uint8)
+        found = dict(zip(names, prepared.session.run(names, {"events": given}), strict=True))
+        if "overflow" in found and found["overflow"].any():
+            recording = which[found["overflow"]][0]
+            raise NumericRangeError(f"onnx: recording {recording}: a register overflows, where the chip is not defined")
+        for layer in prepared.layers:
+            window = np.arange(layer.depth, layer.depth + end)
+            spikes[np.ix_(which, window, layer.ids)] = found[f"{layer.name}.spikes"].transpose(1, 0, 2)
+        votes[which] = found.get("votes", 0)
     return spikes, votes
 
 

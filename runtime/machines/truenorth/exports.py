@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import ranc
-from spikeloom.runtime.machines.export_format import Export, Format, Request
+from spikeloom.runtime.machines.base import Export, Format, Request
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
