@@ -68,7 +68,7 @@ compile, crossbars:
     axons classes cores crossing_points drain_ticks feeds layers limits max_crossing_points_of_an_axon neurons
     provenance sha256 target taxels tick_clocks ticks_per_step wires clocks?
 data:
-    bin_s dead duration_s events found hot labels one_sided picture rate recordings rules source split steps taxels
+    bin_s dead duration_s events found hot labels one_sided rate recordings rules source split steps taxels
     unlabelled
 estimate:
     chip_steps cores detail energy_by_part_j energy_range_j layers max min not_modelled not_priced pace

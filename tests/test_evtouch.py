@@ -16,8 +16,7 @@ from oracles import refused
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.events import load_data
-from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.recordings.windows import first_part, parse_window
+from spikeloom.models.recordings.evtouch import Recordings, first_part, parse_window
 
 EVENTS = (np.arange(3 * 2 * 5) % 3 == 0).reshape(3, 2, 5)
 SAMPLE = "sample_0_label_0.npy"

@@ -24,7 +24,7 @@ from spikeloom.compiler.formats.onnx.operators import apply
 from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
-from spikeloom.models.networks.module import compile_module, module_network
+from spikeloom.models.networks.module import module_network
 from spikeloom.runtime import cli
 
 needs_dynamo = pytest.mark.skipif(
@@ -120,7 +120,7 @@ def test_modules_come_back_with_the_same_integers(read, name, opset):
 @pytest.mark.parametrize("name", [*NETS])
 def test_the_newer_exporter(read, name):
     net, example = NETS[name](), example_of(name)
-    ours = compile_module(net, example).integer
+    ours = compile_network(module_network(net, example)).integer
     one = read(one_step(net, example, dynamo=True))
     several = read(exported(AllSteps(net), (torch.zeros(*example.shape, 3),), dynamo=True))
     for found in (one, several):
@@ -146,7 +146,9 @@ def test_open_size_in_front_is_one_recording(read):
     axes = {"input": {0: "batch"}}
     found = read(one_step(net, example, input_names=["input"], dynamic_axes=axes))
     assert "the open size 'batch' is the batch's, read as 1" in found.facts
-    assert not weight_differences(compile_module(net, example).integer, compile_network(found.network).integer)
+    assert not weight_differences(
+        compile_network(module_network(net, example)).integer, compile_network(found.network).integer
+    )
 
 
 def test_the_largest_of_the_votes_is_what_is_counted(read):

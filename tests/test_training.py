@@ -90,7 +90,6 @@ def test_seeds_side_by_side_equal_single_ones_and_finished_ones_are_left_alone(d
         (["--seeds", "0"], "--seeds 0: at least 1 is needed"),
         (["--seed", str(10**22)], f"--seed {10**22}: allowed are 0 to {2**63 - 1}"),
         (["--picture", "x.jpg"], "--picture x.jpg: allowed are .png, .svg, .pdf"),
-        (["--picture", "x.png", "--keep", "clean"], "--picture x.png: draws the last epoch; add --keep last"),
         (["--picture", "none/x.png"], "--picture none/x.png: the folder does not exist"),
         (
             ["--picture", "./x-seed1.png", "--seeds", "2", "-o", "x.png"],
@@ -188,9 +187,6 @@ def test_resume_does_not_take_another_training_for_this_one(data):
     as_json(*WORDS, "--epochs", "1", "--keep", "best", "-o", "x.pt")
     assert refusal(*WORDS, "--epochs", "2", "--seed", "3", "-o", "x.pt", "--resume") == (
         "x.pt: holds another training (other epochs, seed); give its options, or another -o"
-    )
-    assert refusal(*WORDS, "--epochs", "1", "-o", "x.pt", "--resume", "--picture", "x.png") == (
-        "x.pt: holds only what --keep best kept; give these, or another -o"
     )
     Path("x.pt").write_bytes(b"old")
     assert refusal(*WORDS, "--epochs", "1", "-o", "x.pt", "--resume").startswith("x.pt: ")

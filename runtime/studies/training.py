@@ -13,11 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import __version__
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
-from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.models.training.kinds import Plan, kind_of, seen_by
@@ -73,7 +71,6 @@ class Job:
     test: Recordings
     epochs: int
     seed: int
-    device: str
     resume: bool
     output: Path
     keep: tuple[str, ...]  # Which of ``last``, ``best`` and ``clean`` to write
@@ -119,7 +116,6 @@ def run_job(job: Job) -> Finished:
         epochs=job.epochs,
         seed=job.seed,
         recipe=plan.recipe,
-        device=job.device,
         state=job.state,
         resume=job.resume,
         position=job.position,
@@ -130,8 +126,6 @@ def run_job(job: Job) -> Finished:
         job.test,
         command=job.command,
         seed=job.seed,
-        version=__version__,
-        device=job.device,
         recipe=None if plan.recipe == RELEASED else plan.recipe.to_json(),
     )
     trained = reported.trained
@@ -155,7 +149,6 @@ def recall(job: Job) -> Finished:
         "epochs": job.epochs,
         "seed": job.seed,
         "data_sha256": data_digest(job.training, job.test),
-        "device": job.device,
     }
     differing = [name.removesuffix("_sha256") for name, value in wanted.items() if record.get(name) != value]
     differing += kind.differing(found, job.plan)
@@ -317,40 +310,25 @@ def training_sections(result: TrainingReport) -> Iterable[Section]:
 
 
 @styled
-def picture(jobs: Sequence[Job], records: Sequence[Finished]) -> Drawing:
-    """Learning curves of all seeds and the confusion matrix of their last epochs, which they have kept, summed."""
-    labels, predictions = jobs[0].test.labels, [_decisions(job) for job in jobs]
-    classes = int(max(labels.max(), *(p.max() for p in predictions))) + 1
-    confusion = np.zeros((classes, classes), np.int64)
-    for predicted in predictions:
-        np.add.at(confusion, (labels, predicted), 1)
-    drawing = sheet("trainings", 4.2, width=13.0)
-    left, middle, right = drawing.figure.subplots(1, 3, width_ratios=(1, 1, 1.05))
+def picture(records: Sequence[Finished]) -> Drawing:
+    """Learning curves of all seeds."""
+    drawing = sheet("trainings", 4.2)
+    left, right = drawing.figure.subplots(1, 2)
     for index, record in enumerate(records):
         training, test, correct = np.array(record.history).T
         epochs = np.arange(1, len(correct) + 1)
         colour, marker = COLOURS[index % len(COLOURS)], "." if len(epochs) == 1 else ""  # a line of one point is none
         left.semilogy(epochs, training, marker=marker, color=colour)
         left.semilogy(epochs, test, marker=marker, color=colour, linestyle="--")
-        middle.plot(epochs, 100 * correct / record.test_samples, color=colour, label=f"seed {record.seed}")
+        right.plot(epochs, 100 * correct / record.test_samples, color=colour, label=f"seed {record.seed}")
         clean = record.clean
-        middle.plot(clean.epoch, 100 * clean.accuracy, "o", color=colour, markeredgecolor="black")
+        right.plot(clean.epoch, 100 * clean.accuracy, "o", color=colour, markeredgecolor="black")
     loss = (records[0].recipe or {}).get("loss", MSE)
     measured = "squared error of spike rates" if loss == MSE else loss
     left.set(xlabel="epoch", ylabel=measured, title="loss: training solid, test dashed")
-    middle.set(xlabel="epoch", ylabel="test accuracy (%)", title="accuracy; circle: epoch of the clean protocol")
-    middle.legend(loc="lower right")
-    image = right.imshow(confusion, cmap="cividis")
-    right.set(xlabel="decision", ylabel="class", title="confusion, last epoch")
-    drawing.figure.colorbar(image, ax=right, label="test recordings")
-    for axes in (left, middle):
+    right.set(xlabel="epoch", ylabel="test accuracy (%)", title="accuracy; circle: epoch of the clean protocol")
+    right.legend(loc="lower right")
+    for axes in (left, right):
         axes.locator_params(axis="x", integer=True)
         axes.grid()
-    right.locator_params(integer=True)
     return drawing
-
-
-def _decisions(job: Job) -> IntArray:
-    """Of the last epoch, on the test recordings."""
-    kind = kind_of(job.plan.system)
-    return kind.predict(kind.read(job.output), job.plan, job.test)

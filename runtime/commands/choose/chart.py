@@ -9,7 +9,7 @@ from pathlib import Path
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.recordings.evtouch import data_digest
-from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_model
+from spikeloom.runtime.commands.options import add_data, add_model
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.machines.base import DEFAULT
 from spikeloom.runtime.report.console import progress
@@ -32,8 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
     parser.add_argument("checkpoints", nargs="+", metavar="CKPT", help="trained networks of one data set")
     add_model(parser)
-    parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
-    add_bin_option(parser)
+    add_data(parser)
     parser.add_argument(
         "--grid",
         metavar="AXIS=V,V,…",

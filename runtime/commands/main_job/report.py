@@ -7,7 +7,7 @@ import argparse
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.options import add_explain_cost, add_netlist_and_model, add_recordings
+from spikeloom.runtime.commands.options import add_check, add_netlist_and_model, add_recordings
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.files import require_place
@@ -36,12 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--recording", metavar="NAME|N", help="recording to draw, by name or from 0 (default: the first that differs)"
     )
-    parser.add_argument(
-        "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
-    )
     parser.add_argument("--stress", metavar="STRESS.json", help="show what stress -o wrote about this netlist")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.html")
-    add_explain_cost(parser)
+    add_check(parser)
     parser.epilog = NOTES
 
 

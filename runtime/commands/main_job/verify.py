@@ -7,7 +7,7 @@ import sys
 from dataclasses import replace
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_explain_cost, add_netlist_and_model, add_recordings
+from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_check, add_netlist_and_model, add_recordings
 from spikeloom.runtime.equivalence.verdict import parse_requirements, sections
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.network import load_network
@@ -23,9 +23,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_recordings(parser, window=True)
     parser.add_argument(
         "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"
-    )
-    parser.add_argument(
-        "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
     )
     parser.add_argument(
         "--engine",
@@ -44,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="E0,E2=X,E3=X",
         help="levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
     )
-    add_explain_cost(parser)
+    add_check(parser)
 
 
 def run(arguments: argparse.Namespace) -> Outcome:

@@ -28,7 +28,7 @@ from spikeloom.models.training.recipes import (
     check_recipe,
     decays_asked,
 )
-from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_graph_options, add_system
+from spikeloom.runtime.commands.options import add_data, add_graph_options, add_system
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_graph, sensor_places
@@ -50,8 +50,7 @@ PICTURES = (".png", ".svg", ".pdf")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
-    add_bin_option(parser)
+    add_data(parser)
     parser.add_argument(
         "--join", type=int, default=1, metavar="N", help="a step joins N bins, an event where one has any (default: 1)"
     )
@@ -95,14 +94,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights and order (default: 0)")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds side by side (default: 1)")
     parser.add_argument("--resume", action="store_true", help="go on with an interrupted training of the same options")
-    parser.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
     parser.add_argument(
         "--keep",
         action="append",
         choices=WEIGHTS,
         help="epoch to store: last, best (on test) or clean (on validation); may be repeated (default: all three)",
     )
-    parser.add_argument("--picture", metavar="OUT.png", help="draw learning curves and confusion matrix")
+    parser.add_argument("--picture", metavar="OUT.png", help="draw learning curves")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
 
 
@@ -116,19 +114,16 @@ def run(arguments: argparse.Namespace) -> Outcome:
         require_place(arguments.picture, "--picture", arguments)
         if Path(arguments.picture).suffix not in PICTURES:
             raise OptionError(f"--picture {arguments.picture}: allowed are {', '.join(PICTURES)}; name one of these")
-        if "last" not in (arguments.keep or WEIGHTS):
-            raise OptionError(f"--picture {arguments.picture}: draws the last epoch; add --keep last, or omit it")
         for seed in range(arguments.seed, arguments.seed + arguments.seeds):
             if output_of(arguments.output, seed, arguments.seeds).absolute() == Path(arguments.picture).absolute():
                 raise OptionError(f"--picture {arguments.picture}: is a network that -o names; give another name")
     graph, _ = _sensor(arguments)
     training, test = both_splits(arguments.data, graph.n_taxels, arguments.bin)
-    jobs = plan_jobs(arguments, training, test)
-    records = train_seeds(jobs, resume=arguments.resume)
+    records = train_seeds(plan_jobs(arguments, training, test), resume=arguments.resume)
     if arguments.picture is not None:
         kind = Path(arguments.picture).suffix.removeprefix(".")
         with write_atomically(arguments.picture) as file:
-            file.write(picture(jobs, records).file(kind))
+            file.write(picture(records).file(kind))
     return Outcome(TrainingReport(runs=records, protocols=summary(records)), training_sections)
 
 
@@ -174,7 +169,6 @@ def plan_jobs(arguments: argparse.Namespace, training: Recordings, test: Recordi
             test=test,
             epochs=epochs,
             seed=seed,
-            device=arguments.device,
             resume=arguments.resume,
             output=output_of(arguments.output, seed, arguments.seeds),
             keep=tuple(dict.fromkeys(arguments.keep or WEIGHTS)),
@@ -218,7 +212,6 @@ def _named_recipe(arguments: argparse.Namespace) -> Recipe:
         "current_decay": None,
         "membrane_decay": None,
         "join": 1,
-        "device": "cpu",
         "spike_penalty": None,
         "copies": None,
     }

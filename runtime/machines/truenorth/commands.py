@@ -27,8 +27,7 @@ from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_
 from spikeloom.compiler.targets.truenorth.passes import Compilation, Options
 from spikeloom.compiler.text import text
 from spikeloom.compiler.types import BoolArray, IntArray, JsonObject
-from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.recordings.windows import steps_of
+from spikeloom.models.recordings.evtouch import Recordings, steps_of
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings

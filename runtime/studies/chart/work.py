@@ -21,8 +21,7 @@ from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.recordings.events import joined_bins
-from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.recordings.windows import WHOLE, first_part, steps_of
+from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part, steps_of
 from spikeloom.runtime.equivalence.reference import votes_so_far
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
