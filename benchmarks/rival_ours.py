@@ -9,8 +9,7 @@ import numpy as np
 from worker import Job, Task, UnfitError, serve
 
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import BoolArray
 from spikeloom.runtime.machines.loihi1 import timing
 from spikeloom.runtime.machines.loihi1.costs import cost
@@ -44,7 +43,7 @@ def counts(netlist: Netlist) -> Run:
         assert trace.charged is not None
         steps = np.full(len(events), events.shape[2])
         timing.simple_times(latencies, trace.charged, steps + netlist.max_depth)
-        cost.estimate(meter, trace.counts, steps + netlist.max_depth)
+        cost.price(meter, trace.counts, steps + netlist.max_depth)
         return trace
 
     return run
@@ -64,7 +63,7 @@ def cycle(netlist: Netlist) -> Run:
         steps = np.full(len(events), events.shape[2])
         timing.simple_times(latencies, trace.charged, steps + netlist.max_depth)
         timing.detailed(latencies, trace.spikes, trace.updated, events)
-        cost.estimate(meter, trace.counts, steps + netlist.max_depth)
+        cost.price(meter, trace.counts, steps + netlist.max_depth)
         return trace
 
     return run

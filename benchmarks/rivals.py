@@ -31,8 +31,7 @@ import workload
 from rivals_chart import digits, draw
 
 from spikeloom.compiler.files import write_atomically
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist, write_netlist
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.report.sections import Table
 

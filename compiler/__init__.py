@@ -8,28 +8,20 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from spikeloom.compiler.ir import IntegerNetwork, Network
     from spikeloom.compiler.passes.expand import Factored
-    from spikeloom.compiler.targets.loihi1.alike import store_alike as store_alike
-    from spikeloom.compiler.targets.loihi1.lift import lift as lift
-    from spikeloom.compiler.targets.loihi1.netlist import Netlist as Netlist
-    from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist as read_netlist
-    from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist as write_netlist
-    from spikeloom.compiler.targets.loihi1.options import GOALS as GOALS
-    from spikeloom.compiler.targets.loihi1.options import MAX_PLANES as MAX_PLANES
-    from spikeloom.compiler.targets.loihi1.options import Options as Options
-    from spikeloom.compiler.targets.loihi1.options import Packing as Packing
-    from spikeloom.compiler.targets.loihi1.options import check_packings as check_packings
-    from spikeloom.compiler.targets.loihi1.passes import Compilation as Compilation
-    from spikeloom.compiler.targets.loihi1.passes import lay_out_again as lay_out_again
-    from spikeloom.compiler.targets.loihi1.passes import to_integers as to_integers
-    from spikeloom.compiler.targets.loihi1.passes import without as without
-    from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms as round_to_forms
-    from spikeloom.compiler.targets.loihi1.storage.scales import layer_of as layer_of
-    from spikeloom.compiler.targets.loihi1.storage.scales import rounded as rounded
-    from spikeloom.compiler.targets.loihi1.storage.width_search import WidthPoint as WidthPoint
-    from spikeloom.compiler.targets.loihi1.storage.width_search import WidthSearch as WidthSearch
-    from spikeloom.compiler.targets.loihi1.storage.width_search import check_widths as check_widths
-    from spikeloom.compiler.targets.loihi1.storage.width_search import search_widths as search_widths
-    from spikeloom.compiler.targets.loihi1.storage.width_search import widths_front as widths_front
+    from spikeloom.compiler.targets.loihi1.alike import store_alike
+    from spikeloom.compiler.targets.loihi1.lift import lift
+    from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist, write_netlist
+    from spikeloom.compiler.targets.loihi1.options import GOALS, MAX_PLANES, Options, Packing, check_packings
+    from spikeloom.compiler.targets.loihi1.passes import Compilation, lay_out_again, to_integers, without
+    from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
+    from spikeloom.compiler.targets.loihi1.storage.scales import layer_of, rounded
+    from spikeloom.compiler.targets.loihi1.storage.width_search import (
+        WidthPoint,
+        WidthSearch,
+        check_widths,
+        search_widths,
+        widths_front,
+    )
 
 __version__ = "0.1.0"
 
@@ -38,8 +30,7 @@ DEFAULT_TARGET = "loihi1"
 _NAMES = {
     "alike": "store_alike",
     "lift": "lift",
-    "netlist": "Netlist",
-    "netlist_file": "read_netlist write_netlist",
+    "netlist": "Netlist read_netlist write_netlist",
     "options": "GOALS MAX_PLANES Options Packing check_packings",
     "passes": "Compilation lay_out_again to_integers without",
     "storage.choose_storage": "round_to_forms",

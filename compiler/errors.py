@@ -6,9 +6,7 @@ and exits with 2; nothing here carries a traceback to a user.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 
 class SpikeloomError(Exception):
@@ -38,14 +36,8 @@ class NumericRangeError(SpikeloomError):
 class UnfinishedError(SpikeloomError):
     """Work of several parts ended without some of them: nothing is wrong with what the user gave; exit code 1.
 
-    The message says what is missing and what is kept; `results` are those of the other parts, `resume` the words to
-    add to the command to go on.
+    The message says what is missing and what is kept.
     """
-
-    def __init__(self, message: str, results: Mapping[str, Any] | None = None, resume: tuple[str, ...] = ()) -> None:
-        self.results = dict(results or {})
-        self.resume = resume
-        super().__init__(message)
 
 
 class VerifyError(Exception):

@@ -65,7 +65,7 @@ class Layer:
         return spikes, kept if membranes else None
 
     def moved(self, sources: Raster, wanted: BoolArray) -> npt.NDArray[np.int32]:
-        """Entries of each neuron that differ from those `wanted`, (samples, steps, neurons), and spikes more than there.
+        """Entries in which neurons differ from those `wanted`, (samples, steps, neurons), and spikes more than there.
 
         The shape is (2, neurons).
         """

@@ -152,7 +152,7 @@ def float_layer(
     """Run the recordings of a raster in the float type of all arguments, each from rest.
 
     `fired` (recordings, steps, neurons) uint8 is filled, and `membranes`, likewise and before the reset, unless it is
-    empty. Unless `wanted`, shaped as `fired`, is empty, `moved` (2, neurons) int32 counts the entries in which each neuron
+    empty. Unless `wanted`, shaped as `fired`, is empty, `moved` (2, neurons) int32 counts in which entries each neuron
     differs from it, and the spikes that it has more.
     """
     recordings, steps, size = fired.shape

@@ -10,14 +10,18 @@ from typing import Any, Generic, Protocol, TypeVar
 class Work(Protocol):
     """What passes hand on: all that was made so far."""
 
-    def verify(self) -> None:
-        """Check every rule of the newest artefact; VerifyError if a pass broke one."""
+    @property
+    def newest(self) -> Any:
+        """What the last pass made that changed anything, which :func:`text.text` prints."""
 
-    def text(self) -> str:
-        """The newest artefact in print; equal text means equal content."""
+    def verify(self) -> None:
+        """Check every rule of that; VerifyError if a pass broke one."""
 
 
 W = TypeVar("W", bound=Work)
+
+LATER: Any = None
+"""Of a field of the work that a pass fills in."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -46,55 +46,42 @@ def sensor_layout(
     shown = f"[{', '.join(map(str, shape))}]"
     if not sizes or min(sizes) < 1:
         raise ModelError(f"the input {shown} has no elements; give it the shape of one step")
-    if len(sizes) == 3:
-        return _image(sizes, shown, polarities, polarities_first)
-    if len(sizes) == 2:
-        return _table(sizes, shown, polarities, polarities_first)
     if len(sizes) == 1:
-        return _flat(sizes[0], shown, polarities, polarities_first)
+        count = polarities or POLARITIES
+        if sizes[0] % count:
+            raise ModelError(
+                f"the input {shown} is no whole number of taxels with {count} polarities; tell how many with "
+                "--polarities"
+            )
+        grid = np.arange(sizes[0]).reshape((count, -1) if polarities_first else (-1, count))
+        assumed = "" if polarities else f"; {count} polarities are assumed"
+        words = f"flat, {'polarity by polarity' if polarities_first else _ORDER}{assumed}"
+        return _layout(grid.T if polarities_first else grid, words)
+    if len(sizes) > 3:
+        raise ModelError(
+            f"the input {shown} is none of [taxels, polarities], flat, [polarities, height, width]; reshape it"
+        )
+    axis = _polarity_axis(sizes, shown, polarities, polarities_first)
+    grid = np.moveaxis(np.arange(np.prod(sizes)).reshape(sizes), axis, -1).reshape(-1, sizes[axis])
+    axes, rows = (["taxels"], "") if len(sizes) == 2 else (["height", "width"], ", taxels row by row")
+    axes.insert(axis, "polarities")
+    return _layout(grid, f"[{', '.join(axes)}]{rows}")
+
+
+def _polarity_axis(sizes: list[int], shown: str, polarities: int | None, first: bool | None) -> int:
+    """Which axis, the outer or the inner one, are the polarities."""
+    inner = len(sizes) - 1
+    if first is not None and polarities is None and inner == 1:
+        return 0 if first else inner
+    fits: list[int] = []
+    for count in (polarities,) if polarities else (POLARITIES, 1):
+        fits = fits or [axis for axis in (0, inner) if sizes[axis] == count and first in (None, axis == 0)]
+    if len(fits) == 1 or (fits and inner == 2):
+        return fits[0]
+    which = "both axes could be" if fits else "no axis is"
     raise ModelError(
-        f"the input {shown} is none of [taxels, polarities], flat, [polarities, height, width]; reshape it"
+        f"the input {shown}: {which} the polarities; tell with --polarities N and --polarities-first or -last"
     )
-
-
-def _image(sizes: list[int], shown: str, polarities: int | None, first: bool | None) -> tuple[Input, IntArray, str]:
-    count = polarities or POLARITIES
-    fits = [axis for axis in (0, 2) if sizes[axis] == count or (polarities is None and sizes[axis] == 1)]
-    if first is not None:
-        fits = [axis for axis in fits if (axis == 0) == first]
-    if not fits:
-        raise ModelError(
-            f"the input {shown} has no axis of {count} polarities where they should be; tell how many with --polarities"
-        )
-    axis = fits[0]
-    grid = np.moveaxis(np.arange(np.prod(sizes)).reshape(sizes), axis, -1)
-    words = "[polarities, height, width]" if axis == 0 else "[height, width, polarities]"
-    return _layout(grid.reshape(-1, sizes[axis]), f"{words}, taxels row by row")
-
-
-def _table(sizes: list[int], shown: str, polarities: int | None, first: bool | None) -> tuple[Input, IntArray, str]:
-    usual = (polarities,) if polarities else (POLARITIES, 1)
-    fits = next((found for count in usual if (found := [axis for axis in (0, 1) if sizes[axis] == count])), [])
-    if first is not None:
-        fits = [0 if first else 1] if polarities is None else [axis for axis in fits if (axis == 0) == first]
-    if len(fits) != 1:
-        which = "both axes could be" if fits else "no axis is"
-        raise ModelError(
-            f"the input {shown}: {which} the polarities; tell with --polarities N and --polarities-first or -last"
-        )
-    grid = np.arange(sizes[0] * sizes[1]).reshape(sizes)
-    return _layout(grid.T if fits[0] == 0 else grid, "[polarities, taxels]" if fits[0] == 0 else "[taxels, polarities]")
-
-
-def _flat(size: int, shown: str, polarities: int | None, first: bool | None) -> tuple[Input, IntArray, str]:
-    count = polarities or POLARITIES
-    if size % count:
-        raise ModelError(
-            f"the input {shown} is no whole number of taxels with {count} polarities; tell how many with --polarities"
-        )
-    grid = np.arange(size).reshape((count, -1) if first else (-1, count))
-    assumed = "" if polarities else f"; {count} polarities are assumed"
-    return _layout(grid.T if first else grid, f"flat, {'polarity by polarity' if first else _ORDER}{assumed}")
 
 
 def _layout(grid: IntArray, words: str) -> tuple[Input, IntArray, str]:

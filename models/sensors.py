@@ -1,8 +1,7 @@
 """Other sensors: taxel positions and hand-drawn edges from CSV files, and the checks that they need.
 
 What makes a graph wrong is an error (a taxel that does not exist, two taxels in one place, an edge from a taxel to
-itself). What may be meant but rarely is (taxels without edges, a graph in parts, an edge listed again) is a
-warning: text that the caller shows.
+itself). A graph in parts may be meant but rarely is: a warning, text that the caller shows.
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ import numpy as np
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.graphs import CHOICES, MAX_TAXELS, Graph, build_graph
-from spikeloom.models.recordings.csvtable import Table, read_table
+from spikeloom.models.recordings.csvtable import read_table
 
 MAX_MILLIMETRES = 1e6
 
-_SHOWN = 8  # numbers that a warning lists
+_SHOWN = 8  # parts that a warning lists
 
 
 def read_taxels(path: str | os.PathLike[str]) -> FloatArray:
@@ -60,13 +59,10 @@ def read_layout(taxels: str | os.PathLike[str]) -> tuple[int, FloatArray | None]
     return int(word), None
 
 
-def read_edges(
-    path: str | os.PathLike[str], n: int | None, *, directed: bool = False
-) -> tuple[IntArray, tuple[str, ...]]:
+def read_edges(path: str | os.PathLike[str], n: int | None, *, directed: bool = False) -> IntArray:
     """Read the edges of a graph of `n` taxels, sorted, each once: lines ``source,target``, counted from 0.
 
-    Unless `directed`, each counts in both directions, listed once or twice. Edges that the file lists again make a
-    warning.
+    Unless `directed`, each counts in both directions, listed once or twice.
 
     DataError if the file is not such a table, or an edge names a taxel that does not exist or joins one to itself.
     """
@@ -88,11 +84,8 @@ def read_edges(
             f"{table.at(row)}: joins taxel {edges[row, 0]} to itself, allowed are two taxels; remove the line "
             "(every taxel receives its own events anyway)"
         )
-    kept, first = np.unique(edges, axis=0, return_index=True)
-    warnings = _repeats(table, edges, first)
-    if not directed:
-        kept = np.unique(np.concatenate([kept, kept[:, ::-1]]), axis=0)
-    return kept, warnings
+    both = edges if directed else np.concatenate([edges, edges[:, ::-1]])
+    return np.unique(both, axis=0)
 
 
 def sensor_graph(
@@ -101,8 +94,8 @@ def sensor_graph(
     taxels: str | os.PathLike[str] | None = None,
     edges: str | os.PathLike[str] | None = None,
     directed: bool = False,
-) -> tuple[Graph, tuple[str, ...]]:
-    """Build the graph that the command line asks for, by name or from a file; the warnings are one line each.
+) -> tuple[Graph, str | None]:
+    """Build the graph that the command line asks for, by name or from a file, and a warning if it is in parts.
 
     It is named as in `graph`, or ``edges:FILE``. A sensor given by edges alone has no positions; its taxels then stand
     on a line in their order, which nothing that is computed from edges uses.
@@ -119,77 +112,39 @@ def sensor_graph(
     if edges is None:
         assert graph is not None  # the first check left one of them
         if taxels is None:
-            return build_graph(graph), ()
+            return build_graph(graph), None
         if places is None:
             raise OptionError(f"--taxels {taxels}: --graph {graph} needs positions; give a CSV file with x,y in mm")
         built = build_graph(graph, places)
-        return built, connection_warnings(f"{Path(taxels).name}, {built.name}", built.edges, built.n_taxels)
-    drawn, warnings = read_edges(edges, count, directed=directed)
+        return built, parts_warning(f"{Path(taxels).name}, {built.name}", built.edges, built.n_taxels)
+    drawn = read_edges(edges, count, directed=directed)
     n = int(drawn.max()) + 1 if count is None else count
     if places is None:
         places = np.arange(float(n))[:, None]
     name = Path(edges).name
     built = Graph(name=f"edges:{name}", coordinates=places, edges=drawn)
-    return built, warnings + connection_warnings(name, drawn, n)
+    return built, parts_warning(name, drawn, n)
 
 
-def connection_warnings(where: str, edges: IntArray, n: int) -> tuple[str, ...]:
-    """Say which of `n` taxels no edge touches, and whether the others fall into parts.
+def parts_warning(where: str, edges: IntArray, n: int) -> str | None:
+    """Say whether a graph of `n` taxels falls into parts, over edges in either direction; the largest first.
 
     Examples
     --------
-    >>> for line in connection_warnings("edges.csv", np.array([[0, 1], [2, 3], [3, 4]]), 6):
-    ...     print(line)
-    edges.csv: taxel 5 has no edge, it receives its own events only; add edges if it should not
-    edges.csv: the graph has 2 parts, of 3 and 2 taxels (with taxels 2 and 0); touch does not spread between them
+    >>> print(parts_warning("edges.csv", np.array([[0, 1], [2, 3], [3, 4]]), 6))
+    edges.csv: the graph has 3 parts, of 3, 2, 1 taxels (with taxels 2, 0, 5); touch does not spread between them
     """
-    warnings = []
-    part = _parts(edges, n)
-    first, sizes = np.unique(part, return_counts=True)
-    isolated = first[sizes == 1].tolist()
-    if isolated:
-        have = "has no edge, it receives its" if len(isolated) == 1 else "have no edges, each receives its"
-        should = "it" if len(isolated) == 1 else "they"
-        taxel = "taxel" if len(isolated) == 1 else "taxels"
-        warnings.append(
-            f"{where}: {taxel} {_listed(isolated)} {have} own events only; add edges if {should} should not"
-        )
-    order = np.argsort(-sizes, kind="stable")
-    several = [index for index in order.tolist() if sizes[index] > 1]
-    if len(several) > 1:
-        warnings.append(
-            f"{where}: the graph has {len(several)} parts, of {_listed([int(sizes[i]) for i in several])} taxels "
-            f"(with taxels {_listed([int(first[i]) for i in several])}); touch does not spread between them"
-        )
-    return tuple(warnings)
-
-
-def _parts(edges: IntArray, n: int) -> IntArray:
-    """Lowest taxel that each taxel is joined to, over edges in either direction, (n,)."""
     from scipy import sparse  # a tenth of a second that named graphs need not wait
 
     links = sparse.coo_array((np.ones(len(edges)), edges.T), (n, n))
     part = sparse.csgraph.connected_components(links, directed=False)[1]
-    lowest: IntArray = np.unique(part, return_index=True)[1][part]
-    return lowest
-
-
-def _repeats(table: Table, edges: IntArray, first: IntArray) -> tuple[str, ...]:
-    """Warn of rows that occurred before."""
-    again = np.ones(len(edges), dtype=bool)
-    again[first] = False
-    if not again.any():
-        return ()
-    row = int(np.argmax(again))
-    source, target = edges[row].tolist()
-    count = int(again.sum())
-    lines = "1 line repeats an edge" if count == 1 else f"{count} lines repeat edges"
-    place = table.at(row).rpartition(": ")[2]
-    return (f"{table.where}: {lines} (first {source},{target} at {place}); each counts once",)
-
-
-def _listed(numbers: list[int]) -> str:
-    """Numbers with commas and an ``and``, the first few of many."""
-    if len(numbers) > _SHOWN:
-        return f"{', '.join(map(str, numbers[:_SHOWN]))} and {len(numbers) - _SHOWN} more"
-    return " and ".join(filter(None, [", ".join(map(str, numbers[:-1])), str(numbers[-1])]))
+    _, first, sizes = np.unique(part, return_index=True, return_counts=True)
+    if len(first) == 1:
+        return None
+    order = np.lexsort((first, -sizes))
+    of, lowest = (", ".join(map(str, each[order[:_SHOWN]].tolist())) for each in (sizes, first))
+    more = f" and {len(first) - _SHOWN} more" if len(first) > _SHOWN else ""
+    return (
+        f"{where}: the graph has {len(first)} parts, of {of} taxels (with taxels {lowest}{more}); touch does not "
+        "spread between them"
+    )

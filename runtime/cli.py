@@ -154,17 +154,6 @@ def _mistake(error: Exception) -> str:
     return " ".join([str(error), *(f"({note})" for note in getattr(error, "__notes__", ()))])
 
 
-def _go_on(words: Sequence[str], more: Sequence[str]) -> str:
-    """Command that goes on where one has left off.
-
-    Examples
-    --------
-    >>> _go_on(["chart", "a b.pt", "--fresh"], ()), _go_on(["train", "--resume"], ["--resume"])
-    ("spikeloom chart 'a b.pt'", 'spikeloom train --resume')
-    """
-    return shlex.join(["spikeloom", *(w for w in words if w != "--fresh"), *(w for w in more if w not in words)])
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
     from spikeloom.runtime.report.console import progress, show
@@ -188,7 +177,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         sys.stderr.writelines(f"spikeloom: {line}\n" for line in _mistake(error).splitlines())
         if isinstance(error, UnfinishedError):
-            sys.stderr.write(f"spikeloom: go on with: {_go_on(words, error.resume)}\n")
+            again = shlex.join(["spikeloom", *(word for word in words if word != "--fresh")])
+            sys.stderr.write(f"spikeloom: go on with: {again}\n")
             return 1
         return 2
     except KeyboardInterrupt as interrupt:

@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import commands
 import pytest
 from made_files import own_file, recordings_folder
 
@@ -70,6 +71,19 @@ def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
 
 
 @pytest.fixture
+def write(tmp_path) -> Callable[[str, str], Path]:
+    """Write a file of text, as it is, under a name."""
+
+    def write(name: str, text: str) -> Path:
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, newline="")
+        return path
+
+    return write
+
+
+@pytest.fixture
 def hdf5_in_one_process(monkeypatch):
     """Read HDF5 files at once: those of most tests make no library spin."""
     monkeypatch.setattr(hdf5, "try_reading", len)
@@ -81,18 +95,25 @@ def place(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("place")
     recordings_folder(folder / "data")
     own_file(folder / "net.pt")
-    assert cli.main(["compile", f"{folder}/net.pt", "-o", f"{folder}/net.loom", "--json"]) == 0
+    words = ["compile", f"{folder}/net.pt", "--calibrate", f"{folder}/data", "-o", f"{folder}/net.loom", "--json"]
+    assert cli.main(words) == 0
     return folder
 
 
 @pytest.fixture
-def spikeloom(capsys, place, monkeypatch) -> Callable[..., tuple[int, str, str]]:
+def spikeloom(place, monkeypatch) -> Callable[..., tuple[int, str, str]]:
     """Run a command in the folder `place`; gives exit code, standard output and standard error."""
     monkeypatch.chdir(place)
+    return commands.run
 
-    def command(*words):
-        capsys.readouterr()
-        code = cli.main([str(word) for word in words])
-        return code, *capsys.readouterr()
 
-    return command
+@pytest.fixture
+def as_json(spikeloom) -> Callable[..., object]:
+    """Run a command there that must succeed with ``--json``; gives the object."""
+    return commands.as_json
+
+
+@pytest.fixture
+def refusal(spikeloom) -> Callable[..., str]:
+    """Run a command there that must fail; gives its one line."""
+    return commands.refusal

@@ -6,11 +6,12 @@ from typing import Any
 
 from spikeloom.runtime.studies.chart import choices
 from spikeloom.runtime.studies.chart.grid import Grid
+from spikeloom.runtime.studies.chart.networks import NetworkFile
 from spikeloom.runtime.studies.chart.results import (
     Chart,
-    ChartedData,
     ChartedNetwork,
     ChosenBy,
+    Data,
     Figures,
     Point,
     Refused,
@@ -63,24 +64,37 @@ def made_point(number: int, **about: Any) -> Point:
     return Point(number=number, **(usual | about))
 
 
-def made_network(name: str = "grasps", **about: Any) -> ChartedNetwork:
-    """A network of the usual kind, but for what is said."""
-    usual: dict[str, Any] = {
-        "path": f"{name}.pt",
-        "target": "loihi1",
-        "sha256": "ab" * 32,
-        "system": "tactilesgnet",
-        "graph": "manual",
-        "weights": "last",
-        "fine_tuned": False,
-        "trained_by": "spikeloom train",
-        "validation": 0.9,
-        "bins": 1,
-        "model": {"50": {split: share(n // 2, n) for split, n in SAMPLES.items()}}
-        | {"100": {split: share(n * 9 // 10, n) for split, n in SAMPLES.items()}},
-        "float_training": 1.0,
+def made_network(
+    name: str = "grasps",
+    *,
+    validation: float | None = 0.9,
+    trained: int = 400,
+    expected: float = 0.0,
+    graph: str = "manual",
+    bins: int = 1,
+) -> ChartedNetwork:
+    """A network of the usual kind, but for what is said; its float model has so many training recordings right."""
+    known = {} if validation is None else {"validation": {"correct": 100 * validation, "samples": 100}}
+    file = NetworkFile(
+        path=f"{name}.pt",
+        name=name,
+        target="loihi1",
+        graph=graph,
+        sha256="ab" * 32,
+        system="tactilesgnet",
+        weights="last",
+        bins=bins,
+        options=(),
+        taxels=39,
+        classes=8,
+        layers=("conv1", "fc1"),
+        training={"command": "spikeloom train"} | known,
+    )
+    model = {
+        50: {split: share(n // 2, n) for split, n in SAMPLES.items()},
+        100: {"train": share(trained, 400), "test": share(90, 100)},
     }
-    return ChartedNetwork(name=name, **(usual | about))
+    return ChartedNetwork(file=file, model=model, expected=expected)
 
 
 def made_chart(*budgets: str) -> Chart:
@@ -116,7 +130,7 @@ def made_chart(*budgets: str) -> Chart:
         spikeloom="0.1.0",
         target="loihi1",
         command="spikeloom chart grasps.pt grasps-knn1.pt --data 'a <b>' -o out",
-        data=ChartedData(path="a <b>", bin_s=0.02, sha256="cd" * 32, steps=250, **SAMPLES),
+        data=Data(path="a <b>", bin_s=0.02, sha256="cd" * 32, steps=250, **SAMPLES),
         tables={"energy": {"one": "prices <one>", "two": "prices two"}, "time": {"clock": "times"}},
         chosen_by=BY,
         grid=Grid(bits=((2,), (4,), (8,)), window=(50, 100)),

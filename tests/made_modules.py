@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from spikeloom.models.networks.lif import LIF, OneStep, reset
+from spikeloom.models.networks.lif import LIF, reset
 
 TAXELS, CLASSES = 6, 3
 RING = np.array([[i, (i + 1) % TAXELS] for i in range(TAXELS)] + [[(i + 1) % TAXELS, i] for i in range(TAXELS)])
@@ -145,6 +145,35 @@ def exported(module, inputs, *, dynamo=False, **options):
         else:
             torch.onnx.export(module, inputs, buffer, dynamo=False, **options)
     return buffer.getvalue()
+
+
+def lif_layers(net):
+    return [module for module in net.modules() if isinstance(module, LIF)]
+
+
+class OneStep(nn.Module):
+    """One step of a network as a function: ``(x, state …) -> (output, state …)``; the example is for shapes."""
+
+    def __init__(self, net: nn.Module, example: torch.Tensor) -> None:
+        super().__init__()
+        self.net = net
+        reset(net)
+        with torch.no_grad():
+            net(example)
+        self.rest = tuple(torch.zeros_like(tensor) for tensor in self._state())
+        reset(net)
+
+    def forward(self, x: torch.Tensor, *state: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        for index, layer in enumerate(lif_layers(self.net)):
+            layer.membrane, layer.spikes = state[2 * index], state[2 * index + 1]
+        output: torch.Tensor = self.net(x)
+        after = self._state()
+        reset(self.net)
+        return output, *after
+
+    def _state(self) -> tuple[torch.Tensor, ...]:
+        both = ((layer.membrane, layer.spikes) for layer in lif_layers(self.net))
+        return tuple(tensor for pair in both for tensor in pair if tensor is not None)
 
 
 def one_step(net, example, **options):

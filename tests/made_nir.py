@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from spikeloom.compiler.formats.nir.file import graph_of
 from spikeloom.compiler.formats.nir.reader import network_of
-from spikeloom.compiler.formats.nir.steps import Steps
+from spikeloom.compiler.formats.nir.stages import Steps
 
 
 def tree_of(graph):

@@ -102,25 +102,3 @@ def two_layers(spelling="product"):
     nodes += [node("MatMul", f"{source} w2", "more"), *neuron(1, "more", spelling)]
     outputs = ["s1_new", *[name for name in results if name != "s1_new"]]
     return model(nodes, [("x", [1, 4]), *states], outputs)
-
-
-def body(spelling="product"):
-    """The same step as the body of a Scan: states in, states and spikes out."""
-    nodes = STAGE + neuron(0, "current", spelling)
-    nodes += [node("MatMul", "s0_new w2", "more"), *neuron(1, "more", spelling), node("Identity", "s1_new", "out")]
-    inputs = [value(name, shape) for name, shape in [*STATE_IN, ("x", [1, 4])]]
-    return helper.make_graph(nodes, "step", inputs, [value(name, None) for name in [*STATE_OUT, "out"]])
-
-
-RESTS = {"r0": np.zeros((1, 3), np.float32), "r1": np.zeros((1, 2), np.float32), "axes": np.array([0])}
-
-
-MEAN = node("ReduceMean", "spikes axes", "rate", keepdims=0)
-
-
-def scanned(steps=4, last=(MEAN,), **more):
-    """All steps by a Scan over (steps, 4), then the mean of the spikes, or what the last nodes make of them."""
-    more |= {"body": body(), "num_scan_inputs": 1}
-    scan = node("Scan", "r0 r0 r1 r1 sequence", "end0 end1 end2 end3 spikes", **more)
-    nodes = [node("Unsqueeze", "events axis", "sequence"), scan, *last]
-    return model(nodes, [("events", [steps, 4])], last[-1].output, RESTS | {"axis": np.array([1])})

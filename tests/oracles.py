@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 
 def probed(stage, channels):
@@ -28,6 +29,12 @@ def weight_differences(first, second):
         name = first.populations[post].name
         found += [(name, int(i), int(j), int(one[i, j]), int(other[i, j])) for i, j in zip(row, column, strict=True)]
     return found
+
+
+def load_weights(network, weights):
+    """Give a TactileSGNet the weights of a checkpoint."""
+    network.gains = ()
+    network.load_state_dict({n: torch.tensor(w.T if n.endswith(".weight") else w) for n, w in weights.items()})
 
 
 def refused(error, words, call, *given, **options):

@@ -113,6 +113,13 @@ def integer_chain(*weights, bits=8, exponent=0, thresholds=None, polarities=1) -
     )
 
 
+def with_population(network, index, **changes):
+    """The network with another population there."""
+    populations = list(network.populations)
+    populations[index] = dataclasses.replace(populations[index], **changes)
+    return dataclasses.replace(network, populations=tuple(populations))
+
+
 def ring(taxels):
     """Normalised adjacency of taxels in a circle."""
     source = np.arange(taxels)

@@ -1,15 +1,12 @@
 """Benchmarks: our netlist, references and the rivals' runners agree; the paper's tables are those of its cells."""
 
 import importlib
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from random_netlists import ungated
 
-from spikeloom.models.recordings.grasps import synthetic_grasps
-from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime.machines.loihi1.engine import simulate
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
@@ -119,14 +116,6 @@ def test_workers_run_in_pairs_and_those_that_cannot_are_skipped(module, task):
     assert found["rival"]["peak_mb"] > 1
 
 
-def test_charts_are_drawn(module, tmp_path):
-    spread = {"min": 0.4, "median": 0.5, "max": 0.7}
-    entries = {"ours": {"cpu_ms": spread}, "other": {"cpu_ms": spread, "ratio": spread}, "no": {"skipped": ""}}
-    workloads = {"tiny": {"synaptic_operations": 5e6, "entries": entries}}
-    module("rivals_chart").draw({"workloads": workloads}, str(tmp_path / "x"))
-    assert len(list(tmp_path.glob("x*"))) == 2
-
-
 def test_a_wrong_spike_is_found(task):
     spikes = [task.expected("aligned", layer).copy() for layer in range(4)]
     spikes[2][1, 3, 4] ^= True
@@ -153,17 +142,6 @@ def test_every_planned_cell_is_there_and_adds_up(module, cells):
             assert cell[which]["accuracy"] == cell[which]["correct"] / cell["test_samples"]
 
 
-def test_tables_of_some_cells(module, cells):
-    few = {name: cell for name, cell in cells.items() if name.endswith(("e100-s0", "e100-s1"))}
-    one = "objects-tactilesgnet-knn-1-e60-s0"
-    few[one] = cells[one]
-    written = module("tables").files(few)
-    assert b"16 of 36 trainings are there" in written["methods.md"]
-    accuracy = f"{100 * few[one]['best']['accuracy']:.2f} (one seed)"
-    assert f"| knn:1 | 1 | not available here | {accuracy} |" in written["graphs.md"].decode()
-    assert all(content.startswith(b"\x89PNG") for name, content in written.items() if name.endswith(".png"))
-
-
 def test_statistics(module):
     spreads = module("spreads")
     spread = spreads.Spread((90.0, 88.0))
@@ -179,21 +157,3 @@ def test_statistics(module):
     rho, p = spreads.rank_correlation([1, 2, 3, 4, 5], [5, 6, 7, 8, 7])
     assert (round(rho, 2), round(p, 2)) == (0.82, 0.09)
     assert spreads.rank_correlation([1, 2, 3], [1, 2, 3]) is None
-
-
-@pytest.mark.slow
-def test_a_cell_is_trained_measured_and_kept(module, tmp_path):
-    cells, train = module("cells"), module("train")
-    splits = [
-        replace(synthetic_grasps(per_class=2, steps=14, seed=seed), split=split)
-        for split, seed in (("train", 1), ("test", 2))
-    ]
-    write_released(tmp_path / "grasps", splits)
-    row = cells.Row(data="grasps", system="mlp", form="none", epochs=1)
-    name, cell = train.make(row, 0, str(tmp_path / "grasps"), tmp_path / "net.pt")
-    assert name == "grasps-mlp-none-e1-s0"
-    assert cell["chip"]["last"]["float_correct"] == cell["last"]["correct"]
-    assert cell["chip"]["last"]["first_layer"]["neurons"] == 64
-    assert train.make(row, 0, str(tmp_path / "grasps"), tmp_path / "net.pt") == (name, cell)  # taken over
-    cells.write_cells(tmp_path, {name: cell})
-    assert cells.read_cells(tmp_path) == {name: cell}

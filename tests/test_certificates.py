@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from made_files import CLASSES, FEATURES, TAXELS, events, ring, small_checkpoint, weights
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
-from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float, vote
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.models.networks.reference import float_spikes
@@ -20,16 +19,10 @@ from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.machines.votes import predictions
 
-SIZES = (9, 8, CLASSES)
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("certificates")
-
-
-def model(folder, seed=0, last=None, **options) -> tuple[Checkpoint, np.ndarray]:
-    return small_checkpoint(folder, last=weights(seed, sizes=SIZES) if last is None else last, **options)
 
 
 def on_chip(netlist, recordings):
@@ -77,7 +70,7 @@ def runs(checkpoint, adjacency, recordings, seed=0):
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 10_000), gain=st.sampled_from([0.4, 1.6, 5.0]), beta=st.sampled_from([0.0, 0.2, 0.9, 0.99]))
 def test_certain_spikes_are_those_of_every_run(folder, seed, gain, beta):
-    checkpoint, adjacency = model(folder, last=weights(seed, sizes=SIZES, gain=gain), beta=beta)
+    checkpoint, adjacency = small_checkpoint(folder, last=weights(seed, gain=gain), beta=beta)
     recordings = events(seed, samples=3)
     certainty = certain_spikes(Factored(checkpoint, adjacency), recordings)
     for run in runs(checkpoint, adjacency, recordings, seed):
@@ -94,7 +87,7 @@ def test_certain_spikes_among_many_ties(folder, seed, step, decimal):
     """Weights on a grid hit the threshold all the time; a grid of tenths does so up to a rounding."""
     unit = step * (0.8 if decimal else 1.0)
     last = {name: (np.round(array / 0.25) * unit).astype(np.float32) for name, array in weights(seed).items()}
-    checkpoint, adjacency = model(folder, last=last, theta=4 * unit, beta=0.5)
+    checkpoint, adjacency = small_checkpoint(folder, last=last, theta=4 * unit, beta=0.5)
     recordings = events(seed, samples=3)
     certainty = certain_spikes(Factored(checkpoint, adjacency), recordings)
     for run in runs(checkpoint, adjacency, recordings, seed):
@@ -114,7 +107,7 @@ def test_uncertain_spikes_reach_the_next_layer(folder):
     arrays["fc1.bias"][:] = [0.5, 1.0]  # the first is at the threshold, the second far above
     arrays["fc2.bias"][:] = [0.25, 0.75, 0.75]
     arrays["fc2.weight"][:, 0] = [0.125, 0.125, -0.5]
-    checkpoint, adjacency = model(folder, last=arrays, beta=0.0)
+    checkpoint, adjacency = small_checkpoint(folder, last=arrays, beta=0.0)
     (_, conv), (fc1, doubt1), (fc2, doubt2), (_, doubt3) = certain_spikes(Factored(checkpoint, adjacency), events(0))
     assert not conv.any()
     assert doubt1[..., 0].all()
@@ -130,7 +123,7 @@ def test_an_uncertain_spike_leaves_both_membranes(folder):
     """After a tie of the first step the membrane is either reset or half of the threshold; input then decides."""
     arrays = {name: np.zeros_like(array) for name, array in weights(sizes=(2, 2, 2)).items()}
     arrays["conv1.hops"][0] = [[0.5, 0.0], [0.375, 0.0], [0.0, 0.0], [0.0, 0.0], [0.5, 0.375]]
-    checkpoint, adjacency = model(folder, last=arrays, beta=0.5)
+    checkpoint, adjacency = small_checkpoint(folder, last=arrays, beta=0.5)
     recordings = np.zeros((1, TAXELS, 2, 4), np.uint8)
     recordings[0, 0, 0, 0] = recordings[0, 0, 1, 1] = 1
     certain, doubt = (
@@ -172,7 +165,7 @@ def test_a_membrane_that_was_not_reset_is_below_its_threshold():
 
 def test_roundings_and_magnitudes_of_the_released_operator_are_those_of_its_loops(tmp_path):
     """Of K = 3 on a ring: each hop adds two neighbours to a taxel's sum, then channels and hops are summed."""
-    checkpoint, adjacency = model(tmp_path, 3)
+    checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(3))
     first, *others = _layers(Factored(checkpoint, adjacency))
     sums = 3 * (2 + 1)
     assert (first.roundings, first.per_spike) == (SPARE + sums + 2 + 1 + 4, False)
@@ -204,7 +197,7 @@ def by_hand(checkpoint, adjacency, recordings, chip, kept=None, lengths=None):
 
 
 def test_entries_are_counted_once_each(folder):
-    checkpoint, adjacency = model(folder, 3)
+    checkpoint, adjacency = small_checkpoint(folder, last=weights(3))
     netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(Packing(bits=4),))).netlist
     recordings = events(4, samples=5, steps=12)
     chip, decisions = on_chip(netlist, recordings)
@@ -212,7 +205,7 @@ def test_entries_are_counted_once_each(folder):
     assert list(found.layers) == ["conv1", "fc1", "fc2", "fc3"]
     expected = by_hand(checkpoint, adjacency, recordings, chip)
     assert [(layer.equal, layer.different) for layer in found.layers.values()] == expected
-    assert [layer.entries for layer in found.layers.values()] == [60 * n for n in (TAXELS * FEATURES, *SIZES)]
+    assert [layer.entries for layer in found.layers.values()] == [60 * n for n in (TAXELS * FEATURES, 9, 8, CLASSES)]
     assert all(layer.undecided == layer.entries - layer.equal - layer.different for layer in found.layers.values())
     assert found.samples == 5
     reference = float_spikes(checkpoint, adjacency, recordings)["fc3"].sum(axis=1).argmax(axis=1)
@@ -222,7 +215,7 @@ def test_entries_are_counted_once_each(folder):
 
 
 def test_parts_of_layers_and_of_recordings(folder):
-    checkpoint, adjacency = model(folder, 3)
+    checkpoint, adjacency = small_checkpoint(folder, last=weights(3))
     netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(Packing(bits=4),))).netlist
     recordings, lengths = events(4, samples=3, steps=12), np.array([5, 12, 9])
     for recording, length in zip(recordings, lengths, strict=True):
@@ -241,17 +234,21 @@ def test_parts_of_layers_and_of_recordings(folder):
 
 def far_from_thresholds():
     """Weights of one half and no bias: without a memory, sums are multiples of one half."""
-    arrays = {name: np.sign(array) * np.float32(0.5) for name, array in weights(3, sizes=SIZES).items()}
+    arrays = {name: np.sign(array) * np.float32(0.5) for name, array in weights(3).items()}
     arrays |= {name: np.zeros_like(array) for name, array in arrays.items() if name.endswith("bias")}
     arrays["conv1.hops"][1:] = 0
     return arrays
 
 
-def test_a_network_far_from_its_thresholds_is_certified_whole(tmp_path):
-    checkpoint, adjacency = small_checkpoint(tmp_path, last=far_from_thresholds(), beta=0.0, theta=0.25)
+def verdict_far_from_thresholds(folder, **constants):
+    checkpoint, adjacency = small_checkpoint(folder, last=far_from_thresholds(), **constants)
     netlist = compile_network(expand(checkpoint, adjacency)).netlist
-    files = tuple("abcdef")
-    verdict = verify(netlist, Factored(checkpoint, adjacency), events(2, steps=8), np.arange(6) % CLASSES, files)
+    labels, files = np.arange(6) % CLASSES, tuple("abcdef")
+    return verify(netlist, Factored(checkpoint, adjacency), events(2, steps=8), labels, files)
+
+
+def test_a_network_far_from_its_thresholds_is_certified_whole(tmp_path):
+    verdict = verdict_far_from_thresholds(tmp_path, beta=0.0, theta=0.25)
     found = verdict.certificate
     assert all(layer.equal == layer.entries > 0 for layer in found.layers.values())
     assert all(layer.chip > 0 for layer in verdict.spikes.values())
@@ -259,11 +256,7 @@ def test_a_network_far_from_its_thresholds_is_certified_whole(tmp_path):
 
 
 def test_the_same_network_at_its_thresholds_is_not(tmp_path):
-    checkpoint, adjacency = small_checkpoint(tmp_path, last=far_from_thresholds(), beta=0.5, theta=0.5)
-    netlist = compile_network(expand(checkpoint, adjacency)).netlist
-    verdict = verify(
-        netlist, Factored(checkpoint, adjacency), events(2, steps=8), np.zeros(6, np.int64), tuple("abcdef")
-    )
+    verdict = verdict_far_from_thresholds(tmp_path, beta=0.5, theta=0.5)
     # these very sums are exact, so that no spike differs; another order of sums is not known to be
     assert verdict.first_divergence is None
     assert verdict.certificate.layers["conv1"].undecided > 0

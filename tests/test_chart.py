@@ -1,6 +1,5 @@
 """The command ``chart`` on small networks: what it writes, that its commands give its figures, resuming, refusals."""
 
-import argparse
 import csv
 import hashlib
 import json
@@ -12,18 +11,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from made_files import CLASSES, events, own_file, recordings_folder, ring, weights
+from random_crossbars import random_network
 from zoo import STORAGE, tuned
 
-from spikeloom.compiler.errors import CapacityError, SpikeloomError, Violation
+from spikeloom.compiler.errors import CapacityError, Violation
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.models.graphs import Graph
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
+from spikeloom.compiler.targets.truenorth.native_file import write_trained
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import data_digest
 from spikeloom.runtime.studies.chart import work as chart_work
-from spikeloom.runtime.studies.chart.networks import Storage, given_networks
 
 GRID = "bits=4,8,window=50-100%:50,cores=cores/fc1:2"
 VIOLATION = Violation(owner="core 0", rule="loihi1.core.axons_in", used=5, allowed=4, remedy="use fewer inputs")
@@ -32,8 +30,8 @@ CHART = ("chart", "ring.pt", "--data", "data", "--grid", GRID, "--jobs", "1")
 
 
 def chain():
-    pairs = [(i, i + 1) for i in range(5)]
-    return Graph(name="knn:1", coordinates=np.arange(6.0)[:, None], edges=np.array(pairs + [(b, a) for a, b in pairs]))
+    pairs = ring().edges
+    return replace(ring(), name="knn:1", edges=pairs[abs(pairs[:, 0] - pairs[:, 1]) == 1])
 
 
 @pytest.fixture(scope="module")
@@ -51,24 +49,18 @@ def place(tmp_path_factory):
     forms = tuned(read_checkpoint(folder / "ring.pt")).forms
     save_checkpoint(folder / "tuned.pt", {"last": weights()}, ring(), beta=0.2, theta=0.5, training=known, forms=forms)
     own_file(folder / "elsewhere.pt", training={"data_sha256": "0" * 64, "data": "Grasps.zip"})
+    network = random_network(4, taxels=6, classes=CLASSES, steps=24)
+    write_trained(folder / "native.pt", {"last": network}, graph="ring", edges=np.zeros((0, 2), int), training=known)
     own_file(folder / "small.pt", last=weights(taxels=4), graph=ring(4))
     (folder / "file").write_text("")
     return folder
 
 
-@pytest.fixture(autouse=True)
-def nothing_kept():
-    chart_work.both_splits.cache_clear()
-    chart_work._network.cache_clear()
-
-
 @pytest.fixture
-def made(spikeloom, place):
+def made(as_json, place):
     """A chart of one network, made once."""
     if not (place / "out" / "chart.json").exists():
-        code, out, err = spikeloom(*CHART, "-o", "out", "--json")
-        assert (code, err) == (0, "")
-        assert json.loads(out) == json.loads((place / "out" / "chart.json").read_text())
+        assert as_json(*CHART, "-o", "out") == json.loads((place / "out" / "chart.json").read_text())
     return json.loads((place / "out" / "chart.json").read_text())
 
 
@@ -110,14 +102,14 @@ def test_every_point_of_the_grid_is_there(made, place):
 
 
 @pytest.mark.parametrize("number", [4, 7])
-def test_the_commands_of_a_point_give_its_netlist_and_its_figures(made, spikeloom, place, number):
+def test_the_commands_of_a_point_give_its_netlist_and_its_figures(made, as_json, place, number):
     point = made["points"][number - 1]
     compiled, ran = (shlex.split(command) for command in point["commands"])
-    assert spikeloom(*compiled[1:])[0] == 0
+    as_json(*compiled[1:])
     netlist = (place / compiled[-1]).read_bytes()
     assert netlist == (place / "out" / point["netlist"]).read_bytes()
     assert hashlib.sha256(netlist).hexdigest() == point["netlist_sha256"]
-    found = json.loads(spikeloom(*ran[1:], "--json")[1])
+    found = as_json(*ran[1:])
     assert found["accuracy"] == point["test"]["accuracy"]
     mean = found["costs"]["per_inference"]
     assert mean["energy_j"] == pytest.approx(point["test"]["energy_j"], rel=1e-12)
@@ -126,7 +118,7 @@ def test_the_commands_of_a_point_give_its_netlist_and_its_figures(made, spikeloo
     assert {clock["table"]: clock["inference_s"]["mean"]} == pytest.approx(point["test"]["time_s"], rel=1e-12)
     assert found["costs"]["chip_steps"] == point["test"]["steps"] + read_netlist(place / compiled[-1]).max_depth
     words = ("--checkpoint", "ring.pt", "--data", "data", "--window", f"{point['window']}%", "--spec-samples", "1")
-    found = json.loads(spikeloom("verify", compiled[-1], *words, "--json")[1])
+    found = as_json("verify", compiled[-1], *words, codes=(0, 1))
     assert found["accuracy"]["float"] == point["test"]["float"]["accuracy"]
     assert found["decision_agreement"] == point["test"]["equal"] / 8
 
@@ -143,31 +135,20 @@ def test_once_more_nothing_is_measured_and_every_byte_is_the_same(made, spikeloo
     assert {file.name: file.read_bytes() for file in (place / "out").glob("chart.*")} == before
 
 
-def test_one_more_window_compiles_only_what_is_gone_or_damaged(made, again, spikeloom, monkeypatch):
-    gone, damaged = (again / made["points"][at]["netlist"] for at in (0, -1))
-    kept = gone.read_bytes(), damaged.read_bytes()
-    gone.unlink()
-    damaged.write_bytes(kept[1][:100])
+def test_one_more_width_measures_nothing_else(made, again, spikeloom, monkeypatch):
     worked, measure = [], chart_work.measure
     monkeypatch.setattr(
         "spikeloom.runtime.studies.chart.work.measure", lambda work: worked.append(work) or measure(work)
     )
-    words = [word if word != GRID else GRID.replace("50-100%:50", "25%,50%,100%") for word in CHART]
+    words = [word.replace("bits=4,8", "bits=4,6,8") for word in CHART]
     assert spikeloom(*words, "-o", "again", "--json")[0] == 0
-    runs = [work for work in worked if isinstance(work, chart_work.Run)]
-    assert [work.window for work in runs] == [25] * 4
-    assert [type(work) for work in worked if work not in runs] == [chart_work.Decide]
-    assert (gone.read_bytes(), damaged.read_bytes()) == kept
+    assert [work.storage.bits for work in worked] == [(6,)]
+    points = json.loads((again / "chart.json").read_text())["points"]
+    assert [point["test"] for point in points if point["bits"] != [6]] == [point["test"] for point in made["points"]]
 
 
 # -- choices -----------------------------------------------------------------------------------------------------------
-def read_as(*checkpoints):
-    """Options of a command that names checkpoints only."""
-    options = dict.fromkeys(("graph", "taxels", "edges", "system", "weights", "beta", "theta"))
-    return argparse.Namespace(checkpoints=list(checkpoints), directed=False, run=0, **options)
-
-
-def test_what_the_chip_refuses_is_listed(spikeloom, place, monkeypatch):
+def test_what_the_chip_refuses_is_listed(as_json, refusal, place, monkeypatch):
     refused, to_integers = {4}, chart_work.to_integers
 
     def picky(network, options, target):
@@ -177,22 +158,17 @@ def test_what_the_chip_refuses_is_listed(spikeloom, place, monkeypatch):
 
     monkeypatch.setattr("spikeloom.runtime.studies.chart.work.to_integers", picky)
     words = ("chart", "ring.pt", "--data", "data", "--jobs", "1", "--grid")
-    code, out, _ = spikeloom(*words, "bits=4,3,window=100%", "-o", "refused")
-    assert code == 0
-    found = json.loads((place / "refused" / "chart.json").read_text())
+    found = as_json(*words, "bits=4,3,window=100%", "-o", "refused")
     assert [(each["bits"], each["why"]) for each in found["refused"]] == [([4], [str(VIOLATION)])]
     refused |= {5, 6}
-    code, out, err = spikeloom(*words, "bits=5-6,window=100%", "-o", "nothing")
-    assert (code, out) == (2, "")
-    assert f"refuses all 2 configurations; the first: {VIOLATION}\n" in err
+    line = refusal(*words, "bits=5-6,window=100%", "-o", "nothing")
+    assert line.endswith(f"refuses all 2 configurations; the first: {VIOLATION}")
     assert not (place / "nothing" / "chart.json").exists()
 
 
-def test_a_fine_tuned_network_keeps_its_storage(spikeloom):
-    words = ("chart", "tuned.pt", "--data", "data", "--jobs", "1", "-o", "tuned", "--json", "--grid")
-    code, out, _ = spikeloom(*words, "bits=2-6,8,window=50%,100%")
-    assert code == 0
-    points = json.loads(out)["points"]
+def test_a_fine_tuned_network_keeps_its_storage(as_json):
+    words = ("chart", "tuned.pt", "--data", "data", "--jobs", "1", "-o", "tuned", "--grid")
+    points = as_json(*words, "bits=2-6,8,window=50%,100%")["points"]
     found = [(tuple(point["bits"]), point["fine_tuned"], point["window"]) for point in points]
     widths = tuple(bits for bits, _ in STORAGE)
     assert found == [(widths, True, 50), (widths, True, 100)]
@@ -201,45 +177,21 @@ def test_a_fine_tuned_network_keeps_its_storage(spikeloom):
 
 # -- bad input ---------------------------------------------------------------------------------------------------------
 
-OUT = ("-o", "bad")
-
 
 @pytest.mark.parametrize(
     ("words", "told"),
     [
         ("ring.pt --data data --grid bits=8+4", r"bits=8\+4: 2 widths, ring.pt has 4 layers \(conv1, fc1, fc2, fc3\)"),
-        (
-            "ring.pt --data data --grid cores=fc9:2",
-            "fc9:2: ring.pt has no layer fc9; it has conv1, fc1, fc2, fc3",
-        ),
+        ("ring.pt --data data --grid cores=fc9:2", "fc9:2: ring.pt has no layer fc9; it has conv1, fc1, fc2, fc3"),
         ("ring.pt ring.pt --data data", "ring.pt: is given twice"),
         ("elsewhere.pt --data data", r"elsewhere.pt: was trained on other recordings \(Grasps.zip\) than data"),
         ("unknown.pt small.pt --data data", f"small.pt: has 4 taxels and {CLASSES} classes, unknown.pt has 6"),
+        ("ring.pt native.pt --data data", "native.pt: is for truenorth, ring.pt for loihi1; .* make a chart of each"),
         ("net.onnx --data data", "net.onnx: is an ONNX file"),
         ("ring.pt --data data -o file", "-o file: is not a folder"),
     ],
 )
-def test_a_mistake_is_named(spikeloom, place, words, told):
-    words = shlex.split(words)
-    code, out, err = spikeloom("chart", *words, *(() if "-o" in words else OUT))
-    assert (code, out) == (2, "")
-    assert re.match(f"spikeloom: .*{told}", err), err
+def test_a_mistake_is_named(refusal, place, words, told):
+    line = refusal("chart", *(words if "-o" in words else f"{words} -o bad").split())
+    assert re.match(f".*{told}", line), line
     assert not (place / "bad").exists()
-
-
-def test_a_worker_that_has_other_files_says_so(place, monkeypatch):
-    monkeypatch.chdir(place)
-    (network,) = given_networks(read_as("ring.pt"))
-    digest = data_digest(load_data("data", "train"), load_data("data", "test"))
-    data = chart_work.Data(path="data", bin_s=0.02, sha256=digest)
-    facts = chart_work.Facts(data=data, targets={"loihi1": load_target("loihi1")}, folder=place)
-    work = facts.build(network, Storage(bits=(6,), planes=1, groups=1, prune=False), ("cores",))
-    assert json.loads(json.dumps(chart_work.measure(work)))["cores"]["cores"] > 0
-    chart_work.both_splits.cache_clear()
-    source = replace(work.network.source, path="unknown.pt")
-    for changed, told in (
-        (replace(work, data=replace(work.data, path="other")), "other: holds other recordings than where"),
-        (replace(work, network=replace(work.network, source=source)), "unknown.pt: is another file than where"),
-    ):
-        with pytest.raises(SpikeloomError, match=f"^{told} the chart was asked for; copy th"):
-            chart_work.measure(changed)

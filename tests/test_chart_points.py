@@ -10,7 +10,6 @@ from made_chart import BY, made_figures, made_network, made_point
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.options import GOALS
 from spikeloom.runtime.studies.chart.choices import (
     TRAINING,
     VALIDATION,
@@ -24,7 +23,7 @@ from spikeloom.runtime.studies.chart.choices import (
     with_expectations,
     with_fronts,
 )
-from spikeloom.runtime.studies.chart.grid import AXES, Grid, parse_grid
+from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
 from spikeloom.runtime.studies.chart.results import ChosenBy
 
 UJ = 1e-6
@@ -69,12 +68,10 @@ def test_fronts_are_of_test_accuracy_and_each_cost(points):
 
 
 def test_expected_is_validation_times_what_is_kept_on_training_recordings():
-    (reached,), (network,), words = with_expectations([point(1, 380, 50, 1, 1)], [made_network(float_training=0.99)])
+    (reached,), (network,), words = with_expectations([point(1, 380, 50, 1, 1)], [made_network(trained=396)])
     assert (reached.expected, network.expected, words) == (pytest.approx(0.9 * 0.95 / 0.99), 0.9, VALIDATION)
-
-
-def test_where_one_checkpoint_knows_no_validation_training_figures_stand_for_all():
-    networks = [made_network(float_training=0.99), made_network("other", validation=None)]
+    # where one checkpoint knows no validation, training figures stand for all
+    networks = [made_network(trained=396), made_network("other", validation=None)]
     (reached,), _, words = with_expectations([point(1, 380, 50, 1, 1)], networks)
     assert (reached.expected, words) == (pytest.approx(0.95), TRAINING)
 
@@ -141,14 +138,9 @@ def test_a_budget_in_units(words, limit):
     "words",
     [
         "power=1W",
-        "energy",
-        "energy=0.1",
-        "energy=1ms",
-        "latency=",
-        "latency=-1ms",
-        "energy=0mJ",
-        "accuracy=101",
-        "accuracy=x",
+        *(f"energy{value}" for value in ("", "=0.1", "=1ms", "=0mJ")),
+        *(f"latency={value}" for value in ("", "-1ms")),
+        *(f"accuracy={value}" for value in ("101", "x")),
     ],
 )
 def test_a_budget_that_is_none(words):
@@ -156,10 +148,6 @@ def test_a_budget_that_is_none(words):
         parse_budgets([words])
     with pytest.raises(OptionError, match="--budget latency=2ms: latency is limited twice; give it once"):
         parse_budgets(["latency=1ms", "latency=2ms"])
-
-
-def picked(points, *words):
-    return pick(points, parse_budgets(words), BY)
 
 
 @pytest.mark.parametrize(
@@ -174,13 +162,13 @@ def picked(points, *words):
     ],
 )
 def test_the_point_that_fits_all_budgets(points, budgets, number, fitting):
-    found = picked(points, *budgets)
+    found = pick(points, parse_budgets(budgets), BY)
     assert (found.fits, found.point, found.fitting, found.misses) == (True, number, fitting, {})
 
 
 def test_what_is_given_up_beside_the_best(points):
-    assert picked(points) is None
-    found = picked(points, "energy=150uJ")
+    assert pick(points, (), BY) is None
+    found = pick(points, parse_budgets(["energy=150uJ"]), BY)
     assert found.best == 1
     assert found.given_up.expected == pytest.approx(-0.0045)
     assert found.given_up.accuracy == pytest.approx(0.02)
@@ -189,15 +177,12 @@ def test_what_is_given_up_beside_the_best(points):
 
 
 def test_the_nearest_point_of_a_budget_that_nothing_fits(points):
-    found = picked(points, "energy=20uJ")
+    found = pick(points, parse_budgets(["energy=20uJ"]), BY)
     assert (found.fits, found.fitting, found.point) == (False, 0, 4)
     (miss,) = found.misses.values()
     assert (miss["limit"], miss["found"]) == (pytest.approx(20 * UJ), pytest.approx(40 * UJ))
-    both = picked(points, "energy=50uJ", "latency=2ms")
+    both = pick(points, parse_budgets(["energy=50uJ", "latency=2ms"]), BY)
     assert (both.point, list(both.misses)) == (3, ["energy"])
-
-
-def test_time_cannot_be_limited_where_nothing_is_timed(points):
     with pytest.raises(OptionError, match=r"--budget latency: .*no time table"):
         pick(points, parse_budgets(["latency=1ms"]), ChosenBy(energy="one", time=None))
 
@@ -210,43 +195,38 @@ def parsed(text):
     return parse_grid(text, TARGET)
 
 
-def test_every_axis_of_the_whole_example():
-    found = parsed("bits=2-6,8,planes=1-2,window=25-100%,cores=latency/fc1:6+conv1:4,prune=0/1,groups=2")
-    assert found == Grid(
-        bits=((2,), (3,), (4,), (5,), (6,), (8,)),
-        planes=(1, 2),
-        window=(25, 50, 75, 100),
-        cores=("latency", "fc1:6+conv1:4"),
-        prune=(0, 1),
-        groups=(2,),
-    )
-
-
-def test_axes_that_are_not_named_keep_their_usual_value():
-    assert parsed("bits=4") == Grid(bits=((4,),))
-    assert Grid().bits == tuple((width,) for width in WIDTHS)
-    assert Grid().window == (25, 50, 75, 100)
-
-
-def test_values_stay_in_order_and_each_is_there_once():
-    assert parsed("bits=8,2-4,3,4+4+4+4").bits == ((8,), (2,), (3,), (4,))
-    assert parsed("bits=8+4+4+8/8").bits == ((8, 4, 4, 8), (8,))
-
-
 @pytest.mark.parametrize(
-    ("text", "windows"),
+    ("text", "axes"),
     [
-        ("50", (50,)),
-        ("50%", (50,)),
-        ("25-100%", (25, 50, 75, 100)),
-        ("25%-100%", (25, 50, 75, 100)),
-        ("40-100%:20", (40, 60, 80, 100)),
-        ("40-100%:50%", (40, 90, 100)),
-        ("100-100", (100,)),
+        (
+            "bits=2-6,8,planes=1-2,window=25-100%,cores=latency/fc1:6+conv1:4,prune=0/1,groups=2",
+            {
+                "bits": ((2,), (3,), (4,), (5,), (6,), (8,)),
+                "planes": (1, 2),
+                "window": (25, 50, 75, 100),
+                "cores": ("latency", "fc1:6+conv1:4"),
+                "prune": (0, 1),
+                "groups": (2,),
+            },
+        ),
+        # in their order, each once
+        ("bits=8,2-4,3,4+4+4+4", {"bits": ((8,), (2,), (3,), (4,))}),
+        ("bits=8+4+4+8/8", {"bits": ((8, 4, 4, 8), (8,))}),
+        (
+            "groups=2 / 1,planes=3/ 1 , cores=cores/fc1:3",
+            {"groups": (2, 1), "planes": (3, 1), "cores": ("cores", "fc1:3")},
+        ),
+        *((f"window={text}", {"window": (50,)}) for text in ("50", "50%")),
+        *((f"window={text}", {"window": (25, 50, 75, 100)}) for text in ("25-100%", "25%-100%")),
+        ("window=40-100%:20", {"window": (40, 60, 80, 100)}),
+        ("window=40-100%:50%", {"window": (40, 90, 100)}),
+        ("window=100-100", {"window": (100,)}),
     ],
 )
-def test_windows(text, windows):
-    assert parsed(f"window={text}").window == windows
+def test_values_of_axes(text, axes):
+    assert parsed(text) == Grid(**axes)
+    assert Grid().bits == tuple((width,) for width in WIDTHS)
+    assert Grid().window == (25, 50, 75, 100)
 
 
 @pytest.mark.parametrize(
@@ -277,46 +257,3 @@ def test_a_grid_that_is_too_large():
     every = "/".join("+".join(map(str, widths)) for widths in product(WIDTHS, repeat=4))
     with pytest.raises(OptionError, match="388,800 points a network, allowed are 100,000"):
         parsed(f"bits={every},planes=1-3,window=1-100%:1")
-
-
-GRIDS = st.builds(
-    Grid,
-    bits=st.lists(
-        st.one_of(
-            st.tuples(st.sampled_from(WIDTHS)),
-            st.tuples(*[st.sampled_from(WIDTHS)] * 3).filter(lambda widths: len(set(widths)) > 1),
-        ),
-        min_size=1,
-        max_size=4,
-        unique=True,
-    ).map(tuple),
-    planes=st.lists(st.integers(1, 3), min_size=1, max_size=3, unique=True).map(tuple),
-    groups=st.lists(st.integers(1, 8), min_size=1, max_size=4, unique=True).map(tuple),
-    prune=st.lists(st.integers(0, 1), min_size=1, max_size=2, unique=True).map(tuple),
-    cores=st.lists(
-        st.one_of(
-            st.sampled_from(GOALS),
-            st.dictionaries(st.sampled_from(["conv1", "fc1", "fc2"]), st.integers(1, 99), min_size=1).map(
-                lambda layers: "+".join(f"{layer}:{count}" for layer, count in layers.items())
-            ),
-        ),
-        min_size=1,
-        max_size=3,
-        unique=True,
-    ).map(tuple),
-    window=st.lists(st.integers(1, 100), min_size=1, max_size=4, unique=True).map(tuple),
-)
-
-
-@given(GRIDS, st.sampled_from([",", "/", " , ", "/ "]), st.permutations(AXES))
-def test_what_is_written_is_read(grid, between, order):
-    words = {
-        "bits": ["+".join(map(str, widths)) for widths in grid.bits],
-        "planes": grid.planes,
-        "groups": grid.groups,
-        "prune": grid.prune,
-        "cores": grid.cores,
-        "window": [f"{window}%" for window in grid.window],
-    }
-    text = ",".join(f"{axis}={between.join(map(str, words[axis]))}" for axis in order if words[axis])
-    assert parsed(text) == grid

@@ -1,4 +1,4 @@
-"""The command line: what each command prints, where, under which keys, and with which exit code."""
+"""The command line: what each command prints, where, with which exit code, and what it says of its own cost."""
 
 import hashlib
 import io
@@ -7,52 +7,32 @@ import os
 import subprocess
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file, recordings_folder, state_dict
+from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file, state_dict
 from made_files import weights as made_weights
+from random_netlists import Axon, Neuron, build, large_netlist
 
 from spikeloom.__main__ import main as start
 from spikeloom.compiler import __version__, lift
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.interpret import channels_last, run_integer
-from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.netlist import netlist_text
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.targets.price_tables import EVENTS
+from spikeloom.compiler.targets.base import EVENTS, load_target
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
+from spikeloom.compiler.text import text
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.runtime import cli
+from spikeloom.runtime.equivalence import reference
 from spikeloom.runtime.inputs import network
 from spikeloom.runtime.inputs import recordings as recordings_input
+from spikeloom.runtime.machines.loihi1 import blocks, engine
 
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    """A folder with recordings, a checkpoint and the netlist that was compiled from it."""
-    folder = tmp_path_factory.mktemp("cli")
-    recordings_folder(folder / "data")
-    own_file(folder / "net.pt")
-    words = ["compile", folder / "net.pt", "--calibrate", folder / "data", "-o", folder / "net.loom", "--json"]
-    assert cli.main([str(word) for word in words]) == 0
-    return folder
-
-
-@pytest.fixture
-def as_json(spikeloom):
-    """Run a command that must succeed with ``--json``; returns the object."""
-
-    def command(*words):
-        code, out, err = spikeloom(*words, "--json")
-        assert (code, err) == (0, "")
-        assert out.count("\n") == 1
-        return json.loads(out)
-
-    return command
 
 
 # -- compile and inspect -----------------------------------------------------------------------------------------------
@@ -102,11 +82,11 @@ def test_provenance_names_everything_that_decided(as_json, place):
 def test_dumps_go_to_standard_error(spikeloom, tmp_path):
     words = [word for step in load_target("loihi1").passes for word in ("--dump-after", step.name)]
     code, out, err = spikeloom("compile", "net.pt", *words, "-o", tmp_path / "out.loom", "--json")
-    assert code == 0
-    json.loads(out)
-    assert err.endswith(netlist_text(read_netlist(tmp_path / "out.loom")))
-    assert err.startswith("(float network (input 6 taxels x 2) (classes 4)\n")
-    assert "(integer network (input 6 taxels x 2) (classes 4)\n" in err
+    assert (code, json.loads(out)["neurons"]) == (0, 51)
+    assert err.endswith(text(read_netlist(tmp_path / "out.loom")))
+    assert err.startswith("Network\n  input (taxels 6) (polarities 2)")
+    assert "\nIntegerNetwork\n" in err
+    assert "\nLayout\n" in err
 
 
 def test_the_graph_of_a_released_file_comes_from_the_user(as_json, tmp_path):
@@ -121,18 +101,13 @@ def test_the_graph_of_a_released_file_comes_from_the_user(as_json, tmp_path):
 
 
 # -- run ---------------------------------------------------------------------------------------------------------------
-def test_run_counts_right_decisions(as_json):
-    report = as_json("run", "net.loom", "--data", "data")
-    assert report["files"] == [f"sample_{i}_label_{i % CLASSES}.npy" for i in range(6)]
-    assert report["labels"] == [i % CLASSES for i in range(6)]
-    assert report["predictions"] == [counts.index(max(counts)) for counts in report["counts"]]
-    right = sum(a == b for a, b in zip(report["labels"], report["predictions"], strict=True))
-    assert 0 < right < 6
-    assert report["accuracy"] == right / 6
-
-
 def test_limit_and_split_choose_the_recordings(as_json):
     everything = as_json("run", "net.loom", "--data", "data")
+    assert everything["files"] == [f"sample_{i}_label_{i % CLASSES}.npy" for i in range(6)]
+    assert everything["labels"] == [i % CLASSES for i in range(6)]
+    right = sum(a == b for a, b in zip(everything["labels"], everything["predictions"], strict=True))
+    assert 0 < right < 6
+    assert everything["accuracy"] == right / 6
     two = as_json("run", "net.loom", "--data", "data", "--limit", 2)
     for key in ("files", "labels", "predictions", "counts"):
         assert two[key] == everything[key][:2]
@@ -242,16 +217,16 @@ def test_help_imports_no_command():
     assert subprocess.run([sys.executable, "-c", code + check], check=False, stdout=subprocess.DEVNULL).returncode == 0
 
 
-def test_progress_goes_to_a_terminal_only(spikeloom, monkeypatch):
+@pytest.mark.usefixtures("spikeloom")
+def test_progress_goes_to_a_terminal_only(monkeypatch, capsys):
     class Terminal(io.StringIO):
         def isatty(self):
             return True
 
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    code, out, _ = spikeloom("run", "net.loom", "--data", "data", "--json")
-    assert code == 0
-    json.loads(out)
+    assert cli.main(["run", "net.loom", "--data", "data", "--json"]) == 0
+    json.loads(capsys.readouterr().out)
     assert "\r\x1b[Krunning …" in terminal.getvalue()
     assert terminal.getvalue().endswith("\r\x1b[K")  # and cleared
 
@@ -285,30 +260,93 @@ def test_a_terminal_without_greek_letters(spikeloom, monkeypatch):
 
 
 # -- recordings without a label ----------------------------------------------------------------------------------------
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """Four recordings, the last two without a label, and a network; the working folder holds both."""
-    monkeypatch.chdir(tmp_path)
-    own_file(tmp_path / "x.pt")
-    (tmp_path / "data").mkdir()
+def test_labelled_recordings_are_scored_and_a_table_scores_the_rest(as_json, tmp_path):
     for index, name in enumerate(("a_label_0", "b_label_1", "c", "d")):
         rows = [f"0.{step:02d},{(step + index) % TAXELS},{step % 2}" for step in range(0, 60, 2)]
-        (tmp_path / "data" / f"{name}.csv").write_text("\n".join(rows))
-    assert cli.main(["compile", "x.pt", "-o", "x.loom"]) == 0
-    return tmp_path / "data"
-
-
-def ran(capsys):
-    capsys.readouterr()
-    assert cli.main(["run", "x.loom", "--data", "data", "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def test_labelled_recordings_are_scored_and_a_table_scores_the_rest(folder, capsys):
-    report = ran(capsys)
+        (tmp_path / f"{name}.csv").write_text("\n".join(rows))
+    report = as_json("run", "net.loom", "--data", tmp_path)
     right = sum(report["predictions"][i] == report["labels"][i] for i in range(2))
     assert (report["samples"], report["labelled"], report["labels"]) == (4, 2, [0, 1, -1, -1])
     assert report["accuracy"] == right / 2
-    (folder / "labels.csv").write_text("file,label\nc.csv,2\nd.csv,3\n")
-    report = ran(capsys)
+    (tmp_path / "labels.csv").write_text("file,label\nc.csv,2\nd.csv,3\n")
+    report = as_json("run", "net.loom", "--data", tmp_path)
     assert (report["labels"], report["labelled"]) == ([0, 1, 2, 3], 4)
+
+
+RUNNING = ("run", "net.loom", "--data", "data")
+VERIFYING = ("verify", "net.loom", "--checkpoint", "net.pt", "--data", "data")
+LAYERS = ["conv1", "fc1", "fc2", "fc3"]
+
+
+@pytest.fixture
+def passes(monkeypatch):
+    """Recordings of every pass of the engine."""
+    found, simulate = [], engine.simulate
+
+    def counted(netlist, events, **options):
+        found.append(len(events))
+        return simulate(netlist, events, **options)
+
+    monkeypatch.setattr(engine, "simulate", counted)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (RUNNING, "spikes"),
+        ((*RUNNING, "--spikes", "out.npz"), "spikes kept"),
+        ((*RUNNING, "--detail", "counts", "--spikes", "out.npz"), "counts"),
+        (("estimate", *RUNNING[1:], "--detail", "cycle"), "cycle"),
+    ],
+)
+def test_every_recording_is_run_once(spikeloom, passes, words, part):
+    _, out, err = spikeloom(*words, "--explain-cost", "--json")
+    assert passes == [6]
+    entry, absent = json.loads(out)["explained_cost"]
+    assert (entry.pop("seconds") > 0, bool(entry.pop("why"))) == (True, True)
+    known = {"part": part, "ran": True, "arithmetic": "chip integers", "recordings": 6, "data_steps": 6 * STEPS}
+    assert entry == known | {"layers": LAYERS, "kernel": "layer by layer, 64 neurons at a time"}
+    assert (absent["ran"], absent["recordings"], absent["layers"]) == (False, 0, [])
+    assert len(err.splitlines()) == 2
+
+
+def test_parts_of_verify(spikeloom):
+    checks = [
+        "float32 reference",
+        "float64 beside it",
+        "chip",
+        "specification",
+        *(f"ladder: {rung}" for rung in ("beta", "weights", "bias_threshold", "proven")),
+        "first divergence",
+        "certificate",
+    ]
+    _, out, err = spikeloom(*VERIFYING, "--spec-samples", 2, "--explain-cost", "--json")
+    entries = {entry["part"]: entry for entry in json.loads(out)["explained_cost"]}
+    assert list(entries) == checks
+    assert entries["specification"]["recordings"] == 2
+    assert not entries["ladder: proven"]["ran"]
+    assert entries["first divergence"]["data_steps"] == STEPS
+    assert len(err.splitlines()) == len(checks)
+
+
+def test_a_rung_that_is_proven_is_what_it_would_be(as_json, monkeypatch):
+    proven = as_json(*VERIFYING, codes=(0, 1))["ladder"]
+    monkeypatch.setattr(reference, "prove_ranges", lambda _: [type("Proof", (), {"holds": False})()])
+    report = as_json(*VERIFYING, "--explain-cost", codes=(0, 1))
+    assert report["ladder"] == proven
+    assert "ladder: rounding" in [entry["part"] for entry in report["explained_cost"] if entry["ran"]]
+
+
+def test_why_a_netlist_runs_step_by_step(place):
+    netlist = read_netlist(place / "net.loom")
+    axon = Axon(source=0, targets=((0, 254),), exponent=7)
+    one, two = (build([Neuron()], [axon] * axons, n_inputs=1, depths=[0]) for axons in (1, 2))
+    slow = replace(netlist, decay_v=read_only(np.zeros(netlist.n_compartments)))
+    wiring = "a layer is recurrent or receives from others than the one before it"
+    assert blocks.lay_out_blocks(large_netlist(1, proved=True)) == wiring
+    for each, large in ((netlist, False), (one, False), (two, True), (slow, True)):
+        why = blocks.lay_out_blocks(each)
+        assert (
+            (why == "a sum may leave 16 bits, or a membrane or current its register") == isinstance(why, str) == large
+        )

@@ -7,9 +7,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from json_keys import KEYS
+from commands import as_json, run
 from numpy.testing import assert_array_equal
-from random_crossbars import assert_same
+from random_crossbars import assert_same, recording_of
 from random_netlists import assert_equal, by_engine, by_steps
 from test_cost import check as check_costs
 from test_onnx_engine import assert_as_specified
@@ -19,11 +19,11 @@ import spikeloom
 from spikeloom.compiler import lift
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
-from spikeloom.compiler.targets.loihi1.netlist import netlist_text
-from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes, read_netlist
 from spikeloom.compiler.targets.truenorth.netlist import crossbar_bytes
+from spikeloom.compiler.text import text
 from spikeloom.models.networks.reference import float_spikes
-from spikeloom.runtime.cli import build_parser, main
+from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.machines.base import machine_for
@@ -32,7 +32,6 @@ from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.trace import aligned, unpack
 from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
 from spikeloom.runtime.machines.truenorth import spec as crossbar_spec
-from spikeloom.runtime.machines.truenorth.spec import Counts, Trace
 from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.encode import encode
 
@@ -52,18 +51,96 @@ def float_side(made):
     return load_network(str(made.network), build_parser("verify").parse_args(words), made.machine.netlist)
 
 
-def as_json(capsys, *words, codes=(0,)):
-    """The one object that a command prints."""
-    capsys.readouterr()
-    assert main([*map(str, words), "--json"]) in codes, capsys.readouterr().err
-    out = capsys.readouterr().out
-    assert out.count("\n") == 1
-    return json.loads(out)
+LISTS = """
+anytime:
+    bins chip_steps decisions files full labelled labels least_interval rules samples savings source split windows
+bits:
+    combinations command float_accuracy front layers netlist of recommended recordings scale_groups wanted
+    widths
+chart:
+    budget chosen_by command data expected format grid networks points recommended refused saving
+    spikeloom tables target
+compile:
+    chips classes compartments cores layers limits neurons provenance sha256 synapses synapses_nonzero
+    synapses_stored target taxels tiles bins? calibration? clocks? core_bound? exactness? facts? layout? path?
+    placement? proofs? removals?
+compile, crossbars:
+    axons classes cores crossing_points drain_ticks feeds layers limits max_crossing_points_of_an_axon neurons
+    provenance sha256 target taxels tick_clocks ticks_per_step wires clocks?
+data:
+    bin_s dead duration_s events found hot labels one_sided rate recordings rules source split steps taxels
+    unlabelled
+estimate:
+    chip_steps cores detail energy_by_part_j energy_range_j layers max min not_modelled not_priced pace
+    per_inference samples static time
+estimate, crossbars:
+    cores cores_of_chip energy layers max min not_priced pace per_inference samples static_w
+explain:
+    causes diagnosis different faults graph layers recording reference roots sample searched split steps top
+export netx:
+    bytes exact format layers neurons path sha256 synapses
+export nir:
+    bytes convention dt format neurons path sha256 synapses
+export onnx:
+    bytes form format inputs neurons outputs path sha256 synapses
+export sanafe:
+    bytes cores format groups input_cores neurons path sha256 synapses
+finetune:
+    before command data data_sha256 epochs file fine_tuned_from fine_tuned_weights history last seed sha256
+    test_samples weight_bits
+inspect checkpoint:
+    assumed beta classes given graph layers layout sha256 system taxels theta training bins? dynamics? hops? towers?
+inspect checkpoint, crossbars:
+    classes clocks copies edges graph layers levels sets sha256 system taxels towers training weights
+inspect netlist:
+    chips classes compartments cores layers limits neurons provenance sha256 synapses synapses_nonzero
+    synapses_stored target taxels tiles bins? clocks?
+inspect netlist, crossbars:
+    axons classes cores crossing_points drain_ticks feeds layers limits max_crossing_points_of_an_axon neurons
+    provenance sha256 target taxels tick_clocks ticks_per_step wires clocks?
+join:
+    classes command file graph layers sha256 system towers
+lean:
+    differ layers output overflowing rows samples source split taken taxels
+report:
+    cores costs decisions netlist output provenance recording taxels verify
+run:
+    accuracy counts files labelled labels predictions samples
+stress:
+    classes clean full missed not_applicable perturbations provenance recordings required seeds
+train:
+    protocols runs
+verify:
+    accuracy breakdowns certificate decision_agreement engine engine_different first_divergence ladder levels missed
+    not_compared quantised_different same_checkpoint samples spec_equals_engine spec_samples spikes weights
+verify, crossbars:
+    E0 E1 correct exact membranes_saturated samples target spec_steps? sums?
+watch bin:
+    bins counts decision grasp kind margin time_s
+watch end:
+    bins events grasps interrupted kind late repeated
+watch grasp:
+    bins counts decision grasp kind margin time_s
+yardsticks:
+    arithmetic graph neurobench not_counted prices_pj samples source
+"""
+"""A command, and the keys that scripts rely on; with a question mark those that only some networks have."""
+
+
+@cache
+def tables():
+    """Of each command those keys that are always there, and those that may be."""
+    found = {}
+    for line in LISTS.strip().splitlines():
+        if not line.startswith(" "):
+            always, sometimes = found[line.rstrip(":")] = set(), set()
+        for word in line.split() if line.startswith(" ") else ():
+            (sometimes if word.endswith("?") else always).add(word.rstrip("?"))
+    return found
 
 
 def require_keys(what, found):
-    """The keys that scripts rely on are there, and no others that the table does not list."""
-    always, sometimes = KEYS[what]
+    always, sometimes = tables()[what]
     assert always <= set(found) <= always | sometimes
 
 
@@ -88,9 +165,7 @@ def test_the_engine_of_crossbars_is_the_specification(name):
     netlist = made.machine.netlist
     batch = crossbar_engine.simulate(netlist, channels(made), spikes=True, membranes=True)
     for sample, recording in enumerate(channels(made)):
-        counts = Counts(**{field.name: getattr(batch.counts, field.name)[sample] for field in fields(Counts)})
-        trace = Trace(counts=counts, spikes=batch.spikes[sample], membranes=batch.membranes[sample])
-        assert_same(trace, crossbar_spec.simulate(netlist, recording))
+        assert_same(recording_of(batch, sample), crossbar_spec.simulate(netlist, recording))
     assert all(batch.spikes[..., netlist.layer == layer].any() for layer in range(len(netlist.layers)))
 
 
@@ -148,14 +223,14 @@ def test_a_file_holds_the_netlist_to_the_byte(name):
     content = made.netlist.read_bytes()
     assert (crossbar_bytes if name in CROSSBARS else netlist_bytes)(made.machine.netlist) == content
     if name in LAYERED:
-        lines = netlist_text(made.machine.netlist).splitlines()
-        assert lines == netlist_text(read_netlist(made.netlist)).splitlines()
+        lines = text(made.machine.netlist).splitlines()
+        assert lines == text(read_netlist(made.netlist)).splitlines()
 
 
 @over(MAKERS)
-def test_compiled_again_the_bytes_are_the_same(name, tmp_path, capsys):
+def test_compiled_again_the_bytes_are_the_same(name, tmp_path):
     made = specimen(name)
-    found = as_json(capsys, *made.compilation, "-o", tmp_path / "again.loom")
+    found = as_json(*made.compilation, "-o", tmp_path / "again.loom")
     require_keys("compile" + ", crossbars" * (name in CROSSBARS), found)
     assert found["sha256"] == hashlib.sha256(made.netlist.read_bytes()).hexdigest()
     assert (tmp_path / "again.loom").read_bytes() == made.netlist.read_bytes()
@@ -217,10 +292,10 @@ def test_the_float_engine_is_the_float_model(name):
 
 # --- commands ------------------------------------------------------------------------------------------------------
 @over((*FLOAT, *CROSSBARS))
-def test_verify_holds_every_network_to_its_file(name, capsys):
+def test_verify_holds_every_network_to_its_file(name):
     made = specimen(name)
     words = ("verify", made.netlist, "--checkpoint", made.network, *made.reading, "--data", made.data)
-    found = as_json(capsys, *words, "--spec-samples", 1, *([] if name in CROSSBARS else ["--require", "E0"]))
+    found = as_json(*words, "--spec-samples", 1, *([] if name in CROSSBARS else ["--require", "E0"]))
     if name in CROSSBARS:
         require_keys("verify, crossbars", found)
         assert found["E0"]["differences"] == 0
@@ -239,30 +314,30 @@ def test_verify_holds_every_network_to_its_file(name, capsys):
 
 
 @over(MAKERS)
-def test_run_estimate_and_inspect_agree(name, capsys):
+def test_run_estimate_and_inspect_agree(name):
     made = specimen(name)
     kind = ", crossbars" if name in CROSSBARS else ""
-    decided = as_json(capsys, "run", made.netlist, "--data", made.data)
+    decided = as_json("run", made.netlist, "--data", made.data)
     require_keys("run", decided)
     run = made.machine.run(made.events)
     assert decided["counts"] == run.votes.tolist()
     assert decided["predictions"] == run.decisions.tolist()
-    costs = as_json(capsys, "estimate", made.netlist, "--data", made.data)
+    costs = as_json("estimate", made.netlist, "--data", made.data)
     require_keys("estimate" + kind, costs)
-    again = as_json(capsys, "run", made.netlist, "--data", made.data, "--detail", "counts")
+    again = as_json("run", made.netlist, "--data", made.data, "--detail", "counts")
     assert again == decided | {"costs": costs}
-    shown = as_json(capsys, "inspect", made.netlist)
+    shown = as_json("inspect", made.netlist)
     require_keys("inspect netlist" + kind, shown)
     assert [layer["name"] for layer in shown["layers"]] == list(made.machine.layers)
     if name in (*CHECKPOINTS, "native"):
-        require_keys("inspect checkpoint" + kind * (name == "native"), as_json(capsys, "inspect", made.network))
+        require_keys("inspect checkpoint" + kind * (name == "native"), as_json("inspect", made.network))
 
 
 @over(FLOAT)
-def test_explain_prints_the_keys_of_the_table(name, capsys):
+def test_explain_prints_the_keys_of_the_table(name):
     made = specimen(name)
     words = ("explain", made.netlist, "--checkpoint", made.network, *made.reading, "--data", made.data)
-    found = as_json(capsys, *words, "--sample", "sample_1_label_1.npy")
+    found = as_json(*words, "--sample", "sample_1_label_1.npy")
     require_keys("explain", found)
 
 
@@ -279,13 +354,12 @@ COMMANDS = {
     "join": ("joined", "join {folder}/1.pt {folder}/2.pt -o {out}/x.pt"),
     "data": ("mlp", "data describe {data}"),
     **{
-        f"export {form}": (name, f"export {{{source}}} --to {form} -o {{out}}/x{suffix}")
-        for form, name, source, suffix in (
-            ("onnx", "timed", "net", ".onnx"),
-            ("onnx-float", "tactilesgnet", "file", ".onnx"),
-            ("nir", "recurrent", "net", ".nir"),
-            ("netx", "binned", "net", ".net"),
-            ("sanafe", "recurrent", "net", ".yaml"),
+        f"export {form}": (name, f"export {{net}} --to {form} -o {{out}}/x{suffix}")
+        for form, name, suffix in (
+            ("onnx", "timed", ".onnx"),
+            ("nir", "recurrent", ".nir"),
+            ("netx", "binned", ".net"),
+            ("sanafe", "recurrent", ".yaml"),
         )
     },
 }
@@ -293,15 +367,15 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_other_commands_print_the_keys_of_the_table(command, tmp_path, capsys):
+def test_other_commands_print_the_keys_of_the_table(command, tmp_path):
     name, words = COMMANDS[command]
     made = specimen(name)
     places = {"net": made.netlist, "file": made.network, "data": made.data, "folder": made.folder, "out": tmp_path}
-    require_keys(command, as_json(capsys, *words.format(**places).split(), codes=(0, 1)))
+    require_keys(command, as_json(*words.format(**places).split(), codes=(0, 1)))
 
 
 @over(("timed", "joined", "binned", "recurrent", "netx"))
-def test_watch_decides_as_run(name, tmp_path, capsys):
+def test_watch_decides_as_run(name, tmp_path):
     made = specimen(name)
     lines = []
     for recording in made.events:
@@ -309,10 +383,8 @@ def test_watch_decides_as_run(name, tmp_path, capsys):
         bin_s = 0.02 * made.machine.netlist.bins
         lines += [f"{bin_s * (s + 0.5):.3f},{x},{p}" for s, x, p in zip(step, taxel, polarity, strict=True)] + [""]
     (tmp_path / "lines.csv").write_text("\n".join(lines) + "\n")
-    capsys.readouterr()
     words = ["watch", made.netlist, "--input", tmp_path / "lines.csv", "--bins", made.events.shape[-1], "--json"]
-    assert main([*map(str, words)]) == 0
-    shown = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    shown = [json.loads(line) for line in run(*words)[1].splitlines()]
     for entry in shown:
         require_keys(f"watch {entry['kind']}", entry)
     counts = [entry["counts"] for entry in shown if entry["kind"] == "grasp"]

@@ -1,4 +1,7 @@
+"""What the compiler refuses: the class of the error, the words that its message must hold, and the call."""
+
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -8,27 +11,32 @@ from oracles import refused
 from random_netlists import Axon, Neuron, build
 from random_networks import (
     LOIHI,
+    chain,
     compiled,
     dense_weights,
     integer_chain,
     integer_networks,
     legal_partition,
-    recordings_for,
+    random_checkpoint,
+    ring,
     seated,
     small_target,
     tight_targets,
 )
 
-from spikeloom.compiler import lift
-from spikeloom.compiler.errors import CapacityError, FormatError, NumericRangeError
+from spikeloom.compiler import Options, Packing, compile_network, lift
+from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import read_only
-from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, fan_in
+from spikeloom.compiler.passes.calibrate import calibrate
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.layout.choose import lay_out, least_cores
+from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.trace import aligned
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
+from spikeloom.compiler.targets.loihi1.storage.width_search import check_widths
 
 
 @settings(deadline=None, max_examples=25)
@@ -71,16 +79,12 @@ def test_the_netlist_holds_exactly_the_network(network, target):
 
 @settings(deadline=None, max_examples=25)
 @given(integer_networks(), tight_targets())
-def test_compartments_hold_the_registers_of_their_neurons(network, target):
+def test_layers_and_votes_are_those_of_the_network(network, target):
     parts = legal_partition(network, target)
     netlist = seated(network, parts, target, {"seed": 1})
     for index, population in enumerate(network.populations):
         ids = netlist.compartments_of(index)
         assert netlist.neuron[ids].tolist() == list(range(population.size))
-        for field in ("threshold", "bias_mantissa", "bias_exponent", "scale"):
-            np.testing.assert_array_equal(getattr(netlist, field)[ids], getattr(population, field))
-        assert set(netlist.decay_u[ids].tolist()) == {population.decay_u}
-        assert set(netlist.decay_v[ids].tolist()) == {population.decay_v}
         voting = index == network.readout.population
         expected = network.readout.label.tolist() if voting else [-1] * population.size
         assert netlist.readout_class[ids].tolist() == expected
@@ -162,22 +166,6 @@ def test_emit_and_back(network, compartments):
     assert kept == formats
 
 
-@MANY
-@given(st.data())
-def test_runs_like_the_chip(data):
-    network = data.draw(integer_networks(exponents=(-1, 0)))
-    netlist = lower(network, core_compartments=5)
-    events = data.draw(recordings_for(network.input.size))
-    try:
-        trace = engine.simulate(netlist, events.transpose(0, 2, 1), spikes=True, membranes=True)
-    except NumericRangeError:
-        assume(False)
-    activity = run_integer(lift(netlist), events, membranes=True)
-    for layer in range(len(netlist.layers)):
-        np.testing.assert_array_equal(activity.spikes[layer], aligned(netlist, trace.spikes, layer))
-        np.testing.assert_array_equal(activity.membranes[layer], aligned(netlist, trace.membranes, layer))
-
-
 @pytest.mark.parametrize("empty", [0, 1, 2])
 def test_a_layer_without_synapses_keeps_its_projection(empty):
     weights = [np.full((3, 4), 50), np.full((2, 3), 60), np.full((2, 2), 70)]
@@ -206,3 +194,105 @@ def test_different_decays_in_a_layer_are_refused(field):
 def test_one_layer_votes(votes, layers):
     netlist = dataclasses.replace(netlist_of(Neuron(), Neuron(layer=1)), readout_class=read_only(votes))
     refused(FormatError, f"{layers} layers vote", lift, netlist)
+
+
+EVENTS = np.ones((2, 5, 2, 8), np.uint8)
+WIDTHS = "2, 3, 4, 5, 6, 8"
+
+
+def compiling(target="loihi1", graph=5, **options):
+    return lambda: compile_network(expand(random_checkpoint(), ring(graph)), Options(**options), target=target)
+
+
+def rounding(weight=1.0, **options):
+    return lambda: choose_storage(chain([[weight]]), LOIHI, **options)
+
+
+def calibrating(shape):
+    return lambda: calibrate(chain([[1.0, 1.0]]), np.zeros(shape, bool))
+
+
+def full(*sizes):
+    return integer_chain(*[np.full((post, pre), 2) for pre, post in itertools.pairwise(sizes)])
+
+
+def laying_out(sizes, target=LOIHI, **cores_for):
+    return lambda: lay_out(full(*sizes), target, cores_for=cores_for)
+
+
+def cutting(sizes, **limits):
+    return lambda: partition(full(*sizes), small_target(**limits))
+
+
+OPTIONS = [
+    ("--prune-unused|--calibrate|--keep-all", compiling(prune_unused=True)),
+    ("--prune-unused|--keep-all", compiling(prune_unused=True, training_events=EVENTS, keep_all=True)),
+    ("--spike-exact|--calibrate", compiling(spike_exact=True)),
+    ("--spike-exact|--planes", compiling(spike_exact=True, training_events=EVENTS, packings=(Packing(planes=2),))),
+    (f"--weight-bits 7|{WIDTHS}", compiling(spike_exact=True, training_events=EVENTS, packings=(Packing(bits=7),))),
+    *((f"--weight-bits {bits}|{WIDTHS}", rounding(packings=(Packing(bits=bits),))) for bits in (-1, 0, 1, 7, 9)),
+    *((f"--planes {planes}|1 to 3", rounding(packings=(Packing(planes=planes),))) for planes in (0, 4)),
+    *((f"--scale-groups {n}|8 thresholds|1 to 8", rounding(packings=(Packing(groups=n),))) for n in (0, 9)),
+    ("--weight-bits: 2 layers|the network has 1", rounding(packings=(Packing(), Packing()))),
+    (f"--widths 7|{WIDTHS}", lambda: check_widths([7], 1, 4, LOIHI)),
+    ("--optimize latency|no time", lambda: lay_out(full(2, 2), dataclasses.replace(LOIHI, time=()), goal="latency")),
+    (
+        "--optimize latency|links between chips|--chips",
+        lambda: Options(optimize="latency", chips=2).require_consistent(calibrated=True),
+    ),
+    ("--cores-for fc1=2|3 cores at least", laying_out((2496, 128), fc1=2)),
+    # four neurons of seven output axons a core: three listening cores each let two of them sit together
+    ("--cores-for fc1=1|2 cores at least", laying_out((1, 4, 9), small_target(core_axons_out=7), fc1=1, fc2=3)),
+    ("--cores-for fc1=7|3 chips|6 cores", lambda: least_cores(full(6, 8), {"fc1": 7}, small_target(chip_cores=2), 3)),
+]
+NETWORKS = [
+    ("fc1|6 bits|32767 units|more bits", rounding(1e6, packings=(Packing(bits=6),))),
+]
+RECORDINGS = [
+    ("calibration|split is empty", compiling(training_events=EVENTS[:0])),
+    ("calibration|split is empty", calibrating((0, 5, 2))),
+    ("3 channels|has 2", calibrating((1, 5, 3))),
+]
+CAPACITIES = [
+    (
+        "fc1 neuron 0: 8 used, 7 allowed (loihi1.core.axons_out)",
+        laying_out((1, 1, 8), small_target(core_axons_out=7), fc2=8),
+    ),
+    ("chip: 129 used, 128 allowed (loihi1.chip.cores)", laying_out((3, 100, 100), fc1=100, fc2=29)),
+    (
+        "2 chips: 5 used, 4 allowed (loihi1.chip.cores)|--chips",
+        lambda: partition(full(1, 5), small_target(core_compartments=1, chip_cores=2), chips=2),
+    ),
+    ("fc1 neuron 0: 4097 used, 4096 allowed (loihi1.core.axons_in)", cutting((4097, 1))),
+    (
+        "neuron 0: 16385 used, 4096 allowed (loihi1.core.axons_in)|\n"
+        "fc1 neuron 0: 16385 used, 16384 allowed (loihi1.core.synapse_words)",
+        cutting((16385, 1)),
+    ),
+    (
+        "fc1 neuron 0: 5 used, 4 allowed (loihi1.core.axons_out); split the layers that it feeds",
+        cutting((1, 1, 5), core_axons_out=4, core_compartments=1),
+    ),
+    ("fc1 neuron 0: 5 used, 4 allowed (loihi1.core.synapse_words)", cutting((5, 1), core_synapse_words=4)),
+    *(
+        (f"fc1 neuron 0: 1 used, 0 allowed (loihi1.core.{rule})", cutting((1, 1), **{f"core_{rule}": 0}))
+        for rule in ("compartments", "threshold_slots", "compartment_configs")
+    ),
+]
+TABLE = {OptionError: OPTIONS, ModelError: NETWORKS, DataError: RECORDINGS, CapacityError: CAPACITIES}
+
+
+@pytest.mark.parametrize(("error", "words", "call"), [(error, *row) for error, rows in TABLE.items() for row in rows])
+def test_what_cannot_be_had_is_refused(error, words, call):
+    refused(error, words, call)
+
+
+def test_what_is_just_allowed():
+    assert least_cores(full(2496, 128), {"fc1": 3}, LOIHI) == {0: 3}
+    assert least_cores(full(6, 8), {"fc1": 6}, small_target(chip_cores=2), 3) == {0: 6}
+    assert check_widths([8, 2, 8], 1, 4, LOIHI) == (2, 8)
+    assert check_widths([2, 3, 4, 5, 6, 8], 1, 4, LOIHI) == (2, 3, 4, 5, 6, 8)
+    assert len(partition(full(4096, 1), LOIHI)) == 1
+    assert len(partition(full(1, 128 * 8), small_target(core_compartments=8))) == 128
+    assert len(cutting((1, 1, 5), core_axons_out=5, core_compartments=1)()) == 6
+    assert len(partition(full(1, 4, 9), small_target(core_axons_out=7), cores_for={1: 3})) == 5

@@ -1,31 +1,22 @@
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from oracles import refused
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings.counts import GAP_S
-from spikeloom.models.recordings.eventfiles import likely_unit, read_stream
+from spikeloom.models.recordings.eventfiles import EventStream, read_stream
 from spikeloom.models.recordings.events import BIN_S, MAX_STEPS, bin_events, data_splits, load_data, need_labels
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
-from spikeloom.runtime.commands.exchange.described import describe
+from spikeloom.runtime.commands.exchange.data import describe
 
 HEADER = "time_s,taxel,polarity\n"
-
-
-@pytest.fixture
-def write(tmp_path):
-    def write(name: str, text: str) -> Path:
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-        return path
-
-    return write
 
 
 @pytest.fixture
@@ -38,11 +29,7 @@ def save(tmp_path):
     return save
 
 
-def message(function, *arguments, error=DataError, **options) -> str:
-    with pytest.raises(error) as caught:
-        function(*arguments, **options)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+message = partial(refused, DataError, "")
 
 
 def made(events, **changes) -> Recordings:
@@ -99,11 +86,13 @@ def test_events_that_cannot_be(write, rows, words):
 
 
 def test_taxels_and_bins_have_limits(write):
-    assert "taxel 4096, allowed are whole numbers 0..4095" in message(load_data, write("a.csv", "0,4096,1\n"))
+    assert "taxel 4096, allowed are whole numbers 0..4095" in refused(
+        DataError, "", load_data, write("a.csv", "0,4096,1\n")
+    )
     path = write("a.csv", "1,0,1\n")
     assert "time 1 s is past 1000000 bins of 4.94066e-324 s" in message(load_data, path, bin_s=5e-324)
     for bin_s in (0.0, -0.02, float("nan"), float("inf")):
-        assert f"--bin {bin_s:g}: not a duration" in message(load_data, path, bin_s=bin_s, error=OptionError)
+        assert f"--bin {bin_s:g}: not a duration" in refused(OptionError, "", load_data, path, bin_s=bin_s)
 
 
 # Labels
@@ -234,8 +223,8 @@ def test_one_released_recording(tmp_path):
         assert np.array_equal(recordings.events, grasps.events[3:4])
         assert recordings.labels.tolist() == [label]
         assert (counts.events, counts.duplicates, recordings.steps) == (grasps.events[3].sum(), 0, 40)
-    refused = message(load_data, tmp_path / "grasp.npy", bin_s=0.05, error=OptionError)
-    assert refused == "--bin 0.05: grasp.npy holds bins, not times; omit --bin"
+    said = refused(OptionError, "", load_data, tmp_path / "grasp.npy", bin_s=0.05)
+    assert said == "--bin 0.05: grasp.npy holds bins, not times; omit --bin"
     np.save(tmp_path / "bad.npy", np.full((3, 2, 4), 0.5))
     assert message(load_data, tmp_path / "bad.npy") == (
         "bad.npy: value 0.5 at taxel 0, polarity 0, step 0, allowed are 0 and 1; recordings are events, not pressures"
@@ -302,9 +291,6 @@ def test_description():
     assert (found.recordings, found.events, found.labels, found.unlabelled) == (2, 15, {3: 1}, 1)
     rates = [[taxel.falling, taxel.rising] for taxel in found.rate.taxels]
     assert rates == [[2, 2], [0, 0], [2, 0], [2, 2], [0, 0]]  # 3 events in 1.5 s
-    assert found.course[0].tolist() == [30, 20]
-    assert found.course[5].tolist() == [30, 20]  # of the recording that is left
-    assert found.course[[1, 2, 3, 4, 6, 7, 8, 9]].sum() == 0
     assert (found.dead, found.one_sided, found.hot) == ((1, 4), (2,), ())
 
 
@@ -344,30 +330,29 @@ def warned(path, **options) -> tuple[str, ...]:
     return load_data(path, **options).counts.notes
 
 
-@pytest.mark.parametrize(
-    ("factor", "unit", "last"),
-    [(1e3, "milliseconds", "1995"), (1e6, "microseconds", "1.995e+06"), (1e9, "nanoseconds", "1.995e+09")],
-)
-def test_times_in_another_unit_are_noticed(write, factor, unit, last):
+@pytest.mark.parametrize("factor", [1e3, 1e6, 1e9])
+def test_times_in_another_unit_are_noticed(write, factor):
     rows = [f"{int(0.005 * factor * i)},{i % 3},1" for i in range(400)]
     path = write("odd/a.csv", "\n".join([HEADER.strip(), *rows]))
     write("odd/b.csv", path.read_text())
-    write("odd/c.csv", "0,0,1\n0.7,1,1\n90,2,1\n")
+    write("odd/c.csv", "0,0,1\n0.7,1,1\n60,2,1\n")
     if factor <= 1e3:
-        assert warned(path.parent) == (f"odd: a.csv (and 1 more): times up to {last} look like {unit}; write seconds",)
-    elif factor == 1e6:
+        note = "times up to 1995 s with less than an event a second; write seconds"
+        assert warned(path.parent) == (f"odd: a.csv (and 1 more): {note}",)
+    else:
         assert message(load_data, path) == (
-            "a.csv: line 401: time 1.995e+06 s is past 1000000 bins of 0.02 s, the limit of a recording; "
-            "the times look like microseconds, write seconds"
+            f"a.csv: line 401: time {1.995 * factor:g} s is past 1000000 bins of 0.02 s, the limit of a recording; "
+            "write seconds"
         )
-    assert likely_unit(read_stream(path).time_s) == unit
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.5, 600), st.integers(1, 2000))
 @settings(deadline=None)
 def test_a_touch_of_several_events_a_second_is_never_taken_for_another_unit(seed, duration, count):
     times = np.random.default_rng(seed).random(max(count, int(4 * duration))) * duration
-    assert likely_unit(times) is None
+    nothing = np.zeros(len(times), np.int64)
+    stream = EventStream(name="a", time_s=times, taxel=nothing, polarity=nothing, label=0, at=str)
+    assert bin_events(stream)[1].notes == ()
 
 
 def test_taxels_that_count_from_one(write):

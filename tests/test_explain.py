@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_folder, weights
-from random_networks import chain, integer_chain
+from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, weights
+from random_networks import chain, integer_chain, with_population
 
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime import cli
@@ -126,12 +126,6 @@ def stored_as(network, thresholds, exponents=(0,)):
         for population, threshold in zip(network.populations, thresholds, strict=True)
     ]
     return round_to_forms(network, forms)[0]
-
-
-def with_population(integer, post, **fields):
-    populations = list(integer.populations)
-    populations[post] = dataclasses.replace(populations[post], **fields)
-    return dataclasses.replace(integer, populations=tuple(populations))
 
 
 def explained(network, integer, events, **options):
@@ -261,28 +255,17 @@ SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    """A folder with recordings, two checkpoints, and a 4-bit netlist of the first."""
-    folder = tmp_path_factory.mktemp("explain")
-    recordings_folder(folder / "data")
-    own_file(folder / "net.pt")
-    own_file(folder / "other.pt", last=weights(7))
-    words = ["compile", folder / "net.pt", "--weight-bits", "4", "--keep-all", "-o", folder / "net.loom", "--json"]
+def place(place):
+    """The folder with another checkpoint, and a netlist of 4 bits."""
+    own_file(place / "other.pt", last=weights(7))
+    words = ["compile", place / "net.pt", "--weight-bits", "4", "--keep-all", "-o", place / "net.loom", "--json"]
     assert cli.main([str(word) for word in words]) == 0
-    return folder
+    return place
 
 
 @pytest.fixture
-def report(spikeloom):
-    """Explain with ``--json``; returns the object."""
-
-    def command(*words):
-        code, out, err = spikeloom(*EXPLAIN, *words, "--json")
-        assert (code, err) == (0, "")
-        assert out.count("\n") == 1
-        return json.loads(out)
-
-    return command
+def report(as_json):
+    return lambda *words: as_json(*EXPLAIN, *words)
 
 
 def test_the_report_counts_what_the_engine_and_the_float64_model_do(report, place):
@@ -332,8 +315,7 @@ def test_the_first_recording_that_differs_and_its_first_roots(report):
 
 
 def test_a_netlist_of_another_checkpoint_is_said_to_be_one(spikeloom, report):
-    words = ("explain", "net.loom", "--checkpoint", "other.pt", "--data", "data", "--json")
-    code, out, err = spikeloom(*words)
+    code, out, err = spikeloom("explain", "net.loom", "--checkpoint", "other.pt", "--data", "data", "--json")
     assert code == 0
     assert err.startswith("spikeloom: warning: net.loom: compiled from a checkpoint of sha256 ")
     assert json.loads(out)["faults"]

@@ -1,11 +1,11 @@
 """Joined networks: towers side by side, from files to the chip and through every command."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from commands import as_json, refusal
 from made_files import checkpoint_bytes, released, state_dict, weights
 from numpy.testing import assert_array_equal
 from test_checkpoint import rebuilt
@@ -17,20 +17,18 @@ from spikeloom.compiler.checkpoint import SHARED, towers_of
 from spikeloom.compiler.dynamics import PLAIN, Clocks, Dynamics, with_clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.formats.towers import arrays_of, join, members
-from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
+from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.networks.quantised import quantised_spikes
 from spikeloom.models.networks.reference import float_membranes, float_spikes
-from spikeloom.runtime.cli import main
-from spikeloom.runtime.costs import yardsticks
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.machines.votes import class_counts, readout_counts
+from spikeloom.runtime.studies import yardsticks
 
 CASES = pytest.mark.parametrize(
     ("system", "dynamics"),
@@ -164,11 +162,6 @@ def test_the_expanded_network_is_sparse_in_blocks(tmp_path, system, dynamics):
     assert [population.relays for population in network.populations] == [clocks, 0, 0, 0]
     assert network.classes == 4
     assert network.readout.label.tolist() == [0, 1, 2, 3] * 3
-    events = events_of(7)
-    wanted = float_spikes(wide, seen, events, dtype="float64")
-    found = run_float(network, channels_last(events, dynamics.clocks)).spikes
-    for (name, spikes), ours in zip(wanted.items(), found, strict=True):
-        assert_array_equal(ours, spikes, err_msg=name)
 
 
 # --- the chip ------------------------------------------------------------------------------------------------------
@@ -237,94 +230,51 @@ def test_yardsticks_count_no_weights_between_towers(tmp_path):
 # --- commands ------------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """Three networks with clocks and three without, each with a record and two sets of weights; joined."""
+    """Three networks, each with a record and two sets of weights; joined."""
     place = tmp_path_factory.mktemp("joined-data")
-    for name, dynamics in (("timed", TIMING), ("plain", PLAIN)):
-        for seed in SEEDS:
-            path = place / f"{name}{seed}.pt"
-            network, _ = written(path, dynamics=dynamics, seed=seed)
-            last = network.export_weights()
-            record = {"command": f"spikeloom train --seed {seed}", "seed": seed, "data_sha256": f"{seed:064}"}
-            known = {"beta": 0.2, "theta": 0.5, "dynamics": dynamics, "training": record | {"last": {"correct": seed}}}
-            sets = {"last": last, "clean": {key: array / 2 for key, array in last.items()}}
-            path.write_bytes(checkpoint_bytes(sets, GRAPH, **known))
-        words = " ".join(f"{place}/{name}{seed}.pt" for seed in SEEDS)
-        assert main(f"join {words} -o {place}/{name}.pt --weights last".split()) == 0
+    for seed in SEEDS:
+        path = place / f"timed{seed}.pt"
+        network, _ = written(path, seed=seed)
+        last = network.export_weights()
+        record = {"command": f"spikeloom train --seed {seed}", "seed": seed, "data_sha256": f"{seed:064}"}
+        known = {"beta": 0.2, "theta": 0.5, "dynamics": TIMING, "training": record | {"last": {"correct": seed}}}
+        sets = {"last": last, "clean": {key: array / 2 for key, array in last.items()}}
+        path.write_bytes(checkpoint_bytes(sets, GRAPH, **known))
+    as_json("join", *(place / f"timed{seed}.pt" for seed in SEEDS), "-o", place / "timed.pt", "--weights", "last")
     return place
 
 
-def as_json(capsys, words):
-    assert main([*words.split(), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def refusal(capsys, words):
-    capsys.readouterr()
-    assert main(words.split()) == 2
-    return capsys.readouterr().err
-
-
-def test_the_record_tells_every_tower(data, capsys):
-    capsys.readouterr()
-    inspected = as_json(capsys, f"inspect {data}/timed.pt")
+def test_the_record_tells_every_tower(data):
+    inspected = as_json(*f"inspect {data}/timed.pt".split())
     assert inspected["towers"] == 3
     assert inspected["classes"] == 4
     record = inspected["training"]
     assert record["command"] == "spikeloom join timed1.pt timed2.pt timed3.pt --weights last"
     assert [tower["seed"] for tower in record["towers"]] == list(SEEDS)
     for seed, tower in zip(SEEDS, record["towers"], strict=True):
-        single = as_json(capsys, f"inspect {data}/timed{seed}.pt")
+        single = as_json(*f"inspect {data}/timed{seed}.pt".split())
         assert tower["file"] == f"timed{seed}.pt"
         assert (tower["sha256"], tower["weights"]) == (single["sha256"], "last")
         for key in ("command", "seed", "data_sha256", "last"):
             assert tower[key] == single["training"][key], key
 
 
-def test_equal_input_gives_equal_bytes_and_other_sets_other_ones(data, capsys):
+def test_equal_input_gives_equal_bytes_and_other_sets_other_ones(data):
     words = " ".join(f"{data}/timed{seed}.pt" for seed in SEEDS)
-    as_json(capsys, f"join {words} --weights last -o {data}/a.pt")
+    as_json(*f"join {words} --weights last -o {data}/a.pt".split())
     assert (data / "a.pt").read_bytes() == (data / "timed.pt").read_bytes()
-    report = as_json(capsys, f"join {words} --weights clean -o {data}/c.pt")
+    report = as_json(*f"join {words} --weights clean -o {data}/c.pt".split())
     assert [tower["weights"] for tower in report["towers"]] == ["clean"] * 3
     for seed, member in zip(SEEDS, members(read_checkpoint(data / "c.pt")), strict=True):
         clean = read_checkpoint(data / f"timed{seed}.pt", weights="clean")
         assert_array_equal(member.dense[0].weight, clean.dense[0].weight)
 
 
-@pytest.mark.parametrize("form", ["step", "scan"])
-def test_the_float_graph_sums_the_votes(tmp_path, capsys, form):
-    onnxruntime = pytest.importorskip("onnxruntime")
-    _, wide, seen = joined(tmp_path, dynamics=PLAIN)
-    report = as_json(capsys, f"export {tmp_path}/wide.pt --to onnx-float --form {form} -o {tmp_path}/x.onnx")
-    assert report["neurons"] == sum(wide.neurons.values())
-    session = onnxruntime.InferenceSession(f"{tmp_path}/x.onnx", providers=["CPUExecutionProvider"])
-    events = events_of(12, samples=5, steps=20)
-    counts = readout_counts(wide.readout, 4, float_spikes(wide, seen, events)["fc3"])
-    flat = np.ascontiguousarray(events.reshape(5, 78, -1).transpose(2, 0, 1))
-    if form == "scan":
-        votes, decided = session.run(["votes", "class"], {"events": flat})
-        assert_array_equal(decided, vote(counts))
-    else:
-        state = {port.name: np.zeros((5, port.shape[1]), np.float32) for port in session.get_inputs()}
-        state["votes"] = state["votes"].astype(np.int32)
-        names = [port.name for port in session.get_outputs()]
-        for step in flat:
-            out = dict(zip(names, session.run(None, state | {"events": step}), strict=True))
-            state = {name: out[f"{name}_next"] for name in state if name != "events"}
-        votes = state["votes"]
-    assert_array_equal(votes, counts)
-    assert len(np.unique(counts, axis=0)) > 1
-    back, ours = read_onnx(f"{tmp_path}/x.onnx").network, expand(wide, seen)  # classes of three neurons again
-    assert (back.classes, back.readout.label.tolist()) == (4, ours.readout.label.tolist())
-    for theirs, projection in zip(back.projections[1:], ours.projections[1:], strict=True):
-        assert theirs.weight.count_nonzero() == projection.weight.count_nonzero()
-
-
-def test_what_disagrees_is_listed_in_one_line(tmp_path, capsys):
+def test_what_disagrees_is_listed_in_one_line(tmp_path):
     written(tmp_path / "a.pt")
     other = Dynamics(betas=(0.2, 0.3, 0.1, 0.4), alphas=(0.0, 0.9, 0.5, 0.0), clocks=Clocks(channels=2, steps=5))
     written(tmp_path / "b.pt", "gcn", other, classes=5, features=2, hidden=(8, 7))
-    said = refusal(capsys, f"join {tmp_path}/a.pt {tmp_path}/b.pt -o {tmp_path}/x.pt")
+    said = refusal(*f"join {tmp_path}/a.pt {tmp_path}/b.pt -o {tmp_path}/x.pt".split())
     for word in ("system", "classes", "layers", "membrane decays", "clocks"):
         assert f"{word} ({tmp_path}/b.pt)" in said
     assert not (tmp_path / "x.pt").exists()
@@ -341,16 +291,16 @@ def test_graphs_and_storage_must_agree(tmp_path):
             join([one, other], ["a", "b"])
 
 
-def test_what_cannot_be_joined_says_so(data, tmp_path, capsys):
-    one, made, old = f"{data}/plain1.pt", specimen("joined"), tmp_path / "old.t7"
+def test_what_cannot_be_joined_says_so(data, tmp_path):
+    one, made, old = f"{data}/timed1.pt", specimen("joined"), tmp_path / "old.t7"
     torch.save(released(state_dict(weights())), old)
     for words, reason in (
         (f"join {one} -o {tmp_path}/x.pt", f"{one} is one network already; give two or more"),
         (f"join {one} {one} -o {one}", f"-o {one}: is an input of this command"),
         (f"join {one} {made.netlist} -o {tmp_path}/x.pt", f"{made.netlist}: "),
-        (f"join {one} {data}/plain.pt --weights best -o {tmp_path}/x.pt", "--weights best: the file holds last"),
+        (f"join {one} {data}/timed.pt --weights best -o {tmp_path}/x.pt", "--weights best: the file holds last"),
         (f"join {one} {old} -o {tmp_path}/x.pt", f"{old}: does not say its graph and constants"),
         (f"finetune {made.network} --data {made.data} --weight-bits 4 -o {tmp_path}/x.pt", "has 3 towers"),
     ):
-        assert reason in refusal(capsys, words)
+        assert reason in refusal(*words.split())
     assert not (tmp_path / "x.pt").exists()

@@ -1,4 +1,7 @@
+"""Layouts: what is expected of them, cores asked for, goals; and networks on several chips."""
+
 import contextlib
+import dataclasses
 import itertools
 
 import numpy as np
@@ -6,6 +9,7 @@ import pytest
 import timing_oracle
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
+from oracles import refused
 from random_networks import (
     LOIHI,
     assert_same_layers,
@@ -19,6 +23,7 @@ from random_networks import (
 )
 
 from spikeloom.compiler.errors import CapacityError, NumericRangeError, OptionError
+from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.ir import depths
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.emit import emit
@@ -26,10 +31,16 @@ from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
 from spikeloom.compiler.targets.loihi1.layout.forecast import Forecast, fastest, sample
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound, cut, partition
-from spikeloom.compiler.targets.loihi1.legalize import require_legal
+from spikeloom.compiler.targets.loihi1.layout.place import chip_count, chip_of_core, place_on_chips, share
+from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, require_legal
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist, write_netlist
 from spikeloom.compiler.targets.loihi1.options import GOALS
-from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1 import engine, spec, timing
+from spikeloom.runtime.machines.loihi1.costs import page
+from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
+from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.machines.loihi1.trace import aligned
+from spikeloom.runtime.report.encode import encode
 
 WITHOUT_SHRINKING = tuple(phase for phase in Phase if phase is not Phase.shrink)
 
@@ -111,11 +122,6 @@ def test_the_mean_of_the_longest_is_not_the_longest_of_the_means():
     assert expected.step_ns == pytest.approx((5 * max(work) + 6 * 40 * 9.7) / 11 + 600)
 
 
-def forecast_of(network, calibration, target=LOIHI):
-    everyone = tuple(np.arange(population.size) for population in network.populations)
-    return Forecast(Needs(network, target), sample(network, calibration, everyone), target.time[0])
-
-
 # --- cores asked for
 def test_cores_asked_for_hold_no_other_layer():
     network = integer_chain(np.full((6, 3), 2), np.full((4, 6), 2), np.full((2, 4), 2))
@@ -185,7 +191,8 @@ def test_the_search_comes_near_the_best_cut(seed):
     sizes = [30, int(rng.integers(20, 40)), int(rng.integers(10, 20))]
     network, calibration = busy(sizes, seed=seed, rates=rng.uniform(0.1, 0.9, 3))
     target = small_target(chip_cores=24)
-    forecast = forecast_of(network, calibration, target)
+    everyone = tuple(np.arange(population.size) for population in network.populations)
+    forecast = Forecast(Needs(network, target), sample(network, calibration, everyone), target.time[0])
     found = fastest(forecast)
 
     def expected(chunks):
@@ -238,3 +245,138 @@ def test_a_goal_is_never_missed_by_more_than_the_usual_layout(data):
     calibration = spikes_for(network, events, np.random.default_rng(0))
     layout, usual = lay_out(network, target, goal="latency", calibration=calibration)
     assert layout.expected.step_ns <= usual.expected.step_ns
+
+
+SMALL = small_target(core_compartments=4, chip_cores=2, mesh_width=2, mesh_height=1, mesh_tile_cores=1)
+"""Two cores of four neurons a chip, one on each tile."""
+
+
+def net():
+    """Three layers of 8, 8 and 4 neurons that need five cores of ``SMALL``."""
+    rng = np.random.default_rng(3)
+    weights = [2 * rng.integers(-20, 60, shape) for shape in ((8, 6), (8, 8), (4, 8))]
+    return integer_chain(*weights, thresholds=[60, 200, 200])
+
+
+@pytest.fixture(scope="module")
+def netlist():
+    layout, _ = lay_out(net(), SMALL, chips=3)
+    made = emit(net(), layout.cores, layout.placement.tiles, SMALL, {})
+    require_legal(made, SMALL)
+    return made
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    return (np.random.default_rng(5).random((3, 6, 40)) < 0.5).astype(np.uint8)
+
+
+def test_a_network_takes_as_few_chips_as_hold_it(netlist, tmp_path):
+    assert netlist.n_cores == 5
+    chip = chip_of_core(netlist.core_tile, SMALL)
+    assert np.bincount(chip).tolist() == [2, 2, 1]
+    assert chip_count(netlist.core_tile, SMALL) == 3
+    assert len(set(netlist.core_tile.tolist())) == 5
+    one, _ = lay_out(net(), LOIHI, chips=9)
+    assert chip_count(np.array(one.placement.tiles), LOIHI) == 1
+    write_netlist(netlist, tmp_path / "net.loom")
+    assert read_netlist(tmp_path / "net.loom").core_tile.tolist() == netlist.core_tile.tolist()
+
+
+def test_the_fullest_chip_is_measured(netlist):
+    assert measure(netlist, SMALL)[-1] == LimitUse(name="chip.cores", used=2, allowed=2, core=None)
+    crowded = dataclasses.replace(netlist, core_tile=np.array([0, 1, 0, 2, 3]))
+    refused(CapacityError, "chip: 3 used, 2 allowed (loihi1.chip.cores)", require_legal, crowded, SMALL)
+
+
+@given(st.integers(1, 9), st.integers(1, 4), st.integers(0, 2**32 - 1))
+def test_every_core_gets_a_chip_that_has_room(cores, room, seed):
+    chip = share(np.random.default_rng(seed).random((cores, cores)), room)
+    assert np.all(np.bincount(chip)[:-1] == room)
+    assert chip.max() + 1 == -(-cores // room)
+
+
+@given(st.integers(3, 8), st.integers(0, 2**32 - 1))
+def test_a_placement_counts_what_stays_and_what_leaves(cores, seed):
+    traffic = np.random.default_rng(seed).random((cores, cores))
+    placement = place_on_chips(traffic, SMALL)
+    chip = np.array(placement.tiles) // 2
+    stays = hops = 0.0
+    for a in range(cores):
+        for b in range(cores):
+            if chip[a] == chip[b]:
+                stays += traffic[a, b]
+                hops += traffic[a, b] * abs(placement.tiles[a] - placement.tiles[b])
+    assert placement.between_chips == pytest.approx(traffic.sum() - stays)
+    assert placement.spike_hops == pytest.approx(hops)
+
+
+@pytest.mark.parametrize("stepwise", [False, True])
+def test_chips_do_not_change_a_spike(netlist, recordings, stepwise):
+    trace = engine.simulate(engine.prepare(netlist, stepwise=stepwise), recordings, spikes=True)
+    one, _ = lay_out(net(), LOIHI)
+    alone = emit(net(), one.cores, one.placement.tiles, LOIHI, {})
+    other = engine.simulate(alone, recordings, spikes=True)
+    for index in range(3):
+        np.testing.assert_array_equal(
+            trace.spikes[:, :, netlist.compartments_of(index)], other.spikes[:, :, alone.compartments_of(index)]
+        )
+    slow = spec.simulate(netlist, recordings[0])
+    np.testing.assert_array_equal(slow.spikes, trace.spikes[0])
+    assert trace.counts.spikes.sum() > 20
+
+
+def test_packets_that_leave_are_counted_and_their_way_is_not(netlist, recordings):
+    trace, found = estimate(netlist, SMALL, recordings)
+    chip = chip_of_core(netlist.core_tile, SMALL)
+    core = netlist.core_of_compartment()
+    left = hops = packets = 0
+    for axon, source in enumerate(netlist.axon_source):
+        if source >= netlist.n_inputs:
+            start, end = core[source - netlist.n_inputs], netlist.core_of_axon()[axon]
+            spikes = trace.counts.spikes[:, source - netlist.n_inputs].sum()
+            packets += spikes
+            if chip[start] != chip[end]:
+                left += spikes
+            else:
+                hops += spikes * abs(netlist.core_tile[start] - netlist.core_tile[end])
+    assert found.costs.between_chips.sum() == left > 0
+    assert found.costs.events["packet"].sum() == packets > left
+    assert found.costs.events["hop_east_west"].sum() == hops > 0
+    assert found.simple == found.detailed == {}
+
+
+def test_the_report_says_what_is_not_modelled(netlist, recordings):
+    _, found = estimate(netlist, SMALL, recordings)
+    report = encode(cost_report(netlist, SMALL, found, bin_s=0.02))
+    left = report["per_inference"]["packets_between_chips"]
+    assert f"links between the 3 chips: {left:,.0f} of " in report["not_modelled"][0]
+    assert report["time"] == []
+    (static,) = report["static"]
+    assert (static["chips"], static["full_speed_j"]) == (3, [])
+    assert static["real_time_j"] == pytest.approx(3 * 104.4e-3 * 40 * 0.02)
+
+
+def test_what_is_refused_of_several_chips(netlist, recordings):
+    for what, call in {
+        "--detail cycle": lambda: estimate(netlist, SMALL, recordings, detail="cycle"),
+        "time": lambda: timing.prepare(netlist, SMALL, SMALL.time[0]),
+        "--to sanafe": lambda: sanafe.cores(netlist, SMALL),
+        "--to sanafe: the netlist": lambda: list(sanafe.export(netlist, SMALL)),
+    }.items():
+        refused(OptionError, f"{what}|takes 3 chips|links between chips|--detail counts", call)
+
+
+def test_the_traffic_of_the_page_has_the_axons_that_the_limits_count_and_the_hops_of_the_placement():
+    target = small_target(core_compartments=4, mesh_tile_cores=1)
+    layout, _ = lay_out(net(), target)
+    made = emit(net(), layout.cores, layout.placement.tiles, target, {})
+    ways = page._traffic(made, target, np.full(made.n_inputs + made.n_compartments, 2.0))
+    used = {(use.name, use.core): use.used for use in measure(made, target)}
+    for core in range(5):
+        assert sum(way.axons for way in ways if way.to == core) == used["core.axons_in", core]
+        assert sum(way.axons for way in ways if way.source == core) == used["core.axons_out", core]
+    assert all(way.packets == 2 * way.axons for way in ways)
+    # without rates every neuron counts as one spike a step
+    assert sum(way.axons * way.hops for way in ways if way.hops is not None) == layout.placement.spike_hops > 0
+    assert [(way.source, way.to) for way in ways if way.source is None] == [(None, 0), (None, 1)]

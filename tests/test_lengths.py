@@ -1,20 +1,30 @@
-"""Recordings of different length in one folder: each decides as it does alone."""
+"""Recordings of different length, and networks whose steps join bins: each decides as on what was cut or joined."""
 
-import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from commands import as_json
 from made_files import CLASSES, TAXELS, own_file, weights
+from numpy.testing import assert_array_equal
+from test_checkpoint import rebuilt
 
 from spikeloom.compiler import lift
+from spikeloom.compiler.dynamics import NO_CLOCKS
+from spikeloom.compiler.errors import FormatError, ModelError
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import run_integer
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes, read_netlist, write_netlist
+from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
 from spikeloom.models.networks.networks import Architecture, SpikingNet
-from spikeloom.models.recordings.events import load_data
-from spikeloom.models.training.evaluate import evaluate, predict
+from spikeloom.models.recordings.events import BIN_S, load_data
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.recordings.release import write_released
+from spikeloom.models.training.evaluate import evaluate
 from spikeloom.models.training.train import train, validation_split
 from spikeloom.runtime.cli import main
+from spikeloom.runtime.studies.stress import bench, disturbances
 
 STEPS = (5, 40, 17, 17, 90, 1)
 
@@ -40,12 +50,6 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "data"
 
 
-def as_json(capsys, *words):
-    capsys.readouterr()
-    assert main([*words, "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
 def files(folder):
     return sorted((folder / "test").iterdir())
 
@@ -62,11 +66,11 @@ def test_silence_after_the_end_would_move_votes(folder):
     assert whole[0, STEPS[0] :].any(), "the network is silent in silence, so nothing is tested here"
 
 
-def test_verify_compares_each_recording_at_its_own_length(folder, capsys):
+def test_verify_compares_each_recording_at_its_own_length(folder):
     words = ("verify", "x.loom", "--checkpoint", "x.pt", "--spec-samples", "1", "--min-agreement", "0")
-    together = as_json(capsys, *words, "--data", "data")
+    together = as_json(*words, "--data", "data")
     assert together["spec_equals_engine"]
-    parts = [as_json(capsys, *words, "--data", str(file)) for file in files(folder)]
+    parts = [as_json(*words, "--data", str(file)) for file in files(folder)]
     for layer, found in together["spikes"].items():
         for key in found:
             assert found[key] == sum(part["spikes"][layer][key] for part in parts), (layer, key)
@@ -76,9 +80,9 @@ def test_verify_compares_each_recording_at_its_own_length(folder, capsys):
     assert together["decision_agreement"] == pytest.approx(np.mean([part["decision_agreement"] for part in parts]))
 
 
-def test_estimate_prices_each_recording_at_its_own_length(folder, capsys):
-    together = as_json(capsys, "estimate", "x.loom", "--data", "data")
-    parts = [as_json(capsys, "estimate", "x.loom", "--data", str(file)) for file in files(folder)]
+def test_estimate_prices_each_recording_at_its_own_length(folder):
+    together = as_json("estimate", "x.loom", "--data", "data")
+    parts = [as_json("estimate", "x.loom", "--data", str(file)) for file in files(folder)]
     assert together["chip_steps"] == max(part["chip_steps"] for part in parts)
     for key in ("neuron_accesses", "neuron_updates", "spikes", "synaptic_operations"):
         alone = [part["per_inference"][key] for part in parts]
@@ -91,7 +95,6 @@ def test_training_sees_each_recording_at_its_own_length(folder):
     network = SpikingNet(Architecture(taxels=TAXELS, classes=CLASSES), adjacency, seed=2)
     together = load_data(folder, "test")
     alone = [load_data(file, taxels=TAXELS) for file in files(folder)]
-    assert predict(network, together).tolist() == [int(predict(network, one)[0]) for one in alone]
     loss, correct = evaluate(network, together)
     parts = [evaluate(network, one) for one in alone]
     assert (loss, correct) == (pytest.approx(np.mean([p[0] for p in parts])), sum(p[1] for p in parts))
@@ -110,3 +113,151 @@ def test_a_training_does_not_depend_on_the_longest_recording(folder):
         fit.append(train(part, part, np.eye(TAXELS), architecture, **options).last)
     for name, array in fit[0].items():
         assert np.array_equal(array, fit[1][name])
+
+
+BINS = 3
+
+
+TRAINED = ("--graph", "manual", "--epochs", "1")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with recordings, the same in longer bins, and a network of each."""
+    folder = tmp_path_factory.mktemp("bins")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(folder)
+        splits = [
+            replace(synthetic_grasps(per_class=2, steps=20, seed=seed, classes=("ring", "box")), split=split)
+            for split, seed in (("train", 1), ("test", 2))
+        ]
+        write_released(folder / "fine", splits)
+        words = (
+            ("data", "convert", "fine", "--join", str(BINS), "-o", "long"),
+            ("train", "--data", "fine", "--join", str(BINS), *TRAINED, "-o", "x.pt"),
+            ("train", "--data", "long", *TRAINED, "-o", "plain.pt"),
+            ("compile", "x.pt", "--calibrate", "fine", "-o", "x.loom"),
+            ("compile", "plain.pt", "--calibrate", "long", "-o", "plain.loom"),
+        )
+        for command in words:
+            assert main([*command, "--json"]) == 0
+    return folder
+
+
+# --- training and files -----------------------------------------------------------------------------------------------
+def test_it_is_the_network_of_recordings_in_longer_bins(place):
+    own, plain = (read_checkpoint(place / f"{name}.pt") for name in ("x", "plain"))
+    assert (own.bins, plain.bins) == (BINS, 1)
+    for ours, theirs in zip((own.hops, own.dense[-1].weight), (plain.hops, plain.dense[-1].weight), strict=True):
+        assert_array_equal(ours, theirs)
+    assert own.training["command"].startswith(f"spikeloom train --data fine --join {BINS} --graph manual ")
+    assert own.training["history"] == plain.training["history"]
+    fine = own.training["data_sha256"]
+    assert fine != plain.training["data_sha256"], "the hash is over what the data set holds"
+
+
+def test_the_netlist_is_that_one_but_for_the_bins(place):
+    own, plain = (read_netlist(place / f"{name}.loom") for name in ("x", "plain"))
+    assert (own.bins, plain.bins) == (BINS, 1)
+    assert netlist_bytes(replace(own, bins=1, provenance={})) == netlist_bytes(replace(plain, provenance={}))
+
+
+@pytest.mark.parametrize("bins", [0, True, "3", 2**20 + 1])
+def test_unusable_bins_are_refused(place, tmp_path, bins):
+    write_netlist(replace(read_netlist(place / "x.loom"), bins=bins), tmp_path / "y.loom")
+    with pytest.raises(FormatError, match="the manifest has no usable bins; compile it again"):
+        read_netlist(tmp_path / "y.loom")
+    content = rebuilt((place / "x.pt").read_bytes(), lambda manifest, _: manifest.update(bins=bins))
+    (tmp_path / "y.pt").write_bytes(content)
+    with pytest.raises(ModelError, match="the manifest has no usable bins"):
+        read_checkpoint(tmp_path / "y.pt")
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (
+            "train --data fine --join 2 --graph manual --epochs 1 --resume -o x.pt",
+            "x.pt: holds another training (other bins); give its options, or another -o",
+        ),
+        (
+            f"train --system {NATIVE} --graph manual --data fine --join 2 -o y.pt",
+            f"--join 2: a network of system {NATIVE} takes bins as they are|spikeloom data convert --join",
+        ),
+        (
+            "verify plain.loom --checkpoint x.pt --data fine",
+            f"netlist and checkpoint disagree|bins of a step {BINS}",
+        ),
+    ],
+)
+def test_other_bins_are_refused(refusal, words, told):
+    line = refusal(*words.split())
+    assert all(part in line for part in told.split("|"))
+
+
+# --- every command that reads recordings ------------------------------------------------------------------------------
+@pytest.mark.usefixtures("spikeloom")
+def test_it_decides_on_the_recordings_what_the_other_does_on_longer_bins():
+    ours, theirs = (
+        as_json("run", f"{name}.loom", "--data", data, "--detail", "counts")
+        for name, data in (("x", "fine"), ("plain", "long"))
+    )
+    assert ours["counts"] == theirs["counts"]
+    assert any(map(any, ours["counts"]))
+    assert ours["predictions"] == theirs["predictions"]
+    own, other = ours["costs"]["per_inference"], theirs["costs"]["per_inference"]
+    assert own["energy_j"] == other["energy_j"]
+    pace, others = (found["costs"]["pace"] for found in (ours, theirs))
+    assert (pace["bin_s"], others["bin_s"]) == (pytest.approx(BINS * BIN_S), BIN_S)
+    for table, watt in pace["real_time_w"].items():
+        assert watt == pytest.approx(others["real_time_w"][table] / BINS)
+
+
+@pytest.mark.parametrize(
+    "words",
+    # what reads recordings in the same way in many runs, bits and lean, is left out: they take long
+    [
+        "verify NET --checkpoint CKPT --data DATA --require E0",
+        "explain NET --checkpoint CKPT --data DATA",
+        "anytime NET --data DATA --calibrate DATA",
+        "stress NET --checkpoint CKPT --data DATA --seeds 1 --only taxels_dead,warm_state,longer,ties_fire",
+    ],
+)
+@pytest.mark.usefixtures("spikeloom")
+def test_other_commands_find_what_they_find_on_longer_bins(words, place):
+    found = []
+    for name, data in (("x", "fine"), ("plain", "long")):
+        names = {"NET": f"{name}.loom", "CKPT": f"{name}.pt", "DATA": data}
+        found.append(_without_names(as_json(*(names.get(word, word) for word in words.split()))))
+    assert found[0] == found[1]
+
+
+def _without_names(value):
+    """A report without names, hashes, commands, times, and what follows from the length of a step."""
+    told = ("calibrated_on", "command", "source", "chosen", "name", "candidate", "data", "provenance", "netlist")
+    told += ("checkpoint", "sha256")
+    if isinstance(value, dict):
+        return {key: _without_names(entry) for key, entry in value.items() if not any(word in key for word in told)}
+    return [_without_names(entry) for entry in value] if isinstance(value, list) else value
+
+
+def test_what_is_done_to_recordings_is_done_before_they_are_joined():
+    events = np.zeros((1, 1, 2, 7), np.uint8)
+    events[..., 4] = 1
+    netlist = SimpleNamespace(bins=3, clocks=NO_CLOCKS)
+    late = bench.whole(disturbances.start_late(events, 2), netlist, np.array([7]))
+    assert late.events.tolist() == [[[0, 0, 1]] * 2]
+    assert late.lengths.tolist() == [3]
+
+
+# --- what else is made of them ----------------------------------------------------------------------------------------
+def test_joined_networks_and_fine_tuned_ones_keep_them(refusal, place):
+    as_json("join", "x.pt", "x.pt", "-o", "both.pt")
+    assert (read_checkpoint(place / "both.pt").bins, read_checkpoint(place / "both.pt").towers) == (BINS, 2)
+    as_json("finetune", "x.pt", "--data", "fine", "--weight-bits", "4", "--epochs", "1", "-o", "tuned.pt")
+    as_json("finetune", "plain.pt", "--data", "long", "--weight-bits", "4", "--epochs", "1", "-o", "plain-tuned.pt")
+    tuned, plain = (read_checkpoint(place / f"{name}.pt") for name in ("tuned", "plain-tuned"))
+    assert (tuned.bins, plain.bins, len(tuned.forms)) == (BINS, 1, 4)
+    assert_array_equal(tuned.dense[0].weight, plain.dense[0].weight)
+    assert tuned.training["data_sha256"] == read_checkpoint(place / "x.pt").training["data_sha256"]
+    assert "bins of a step (plain.pt)" in refusal("join", "x.pt", "plain.pt", "-o", "z.pt")

@@ -1,25 +1,36 @@
 """The one interface of all chips: what it returns is the simulator's, and a further chip is a folder."""
 
 import sys
-from dataclasses import replace
-from pathlib import Path
+from importlib import resources
 
 import numpy as np
 import pytest
-from random_netlists import lively
+from oracles import refused
+from random_networks import random_checkpoint, ring
 from zoo import specimen
 
-from spikeloom.compiler import targets
+from spikeloom.compiler import compile_network, targets
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.targets.base import shipped
-from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.compiler.interpret import channels_last, run_integer
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.base import (
+    CROSSBARS,
+    LATENCIES,
+    known_targets,
+    load_target,
+    read_target,
+    shipped,
+    with_tables,
+)
+from spikeloom.compiler.targets.loihi1.legalize import REMEDIES
+from spikeloom.compiler.targets.loihi1.netlist import write_netlist
 from spikeloom.runtime import machines
-from spikeloom.runtime.machines.base import machine_for, machine_of
+from spikeloom.runtime.machines.base import machine_for
 from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
-from spikeloom.runtime.machines.votes import class_counts
+from spikeloom.runtime.machines.votes import class_counts, readout_counts
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import terminal
 
@@ -90,9 +101,26 @@ def test_what_is_compared_with_a_float_model():
     np.testing.assert_array_equal(ran.operations[:, -1], price.synaptic_operations)
 
 
-TOY = """
+PASSES = """
+import numpy as np
+from dataclasses import replace
+from spikeloom.compiler.passes.prune import without_channels
+from spikeloom.compiler.pipeline import Pass
+from spikeloom.compiler.targets.loihi1 import passes
+from spikeloom.compiler.targets.loihi1.options import Options
+
+def unplug(done):
+    return replace(done, integer=without_channels(done.integer, np.arange(done.integer.input.size) == 0))
+
+PASSES = (*passes.FLOATS, Pass(name="unplug", does="ignores channel 0", keeps="the rest", apply=unplug),
+          *passes.INTEGERS, *passes.LAYOUT)
+
+def start(source, options, target):
+    return passes.start(source, options, target)[0], PASSES
+"""
+MACHINE = """
 from spikeloom.runtime.machines.loihi1.machine import Loihi
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 
 class Toy(Loihi):
     details = ("counts",)
@@ -105,25 +133,205 @@ def load(path):
 """
 
 
-def test_a_third_chip_is_a_folder(tmp_path, monkeypatch):
-    (tmp_path / "machines" / "toy").mkdir(parents=True)
-    (tmp_path / "machines" / "toy" / "machine.py").write_text(TOY)
-    (tmp_path / "targets" / "toy").mkdir(parents=True)
-    limits = (Path(targets.__path__[0]) / "loihi1" / "chip.toml").read_text("utf-8")
-    (tmp_path / "targets" / "toy" / "chip.toml").write_text(limits.replace('"loihi1"', '"toy"'))
-    monkeypatch.setattr(targets, "__path__", [*targets.__path__, str(tmp_path / "targets")])
-    monkeypatch.setattr(machines, "__path__", [*machines.__path__, str(tmp_path / "machines")])
+def test_a_third_chip_is_a_folder_of_the_compiler_and_one_of_the_machines(tmp_path, monkeypatch):
+    """With cores of eight neurons and one pass more."""
+    limits = (resources.files(targets) / "loihi1" / "chip.toml").read_text("utf-8").replace('"loihi1"', '"toy"')
+    limits = limits.replace("core.compartments = { value = 1024", "core.compartments = { value = 8")
+    for package, texts in ((targets, {"chip.toml": limits, "passes.py": PASSES}), (machines, {"machine.py": MACHINE})):
+        folder = tmp_path / package.__name__ / "toy"
+        folder.mkdir(parents=True)
+        for name, text in texts.items():
+            (folder / name).write_text(text)
+        monkeypatch.setattr(package, "__path__", [*package.__path__, str(folder.parent)])
     shipped.cache_clear()
     try:
-        write_netlist(replace(lively(), target="toy"), tmp_path / "net.loom")
+        done = compile_network(expand(random_checkpoint(), ring(5)), target="toy")
+        assert [step.name for step in load_target("toy").passes][4] == "unplug"
+        assert np.diff(done.netlist.core_compartments).max() <= 8
+        assert not (done.netlist.axon_source == 0).any()
+        write_netlist(done.netlist, tmp_path / "net.loom")
         machine = machine_for(tmp_path / "net.loom")
         assert (type(machine).__name__, machine.target.name) == ("Toy", "toy")
-        events = (np.random.default_rng(0).random((4, machine.netlist.taxels, 2, 12)) < 0.3).astype(np.uint8)
-        np.testing.assert_array_equal(machine.run(events).votes, machine_of(lively()).run(events).votes)
+        events = (np.random.default_rng(0).random((4, 5, 2, 12)) < 0.3).astype(np.uint8)
+        expected = run_integer(done.integer, channels_last(events)).spikes[-1]
+        votes = readout_counts(done.integer.readout, done.integer.classes, expected)
+        np.testing.assert_array_equal(machine.run(events).votes, votes)
+        assert votes.any()
         assert integer_machine(machine).check(events[:1]) == 0
         with pytest.raises(OptionError, match="toy has no such price model; allowed: counts"):
             machine.price(events, bin_s=0.02, detail="cycle")
     finally:
         shipped.cache_clear()
-        for name in [name for name in sys.modules if name.startswith("spikeloom.runtime.machines.toy")]:
+        for name in [name for name in sys.modules if ".toy" in name]:
             del sys.modules[name]
+
+
+def table(text):
+    """Values by name, a line of each kind."""
+    words = text.split()
+    return {name: float(value) for name, value in zip(words[::2], words[1::2], strict=True)}
+
+
+# 16,384 words of 64 bits are 128 KiB
+LIMITS = table("""
+    core.compartments 1024  core.axons_in 4096  core.axons_out 4096  core.synapse_words 16384  core.threshold_slots 8
+    core.synapse_formats 7  core.compartment_configs 32  core.dense_base 256  chip.cores 128
+    synapse.block 64  synapse.block_header_bits 10  synapse.word_bits 64
+    mesh.tile_cores 4  mesh.width 8  mesh.height 4
+""")
+CHOICES = {
+    "synapse.weight_bits": (2, 3, 4, 5, 6, 8),
+    "synapse.index_bits": (0, 6, 7, 8, 9, 10, 11, 12),
+    "synapse.exponent": (-1, 0, 1, 2, 3, 4, 5, 6, 7),
+}
+DAVIES = table("""
+    synaptic_operation 23.6  neuron_idle 52  neuron_active 81  packet 1.7  hop_east_west 3  hop_north_south 4
+""")
+SANAFE = table("""
+    synaptic_operation_dense 35.5  synaptic_operation_sparse 33.6  neuron_idle 51.2  neuron_active 72.8  spike 69.3
+    packet 111  hop_east_west 3  hop_north_south 4.2
+""")
+TIME = table("""
+    neuron_access 6  neuron_update 3.7  spike 30  axon_out 5.1  axon_in 16  synaptic_operation_dense 3.8
+    synaptic_operation_sparse 4.7  hop_east_west 4.1  hop_north_south 6.5
+""")
+BARRIERS = {1: 600, 2: 1000, 4: 1400, 29: 1800}
+
+
+def test_limits_are_the_published_ones():
+    target = load_target("loihi1")
+    assert (target.name, target.title) == ("loihi1", "Intel Loihi 1")
+    assert {rule: entry.value for rule, entry in target.limits.items()} == LIMITS
+    assert [target.limit(rule) for rule in LIMITS] == list(LIMITS.values())
+    assert dict(target.choices) == CHOICES
+    assert {name: power.value for name, power in target.static.items()} == {"frady2020": 104.4}
+    assert LIMITS["mesh.width"] * LIMITS["mesh.height"] * LIMITS["mesh.tile_cores"] == LIMITS["chip.cores"]
+    assert set(REMEDIES) == {rule for rule in LIMITS if rule.startswith(("core.", "chip."))}
+
+
+@pytest.mark.parametrize(("table", "prices"), [("davies2018", DAVIES), ("sanafe", SANAFE)])
+def test_energies_are_the_published_ones(table, prices):
+    found = {entry.name: entry for entry in load_target("loihi1").energy}
+    assert set(found) == {"davies2018", "sanafe"}
+    assert {event: price.value for event, price in found[table].prices.items()} == prices
+    assert {price.unit for price in found[table].prices.values()} == {"pJ"}
+    for event, picojoule in prices.items():
+        assert found[table].joule(event) == pytest.approx(picojoule * 1e-12, rel=1e-15)
+    with pytest.raises(KeyError):  # unknown, not free
+        found["davies2018"].joule("spike")
+
+
+def test_latencies_are_the_published_ones():
+    (table,) = load_target("loihi1").time
+    assert table.name == "sanafe"
+    assert set(TIME) == set(LATENCIES)
+    assert {event: entry.value for event, entry in table.latencies.items()} == TIME
+    assert {least: entry.value for least, entry in table.barriers.items()} == BARRIERS
+    assert {entry.unit for entry in (*table.latencies.values(), *table.barriers.values())} == {"ns"}
+    assert (table.link_buffer.value, table.link_buffer.unit) == (16, "messages per link")
+    assert [table.picoseconds(event) for event in TIME] == [round(1000 * nanoseconds) for nanoseconds in TIME.values()]
+    barriers = [table.barrier(tiles) for tiles in (1, 2, 3, 4, 28, 29, 32)]
+    assert barriers == [600_000, *[1_000_000] * 2, *[1_400_000] * 2, *[1_800_000] * 2]
+
+
+def test_known_targets_are_the_folders():
+    assert known_targets() == ("loihi1", "truenorth")
+    assert known_targets(CROSSBARS) == ("truenorth",)
+
+
+# -- files that are wrong ----------------------------------------------------------------------------------------------
+
+TEXT = (resources.files("spikeloom.compiler.targets") / "loihi1" / "chip.toml").read_text("utf-8")
+
+
+WRONG = [
+    ('title = "Intel Loihi 1"\n', "", "title: missing"),
+    ("core.axons_in = { value = 4096,", "core.axons_in = { value = -1,", "limits.core.axons_in: value is -1, a finite"),
+    ("core.axons_in = { value = 4096,", "core.axons_in = { unt = 2, value = 4096,", "core.axons_in: is {'unt': 2"),
+    ("mesh.height = { value = 4,", "mesh.height = { value = nan,", "mesh.height: value is nan, a finite"),
+    ("mesh.height = { value = 4,", 'mesh.height = { value = "4",', "mesh.height: value is '4', a finite"),
+    ("synapse.word_bits = { value = 64,", "synapse.word_bits = {", "synapse.word_bits: is {'unit'"),
+    ('spike = { value = 69.3, unit = "pJ"', 'spkie = { value = 69.3, unit = "pJ"', "sanafe.spkie: unknown, allowed"),
+    ('spike = { value = 69.3, unit = "pJ"', 'spike = { value = 69, unit = "nJ"', "spike: unit is 'nJ', allowed is"),
+    ('spike = { value = 69.3, unit = "pJ"', 'spike = { value = inf, unit = "pJ"', "sanafe.spike: value is inf"),
+    ("neuron_access = {", "neuron_acess = {", "time.sanafe.neuron_acess: unknown|neuron_access"),
+    ('neuron_access = { value = 6.0, unit = "ns"', 'neuron_access = { value = 6.0, unit = "s"', "unit is 's'"),
+    ("link_buffer = {", "#", "time.sanafe: lacks link_buffer"),
+    ("barrier.1 = {", "barrier.3 = {", "time.sanafe: lacks barrier.1"),
+    ("barrier.2 = {", "barrier.two = {", "time.sanafe: lacks barrier.1, and others with a number"),
+    ("name = ", "name = \n", "is not TOML"),
+    ('title = "SANA-FE\'s fit to a Nahuku board"\nneuron', "neuron", "time.sanafe: lacks its title"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "words"), WRONG)
+def test_a_wrong_entry_is_named(tmp_path, old, new, words):
+    assert TEXT.count(old) == 1
+    (tmp_path / "x.toml").write_text(TEXT.replace(old, new), "utf-8")
+    refused(OptionError, f"{tmp_path / 'x.toml'}: |{words}", read_target, tmp_path / "x.toml")
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    refused(OptionError, "cannot be read", read_target, tmp_path / "no.toml")
+
+
+# -- tables of one's own -----------------------------------------------------------------------------------------------
+
+MINE = """
+[energy.mine]
+title = "Measured in our lab"
+neuron_active = { value = 80.0, unit = "pJ", source = "board 7" }
+"""
+
+
+def test_tables_by_name_or_from_a_file(tmp_path):
+    chip = load_target("loihi1")
+    assert [table.name for table in with_tables(chip, "davies2018").energy] == ["davies2018"]
+    assert with_tables(chip, "davies2018").time == chip.time
+    (tmp_path / "mine.toml").write_text(MINE)
+    found = with_tables(chip, str(tmp_path / "mine.toml"))
+    assert [(table.name, table.joule("neuron_active")) for table in found.energy] == [("mine", 80e-12)]
+    assert (found.time, found.limits, found.static) == (chip.time, chip.limits, chip.static)
+
+
+def test_tables_that_are_not_there_or_wrong(tmp_path):
+    chip, path = load_target("loihi1"), tmp_path / "mine.toml"
+    refused(OptionError, "--table davis: unknown|davies2018, sanafe|.toml", with_tables, chip, "davis")
+    refused(OptionError, f"{path}: cannot be read", with_tables, chip, str(path))
+    path.write_text("limits = 3")
+    refused(OptionError, "holds limits|[energy.NAME]|[time.NAME]", with_tables, chip, str(path))
+    path.write_text("")
+    refused(OptionError, "holds nothing|[energy.NAME]", with_tables, chip, str(path))
+    path.write_text(MINE.replace("80.0", "-80.0"))
+    refused(OptionError, "energy.mine.neuron_active: value is -80.0", with_tables, chip, str(path))
+    path.write_text(MINE.replace("[energy.mine]", "[energy.mine]\nhopp = 1"))
+    refused(OptionError, "energy.mine.hopp: unknown", with_tables, chip, str(path))
+
+
+# -- crossbars ---------------------------------------------------------------------------------------------------------
+
+TRUENORTH = table("""
+    core.axons 256  core.neurons 256  core.axon_types 4  chip.cores 4096  mesh.width 64  mesh.height 64  mesh.reach 255
+    neuron.weight_bits 9  neuron.leak_bits 9  neuron.threshold_bits 18  neuron.reset_bits 9
+    neuron.membrane_bits 20  neuron.targets 1  neuron.delay 15  tick.length 1000
+""")
+UNVERIFIED = {"neuron.leak_bits", "neuron.threshold_bits", "neuron.reset_bits"}
+
+
+def test_truenorth_limits_with_source_and_confidence():
+    target = load_target("truenorth")
+    assert {rule: target.limit(rule) for rule in target.limits} == TRUENORTH
+    assert all(entry.source and entry.confidence for entry in target.limits.values())
+    assert {rule for rule, entry in target.limits.items() if entry.confidence == "unverified"} == UNVERIFIED
+    assert not target.choices
+    assert not target.time
+
+
+def test_truenorth_energy_has_two_readings_and_only_one_has_a_floor():
+    target = load_target("truenorth")
+    read = {table.name: (table.joule("synaptic_event"), table.floor_w) for table in target.energy}
+    assert read == {
+        "all_in": (pytest.approx(26e-12), None),
+        "marginal": (pytest.approx(2.3e-12), pytest.approx(0.0644)),
+    }
+    assert {name: power.value for name, power in target.static.items()} == {"idle_0v70": 42.0, "typical_0v75": 65.0}

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 import torch
-from made_modules import CLASSES, NETS, TAXELS, AllSteps, example_of, mlp, seeded
+from made_modules import CLASSES, NETS, TAXELS, AllSteps, OneStep, example_of, mlp, seeded
 from oracles import refused
 from torch import nn
 
+from spikeloom.compiler import compile_network
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.interpret import channels_last, run_float
-from spikeloom.models.networks.lif import LIF, OneStep, reset
-from spikeloom.models.networks.module import compile_module, module_network
+from spikeloom.models.networks.lif import LIF, reset
+from spikeloom.models.networks.module import module_network
 from spikeloom.runtime.equivalence.verify import verify
 
 STEPS = 12
@@ -93,11 +94,11 @@ def test_layers_beside_each_other():
     network = module_network(net, torch.zeros(1, 4))
     assert [(p.pre, p.post) for p in network.projections] == [(-1, 0), (-1, 1), (0, 2), (1, 2)]
     events = events_of(network)
-    found = verify(compile_module(net, torch.zeros(1, 4)).netlist, network, events, np.arange(3) % 2, tuple("abc"))
+    found = verify(compile_network(network).netlist, network, events, np.arange(3) % 2, tuple("abc"))
     assert found.spec_equals_engine
 
 
-def test_without_a_batch_axis_inputs_are_probed_one_by_one():
+def test_an_example_may_have_no_batch_axis():
     class Flat(nn.Module):
         def __init__(self):
             super().__init__()

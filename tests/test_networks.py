@@ -1,4 +1,4 @@
-"""Layers and networks against step-by-step code, and the float reference against the released outputs."""
+"""Networks of every system against step-by-step code, in files and on the chip; and the released outputs."""
 
 import json
 import math
@@ -11,12 +11,27 @@ from hypothesis import strategies as st
 from made_files import events as made_events
 from made_files import small_checkpoint
 from numpy.testing import assert_allclose, assert_array_equal
+from oracles import probed
+from scipy import sparse
+from test_dynamics import surrogate_spike
 
-from spikeloom.models.graphs import build_graph, normalised_adjacency
-from spikeloom.models.networks.layers import lif, spike_linear
+from spikeloom.compiler import Options, compile_network, lift
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.passes.expand import Factored, expand
+from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, TACTILESGNET, Grid, in_order
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.models.graphs import NEUTOUCH, build_graph, normalised_adjacency
+from spikeloom.models.networks.checkpoint import save_checkpoint
+from spikeloom.models.networks.layers import filter_places, lif, spike_linear
 from spikeloom.models.networks.networks import Architecture, SpikingNet
+from spikeloom.models.networks.quantised import quantised_spikes
 from spikeloom.models.networks.reference import BATCH, float_membranes, float_spikes
+from spikeloom.models.networks.surrogate import RECTANGLE
 from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.systems import filters_of, grid_cells, propagation_of, sensor_grid, taxels_alone
+from spikeloom.models.training.finetune import finetune
+from spikeloom.runtime.equivalence.verify import verify
 
 BETA, THETA = 0.2, 0.5
 
@@ -100,52 +115,6 @@ def test_initial_weights_follow_the_seed_and_leave_the_global_random_state_alone
 
 
 # --- the reference of a checkpoint ------------------------------------------------------------------------------------
-def reference_step_by_step(checkpoint, adjacency, recording, dtype):
-    """Spikes and membranes of one recording, (steps, neurons) per layer, in plain loops as the equations say."""
-    a, theta, beta = adjacency.astype(dtype), dtype(checkpoint.theta), dtype(checkpoint.beta)
-    stages = [dense.weight.astype(dtype) for dense in checkpoint.dense]
-    biases = [dense.bias.astype(dtype) for dense in checkpoint.dense]
-    sizes = [len(a) * checkpoint.hops.shape[1], *(len(bias) for bias in biases)]
-    u, s = [np.zeros(size, dtype) for size in sizes], [np.zeros(size, dtype) for size in sizes]
-    spikes, membranes = [[] for _ in sizes], [[] for _ in sizes]
-    for t in range(recording.shape[2]):
-        x = recording[:, :, t].astype(dtype)  # (taxels, channels)
-        total = x @ checkpoint.hops[0].astype(dtype).T
-        for hop in checkpoint.hops[1:]:
-            x = a @ x
-            total = total + x @ hop.astype(dtype).T
-        signal = (total + checkpoint.conv_bias.astype(dtype)).reshape(-1)  # taxel-major
-        for layer in range(len(sizes)):
-            u[layer] = beta * u[layer] * (1 - s[layer]) + signal
-            s[layer] = (u[layer] > theta).astype(dtype)
-            membranes[layer].append(u[layer].copy())
-            spikes[layer].append(s[layer].astype(bool))
-            if layer < len(stages):
-                signal = stages[layer] @ s[layer] + biases[layer]
-    return [np.array(trace) for trace in spikes], [np.array(trace) for trace in membranes]
-
-
-@pytest.mark.parametrize(("name", "dtype"), [("float32", np.float32), ("float64", np.float64)])
-@pytest.mark.parametrize("constants", [{}, {"beta": 0.9, "theta": 0.8}, {"beta": 0.0, "theta": 0.1}])
-def test_against_the_equations(tmp_path, name, dtype, constants):
-    checkpoint, adjacency = small_checkpoint(tmp_path, **constants)
-    recordings = made_events(3)
-    spikes = float_spikes(checkpoint, adjacency, recordings, dtype=name)
-    membranes = float_membranes(checkpoint, adjacency, recordings, dtype=name)
-    assert list(spikes) == list(membranes) == ["conv1", "fc1", "fc2", "fc3"]
-    # sums may be added in another order than here, so a membrane beside the threshold could fall to either side;
-    # none does on these recordings
-    tolerance = 1e-5 if name == "float32" else 1e-12
-    for sample, recording in enumerate(recordings):
-        expected = reference_step_by_step(checkpoint, adjacency, recording, dtype)
-        for layer, one, wanted, membrane in zip(spikes, spikes.values(), *expected, strict=True):
-            assert one.dtype == np.bool_
-            assert_array_equal(one[sample], wanted, err_msg=layer)
-            assert membranes[layer].dtype == dtype
-            assert_allclose(membranes[layer][sample], membrane, rtol=tolerance, atol=tolerance)
-    assert all(0 < trace.mean() < 1 for trace in spikes.values())
-
-
 def test_recordings_do_not_influence_each_other(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     recordings = made_events(4, samples=BATCH + 3)  # two batches
@@ -157,21 +126,12 @@ def test_recordings_do_not_influence_each_other(tmp_path):
 
 
 # -- the released checkpoint -------------------------------------------------------------------------------------------
-@pytest.fixture(scope="module")
-def released_run(released_checkpoint, objects_zip, shared_dir):
-    """Checkpoint, propagation matrix, recordings, float32 spikes and the published outputs."""
-    from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-
-    checkpoint, graph = read_checkpoint(released_checkpoint), build_graph("manual")
-    adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
+@pytest.mark.recordings
+def test_every_released_spike_count(released_checkpoint, objects_zip, shared_dir):
+    checkpoint = read_checkpoint(released_checkpoint)
     data = load_data(objects_zip, "test", classes=checkpoint.classes, taxels=checkpoint.taxels)
     expected = json.loads((shared_dir / "checkpoints" / "objects_manual.expected.json").read_text())
-    return checkpoint, adjacency, data, float_spikes(checkpoint, adjacency, data.events), expected
-
-
-@pytest.mark.recordings
-def test_every_released_spike_count(released_run):
-    _, _, data, spikes, expected = released_run
+    spikes = float_spikes(checkpoint, adjacency_of(), data.events)
     assert list(data.files) == expected["files"]
     assert data.labels.tolist() == expected["labels"]
     counts = spikes["fc3"].sum(axis=1)
@@ -179,3 +139,237 @@ def test_every_released_spike_count(released_run):
     predictions = counts.argmax(axis=1)
     assert predictions.tolist() == expected["predictions"]
     assert int(np.count_nonzero(predictions == data.labels)) == expected["right"] == 127
+
+
+NEW = (MLP, GCN, GRID_CNN)
+FORMED = ((TACTILESGNET, "none"), (MLP, "none"), (GCN, "none"), (GRID_CNN, "none"), (GRID_CNN, "same"))
+MANUAL = build_graph("manual")
+FORMS = {"none": sensor_grid(NEUTOUCH, "none"), "same": sensor_grid(NEUTOUCH, "same")}
+
+
+def seen_by(system, padding="none"):
+    return propagation_of(system, MANUAL.edges, 39, FORMS[padding], filters_of(system, 39, 3))
+
+
+def network_of(system, *, seed=1, gain=3.0, padding="none", features=4, hidden=(8, 6), classes=4) -> SpikingNet:
+    """A small network of random weights, lively enough to spike in every layer."""
+    sizes = Architecture(taxels=39, classes=classes, features=features, hidden=hidden, system=system)
+    network = SpikingNet(sizes, seen_by(system, padding), seed=seed)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.mul_(gain)
+    return network
+
+
+def events_of(seed, samples=3, steps=25, rate=0.15):
+    return (np.random.default_rng(seed).random((samples, 39, 2, steps)) < rate).astype(np.uint8)
+
+
+def saved(tmp_path, network, *, padding="none", weights=None, **more):
+    system = network.architecture.system
+    graph = MANUAL if system in GRAPH_SYSTEMS else taxels_alone(NEUTOUCH)
+    more = {"beta": 0.2, "theta": 0.5, "grid": FORMS[padding] if system == GRID_CNN else None} | more
+    sets = {"last": weights or network.export_weights()}
+    save_checkpoint(tmp_path / "x.pt", sets, graph, training={}, system=system, **more)
+    return read_checkpoint(tmp_path / "x.pt")
+
+
+# --- plain code, as a script with torch's own layers would have it ---------------------------------------------------
+def plain_first(system, state, *, padding="none"):
+    """Current of the first layer of one step, a function of (taxels, channels), from a released-style state dict."""
+    if system == MLP:
+        return lambda x: torch.nn.functional.linear(x.reshape(-1), state["fc0.weight"], state["fc0.bias"])
+    if system == GCN:
+        source, target = torch.tensor(np.concatenate([MANUAL.edges, np.arange(39)[:, None].repeat(2, 1)])).T
+        degree = torch.zeros(39, dtype=torch.float64).index_add_(
+            0, target, torch.ones(len(target), dtype=torch.float64)
+        )
+        norm = (degree[source] * degree[target]) ** -0.5
+
+        def gcn(x):
+            mapped = x @ state["conv1.lin.weight"].t()
+            return (torch.zeros_like(mapped).index_add_(0, target, norm[:, None].to(x) * mapped[source])
+                    + state["conv1.bias"]).reshape(-1)  # fmt: skip
+
+        return gcn
+    if system == TACTILESGNET:
+        adjacency = torch.tensor(adjacency_of())
+
+        def tag(x):
+            total = x @ state["conv1.hops"][0].t()
+            for hop in state["conv1.hops"][1:]:
+                x = adjacency.to(x) @ x
+                total = total + x @ hop.t()
+            return (total + state["conv1.bias"]).reshape(-1)
+
+        return tag
+
+    def convolution(x):
+        picture = torch.zeros(2, 13, 19, dtype=x.dtype)
+        for taxel, (a, b) in enumerate(NEUTOUCH):
+            picture[:, round(a) + 6, round(b) + 9] = x[taxel]
+        stride, pad = (2, 0) if padding == "none" else (1, 1)
+        weight, bias = state["conv1.weight"], state["conv1.bias"]
+        return torch.nn.functional.conv2d(picture, weight, bias, stride=stride, padding=pad).reshape(-1)
+
+    return convolution
+
+
+def state_of(network) -> dict[str, torch.Tensor]:
+    """Weights of a network under the keys of a released-style file."""
+    weights = {name: torch.tensor(array) for name, array in network.export_weights().items()}
+    if network.architecture.system == TACTILESGNET:
+        return weights
+    hops, bias = weights.pop("conv1.hops"), weights.pop("conv1.bias")
+    match network.architecture.system:
+        case "mlp":
+            first = {"fc0.weight": hops.permute(1, 0, 2).reshape(len(bias), -1), "fc0.bias": bias}
+        case "gcn":
+            first = {"conv1.lin.weight": hops[0], "conv1.bias": bias}
+        case _:
+            first = {"conv1.weight": hops.permute(1, 2, 0).reshape(len(bias), 2, 3, 3), "conv1.bias": bias}
+    return first | weights
+
+
+def plain_run(system, state, events, *, padding="none", beta=0.2, theta=0.5):
+    """Spikes and membranes of every layer, step by step, of one recording (taxels, channels, steps)."""
+    stages = [plain_first(system, state, padding=padding)]
+    stages += [
+        lambda x, k=k: torch.nn.functional.linear(x, state[f"fc{k}.weight"], state[f"fc{k}.bias"]) for k in (1, 2, 3)
+    ]
+    kind, fire = state["fc1.weight"].dtype, surrogate_spike(RECTANGLE)
+    membranes, spikes, trace = [0.0] * 4, [torch.zeros(())] * 4, []
+    for t in range(events.shape[-1]):
+        x = torch.tensor(events[..., t], dtype=kind)
+        for layer, stage in enumerate(stages):
+            membranes[layer] = membranes[layer] * beta * (1 - spikes[layer]) + stage(x)
+            spikes[layer] = x = fire(membranes[layer], theta)
+        trace.append((list(spikes), list(membranes)))
+    return [[torch.stack([step[kind][layer] for step in trace]) for layer in range(4)] for kind in (0, 1)]
+
+
+# --- the first layer -------------------------------------------------------------------------------------------------
+@given(
+    kernel=st.integers(1, 4),
+    stride=st.integers(1, 3),
+    padding=st.integers(0, 2),
+    rows=st.integers(4, 7),
+    columns=st.integers(4, 6),
+    seed=st.integers(0, 99),
+)
+@settings(max_examples=40, deadline=None)
+def test_a_window_over_a_grid_equals_torchs_convolution(kernel, stride, padding, rows, columns, seed):
+    rng = np.random.default_rng(seed)
+    cells = rng.integers((rows, columns), size=(6, 2))
+    grid = Grid(rows=rows, columns=columns, stride=stride, padding=padding, cells=cells)
+    x, filters, bias = rng.normal(size=(5, 6, 2)), rng.normal(size=(kernel**2, 3, 2)), rng.normal(size=3)
+    picture = np.zeros((5, 2, rows, columns))
+    for taxel, (row, column) in enumerate(cells):
+        picture[:, :, row, column] += x[:, taxel]
+    weight = torch.tensor(filters).permute(1, 2, 0).reshape(3, 2, kernel, kernel)
+    expected = torch.nn.functional.conv2d(torch.tensor(picture), weight, torch.tensor(bias), stride, padding)
+    assert grid.places(kernel) == tuple(expected.shape[2:])
+    found = filter_places(
+        torch.tensor(x)[:, None], torch.tensor(grid.propagation(kernel)), torch.tensor(filters), torch.tensor(bias)
+    )
+    assert_allclose(in_order(GRID_CNN, found.view(5, -1, 3).permute(1, 2, 0)).T, expected.flatten(1), atol=1e-12)
+
+
+def test_the_grid_over_the_built_in_sensor():
+    cells = grid_cells()
+    assert_array_equal(cells, np.rint(NEUTOUCH) + np.array([6, 9]))
+    assert len({tuple(cell) for cell in cells.tolist()}) == 39, "no two taxels share a cell"
+    assert [(g.rows, g.columns, *g.places(3)) for g in FORMS.values()] == [(13, 19, 6, 9), (13, 19, 13, 19)]
+    assert [64 * g.places(3)[0] * g.places(3)[1] for g in FORMS.values()] == [3456, 15808]
+
+
+@pytest.mark.parametrize(("system", "padding"), FORMED)
+def test_spikes_and_gradients_equal_plain_code(system, padding):
+    events = events_of(4, samples=1)
+    for seed in range(20):
+        network = network_of(system, seed=seed, padding=padding).double()
+        network.adjacency = torch.tensor(seen_by(system, padding))
+        state = {name: tensor.double().requires_grad_() for name, tensor in state_of(network).items()}
+        expected, _ = plain_run(system, state, events[0], padding=padding)
+        if all(layer.any() and not layer.all() for layer in expected):
+            break
+    rates = network(torch.tensor(events.transpose(3, 0, 1, 2), dtype=torch.float64))
+    assert_array_equal(rates[0].detach(), expected[-1].mean(0).detach())
+    assert all(layer.any() and not layer.all() for layer in expected), "some layer never or always spikes"
+    target = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
+    ((rates[0] - target) ** 2).mean().backward()
+    ((expected[-1].mean(0) - target) ** 2).mean().backward()
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.copy_(parameter.grad)
+    for name, found in state_of(network).items():  # gradients have the order of the weights
+        assert_allclose(found, state[name].grad, rtol=1e-5, atol=1e-9, err_msg=name)
+        assert found.any()
+
+
+@pytest.mark.parametrize(("system", "bound"), [(MLP, 78**-0.5), (GCN, (6 / 66) ** 0.5), (GRID_CNN, 18**-0.5)])
+def test_initial_weights_are_those_of_the_usual_layers(system, bound):
+    weights = network_of(system, gain=1.0, features=64).export_weights()
+    assert 0.9 * bound < np.abs(weights["conv1.hops"]).max() <= bound
+    assert weights["conv1.bias"].any() == (system != GCN)
+    again = network_of(system, gain=1.0, features=64).export_weights()
+    assert all(np.array_equal(weights[name], again[name]) for name in weights)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("constants", [(0.2, 0.5), (0.9, 0.8), (0.0, 0.1)])
+@pytest.mark.parametrize(("system", "padding"), FORMED)
+def test_spikes_and_membranes_are_those_of_plain_torch(tmp_path, system, padding, constants, dtype):
+    beta, theta = constants
+    network = network_of(system, padding=padding)
+    state = {name: tensor.to(getattr(torch, dtype)) for name, tensor in state_of(network).items()}
+    found, events = saved(tmp_path, network, padding=padding, beta=beta, theta=theta), events_of(7)
+    spikes = float_spikes(found, seen_by(system, padding), events, dtype=dtype)
+    membranes = float_membranes(found, seen_by(system, padding), events, dtype=dtype)
+    assert list(spikes) == list(membranes) == ["conv1", "fc1", "fc2", "fc3"]
+    tolerance = 1e-5 if dtype == "float32" else 1e-12
+    for sample, recording in enumerate(events):
+        plain = plain_run(system, state, recording, padding=padding, beta=beta, theta=theta)
+        for layer, fired, membrane in zip(spikes, *plain, strict=True):
+            # sums may be added in another order; no membrane of these recordings is so near to its threshold
+            assert_array_equal(spikes[layer][sample], fired.bool(), err_msg=layer)
+            assert membranes[layer].dtype == dtype
+            assert_allclose(membranes[layer][sample], membrane, rtol=tolerance, atol=tolerance)
+    assert all(0 < spikes[layer].mean() < 1 for layer in ("conv1", "fc1"))
+
+
+# --- to the chip -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("system", NEW)
+def test_expansion_equals_probing_the_layer(tmp_path, system):
+    """The general way: any affine stage, here plain torch code, by its responses to unit vectors."""
+    network = network_of(system)
+    checkpoint = saved(tmp_path, network)
+    first = plain_first(system, {name: tensor.double() for name, tensor in state_of(network).items()})
+    weight, bias = probed(lambda batch: np.stack([first(torch.tensor(row).view(39, 2)).numpy() for row in batch]), 78)
+    expanded = expand(checkpoint, seen_by(system))
+    assert expanded.populations[0].name == "conv1"
+    assert_allclose(expanded.projections[0].weight.toarray(), weight, atol=1e-12)
+    assert_allclose(expanded.populations[0].bias, bias, atol=1e-12)
+    assert isinstance(expanded.projections[0].weight, sparse.csr_array)
+    assert expanded.projections[0].weight.nnz == np.count_nonzero(weight)
+
+
+@pytest.mark.parametrize(("system", "bits"), [(TACTILESGNET, 2), (TACTILESGNET, 4), *((system, 4) for system in NEW)])
+def test_fine_tuned_on_the_chips_integers_they_are_the_chip(tmp_path, system, bits):
+    network, seen = network_of(system), seen_by(system)
+    checkpoint = saved(tmp_path, network)
+    data = [synthetic_grasps(per_class=2, steps=12, seed=seed) for seed in (1, 2)]
+    training, test = (grasps.part(grasps.labels < 4) for grasps in data)
+    tuned = finetune(checkpoint, seen, training, test, load_target("loihi1"), bits=[bits], epochs=2)
+    assert system != TACTILESGNET or bits == 2 or tuned.history[-1].loss < tuned.history[0].loss
+    again = saved(tmp_path, network, weights=tuned.weights, forms=tuned.forms)
+    for ours, theirs in zip(again.forms, tuned.forms, strict=True):
+        assert (ours.bits, ours.exponents) == (theirs.bits, theirs.exponents) == (bits, theirs.exponents)
+        assert_array_equal(ours.threshold, theirs.threshold)
+    netlist = compile_network(expand(again, seen), Options(forms=again.forms)).netlist
+    assert {projection.bits for projection in lift(netlist).projections} == {bits}
+    verdict = verify(netlist, Factored(again, seen), test.events, test.labels, test.files)
+    assert verdict.quantised_different == 0
+    assert verdict.spikes["fc1"].chip > 0
+    model = list(quantised_spikes(again, seen, test.events).values())[-1]
+    assert np.count_nonzero(model.sum(axis=1).argmax(axis=1) == test.labels) == tuned.after

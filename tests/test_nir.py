@@ -190,18 +190,6 @@ def test_a_leaky_integrator_is_the_filter_of_what_follows():
     assert network.populations[0].alpha == pytest.approx(1 - 0.02 / 0.06)
 
 
-def test_a_node_of_several_decays_is_several_layers():
-    rng = np.random.default_rng(6)
-    mixed = lif(9, tau=np.array([0.05, 0.2, 0.05] * 3), r=2.5)
-    graph = chain(affine(rng, 9, 6, 1.5), mixed, affine(rng, 4, 9, 1.5), lif(4, r=2.0))
-    network = lowered(graph).network
-    assert [(p.name, p.size) for p in network.populations] == [("n1_1", 6), ("n1_2", 3), ("n3", 4)]
-    events = bits(1, 6)
-    ours, theirs = float_spikes(network, events), simulate(graph, events, 0.02)
-    assert_array_equal(ours["n3"], theirs["n3"])
-    assert_array_equal(ours["n1_2"], theirs["n1"][:, 1::3])
-
-
 def test_branches_and_nested_graphs():
     rng = np.random.default_rng(10)
     inner = chain(affine(rng, 8, 6, 2.0), lif(8, r=2.0))
@@ -285,10 +273,7 @@ def test_groups_of_neurons_vote_for_a_class():
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
-FEW = settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-
-
-@FEW
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(float_networks(betas=(0.0, 0.2, 0.9)))
 def test_the_nir_file_alone_has_the_integers_and_the_decays(tmp_path_factory, network):
     path = tmp_path_factory.mktemp("nir") / "net.nir"
@@ -309,16 +294,9 @@ def test_the_nir_file_alone_has_the_integers_and_the_decays(tmp_path_factory, ne
     assert_array_equal(found.readout.label, integer.readout.label)
 
 
-@pytest.fixture(scope="module")
-def timed(tmp_path_factory):
-    """A netlist with currents and clocks, and its file."""
-    netlist, path = specimen("timed").machine.netlist, tmp_path_factory.mktemp("timed") / "net.nir"
+def test_another_program_that_follows_nir_makes_nearly_the_same_spikes(tmp_path):
+    netlist, path = specimen("timed").machine.netlist, tmp_path / "net.nir"
     path.write_bytes(nir_export.export(netlist, 0.02))
-    return netlist, path
-
-
-def test_another_program_that_follows_nir_makes_nearly_the_same_spikes(timed):
-    netlist, path = timed
     graph = nir.read(path)
     events = with_clocks(events_of(5, samples=1, steps=60), netlist.clocks)
     chip = engine.simulate(netlist, events, spikes=True)

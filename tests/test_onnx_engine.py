@@ -1,12 +1,15 @@
-"""onnxruntime on the integer graph: every spike and membrane of the specification."""
+"""onnxruntime on the integer graph: every spike and membrane of the specification; and what is in the files."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
+import onnx
 import pytest
+from commands import as_json
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from onnx.reference import ReferenceEvaluator
 from oracles import refused
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
 from test_timing import six_steps
@@ -15,22 +18,47 @@ from zoo import specimen
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.formats.onnx.writer import digits, plan
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine, spec
 
-FORMS = onnx_writer.FORMS
 SETTINGS = settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
-def by_onnx(netlist, events, form, **options):
-    return onnx_engine.simulate(onnx_engine.prepare(netlist, form=form), events, **options)
+def by_scan(netlist, events, **options):
+    return onnx_engine.simulate(onnx_engine.prepare(netlist), events, **options)
 
 
-def left(trace):
-    """Membranes after the reset."""
-    return np.where(trace.spikes, 0, trace.membranes)
+def by_name(session, given):
+    names = [port.name for port in session.get_outputs()]
+    return dict(zip(names, session.run(names, given), strict=True))
+
+
+def by_steps(netlist, events):
+    """Spikes, membranes after the reset and votes of recordings in the form ``step``."""
+    session = onnx_engine.open_session(onnx_writer.export(netlist, "step"))
+    samples, _, length = events.shape
+    given = {
+        port.name: np.zeros(
+            [samples if size == "batch" else size for size in port.shape], port.type[len("tensor(") : -1]
+        )
+        for port in session.get_inputs()
+    }
+    given["length"][...] = length
+    steps = np.pad(events, ((0, 0), (0, 0), (0, netlist.max_depth))).transpose(2, 0, 1)
+    spikes = np.zeros((samples, len(steps), netlist.n_compartments), np.bool_)
+    membranes = spikes.astype(np.int64)
+    for step, now in enumerate(steps):
+        found = by_name(session, given | {"events": now})
+        if "overflow" in found and found["overflow"].any():
+            raise NumericRangeError(f"chip step {step}: a register overflows")
+        given |= {name.removesuffix("_next"): array for name, array in found.items() if name.endswith("_next")}
+        for layer in plan(netlist):
+            spikes[:, step, layer.ids] = given[f"{layer.name}.spikes"]
+            membranes[:, step, layer.ids] = given[f"{layer.name}.membrane"]
+    return spikes, membranes, given.get("votes", np.zeros((samples, netlist.classes)))
 
 
 def assert_as_specified(netlist, events, expected=None):
@@ -38,17 +66,17 @@ def assert_as_specified(netlist, events, expected=None):
     try:
         expected = expected or spec.simulate(netlist, events)
     except NumericRangeError:
-        for form in FORMS:
+        for run in (by_scan, by_steps):
             with pytest.raises(NumericRangeError, match="a register overflows"):
-                by_onnx(netlist, events[None], form)
+                run(netlist, events[None])
         return
-    steps = by_onnx(netlist, events[None], "step", membranes=True)
-    np.testing.assert_array_equal(steps.spikes[0], expected.spikes)
-    np.testing.assert_array_equal(steps.membranes[0], left(expected))
-    scan = by_onnx(netlist, events[None], "scan")
-    np.testing.assert_array_equal(scan.spikes[0], expected.spikes)
-    votes = [expected.counts.spikes[netlist.readout_class == label].sum() for label in range(netlist.classes)]
-    assert scan.votes[0].tolist() == steps.votes[0].tolist() == votes
+    spikes, membranes, votes = by_steps(netlist, events[None])
+    np.testing.assert_array_equal(spikes[0], expected.spikes)
+    np.testing.assert_array_equal(membranes[0], np.where(expected.spikes, 0, expected.membranes))
+    spikes, counts = by_scan(netlist, events[None])
+    np.testing.assert_array_equal(spikes[0], expected.spikes)
+    due = [expected.counts.spikes[netlist.readout_class == label].sum() for label in range(netlist.classes)]
+    assert counts[0].tolist() == votes[0].tolist() == due
 
 
 @SETTINGS
@@ -70,11 +98,9 @@ def test_a_large_network_is_the_engine(proved):
     except NumericRangeError:
         assert not proved
         with pytest.raises(NumericRangeError):
-            by_onnx(netlist, events, "scan", lengths=lengths)
+            by_scan(netlist, events, lengths=lengths)
         return
-    for form in FORMS:
-        found = by_onnx(netlist, events, form, lengths=lengths)
-        np.testing.assert_array_equal(found.spikes, expected.spikes)
+    np.testing.assert_array_equal(by_scan(netlist, events, lengths=lengths)[0], expected.spikes)
 
 
 def three_neurons():
@@ -86,83 +112,45 @@ def three_neurons():
 def test_a_run_by_hand():
     # neuron 0: 60 + 50 = 110 > 80 spikes, then 60, 60 * 819/4096 + 50 = 61; neuron 1: 60, then -30 ..., 90 spikes
     events = np.array([[[1, 1, 0], [1, 0, 1]]], np.uint8)
-    for form in FORMS:
-        found = by_onnx(three_neurons(), events, form, membranes=form == "step")
-        assert found.spikes[0].astype(int).tolist() == [[1, 0, 0], [0, 0, 1], [0, 1, 0], [0, 0, 0]]
-        assert found.votes.tolist() == [[0, 1]]
-        if found.membranes is not None:
-            assert found.membranes[0, :2, :2].tolist() == [[0, 3833], [3840, -1161]]
-            assert found.membranes[0, 3].tolist() == [0, 0, 4480]
+    stepped, membranes, votes = by_steps(three_neurons(), events)
+    for spikes, counts in ((stepped, votes), by_scan(three_neurons(), events)):
+        assert spikes[0].astype(int).tolist() == [[1, 0, 0], [0, 0, 1], [0, 1, 0], [0, 0, 0]]
+        assert counts.tolist() == [[0, 1]]
+    assert membranes[0, :2, :2].tolist() == [[0, 3833], [3840, -1161]]
+    assert membranes[0, 3].tolist() == [0, 0, 4480]
 
 
-@pytest.mark.parametrize(("form", "where"), [("step", "recording 1, chip step 2"), ("scan", "recording 1")])
-def test_a_register_that_overflows(form, where):
+@pytest.mark.parametrize(("run", "where"), [(by_steps, "chip step 2"), (by_scan, "recording 1")])
+def test_a_register_that_overflows(run, where):
     axons = [Axon(source=0, targets=((0, 254),), exponent=7), Axon(source=1, targets=((0, 254),), exponent=7)]
     netlist = build([Neuron()], axons, n_inputs=2, depths=[0])
     events = np.zeros((2, 2, 4), np.uint8)
     events[:, 0, 1] = 1
-    assert by_onnx(netlist, events, form).spikes[:, :, 0].tolist() == [[False, True, False, False]] * 2
+    assert run(netlist, events)[0][:, :, 0].tolist() == [[False, True, False, False]] * 2
     events[1, :, 2] = 1
-    refused(NumericRangeError, f"{where}: a register overflows", by_onnx, netlist, events, form)
+    refused(NumericRangeError, f"{where}: a register overflows", run, netlist, events)
 
 
-# -- verify ------------------------------------------------------------------------------------------------------------
-@pytest.fixture
-def verified():
-    """Words of a verify command on a small network."""
-    made = specimen("mlp")
-    return [
-        "verify",
-        str(made.netlist),
-        "--checkpoint",
-        str(made.network),
-        "--data",
-        str(made.data),
-        "--min-agreement=0",
-    ]
-
-
-def as_json(capsys, words, code=0):
-    capsys.readouterr()
-    assert cli.main([*words, "--json"]) == code
-    return json.loads(capsys.readouterr().out)
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_verify_finds_an_engine_that_strays(verified, form, monkeypatch, capsys):
+def test_verify_finds_an_engine_that_strays(monkeypatch):
     plain = onnx_engine.simulate
 
     def stray(prepared, *words, **options):
-        trace = plain(prepared, *words, **options)
-        if prepared.form == form:
-            trace.spikes[0, 5, 0] ^= True
-        return trace
+        spikes, votes = plain(prepared, *words, **options)
+        spikes[0, 5, 0] ^= True
+        votes[0, 0] += 1
+        return spikes, votes
 
     monkeypatch.setattr(onnx_engine, "simulate", stray)
-    report = as_json(capsys, [*verified, "--engine", "onnx"], code=1)
+    made = specimen("mlp")
+    words = ["verify", made.netlist, "--checkpoint", made.network, "--data", made.data, "--min-agreement=0"]
+    report = as_json(*words, "--engine", "onnx", codes=(1,))
     assert not report["spec_equals_engine"]
-    assert report["engine_different"] == (form == "scan")
+    assert report["engine_different"] == 2
 
 
 # --- every recording --------------------------------------------------------------------------------------------------
 PART = 48
 SETS = {"objects_zip": ("objects", (576, 144)), "containers_zip": ("containers", (240, 60))}
-
-
-def spikes_of(folder, recordings, *words):
-    """Compile a network and run recordings; spikes of our engine, none of which differs in either form."""
-    path = folder / "net.loom"
-    assert cli.main(["compile", *map(str, words), "-o", str(path)]) == 0
-    netlist = read_netlist(path)
-    engines = [onnx_engine.prepare(netlist, form=form) for form in ("step", "scan")]
-    total = 0
-    for start in range(0, len(recordings), PART):
-        part = recordings[start : start + PART].reshape(-1, netlist.n_inputs, recordings.shape[3])
-        expected = engine.simulate(netlist, part, spikes=True).spikes
-        total += int(np.count_nonzero(expected))
-        for prepared in engines:
-            assert np.array_equal(onnx_engine.simulate(prepared, part).spikes, expected), prepared.form
-    return total
 
 
 @pytest.mark.slow
@@ -175,5 +163,82 @@ def test_all_recordings(fixture, bits, request, tmp_path):
     for split, size in zip(("train", "test"), sizes, strict=True):
         events = load_data(archive, split).events
         assert len(events) == size
-        words = (f"pretrained:{name}", "--calibrate", archive, "--weight-bits", bits)
-        assert spikes_of(tmp_path, events, *words) > 1_000_000
+        words = ["compile", f"pretrained:{name}", "--calibrate", archive, "--weight-bits", bits, "-o", tmp_path / "net"]
+        assert cli.main([*map(str, words)]) == 0
+        netlist = read_netlist(tmp_path / "net")
+        total = 0
+        for start in range(0, size, PART):
+            part = events[start : start + PART].reshape(-1, netlist.n_inputs, events.shape[3])
+            expected = engine.simulate(netlist, part, spikes=True).spikes
+            total += int(np.count_nonzero(expected))
+            for run in (by_steps, by_scan):
+                assert np.array_equal(run(netlist, part)[0], expected), run
+        assert total > 1_000_000
+
+
+# -- digits and widths -------------------------------------------------------------------------------------------------
+@given(
+    arrays.arrays(np.int64, st.tuples(st.integers(1, 4), st.integers(1, 4)), elements=st.integers(-(2**22), 2**22)),
+    st.integers(0, 6),
+)
+def test_digits_add_up_to_the_weights(weight, shift):
+    found = digits(weight << shift)
+    assert all(digit.dtype == np.int8 for digit, _ in found)
+    np.testing.assert_array_equal(sum(digit.astype(np.int64) * factor for digit, factor in found), weight << shift)
+
+
+@pytest.mark.parametrize(
+    ("weights", "count"),
+    [
+        ([0], 1),
+        ([254, -254], 1),
+        ([254 * 128, -2 * 128], 1),
+        ([127, -128], 1),
+        ([128, 1], 2),
+        ([32639, 1], 2),
+        ([32640, 1], 3),
+    ],
+)
+def test_weights_of_one_exponent_are_one_digit(weights, count):
+    assert len(digits(np.array([weights]).T)) == count
+
+
+def one_layer(**neuron):
+    return plan(build([Neuron(**neuron)], [Axon(source=0, targets=((0, -254),))], n_inputs=1, depths=[0]))[0]
+
+
+def test_registers_are_int32_where_no_product_can_be_wider():
+    assert one_layer().kind is np.int32
+    # 64 * 32767 * 1024 is below 2**31, 64 * 32769 * 1024 is above
+    assert one_layer(threshold=32767, decay_v=3072).kind is np.int32
+    assert one_layer(threshold=32769, decay_v=3072).kind is np.int64
+    # -254 * 64 adds up to -254 * 64 * 4096 / 100, times 3996 that is 2.7e9; 160 in place of 100: 1.7e9
+    assert one_layer(decay_v=100).kind is np.int64
+    assert one_layer(decay_v=160).kind is np.int32
+    assert one_layer(decay_v=0).kind is np.int64
+
+
+def test_ranges_that_are_proven_are_not_checked():
+    assert not one_layer().checked
+    assert not one_layer().saturates
+    assert one_layer(decay_v=0).saturates
+    assert not one_layer(decay_u=100).checked
+    assert one_layer(decay_u=1).checked
+    axons = [Axon(source=0, targets=((0, 254),), exponent=7), Axon(source=0, targets=((0, 256 - 2),), exponent=7)]
+    assert plan(build([Neuron()], axons, n_inputs=1, depths=[0]))[0].checked
+    assert not plan(build([Neuron()], axons[:1], n_inputs=1, depths=[0]))[0].checked
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+def test_the_reference_of_the_format_computes_the_same():
+    netlist = three_neurons()
+    given = np.random.default_rng(2).integers(0, 2, (2, 2, 12), np.uint8)
+    expected = engine.simulate(netlist, given, spikes=True).spikes
+    content = onnx.load_from_string(onnx_writer.export(netlist, "scan"))
+    onnx.checker.check_model(content, full_check=True)
+    model = ReferenceEvaluator(content)
+    found = dict(zip(model.output_names, model.run(None, {"events": given.transpose(2, 0, 1)}), strict=True))
+    np.testing.assert_array_equal(found["layer0.spikes"].transpose(1, 0, 2), expected[:, :12, :2])
+    np.testing.assert_array_equal(found["layer1.spikes"].transpose(1, 0, 2), expected[:, 1:13, 2:])
+    assert found["votes"].tolist() == [[0, int(sample[:, 2].sum())] for sample in expected]
+    assert found["class"].tolist() == [int(sample[:, 2].any()) for sample in expected]

@@ -10,33 +10,21 @@ import numpy as np
 import pytest
 import torch
 from made_modules import NETS, AllSteps, example_of, exported, one_step
-from made_onnx import (
-    BIAS,
-    FIRES,
-    SECOND,
-    STAGE,
-    STATE_IN,
-    WEIGHTS,
-    fire,
-    model,
-    neuron,
-    node,
-    scanned,
-    two_layers,
-)
+from made_onnx import BIAS, FIRES, SECOND, STAGE, STATE_IN, WEIGHTS, fire, model, neuron, node, two_layers
 from onnx import helper
 from onnx.reference import ReferenceEvaluator
 from oracles import refused, weight_differences
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.onnx.affine import INPUT_ATOM, Affine, Table
+from spikeloom.compiler.formats.affine import Affine
+from spikeloom.compiler.formats.onnx.atoms import INPUT_ATOM, Table
 from spikeloom.compiler.formats.onnx.file import Node
 from spikeloom.compiler.formats.onnx.operators import apply
 from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.sensor_layout import sensor_layout
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.models.networks.module import compile_module, module_network
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
+from spikeloom.models.networks.module import module_network
 from spikeloom.runtime import cli
 
 needs_dynamo = pytest.mark.skipif(
@@ -93,13 +81,6 @@ def test_at_the_threshold_is_the_next_number_below(read):
         assert (np.float32(membrane) >= np.float32(0.5)) == (np.float32(membrane) > np.float32(population.theta))
 
 
-@pytest.mark.parametrize("content", [scanned(), scanned(1 + 2)])
-def test_loops_are_unrolled(read, content):
-    found = read(content)
-    require_the_two_layers(found.network)
-    assert "steps unrolled" in found.facts[0]
-
-
 @pytest.mark.parametrize(
     ("last", "inputs", "label"),
     [
@@ -139,7 +120,7 @@ def test_modules_come_back_with_the_same_integers(read, name, opset):
 @pytest.mark.parametrize("name", [*NETS])
 def test_the_newer_exporter(read, name):
     net, example = NETS[name](), example_of(name)
-    ours = compile_module(net, example).integer
+    ours = compile_network(module_network(net, example)).integer
     one = read(one_step(net, example, dynamo=True))
     several = read(exported(AllSteps(net), (torch.zeros(*example.shape, 3),), dynamo=True))
     for found in (one, several):
@@ -165,18 +146,16 @@ def test_open_size_in_front_is_one_recording(read):
     axes = {"input": {0: "batch"}}
     found = read(one_step(net, example, input_names=["input"], dynamic_axes=axes))
     assert "the open size 'batch' is the batch's, read as 1" in found.facts
-    assert not weight_differences(compile_module(net, example).integer, compile_network(found.network).integer)
-
-
-def test_open_time_of_a_loop_is_run_for_three_steps(read):
-    count = [node("Cast", "spikes", "whole", to=6), node("ReduceSum", "whole axes", "votes", keepdims=0)]
-    found = read(scanned("time", [*count, node("ArgMax", "votes", "class", axis=1)]))
-    require_the_two_layers(found.network)
-    assert "3 steps unrolled" in found.facts[2]
-    assert found.facts[:2] == (
-        "output class: the class of the largest of votes",
-        "the open size 'time' is time, read as 3 steps",
+    assert not weight_differences(
+        compile_network(module_network(net, example)).integer, compile_network(found.network).integer
     )
+
+
+def test_the_largest_of_the_votes_is_what_is_counted(read):
+    nodes = [*STAGE, *neuron(0, "current"), node("ArgMax", "s0_new", "class", axis=1)]
+    found = read(model(nodes, [("x", [1, 4]), *STATE_IN[:2]], ["class", "u0_new", "s0_new"]))
+    assert found.network.readout.label.tolist() == [0, 1, 2]
+    assert found.facts[0] == "output class: the class of the largest of s0_new"
 
 
 @pytest.mark.parametrize(
@@ -211,7 +190,7 @@ def test_shapes_of_inputs(shape, options, expected):
         ([39, 5], {}, "the input [39, 5]: no axis is the polarities"),
         ([2, 2], {}, "the input [2, 2]: both axes could be the polarities"),
         ([77], {}, "the input [77] is no whole number of taxels with 2 polarities"),
-        ([3, 4, 5], {}, "the input [3, 4, 5] has no axis of 2 polarities"),
+        ([3, 4, 5], {}, "the input [3, 4, 5]: no axis is the polarities"),
         ([2, 3, 4, 5], {}, "the input [2, 3, 4, 5] is none of [taxels, polarities]"),
         ([39, 2], {"polarities": 0}, "--polarities 0: allowed are numbers from 1"),
     ],

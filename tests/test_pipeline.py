@@ -1,7 +1,6 @@
 """The passes, one after the other: expansion of the graph convolution, pruning; and a third chip."""
 
 import dataclasses
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_files import events, small_checkpoint
-from oracles import comparable, probed
+from oracles import probed
 from random_networks import (
     assert_same_layers,
     chain,
@@ -21,7 +20,7 @@ from random_networks import (
     ring,
 )
 
-from spikeloom.compiler import Options, compile_network, invariants, targets
+from spikeloom.compiler import Options, compile_network, invariants
 from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import INPUT, depths, fan_in
@@ -29,20 +28,12 @@ from spikeloom.compiler.passes.expand import Factored, expand, hop_powers, synap
 from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, removable, removals
 from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.pipeline import run
-from spikeloom.compiler.targets import base
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.compiler.targets.loihi1.passes import start
 from spikeloom.compiler.text import text
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.runtime.equivalence.verify import verify
-from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.trace import aligned
-
-
-def grasps(samples=6, *, taxels=5, steps=40, seed=0):
-    return (np.random.default_rng(seed).random((samples, taxels, 2, steps)) < 0.2).astype(np.uint8)
 
 
 # --- a toy
@@ -92,60 +83,6 @@ def test_a_pass_that_breaks_a_rule_is_named_at_once(name, change):
     with pytest.raises(VerifyError):
         run(passes, work, lambda name, _: seen.append(name))
     assert name not in seen
-
-
-TOY = """
-from dataclasses import replace
-from spikeloom.compiler.passes.prune import compact, without_channels
-from spikeloom.compiler.pipeline import Pass
-from spikeloom.compiler.targets.loihi1 import passes
-from spikeloom.compiler.targets.loihi1.options import Options
-
-def unplug(done):
-    channels = [channel == 0 for channel in range(done.integer.input.size)]
-    import numpy as np
-    return replace(done, integer=without_channels(done.integer, np.array(channels)))
-
-PASSES = (*passes.FLOATS, Pass(name="unplug", does="ignores channel 0", keeps="the rest", apply=unplug),
-          *passes.INTEGERS, *passes.LAYOUT)
-
-def start(source, options, target):
-    return passes.start(source, options, target)[0], PASSES
-"""
-
-
-@pytest.fixture
-def toy(tmp_path, monkeypatch):
-    """A third chip: a folder with other limits and one other pass."""
-    (tmp_path / "toy").mkdir()
-    (tmp_path / "toy" / "passes.py").write_text(TOY)
-    limits = (Path(targets.__path__[0]) / "loihi1" / "chip.toml").read_text("utf-8")
-    small = limits.replace("core.compartments = { value = 1024", "core.compartments = { value = 8")
-    (tmp_path / "toy" / "chip.toml").write_text(small.replace('"loihi1"', '"toy"'))
-    monkeypatch.setattr(targets, "__path__", [*targets.__path__, str(tmp_path)])
-    base.shipped.cache_clear()
-    yield
-    base.shipped.cache_clear()
-    for name in [name for name in sys.modules if name.startswith("spikeloom.compiler.targets.toy")]:
-        del sys.modules[name]
-
-
-@pytest.mark.usefixtures("toy")
-def test_a_third_chip_is_a_folder(tmp_path):
-    done = compile_network(expand(random_checkpoint(), ring(5)), target="toy")
-    assert [step.name for step in load_target("toy").passes][4] == "unplug"
-    assert np.diff(done.netlist.core_compartments).max() <= 8
-    assert not (done.netlist.axon_source == 0).any()
-    write_netlist(done.netlist, tmp_path / "net.loom")
-    netlist = read_netlist(tmp_path / "net.loom")
-    assert netlist.target == "toy"
-    batch = grasps().reshape(6, 10, 40)
-    ran = engine.simulate(netlist, batch, spikes=True).spikes
-    expected = run_integer(done.integer, channels_last(grasps()))
-    for layer in range(4):
-        np.testing.assert_array_equal(
-            aligned(netlist, ran, layer), expected.spikes[layer][..., comparable(netlist, layer)]
-        )
 
 
 def test_the_proof_covers_the_netlist():

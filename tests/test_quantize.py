@@ -36,7 +36,6 @@ from spikeloom.compiler.fixedpoint import (
     weight_step,
 )
 from spikeloom.compiler.interpret import run_float, run_integer
-from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import Form, one_sided
 from spikeloom.compiler.passes.calibrate import calibrate, evenly_spaced
 from spikeloom.compiler.passes.range_proof import prove_ranges
@@ -58,57 +57,12 @@ def noisy_layer(seed=0, *, inputs=40, outputs=30, outlier=0.0):
     return chain(weight, biases=[rng.normal(0, 0.05, outputs)])
 
 
-def one_sided_sums(network, post):
-    weights = np.concatenate(list(dense_weights(network, post).values()), axis=1)
-    return np.maximum(weights, 0).sum(axis=1), np.maximum(-weights, 0).sum(axis=1)
-
-
 # --- registers
 def test_decays_are_the_nearest_registers():
     assert [decay_registers(beta)[1] for beta in (0.0, 1.0, 0.5, 0.9, 819 / 4096)] == [4095, 0, 2048, 410, 3277]
     population = choose_storage(noisy_layer(), LOIHI)[0].populations[0]
     assert (population.beta, population.realised_beta) == (0.2, 819 / 4096)
     assert (population.decay_u, population.decay_v) == (4095, 3277)
-
-
-@settings(deadline=None, max_examples=8)
-@given(float_networks(), st.sampled_from(BITS), st.booleans(), st.data())
-def test_every_network_is_rounded_to_registers(network, bits, calibrated, data):
-    events = data.draw(recordings_for(network.input.size))
-    calibration = calibrate(network, events) if calibrated else None
-    integer, choices = choose_storage(network, LOIHI, packings=(Packing(bits=bits),), calibration=calibration)
-    verify(integer)
-    assert [choice.layer for choice in choices] == [population.name for population in network.populations]
-    for post, (population, model, choice) in enumerate(
-        zip(integer.populations, network.populations, choices, strict=True)
-    ):
-        # The threshold carries no rounding.
-        assert len(set(population.threshold.tolist())) == 1
-        assert population.realised_theta[0] == pytest.approx(model.theta, rel=1e-15)
-        assert set(population.scale.tolist()) == {choice.scale}
-        # A bias is off by half a unit of its register at most.
-        error = population.bias / (64 * population.scale) - model.bias
-        assert choice.compensated or np.all(
-            np.abs(error) <= 0.5 * 2.0**population.bias_exponent / (64 * population.scale) * (1 + 1e-9)
-        )
-        up, down = one_sided_sums(integer, post)
-        reached = max(up.max(), down.max())
-        assert reached <= ONE_STEP_SUM_MAX
-        assert choice.headroom == pytest.approx(1 - reached / ONE_STEP_SUM_MAX, abs=1e-12)
-    for projection in integer.projections:
-        step = weight_step(bits)
-        assert projection.bits == bits
-        assert projection.exponent in LOIHI.choices["synapse.exponent"]
-        assert not np.any(projection.weight.data % step)
-        assert np.all(np.abs(projection.weight.data) <= 256 - step)
-        original = next(p for p in network.projections if (p.pre, p.post) == (projection.pre, projection.post))
-        assert np.array_equal(original.weight.indices, projection.weight.indices)
-        assert np.array_equal(original.weight.indptr, projection.weight.indptr)
-        # Each weight is the nearest of its grid, or the end of the range.
-        scale = integer.populations[projection.post].scale[0] / 2.0**projection.exponent
-        wanted = np.clip(original.weight.data * scale, -(256 - step), 256 - step)
-        error = np.abs(projection.weight.data - wanted)
-        assert choices[projection.post].compensated or np.all(error <= step / 2 * (1 + 1e-9))
 
 
 @settings(deadline=None, max_examples=10)

@@ -3,14 +3,17 @@
 import argparse
 import doctest
 import functools
+import os
 import pkgutil
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes
+from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence.verify import verify
 
@@ -26,7 +29,7 @@ FENCED = re.compile(r"^```.*?^```$", flags=re.MULTILINE | re.DOTALL)
 SHOWN = re.compile(r"^\$ spikeloom (.+)$", flags=re.MULTILINE)
 IN_A_LINE = re.compile(r"`([^`]+)`")
 DOTTED = re.compile(r"`((?:compiler|runtime|models)\.[\w.]+)[(`]")
-OTHERS = {"python", "pip", "pytest", "dask", "helm"}
+OTHERS = {"python", "pip", "pytest", "helm"}
 """Programs that have options of their own."""
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 FILE = re.compile(r"\b(?:compiler|runtime|models|tests|benchmarks|examples)/[\w/.-]+\.(?:py|toml|sh|png|md)")
@@ -138,3 +141,30 @@ def test_every_link_leads_somewhere(page):
         assert there.exists(), link
         if anchor:
             assert anchor in anchors(TEXTS[there]), link
+
+
+def test_the_square_sensor_example_reaches_a_decision(tmp_path):
+    # `spikeloom` is whatever this interpreter runs, installed or not
+    command = tmp_path / "bin" / "spikeloom"
+    command.parent.mkdir()
+    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m spikeloom "$@"\n')
+    command.chmod(0o755)
+    environment = os.environ | {
+        "PATH": f"{command.parent}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT / "src"),
+    }
+    done = subprocess.run(
+        ["bash", ROOT / "examples" / "square_sensor.sh", tmp_path / "made"],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=540,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    made = tmp_path / "made"
+    for name in ("coords.csv", "grasps.png", "training.png", "square.pt", "square.loom", "grasp.csv"):
+        assert (made / name).stat().st_size > 0
+    assert "E0  specification = engine in every" in done.stdout
+    assert "grasp 1: class " in done.stdout
+    assert "1 grasp, 100 bins" in done.stdout

@@ -3,7 +3,6 @@
 One table: what is typed, and the words that the line must hold: the option or file, the value, what is allowed.
 """
 
-import contextlib
 import dataclasses
 import errno
 import io
@@ -14,6 +13,7 @@ import shlex
 import zipfile
 from pathlib import Path
 
+import commands
 import numpy as np
 import pytest
 import torch
@@ -21,9 +21,6 @@ from made_files import CLASSES, TAXELS, events, own_file, recordings_folder, rel
 from made_files import weights as made_weights
 
 from spikeloom.compiler import read_netlist, write_netlist
-from spikeloom.compiler.archive import digest, read_members
-from spikeloom.compiler.errors import FormatError
-from spikeloom.compiler.targets.loihi1 import netlist_file
 from spikeloom.runtime import cli
 
 GOOD = events(2)[0].astype(np.float32)
@@ -52,45 +49,6 @@ def zipped(path, name, content, method=zipfile.ZIP_DEFLATED):
         archive.writestr(name, content)
 
 
-def rewritten(source, path, change, *, sign=True):
-    """A netlist after `change` was applied to its manifest and members; with a fitting hash if `sign`."""
-    members = read_members(source)
-    manifest = json.loads(str(members["manifest"]))
-    stated = members.pop("sha256")
-    change(manifest, members)
-    members["manifest"] = np.array(json.dumps(manifest, sort_keys=True))
-    if sign:
-        held = {name: members[name] for name in netlist_file.FILE.arrays if name in members}
-        stated = np.array(digest({"manifest": members["manifest"], **held}))
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, array in (members | {"sha256": stated}).items():
-            content = io.BytesIO()
-            np.lib.format.write_array(content, array, allow_pickle=False)
-            archive.writestr(f"{name}.npy", content.getvalue())
-
-
-def set_layer(key, value):
-    return lambda manifest, _: manifest["layers"][0].update({key: value})
-
-
-WRONG_NETLISTS = {
-    "version": (lambda m, _: m.update(version=99), "has format version 99"),
-    "format": (lambda m, _: m.update(format="x"), "is not a netlist"),
-    "target": (lambda m, _: m.update(target="loihi9"), "is for 'loihi9', this program knows loihi1"),
-    "notarget": (lambda m, _: m.pop("target"), "no usable target"),
-    "taxels": (lambda m, _: m.update(taxels="6"), "no usable taxels"),
-    "layers": (lambda m, _: m.update(layers=[]), "no usable layers"),
-    "neurons": (set_layer("neurons", -1), "no usable layers"),
-    "depth": (set_layer("depth", -1), "no usable layers"),
-    "missing": (lambda _, a: a.pop("threshold"), "missing or unknown members (threshold)"),
-    "floats": (lambda _, a: a.update(threshold=a["threshold"] / 2), "threshold is no list of integers"),
-    "exponent": (lambda _, a: a.update(format_exponent=a["format_exponent"] - 9), "outside -1 … 7"),
-    "beyond": (lambda _, a: a.update(synapse_target=a["synapse_target"].astype(int) + 99), "points beyond its core"),
-}
-ALTERED = {
-    "thresholds": lambda _, a: a.update(threshold=a["threshold"] + 1),
-    "graph": lambda m, _: m["provenance"].update(graph="manual"),
-}
 ARRAYS = {
     "taxels": (GOOD[:5], "has 5 taxels|the network has 6"),
     "pressures": (GOOD * 0.5, "value 0.5 at taxel 0, polarity 0, step 3|allowed are 0 and 1"),
@@ -153,10 +111,6 @@ def place(tmp_path_factory):
     (at / "empty.loom").touch()
     (at / "half.loom").write_bytes((at / "net.loom").read_bytes()[:900])
     zipped(at / "notes.loom", "notes.txt", b"hello")
-    for name, (change, _) in WRONG_NETLISTS.items():
-        rewritten(at / "net.loom", at / f"{name}.loom", change)
-    for name, change in ALTERED.items():
-        rewritten(at / "net.loom", at / f"altered_{name}.loom", change, sign=False)
     return at
 
 
@@ -239,11 +193,7 @@ TABLE = [
     # places to write
     *(
         (f"{command} {where!r}", f"{command.split()[-1]} {where}: {why}")
-        for command in (
-            "compile net.pt -o",
-            "run net.loom --data data --spikes",
-            "train --data data --graph manual -o",
-        )
+        for command in ("compile net.pt -o", "run net.loom --data data --spikes", "train --data data --graph manual -o")
         for where, why in (
             ("nowhere/out", "the folder does not exist"),
             ("data", "is not a regular file"),
@@ -290,36 +240,23 @@ TABLE = [
     ("run finger.loom --data synthetic --limit 4", "synthetic|label 3, the network has 3 classes"),
     # netlists
     ("run data --data data", "data: is not a file|spikeloom compile"),
-    *(
-        (f"{command} {name}.loom", f"{name}.loom: |{words}")
-        for command in ("run --data data",)
-        for name, words in (
-            ("nowhere", "no such file; write one with spikeloom compile"),
-            ("empty", "is truncated or not a netlist"),
-            ("half", "is truncated or not a netlist"),
-            *((f"altered_{name}", "its content does not match its hash") for name in ALTERED),
-            *((name, words) for name, (_, words) in WRONG_NETLISTS.items()),
-        )
-    ),
+    ("run --data data nowhere.loom", "nowhere.loom: no such file; write one with spikeloom compile"),
+    *((f"run --data data {name}.loom", f"{name}.loom: is truncated or not a netlist") for name in ("empty", "half")),
     ("run net.t7 --data data", "net.t7: "),
     ("inspect notes.loom", "has compressed members"),
 ]
 
 
 @pytest.fixture
-def refusal(capsys, place, monkeypatch):
+def refusal(place, monkeypatch):
     """Run a command in that folder that must fail; returns its only line."""
     monkeypatch.chdir(place)
     before = sorted(path.name for path in place.iterdir())
 
     def command(*words):
-        capsys.readouterr()
-        code = cli.main([str(word) for word in words])
-        out, err = capsys.readouterr()
-        assert (code, out) == (2, "")
-        assert err.startswith("spikeloom: ")
-        assert err.count("\n") == 1
-        return err.removeprefix("spikeloom: ").removesuffix("\n")
+        code, out, err = commands.run(*words)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        return err.removeprefix("spikeloom: ").rstrip("\n")
 
     yield command
     assert sorted(path.name for path in place.iterdir()) == before
@@ -330,22 +267,6 @@ def test_refusals(refusal, words, telling):
     line = refusal(*shlex.split(words))
     for part in telling.split("|"):
         assert part in line
-
-
-def test_flipped_bits_of_a_netlist(refusal, tmp_path, place):
-    whole, path = bytearray((place / "net.loom").read_bytes()), tmp_path / "net.loom"
-    rng, refused = np.random.default_rng(0), 0
-    for position in rng.integers(len(whole), size=40).tolist():
-        flipped = bytearray(whole)
-        flipped[position] ^= 1 << int(rng.integers(8))
-        path.write_bytes(flipped)
-        with contextlib.suppress(FormatError):
-            # read: then it was a bit that says nothing, such as the creation date of a member
-            assert netlist_file.netlist_bytes(netlist_file.read_netlist(path)) == bytes(whole), position
-            continue
-        assert refusal("run", "--data", "data", path).startswith(f"{path}: ")
-        refused += 1
-    assert refused > 30
 
 
 def test_recordings_of_another_number_of_channels(refusal, tmp_path):
@@ -371,13 +292,12 @@ def test_overflow_on_the_chip_names_neuron_step_and_recording(refusal, tmp_path)
 
 
 @pytest.mark.parametrize(("features", "limits"), [(128, ["axons_in"]), (424, ["axons_in", "synapse_words"])])
-def test_every_violated_limit_is_listed(place, capsys, tmp_path, features, limits):
+def test_every_violated_limit_is_listed(place, tmp_path, features, limits):
     arrays = made_weights(taxels=39, features=features, sizes=(2, 2, 2))
     signs = {name: np.where(array >= 0, 0.5, -0.5).astype(np.float32) for name, array in arrays.items()}
     torch.save(state_dict(signs), tmp_path / "wide.pt")
     words = ["compile", f"{tmp_path}/wide.pt", "--graph", "mst:0", "--keep-all", "-o", f"{tmp_path}/out.loom"]
-    assert cli.main(words) == 2
-    lines = capsys.readouterr().err.splitlines()
+    lines = commands.run(*words)[2].splitlines()
     assert len(lines) == len(limits)
     for line, limit in zip(lines, limits, strict=True):
         assert f"fc1 neuron 0: {39 * features} used" in line
@@ -422,10 +342,7 @@ def almost_full(path, mode="r", *options, whole=Path.open, **more):
 
 @pytest.mark.parametrize(
     ("old", "words"),
-    [
-        (b"an older result", ["compile", "net.pt", "-o"]),
-        (None, ["run", "net.loom", "--data", "data", "--spikes"]),
-    ],
+    [(b"an older result", ["compile", "net.pt", "-o"]), (None, ["run", "net.loom", "--data", "data", "--spikes"])],
 )
 @pytest.mark.parametrize(
     ("patched", "replacement", "line"),

@@ -1,26 +1,34 @@
-"""The command ``report``: what is on the page, that it needs nothing else, and what is refused."""
+"""Sections as text and as a page, results as JSON and back; the pages of ``report`` and of a chart."""
 
 import dataclasses
 import hashlib
 import json
+import math
 import re
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 from browser import browsed
+from commands import as_json
+from made_chart import made_chart
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_folder, weights
 from numpy.testing import assert_allclose, assert_array_equal
 from zoo import specimen
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist, write_netlist
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
+from spikeloom.runtime.report import drawing, html
+from spikeloom.runtime.report.encode import OPTIONAL, decode, encode, key
+from spikeloom.runtime.report.sections import Code, Details, Facts, Figure, Section, Table, Text, terminal
+from spikeloom.runtime.studies.chart.sections import page, panels, printed, series_of
 
 REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data", "-o", "out.html")
 HEADINGS = ["Verdict", "Decisions", "Cores", "Taxels", "One recording", "Energy and time", "Provenance"]
@@ -186,17 +194,16 @@ def test_where_no_spike_differs_the_widest_membranes_are_shown(spikeloom, place)
 
 
 # -- other networks ----------------------------------------------------------------------------------------------------
-def report_of(made, folder, capsys):
+def report_of(made, folder):
     """The page of a network of the zoo, and its data."""
     words = ("report", made.netlist, "--checkpoint", made.network, *made.reading, "--data", made.data)
-    capsys.readouterr()
-    assert cli.main([*map(str, words), "-o", str(folder / "x.html"), "--json"]) == 0
-    return (folder / "x.html").read_text("utf-8"), json.loads(capsys.readouterr().out)
+    found = as_json(*words, "-o", folder / "x.html")
+    return (folder / "x.html").read_text("utf-8"), found
 
 
-def test_networks_without_a_graph_show_their_taxels(tmp_path, capsys):
+def test_networks_without_a_graph_show_their_taxels(tmp_path):
     made = specimen("onnx")
-    text, found = report_of(made, tmp_path, capsys)
+    text, found = report_of(made, tmp_path)
     taxels, sensor = found["taxels"], made.machine.netlist.taxels
     assert (taxels["graph"], taxels["spikes"], taxels["edges"]) == (None, None, [])
     assert (taxels["sensor"], len(taxels["positions_mm"] or ())) == (("NeuTouch", 39) if sensor == 39 else (None, 0))
@@ -204,9 +211,9 @@ def test_networks_without_a_graph_show_their_taxels(tmp_path, capsys):
     assert drawings(text) >= FIGURES - {f"raster-{name}" for name in LAYERS} - {"time-cores"}
 
 
-def test_clocks_and_lasting_currents_have_their_page(tmp_path, capsys):
+def test_clocks_and_lasting_currents_have_their_page(tmp_path):
     made = specimen("timed")
-    text, found = report_of(made, tmp_path, capsys)
+    text, found = report_of(made, tmp_path)
     assert found["provenance"]["checkpoint"]["dynamics"]["clocks"] == {"channels": 3, "steps": 4}
     assert "Decays by layer, and clocks" in text
     channels = {channel for _, channel in found["recording"]["input"]}
@@ -280,3 +287,155 @@ def test_arrow_keys_walk_through_the_differences_and_the_pointer_reads_cells(mad
     assert walked == [tips[index][2] for index in (0, 1, 0, -1)]
     assert pointed.startswith(f"neuron {layer['active'][row]}, step {step}")
     assert energy.startswith("conv1, davies2018: ")
+
+
+NUMBERS = Table(["layer", "spikes"], [["conv1", "12"], ["fc1", "3 < 4"]], "Spikes by layer")
+CHAPTER = Section(
+    "What was found",
+    [
+        Facts({"accuracy": ("90 %", "9 of 10")}),
+        Text("first\nsecond"),
+        Section(
+            "Spikes", [Figure("spikes", lambda: drawing.bars("Spikes", {"conv1": [12]}, ["n"]), "By layer.", [NUMBERS])]
+        ),
+        Details("More", [Text("folded")], group="more"),
+        Code(["spikeloom run 'a b'"]),
+    ],
+    chapter=True,
+)
+
+
+def test_text_shows_all_but_what_is_folded_or_for_the_eye():
+    assert terminal([CHAPTER, Section("", [NUMBERS])]) == (
+        "What was found\n--------------\nfirst\nsecond\n\n"
+        "  layer  spikes\n  conv1      12\n  fc1     3 < 4\n\n"
+        "$ spikeloom run 'a b'\n\n"
+        "  layer  spikes\n  conv1      12\n  fc1     3 < 4"
+    )
+
+
+def test_a_page_is_whole_escaped_and_the_same_each_time():
+    page = html.page("a <b>", "about", [CHAPTER])
+    assert page == html.page("a <b>", "about", [CHAPTER])
+    assert "<h1>a &lt;b&gt;</h1>" in page
+    assert '<section id="what-was-found"><h2>What was found</h2>' in page
+    assert "3 &lt; 4" in page
+    assert '<details name="more">' in page
+    values = json.loads(page.partition('<script type="application/json">')[2].partition("</script>")[0])
+    ((_, _, tip),) = values["tips"]
+    assert tip == "conv1, n: 12"
+
+
+def test_values_of_a_drawing_lie_on_its_marks():
+    drawn = drawing.bars("bars", {"a": [1.0], "b": [2.0], "c": [3.0]}, ["n"])
+    drawn.svg("x")
+    (left, high), (middle, _), (right, low) = (tip[:2] for tip in drawn.values()["tips"])
+    assert left < middle < right <= 72 * drawing.WIDTH
+    assert 0 <= high < low
+    assert middle == pytest.approx((left + right) / 2, abs=0.2)
+
+
+@dataclass(frozen=True)
+class Inner:
+    share: float
+    name: str | None = field(default=None, metadata=OPTIONAL)
+
+
+@dataclass(frozen=True)
+class Outer:
+    json_properties = ("twice",)
+    inner: tuple[Inner, ...]
+    by_window: dict[int, float] = field(metadata=key("windows"))
+    pair: tuple[str, int] = ("a", 1)
+
+    @property
+    def twice(self) -> int:
+        return 2 * self.pair[1]
+
+
+def test_a_result_is_written_as_json_and_read_back():
+    result = Outer(inner=(Inner(0.5), Inner(1.0, "x")), by_window={50: 1.0})
+    value = json.loads(json.dumps(encode(result)))
+    wanted = {"inner": [{"share": 0.5}, {"share": 1.0, "name": "x"}], "windows": {"50": 1.0}, "pair": ["a", 1]}
+    assert value == wanted | {"twice": 2}
+    assert decode(Outer, value) == result
+    for wrong in ({}, [], value | {"inner": [{"share": "much"}]}, value | {"pair": ["a"]}):
+        with pytest.raises((TypeError, ValueError, KeyError)):
+            decode(Outer, wrong)
+
+
+def test_numbers_of_numpy_are_plain_and_what_has_no_form_is_refused():
+    assert encode({"a": np.float32(0.5), "b": np.arange(2), "c": math.nan}) == {"a": 0.5, "b": [0, 1], "c": None}
+    with pytest.raises(TypeError):
+        encode(object())
+
+
+PARTS = ["Networks", "Which one to deploy", "Accuracy against cost", "Every point", "Provenance"]
+
+
+@pytest.fixture
+def chart():
+    return made_chart("energy=100uJ", "accuracy=80")
+
+
+def told(chart):
+    return terminal(printed(chart, "out")) + "\n"
+
+
+# -- terminal and files ------------------------------------------------------------------------------------------------
+def test_the_terminal_shows_choices_fronts_saving_and_budget(chart, golden):
+    golden("chart.txt", told(chart))
+
+
+# -- pictures ----------------------------------------------------------------------------------------------------------
+def test_colours_are_for_networks_where_there_are_several_else_for_storage(chart):
+    assert series_of(chart.points) == "network"
+    assert series_of(chart.points[:6]) == "storage"
+    assert series_of(chart.points[4:6]) == "window"
+
+
+def test_every_point_is_a_mark_that_tells_its_figures_and_commands(chart):
+    drawn = panels(chart, ["energy"], "a chart")
+    tips = [tip for _, _, tip in drawn.values()["tips"]]
+    assert sorted(int(tip[1:].split()[0]) for tip in tips) == [point.number for point in chart.points]
+    (first,) = (tip for tip in tips if tip.startswith("#1 "))
+    assert first.startswith("#1 grasps 2b, 50 %: test 68.00 % (58.3 … 76.3), float 70.00 %, expected ")
+    assert first.splitlines()[1:] == list(chart.points[0].commands)
+
+
+# -- page --------------------------------------------------------------------------------------------------------------
+def test_the_page_needs_nothing_else_and_holds_every_command(chart):
+    text = page(chart)
+    assert not re.findall(r'(?:src|href)="(?!#)', text)
+    assert not re.search(r"url\((?!#)|@import", text)
+    assert "a <b>" not in text
+    assert re.findall("<h2>(.*?)</h2>", text) == PARTS
+    for point in chart.points:
+        for command in point.commands:
+            assert command.replace("<", "&lt;").replace(">", "&gt;").replace("'", "&#39;") in text
+    assert page(made_chart("energy=100uJ", "accuracy=80")) == text
+
+
+@pytest.fixture
+def page_file(chart, tmp_path):
+    file = tmp_path / "chart.html"
+    file.write_text(page(chart), "utf-8")
+    return file
+
+
+def test_in_a_browser_keys_and_pointer_read_the_points(page_file):
+    script = """
+    const tips = JSON.parse(drawing("chart-energy").nextElementSibling.textContent).tips;
+    const [x, y] = tips.find((tip) => tip[2].startsWith("#2 "));
+    return [press("chart-energy", "ArrowRight"), press("chart-energy", "ArrowLeft"), point("chart-energy", x, y)];"""
+    cheapest, dearest, second = browsed(page_file, script)
+    assert cheapest.startswith("#7 grasps-knn1 2b, 50 %")
+    assert dearest.startswith("#6 grasps 8b, 100 %")
+    assert second.startswith("#2 grasps 2b, 100 %")
+
+
+def test_the_page_fits_a_narrow_window_and_a_dark_scheme(page_file):
+    script = "return [document.documentElement.scrollWidth, background];"
+    wide, colour = browsed(page_file, script, width=500, scheme="dark")
+    assert wide <= 500
+    assert colour == "rgb(20, 23, 27)"

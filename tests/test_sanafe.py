@@ -1,26 +1,30 @@
-"""Exported netlists in SANA-FE itself: the same spikes, energies and times.
+"""The command ``export`` and its files; and netlists in SANA-FE itself: the same spikes, energies and times.
 
 SANA-FE is run in an interpreter of its own: the one that SPIKELOOM_SANAFE_PYTHON names, or this one if it has it.
 """
 
+import hashlib
 import importlib.util
 import json
 import os
+import re
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import timing_oracle
-from random_netlists import large_netlist, ungated
-from test_timing import DETAILED, ENERGY_PJ, LOIHI, SANAFE, SIMPLE, six_steps
+from commands import as_json, refusal
+from random_netlists import Axon, Neuron, build, large_netlist, ungated
+from test_timing import DETAILED, ENERGY_PJ, LOIHI, PICO, SANAFE, SIMPLE, six_steps
 
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import sanafe
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, write_netlist
+from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost
 
 PROGRAM = """
@@ -61,23 +65,9 @@ def interpreter() -> str:
     return named or sys.executable
 
 
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """One recording in both programs; times in ns per step, energies in joules per part."""
-
-    spikes: np.ndarray
-    expected_spikes: np.ndarray
-    simple: np.ndarray
-    detailed: np.ndarray
-    energy: dict[str, float]
-    steps_energy: dict[str, np.ndarray]
-    ours_simple: np.ndarray
-    ours_detailed: np.ndarray
-    ours_energy: dict[str, float]
-
-
-def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> list[Run]:
-    """Run recordings, (recordings, n_inputs, T), in SANA-FE and here, under its conventions.
+def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> list[SimpleNamespace]:
+    """Run recordings, (recordings, n_inputs, T), in SANA-FE and here, under its conventions: spikes, times in ns per
+    step, energies in joules per part.
 
     Its channels fire one step before they act, and every layer integrates in each of T + depth + 1 steps.
     """
@@ -93,13 +83,11 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
     shifted[:, :, 1 : events.shape[2] + 1] = events
     trace = engine.simulate(ungated(netlist), shifted, spikes=True, membranes=True)
     updated = timing_oracle.updates(netlist, shifted, trace.spikes, trace.membranes)
-    as_priced = {"input_tiles": sanafe.input_tiles(netlist, LOIHI), "dense": timing_oracle.dense_synapses(netlist)}
-    latencies = timing.prepare(netlist, LOIHI, SANAFE, **as_priced)
-    batch = trace.spikes, updated, shifted
-    simple, detailed = timing_oracle.simple(latencies, *batch), timing.detailed(latencies, *batch)
-    counts = replace(trace.counts, updates=cost.updates_by_core(netlist, updated))
-    meter = cost.prepare(netlist, LOIHI, "core", **as_priced)
-    parts = cost.by_part(LOIHI, cost.count(meter, counts, steps))["sanafe"]
+    tiles, dense = sanafe.input_tiles(netlist, LOIHI), timing_oracle.dense_synapses(netlist)
+    chip = timing_oracle.Chip(netlist, LOIHI, SANAFE, tiles, dense)
+    times = [chip.run(*each) for each in zip(trace.spikes, updated, shifted, strict=True)]
+    worked = updated.sum(axis=(1, 2))
+    parts = timing_oracle.parts_of_energy(netlist, LOIHI, trace.counts, worked, steps, tiles, dense)
 
     names, number = sanafe.group_names(netlist), netlist.number_in_layer()
     compartment = {(names[netlist.layer[c]], int(number[c])): c for c in range(netlist.n_compartments)}
@@ -110,15 +98,15 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
         for step, group, k in first["spikes"]:
             fired[step, compartment[group, k]] = True
         runs.append(
-            Run(
+            SimpleNamespace(
                 spikes=fired,
                 expected_spikes=trace.spikes[i],
                 simple=1e9 * np.array(first["trace"]["sim_time"]),
                 detailed=1e9 * np.array(second["trace"]["sim_time"]),
                 energy={part: first["energy"][part] for part in cost.PARTS},
                 steps_energy={part: np.array(first["trace"][f"{part}_energy"]) for part in cost.PARTS},
-                ours_simple=simple.duration_ns[i],
-                ours_detailed=detailed.duration_ns[i],
+                ours_simple=np.array([step.simple for step in times[i]]) / PICO,
+                ours_detailed=np.array([step.detailed for step in times[i]]) / PICO,
                 ours_energy={part: float(joules[i].sum()) for part, joules in parts.items()},
             )
         )
@@ -169,3 +157,131 @@ def without_second_lists(netlist: Netlist, kept: np.ndarray) -> Netlist:
         synapse_target=read_only(netlist.synapse_target[synapses]),
         synapse_weight=read_only(netlist.synapse_weight[synapses]),
     )
+
+
+SIX_STEPS = """\
+# spikeloom netlist for SANA-FE 2.2.9 and its loihi.yaml; give the neurons of group input 'spikes'
+network:
+  name: spikeloom
+  groups:
+    - name: input
+      attributes: {log_spikes: false}
+      neurons:
+        - 0: {soma_hw_name: 'loihi_inputs[0]'}
+        - 1: {soma_hw_name: 'loihi_inputs[1]'}
+    - name: layer0
+      attributes: {soma_hw_name: loihi_lif, reset: 0.0, input_decay: 0.0, log_spikes: true}
+      neurons:
+        - 0: {threshold: 80.0, leak_decay: 0.199951171875, bias: 0.0, synapse_hw_name: loihi_dense_synapse}
+        - 1: {threshold: 80.0, leak_decay: 0.199951171875, bias: 0.0, synapse_hw_name: loihi_dense_synapse}
+    - name: layer1
+      attributes: {soma_hw_name: loihi_lif, reset: 0.0, input_decay: 0.0, log_spikes: true}
+      neurons:
+        - 0: {threshold: 80.0, leak_decay: 0.199951171875, bias: 0.0, synapse_hw_name: loihi_dense_synapse}
+  edges:
+    - input -> layer0:
+        type: sparse
+        source_target_pairs: [[0, 0], [0, 1], [1, 0], [1, 1]]
+        weight: [60.0, -30.0, 50.0, 90.0]
+    - layer0 -> layer1:
+        type: sparse
+        source_target_pairs: [[0, 0], [1, 0]]
+        weight: [100.0, 70.0]
+mappings:
+  - input.0..1: {core: '1.1'}
+  - layer0.0..1: {core: '1.0'}
+  - layer1.0..0: {core: '5.0'}
+"""
+
+
+def lines(netlist):
+    return list(sanafe.export(netlist, LOIHI))
+
+
+def test_the_whole_file(tmp_path):
+    netlist, _, _ = six_steps()
+    write_netlist(netlist, tmp_path / "net.loom")
+    path = tmp_path / "net.yaml"
+    report = as_json("export", tmp_path / "net.loom", "--to", "sanafe", "-o", path)
+    assert path.read_text("utf-8") == SIX_STEPS
+    assert (report["bytes"], report["sha256"]) == (len(SIX_STEPS), hashlib.sha256(SIX_STEPS.encode()).hexdigest())
+    assert (report["neurons"], report["synapses"], report["groups"]) == (3, 6, ["input", "layer0", "layer1"])
+
+
+def test_neurons_are_mapped_in_the_order_of_their_compartments():
+    neurons = [Neuron(layer=layer) for layer in (0, 1, 0, 0)] + [Neuron(core=1)]
+    netlist = build(neurons, [Axon(source=0, targets=((0, 2),))], n_inputs=1, depths=[0, 1])
+    netlist = replace(netlist, neuron=read_only([5, 0, 9, 7, 8]), core_tile=read_only([31, 31]))
+    assert netlist.number_in_layer().tolist() == [0, 0, 3, 1, 2]
+    mapped = lines(netlist)[lines(netlist).index("mappings:") + 1 :]
+    assert mapped == [
+        "  - input.0..0: {core: '31.2'}",
+        "  - layer0.0..0: {core: '31.0'}",
+        "  - layer1.0..0: {core: '31.0'}",
+        "  - layer0.3..3: {core: '31.0'}",
+        "  - layer0.1..1: {core: '31.0'}",
+        "  - layer0.2..2: {core: '31.1'}",
+    ]
+
+
+def test_parameters_and_weights_are_exact():
+    neuron = Neuron(threshold=131071, decay_v=0, bias=-4095, bias_exponent=7)
+    axons = [Axon(source=0, targets=((0, -254),), exponent=-1), Axon(source=1, targets=((0, 6),), exponent=7)]
+    text = "\n".join(lines(build([neuron, Neuron(bias=1)], axons, n_inputs=2, depths=[0])))
+    assert "- 0: {threshold: 131071.0, leak_decay: 1.0, bias: -8190.0, " in text
+    assert f"bias: {1 / 64}, " in text
+    assert "weight: [-127.0, 768.0]" in text
+
+
+def test_a_neuron_names_the_unit_of_most_of_its_synapses():
+    axons = [Axon(source=i, targets=((0, 2), (1, 2)), exponent=i) for i in range(3)]
+    netlist = build([Neuron(), Neuron()], axons, n_inputs=3, depths=[0])
+    netlist = replace(netlist, format_index_bits=read_only([0, 10, 10]))
+    assert len(re.findall("loihi_sparse_synapse", "\n".join(lines(netlist)))) == 2
+    assert not timing_oracle.dense_synapses(netlist).any()
+    netlist = replace(netlist, format_index_bits=read_only([0, 0, 10]))
+    assert len(re.findall("loihi_dense_synapse", "\n".join(lines(netlist)))) == 2
+    assert timing_oracle.dense_synapses(netlist).all()
+
+
+def test_names_are_such_that_the_format_can_hold_them():
+    netlist, _, _ = six_steps()
+    layers = tuple(replace(layer, name=name) for layer, name in zip(netlist.layers, ("a.b c", "input"), strict=True))
+    assert sanafe.group_names(replace(netlist, layers=layers)) == ("a_b_c", "input_1")
+    layers = tuple(replace(layer, name="fc") for layer in netlist.layers)
+    assert sanafe.group_names(replace(netlist, layers=layers)) == ("fc_0", "fc_1")
+
+
+def test_channels_fill_cores_of_their_own():
+    netlist = replace(six_steps()[0], taxels=1030)
+    text = "\n".join(lines(netlist))
+    assert "- 1029: {soma_hw_name: 'loihi_inputs[5]'}" in text
+    assert "- input.0..1023: {core: '1.1'}\n  - input.1024..1029: {core: '1.2'}" in text
+
+
+def test_a_current_that_lasts_is_a_float_there_and_that_is_said(tmp_path):
+    netlist, _, _ = six_steps()
+    netlist = replace(netlist, decay_u=read_only([4095, 4095, 2047]))
+    write_netlist(netlist, tmp_path / "net.loom")
+    report = as_json("export", tmp_path / "net.loom", "--to", "sanafe", "-o", tmp_path / "net.yaml")
+    assert report["floating_currents"] == ["layer1"]
+    written = (tmp_path / "net.yaml").read_text("utf-8")
+    assert written.count("input_decay: 0.5, ") == 1
+    told = "# currents of layer1 outlast a step: floats here, whole 64ths on the chip\n"
+    assert written.replace("input_decay: 0.5, ", "").replace(told, "") == SIX_STEPS
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("sanafe --data x", "--data x: is for netx and ranc"),
+        ("onnx --recording 0", "--recording 0: is for ranc"),
+        ("ranc --limit 1 --data x", "--limit 1: is for netx"),
+        ("netx --limit 2", "--limit 2: says which recording of --data"),
+        ("nir --form step", "--form step: is for onnx"),
+        ("sanafe --dt 1", "--dt 1.0: is for nir"),
+        ("sanafe --strict", "--strict: is for netx"),
+    ],
+)
+def test_options_that_a_format_would_ignore(tmp_path, words, said):
+    assert refusal("export", "x.loom", "-o", tmp_path / "x", "--to", *words.split()).startswith(said)

@@ -20,9 +20,9 @@ from spikeloom.compiler import archive
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import CapacityError, FormatError
 from spikeloom.compiler.files import remove_leftovers, write_atomically
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import (
+from spikeloom.compiler.targets.loihi1.netlist import (
     FILE,
+    Netlist,
     inconsistencies,
     netlist_bytes,
     read_netlist,
@@ -156,6 +156,10 @@ def manifest(text):
     return lambda path: rewrite(path, manifest=np.array(text))
 
 
+def without(name):
+    return lambda path: write_members(path, {k: v for k, v in archive.read_members(path).items() if k != name})
+
+
 LAYER = {"name": "fc1", "neurons": 3, "unread": [], "depth": 0, "weight_bits": 8, "synapses": 9, "max_fan_in": 6}
 LAYER |= {"beta": 0.2, "theta": 0.5, "alpha": 0.0}
 DAMAGES = [
@@ -175,9 +179,12 @@ DAMAGES = [
     *((manifest(text), "not a netlist") for text in ("[]", "3", "{}", '{"format": "spikeloom-checkpoint"}')),
     *(
         (stating(layers=[LAYER | {name: value}]), "no usable layers")
-        for name, value in {"neurons": "3", "scale": 0, "depth": 0.5, "name": 7, "beta": -1, "colour": "red"}.items()
+        for name, value in {"neurons": -1, "scale": 0, "depth": 0.5, "name": 7, "beta": -1, "colour": "red"}.items()
     ),
+    (stating(layers=[]), "no usable layers"),
+    (stating(target="loihi9"), "is for 'loihi9', this program knows loihi1"),
     (lambda path: rewrite(path, axon_sauce=np.zeros(1, "<i1")), "unknown members (axon_sauce)"),
+    (without("threshold"), "missing or unknown members (threshold)"),
 ]
 
 

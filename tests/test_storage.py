@@ -10,7 +10,7 @@ from random_networks import BITS, LOIHI, chain, float_networks, moved, random_ch
 
 from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, plane_distance, reach, split_planes, weight_step
-from spikeloom.compiler.interpret import cut, run_float, run_integer, vote
+from spikeloom.compiler.interpret import channels_last, cut, run_float, run_integer, vote
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import Form, one_sided
 from spikeloom.compiler.passes.calibrate import calibrate
@@ -163,7 +163,7 @@ def test_the_finest_scales_are_legal_and_hardly_more_is(bits, exponents):
     assert abs(units[0] - finest.min()) <= max(1, units[0] // SCALE_STEPS)
 
 
-@settings(deadline=None, max_examples=6)
+@settings(deadline=None, max_examples=10)
 @given(float_networks(), st.sampled_from(BITS), st.integers(1, 3), st.integers(1, 8), st.booleans(), st.data())
 def test_every_recipe_gives_a_proven_legal_network(network, bits, planes, groups, calibrated, data):
     calibration = calibrate(network, data.draw(recordings_for(network.input.size))) if calibrated else None
@@ -171,11 +171,25 @@ def test_every_recipe_gives_a_proven_legal_network(network, bits, planes, groups
     integer, choices = choose_storage(network, LOIHI, packings=(packing,), calibration=calibration)
     verify(integer)
     assert all(proof.accumulator <= 2**21 - 1 for proof in prove_ranges(integer))
-    for population, choice in zip(integer.populations, choices, strict=True):
+    assert [choice.layer for choice in choices] == [population.name for population in network.populations]
+    for population, model, choice in zip(integer.populations, network.populations, choices, strict=True):
         assert len(np.unique(population.threshold)) == choice.groups <= groups
         assert 1 <= choice.planes <= planes
         assert choice.scale <= choice.finest_scale
-        np.testing.assert_allclose(population.realised_theta, population.theta, rtol=1e-15)
+        np.testing.assert_allclose(population.realised_theta, model.theta, rtol=1e-15)
+        # a bias is off by half a unit of its register at most
+        unit = 2.0**population.bias_exponent / (64 * population.scale)
+        error = population.bias / (64 * population.scale) - model.bias
+        assert choice.compensated or np.all(np.abs(error) <= unit / 2 * (1 + 1e-9))
+    for projection in integer.projections:
+        assert projection.bits == bits
+        assert projection.exponent in LOIHI.choices["synapse.exponent"]
+        assert not np.any(projection.weight.data % weight_step(bits))
+        assert np.all(np.abs(projection.weight.data) <= 256 - weight_step(bits))
+    for original in network.projections:  # the finest plane, which comes first, has every synapse
+        finest = next(p for p in integer.projections if (p.pre, p.post) == (original.pre, original.post))
+        assert np.array_equal(original.weight.indices, finest.weight.indices)
+        assert np.array_equal(original.weight.indptr, finest.weight.indptr)
 
 
 # --- compensation
@@ -295,55 +309,48 @@ WIDTHS = (2, 4, 8)
 
 def drawn(seed, *, samples=24, steps=16, taxels=5, rate=0.3):
     """A small network, recordings and labels that it gets right half the time."""
-    checkpoint = random_checkpoint(seed=seed, taxels=taxels, sizes=(7, 6, 4))
     rng = np.random.default_rng(seed + 100)
     events = (rng.random((samples, taxels, 2, steps)) < rate).astype(np.uint8)
+    checkpoint = random_checkpoint(seed=seed, taxels=taxels, sizes=(7, 6, 4))
     network = expand(checkpoint, np.full((taxels, taxels), 1 / taxels))
-    decided = vote(run_float(network, channels(events)).spikes[-1].sum(axis=1))
+    decided = vote(run_float(network, channels_last(events)).spikes[-1].sum(axis=1))
     labels = np.where(rng.random(samples) < 0.5, decided, rng.integers(0, 4, samples))
-    return checkpoint, network, events, labels
+    return network, events, labels
 
 
-def channels(events):
-    samples, taxels, polarities, steps = events.shape
-    return events.reshape(samples, taxels * polarities, steps).transpose(0, 2, 1).astype(bool)
-
-
-def compiled(checkpoint, events, bits, groups=1):
-    taxels = events.shape[1]
-    packings = [Packing(bits=b, groups=groups) for b in bits]
-    return compile_network(
-        expand(checkpoint, np.full((taxels, taxels), 1 / taxels)), Options(packings=packings, training_events=events)
-    )
-
-
-def decisions(integer, events, lengths=None):
-    return vote(cut(run_integer(integer, events).spikes[-1], lengths).sum(axis=1))
-
-
-def test_figures_are_those_of_the_compiler():
-    """Every point that is built counts what the compiled netlist does, and no other built point beats it."""
-    checkpoint, network, events, labels = drawn(2)
-    samples, flat = 9, channels(events)
-    made = search_widths(network, LOIHI, flat, labels, widths=(2, 8), groups=2, samples=samples)
+@pytest.mark.parametrize("shorter", [False, True])
+def test_figures_are_those_of_the_compiler(shorter):
+    """Every point that is built counts what the compiled netlist does; recordings count up to their own length."""
+    network, events, labels = drawn(2)
+    lengths = np.random.default_rng(0).integers(3, events.shape[3] + 1, len(events)) if shorter else None
+    for index, length in enumerate(lengths if shorter else ()):
+        events[index, ..., length:] = 0
+    samples, flat = 9, channels_last(events)
+    options = {"widths": (2, 8), "groups": 2, "samples": samples, "lengths": lengths}
+    made = search_widths(network, LOIHI, flat, labels, **options)
     picked = np.linspace(0, len(events) - 1, samples).round().astype(int)
-    wanted = vote(run_float(network, flat[picked]).spikes[-1].sum(axis=1))
+
+    def decided(spikes):
+        return vote(cut(spikes, lengths[picked] if shorter else None).sum(axis=1))
+
+    wanted = decided(run_float(network, flat[picked]).spikes[-1])
     assert (made.samples, made.float_right) == (samples, np.count_nonzero(wanted == labels[picked]))
     assert {point.bits for point in made.built} <= {point.bits for point in made.points}
     assert {(8,) * 4, (2,) * 4} <= {point.bits for point in made.points}
     for point in made.built:
-        compilation = compiled(checkpoint, events, point.bits, 2)
-        decided = decisions(compilation.integer, flat[picked])
-        assert point.equal == np.count_nonzero(decided == wanted)
-        assert point.right == np.count_nonzero(decided == labels[picked])
+        packings = [Packing(bits=bits, groups=2) for bits in point.bits]
+        compilation = compile_network(network, Options(packings=packings, training_events=events))
+        ours = decided(run_integer(compilation.integer, flat[picked]).spikes[-1])
+        assert point.equal == np.count_nonzero(ours == wanted)
+        assert point.right == np.count_nonzero(ours == labels[picked])
         assert point.cores == compilation.netlist.n_cores
         used = sum(use.used for use in measure(compilation.netlist, LOIHI) if use.name == "core.synapse_words")
         assert point.words <= used
 
 
 def test_the_descent_takes_the_best_neighbour_and_builds_the_best():
-    _, network, events, labels = drawn(0)
-    made = search_widths(network, LOIHI, channels(events), labels, widths=WIDTHS)
+    network, events, labels = drawn(0)
+    made = search_widths(network, LOIHI, channels_last(events), labels, widths=WIDTHS)
     best = {point.bits for by in ("equal", "right") for point in widths_front(made.built, by)}
     assert best <= {point.bits for point in made.built} <= {point.bits for point in made.points}
     points = {point.bits: point for point in made.points}
@@ -352,20 +359,6 @@ def test_the_descent_takes_the_best_neighbour_and_builds_the_best():
         while at != (2, 2, 2, 2):
             below = [(*at[:i], WIDTHS[WIDTHS.index(b) - 1], *at[i + 1 :]) for i, b in enumerate(at) if b > 2]
             at = max(below, key=lambda bits: (getattr(points[bits], figure), -points[bits].words))
-
-
-def test_recordings_count_up_to_their_own_length():
-    checkpoint, network, events, labels = drawn(6)
-    lengths = np.random.default_rng(0).integers(3, events.shape[3] + 1, len(events))
-    for index, length in enumerate(lengths):
-        events[index, ..., length:] = 0
-    flat = channels(events)
-    made = search_widths(network, LOIHI, flat, labels, widths=(2, 8), lengths=lengths)
-    wanted = vote(cut(run_float(network, flat).spikes[-1], lengths).sum(axis=1))
-    assert made.float_right == np.count_nonzero(wanted == labels)
-    for point in made.built:
-        decided = decisions(compiled(checkpoint, events, point.bits).integer, flat, lengths)
-        assert point.equal == np.count_nonzero(decided == wanted)
 
 
 def test_memory_is_counted_list_by_list():

@@ -17,7 +17,6 @@ from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.models.graphs import NEUTOUCH, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
-from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.trace import unpack
@@ -30,8 +29,8 @@ from spikeloom.runtime.studies.stress.results import Run, Spread
 from spikeloom.runtime.studies.stress.study import clean, generator, measure
 from spikeloom.runtime.studies.stress.verdicts import curve, parse_requirement, reasons, spread, unmet
 
-REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data")
-FEW = ("--seeds", "2", "--only", "taxels_dead,events_lost,warm_state,longer,weight_bit_flips,other_graph,fewer_bits")
+STRESS, REPORT = (f"{command} net.loom --checkpoint net.pt --data data".split() for command in ("stress", "report"))
+FEW = "taxels_dead,events_lost,warm_state,longer,weight_bit_flips,other_graph,fewer_bits"
 
 
 def bench_of(network, netlist, recordings, *, checkpoint=None, edges=None, places=None):
@@ -47,13 +46,6 @@ def bench_of(network, netlist, recordings, *, checkpoint=None, edges=None, place
     )
 
 
-def timed_bench(folder):
-    """A network with clocks and lasting currents."""
-    _, seen = written(folder / "net.pt")
-    network = expand(read_checkpoint(folder / "net.pt"), seen)
-    return bench_of(network, compile_network(network).netlist, events_of(3))
-
-
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
     """A small TactileSGNet, labelled as its float model decides."""
@@ -63,12 +55,6 @@ def bench(tmp_path_factory):
     made = bench_of(network, compile_network(network).netlist, events(2, samples=8), **known)
     found, _ = clean(made)
     return replace(made, labels=found.decisions("float"))
-
-
-@pytest.fixture
-def stress(spikeloom):
-    """Run the command; gives exit code, standard output and standard error."""
-    return lambda *words: spikeloom("stress", "net.loom", "--checkpoint", "net.pt", "--data", "data", *words)
 
 
 # -- both sides --------------------------------------------------------------------------------------------------------
@@ -119,8 +105,10 @@ def test_ten_times_as_long_is_ten_recordings_of_which_the_last_counts(bench):
 
 def test_clocks_are_no_taxels(tmp_path):
     """Whatever happens to taxels, clocks tick: again with each recording, and to their end in a longer one."""
-    made = timed_bench(tmp_path)
-    netlist = made.pair.netlist
+    _, seen = written(tmp_path / "net.pt")
+    network = expand(read_checkpoint(tmp_path / "net.pt"), seen)
+    netlist = compile_network(network).netlist
+    made = bench_of(network, netlist, events_of(3))
     ticks = netlist.clocks.events(15)
     sensor = netlist.taxels * netlist.polarities
     silent = NAMES["taxels_dead"](made.events, 39, made.sensor, generator("taxels_dead", 0))
@@ -146,7 +134,7 @@ def test_recordings_of_different_length_are_disturbed_within_their_own(bench):
     shorter = replace(bench, events=cut, lengths=lengths)
     reference, _ = clean(shorter)
     for name in ("saturated", "warm_state", "longer"):
-        (run,) = measure(shorter, name, 1, [0], reference)
+        run = measure(shorter, name, 1, 0, reference)
         assert sum(run.right.values()) <= 16
     alone = engine.simulate(bench.pair.netlist, with_clocks(cut[1:2, ..., :10], bench.pair.netlist.clocks))
     assert_array_equal(reference.votes["chip"][1], class_counts(bench.pair.netlist, alone.counts.spikes)[0])
@@ -171,9 +159,8 @@ def test_every_perturbation_runs_at_its_mildest_and_harshest_the_same_for_a_seed
     levels = NAMES[name].levels_of(TAXELS, full=False)
     for level in {levels[0], levels[-1]}:
         seeds = [0, 1] if NAMES[name].seeded else [0]
-        runs = measure(bench, name, level, seeds, reference)
-        again = measure(bench, name, level, seeds[::-1], reference)[::-1]
-        assert runs == again
+        runs = [measure(bench, name, level, seed, reference) for seed in seeds]
+        assert runs == [measure(bench, name, level, seed, reference) for seed in seeds]
         assert [run.seed for run in runs] == seeds
         for run in runs:
             assert run.layers.keys() == undisturbed.layers.keys()
@@ -209,15 +196,8 @@ def test_all_systems_timed_and_joined(tmp_path, system):
     recordings = events_of(3, samples=2)
     for checkpoint in (members[0], joined):
         network = expand(checkpoint, seen)
-        edges = None if system == "mlp" else checkpoint.edges
-        made = bench_of(
-            network,
-            compile_network(network).netlist,
-            recordings,
-            checkpoint=checkpoint,
-            edges=edges,
-            places=NEUTOUCH,
-        )
+        known = {"checkpoint": checkpoint, "edges": None if system == "mlp" else checkpoint.edges, "places": NEUTOUCH}
+        made = bench_of(network, compile_network(network).netlist, recordings, **known)
         reference, _ = clean(made)
         spikes = list(float_spikes(checkpoint, seen, recordings).values())[-1]
         assert_array_equal(reference.votes["float"], readout_counts(network.readout, network.classes, spikes))
@@ -226,7 +206,7 @@ def test_all_systems_timed_and_joined(tmp_path, system):
         assert {name for name, why in skipped.items() if why} == (graphs if system == "mlp" else set())
         for name, why in skipped.items():
             if why is None:
-                (run,) = measure(made, name, NAMES[name].levels_of(39, full=False)[0], [0], reference)
+                run = measure(made, name, NAMES[name].levels_of(39, full=False)[0], 0, reference)
                 assert run.stopped in range(3)
 
 
@@ -337,13 +317,14 @@ def test_spikes_in_common_and_requirements():
 
 
 # -- the command -------------------------------------------------------------------------------------------------------
-def test_any_number_of_threads_says_the_same(stress, place):
-    code, out, err = stress(*FEW, "-o", "one.json")
+def test_any_number_of_threads_says_the_same(spikeloom, place):
+    words = (*STRESS, "--seeds", "2", "--only", FEW)
+    code, out, err = spikeloom(*words, "-o", "one.json")
     assert (code, err) == (0, "")
-    assert stress(*FEW, "--jobs", "1", "-o", "two.json")[1] == out
+    assert spikeloom(*words, "--jobs", "1", "-o", "two.json")[1] == out
     assert (place / "one.json").read_bytes() == (place / "two.json").read_bytes()
     report = json.loads((place / "one.json").read_bytes())
-    wanted = set(FEW[3].split(",")) - {"other_graph"}  # the positions of its taxels are not known
+    wanted = {*FEW.split(",")} - {"other_graph"}  # the positions of its taxels are not known
     assert list(report["perturbations"]) == [name for name in NAMES if name in wanted]
     assert list(report["not_applicable"]) == ["other_graph"]
     levels = report["perturbations"]["taxels_dead"]["levels"]
@@ -353,23 +334,14 @@ def test_any_number_of_threads_says_the_same(stress, place):
     assert report["provenance"]["netlist"] == "net.loom"
 
 
-def test_requirements_decide_about_the_exit_code(stress):
-    words = ("--only", "taxels_dead", "--seeds", "2", "--require", "taxels_dead:2>=0")
-    code, out, _ = stress(*words, "--json")
-    report = json.loads(out)
-    assert (code, report["missed"], report["required"]) == (0, [], ["taxels_dead:2>=0"])
+def test_requirements_decide_about_the_exit_code(as_json):
+    words = (*STRESS, "--only", "taxels_dead", "--seeds", "2", "--require", "taxels_dead:2>=0")
+    report = as_json(*words)
+    assert (report["missed"], report["required"]) == ([], ["taxels_dead:2>=0"])
     levels = report["perturbations"]["taxels_dead"]["levels"]
     assert [point["level"] for point in levels] == [1, 2, 3, 5]
-    code, out, _ = stress(*words, "--require", "taxels_dead:2>=1", "--json")
     missed = [f"taxels_dead:2>=1: {levels[1]['chip']['mean']:.4f} reached"]
-    assert (code, json.loads(out)["missed"]) == (1, missed)
-
-
-def test_the_page_of_a_network_shows_it(stress, place, capsys):
-    assert stress("--only", "taxels_dead", "--seeds", "1", "-o", "page.json")[0] == 0
-    assert cli.main([*REPORT, "--stress", "page.json", "-o", "page.html", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["stress"] == json.loads((place / "page.json").read_bytes())
-    assert ">taxels_dead: " in (place / "page.html").read_text("utf-8")
+    assert as_json(*words, "--require", "taxels_dead:2>=1", codes=(1,))["missed"] == missed
 
 
 @pytest.mark.parametrize(
@@ -387,11 +359,8 @@ def test_the_page_of_a_network_shows_it(stress, place, capsys):
         ("--seeds 0", "allowed are 1 or more"),
     ],
 )
-def test_what_is_refused(stress, words, telling):
-    code, out, err = stress(*words.split())
-    assert (code, out) == (2, "")
-    assert err.startswith("spikeloom: ")
-    assert telling in err
+def test_what_is_refused(refusal, words, telling):
+    assert telling in refusal(*STRESS, *words.split())
 
 
 def test_what_does_not_apply(bench):
@@ -403,17 +372,19 @@ def test_what_does_not_apply(bench):
     assert "ONNX or NIR file has no taxel graph" in NAMES["edges_rewired"].why_not(pair, onnx)
 
 
-@pytest.mark.parametrize("content", ["{", '{"recordings": 3}', "foreign"])
-def test_a_page_refuses_what_is_no_result_about_its_netlist(stress, place, capsys, content):
-    telling = "is not what spikeloom stress -o writes"
-    if content == "foreign":
-        assert stress("--only", "longer", "-o", "s.json")[0] == 0
-        found = json.loads((place / "s.json").read_bytes())
-        telling = f"sha256 000000000000…, net.loom has {found['provenance']['netlist_sha256'][:12]}…"
-        found["provenance"]["netlist_sha256"] = "0" * 64
-        content = json.dumps(found)
-    (place / "s.json").write_text(content)
-    assert cli.main([*REPORT, "--stress", "s.json", "-o", "x.html"]) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("spikeloom: --stress s.json: ")
-    assert telling in err
+def test_the_page_of_a_network_shows_it_if_it_is_a_result_about_its_netlist(as_json, refusal, place):
+    as_json(*STRESS, "--only", "taxels_dead", "--seeds", "1", "-o", "page.json")
+    words, content = (*REPORT, "-o", "page.html", "--stress"), (place / "page.json").read_text()
+    found = json.loads(content)
+    assert as_json(*words, "page.json")["stress"] == found
+    assert ">taxels_dead: " in (place / "page.html").read_text("utf-8")
+    sha256 = found["provenance"]["netlist_sha256"]
+    for wrong, telling in (
+        ("{", "is not what spikeloom stress -o writes"),
+        ('{"recordings": 3}', "is not what spikeloom stress -o writes"),
+        (content.replace(sha256, "0" * 64), f"sha256 000000000000…, net.loom has {sha256[:12]}…"),
+    ):
+        (place / "wrong.json").write_text(wrong)
+        line = refusal(*words, "wrong.json")
+        assert line.startswith("--stress wrong.json: ")
+        assert telling in line

@@ -11,8 +11,7 @@ from random_netlists import Axon, Neuron, build, by_engine, large_netlist, netli
 
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import sanafe
-from spikeloom.compiler.targets.base import Quantity, load_target
-from spikeloom.compiler.targets.price_tables import LATENCIES
+from spikeloom.compiler.targets.base import LATENCIES, Quantity, load_target
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost
 
@@ -33,23 +32,23 @@ def table(link_buffer=16, **latencies):
     )
 
 
-def both(netlist, trace, events, *, times=SANAFE, input_tiles=()):
+def both(netlist, trace, events, *, times=SANAFE):
     """Simple and detailed times of one recording."""
-    latencies = timing.prepare(netlist, LOIHI, times, input_tiles=input_tiles)
+    latencies = timing.prepare(netlist, LOIHI, times)
     batch = trace.spikes[None], trace.updated[None], events[None]
     return timing_oracle.simple(latencies, *batch), timing.detailed(latencies, *batch)
 
 
-def assert_as_defined(netlist, trace, events, *, times=SANAFE, input_tiles=()):
+def assert_as_defined(netlist, trace, events, *, times=SANAFE):
     """Every figure of both models is the definition's; returns what it says."""
-    simple, detailed = both(netlist, trace, events, times=times, input_tiles=input_tiles)
-    wanted = timing_oracle.Chip(netlist, LOIHI, times, input_tiles).run(trace.spikes, trace.updated, events)
+    simple, detailed = both(netlist, trace, events, times=times)
+    wanted = timing_oracle.Chip(netlist, LOIHI, times).run(trace.spikes, trace.updated, events)
 
     def column(name, scale=PICO):
         return np.array([[getattr(step, name) for step in wanted]]) / scale
 
     np.testing.assert_array_equal(simple.duration_ns, column("simple"))
-    cores = len(wanted[0].generation) if wanted else netlist.n_cores + len(input_tiles)
+    cores = netlist.n_cores
     for name in ("generation", "processing"):
         total = [sum(getattr(step, name)[core] for step in wanted) / PICO for core in range(cores)]
         np.testing.assert_array_equal(getattr(simple, f"{name}_ns"), [total])
@@ -89,11 +88,11 @@ SIMPLE = [1047.2, 1054.5, 1039.7, 1047.2, 1054.5, 1054.5]
 def test_the_published_times_to_the_decimal():
     netlist, events, trace = six_steps()
     assert np.argwhere(trace.spikes).tolist() == [[1, 0], [2, 2], [4, 0], [5, 1], [5, 2]]
-    simple, detailed = both(netlist, trace, events, input_tiles=(0,))
-    assert detailed.duration_ns[0].round(1).tolist() == DETAILED
-    assert simple.duration_ns[0].tolist() == SIMPLE
-    assert detailed.duration_ns.sum() == pytest.approx(6373.1, abs=0.05)
-    assert_as_defined(netlist, trace, events, input_tiles=(0,))
+    steps = timing_oracle.Chip(netlist, LOIHI, SANAFE, (0,)).run(trace.spikes, trace.updated, events)
+    assert [round(step.detailed / PICO, 1) for step in steps] == DETAILED
+    assert [step.simple / PICO for step in steps] == SIMPLE
+    assert sum(step.detailed for step in steps) / PICO == pytest.approx(6373.1, abs=0.05)
+    assert_as_defined(netlist, trace, events)
 
 
 ENERGY_PJ = {
@@ -111,9 +110,7 @@ def test_the_published_energies_to_the_decimal():
     updated = timing_oracle.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
     # o fired in step 2 on what arrived; its current still holds that in step 3, and nothing else happens to it
     assert np.argwhere(trace.updated & ~updated).tolist() == [[3, 2]]
-    counts = replace(counts, updates=cost.updates_by_core(netlist, updated[:, None]))
-    amounts = cost.count(cost.prepare(netlist, LOIHI, "core", input_tiles=(0,)), counts, 1)
-    parts = cost.by_part(LOIHI, amounts)["sanafe"]
+    parts = timing_oracle.parts_of_energy(netlist, LOIHI, counts, updated.sum(axis=1), 1, (0,))
     assert {part: (1e12 * joules.sum(axis=1)).round(1).tolist() for part, joules in parts.items()} == ENERGY_PJ
 
 
@@ -135,7 +132,7 @@ def test_inputs_on_no_core_are_processed_at_once_and_from_the_start():
 # -- the definition ----------------------------------------------------------------------------------------------------
 @st.composite
 def cases(draw):
-    """A network on any tiles, a recording, a table with large and small latencies, tiles of inputs or none."""
+    """A network on any tiles, a recording, a table with large and small latencies."""
     netlist = draw(netlists(weight_exponents=(0,)))
     tile = st.sampled_from([0, 1, 8, 12, 31])
     tiles = draw(st.lists(tile, min_size=netlist.n_cores, max_size=netlist.n_cores))
@@ -147,29 +144,28 @@ def cases(draw):
     chosen = {event: draw(latency) for event in LATENCIES}
     times = table(draw(st.sampled_from([0, 1, 16])), **chosen)
     events = draw(recordings(netlist, max_length=5))
-    input_tiles = draw(st.sampled_from([(), (0,), (9,)]))
-    return netlist, events, times, input_tiles
+    return netlist, events, times
 
 
 @settings(deadline=None, max_examples=50)
 @given(cases(), st.integers(0, 2**32 - 1))
 def test_kernels_and_definition_agree_exactly(case, seed):
-    netlist, events, times, input_tiles = case
+    netlist, events, times = case
     steps = events.shape[1] + 2
     rng = np.random.default_rng(seed)
     spikes = rng.random((steps, netlist.n_compartments)) < 0.5
     trace = forced(netlist, spikes, spikes | (rng.random(spikes.shape) < 0.5))
-    assert_as_defined(netlist, trace, events, times=times, input_tiles=input_tiles)
+    assert_as_defined(netlist, trace, events, times=times)
 
 
-@pytest.mark.parametrize(("link_buffer", "input_tiles"), [(0, ()), (2, (1,)), (16, (1,))])
-def test_kernels_and_definition_agree_on_a_crowded_mesh(link_buffer, input_tiles):
+@pytest.mark.parametrize("link_buffer", [0, 2, 16])
+def test_kernels_and_definition_agree_on_a_crowded_mesh(link_buffer):
     netlist = replace(large_netlist(1, proved=True), core_tile=read_only([0, 0, 3, 17, 30]))
     rng = np.random.default_rng(2)
     spikes = rng.random((3, netlist.n_compartments)) < 0.3
     events = (rng.random((netlist.n_inputs, 3)) < 0.5).astype(np.uint8)
     trace = forced(netlist, spikes, spikes | (rng.random(spikes.shape) < 0.5))
-    wanted = assert_as_defined(netlist, trace, events, times=table(link_buffer), input_tiles=input_tiles)
+    wanted = assert_as_defined(netlist, trace, events, times=table(link_buffer))
     assert (max(step.blocked for step in wanted) > 0) == (link_buffer < 16)
 
 
@@ -252,14 +248,6 @@ def test_input_cores_go_where_there_is_room():
     assert sanafe.input_tiles(one_left, LOIHI) == (31,)
 
 
-def test_input_channels_spread_over_their_cores():
-    netlist = replace(six_steps()[0], taxels=1500)
-    latencies = timing.prepare(netlist, LOIHI, SANAFE, input_tiles=(3, 4))
-    size = netlist.n_compartments
-    assert latencies.start.tolist() == [0, 2, size, size + 1024, size + 1500]
-    assert latencies.barrier == 1400 * PICO  # four tiles
-
-
 # -- energy by part and core -------------------------------------------------------------------------------------------
 def test_parts_and_cores_add_up_to_the_estimate():
     netlist = replace(large_netlist(3, proved=True), core_tile=read_only([0, 0, 3, 17, 30]))
@@ -268,9 +256,9 @@ def test_parts_and_cores_add_up_to_the_estimate():
     events = (np.random.default_rng(4).random((3, netlist.n_inputs, 12)) < 0.3).astype(np.uint8)
     lengths = np.array([12, 5, 0])
     trace = engine.simulate(netlist, events, lengths=lengths, spikes=True, updated=True)
-    estimate = cost.estimate(cost.prepare(netlist, LOIHI), trace.counts, lengths + netlist.max_depth)
+    estimate = cost.price(cost.prepare(netlist, LOIHI), trace.counts, lengths + netlist.max_depth)
     counts = replace(trace.counts, updates=cost.updates_by_core(netlist, trace.updated))
-    amounts = cost.estimate(cost.prepare(netlist, LOIHI, "core"), counts, lengths + netlist.max_depth).events
+    amounts = cost.price(cost.prepare(netlist, LOIHI, "core"), counts, lengths + netlist.max_depth).events
     assert all(amount.shape == (3, netlist.n_cores) for amount in amounts.values())
     for event, amount in amounts.items():
         np.testing.assert_allclose(amount.sum(axis=1), estimate.events[event].sum(axis=1), err_msg=event)
@@ -285,11 +273,7 @@ def test_amounts_of_a_core_are_its_own():
     netlist, _, trace = six_steps()
     updates = cost.updates_by_core(netlist, trace.updated[None])
     counts = replace(trace.counts, inputs=trace.counts.inputs[None], spikes=trace.counts.spikes[None], updates=updates)
-
-    def amounts_of(**options):
-        return cost.count(cost.prepare(netlist, LOIHI, "core", **options), counts, 6)
-
-    amounts = amounts_of()
+    amounts = cost.count(cost.prepare(netlist, LOIHI, "core"), counts, 6)
     # h0 fires twice and h1 once, all to o; o fires twice, to nobody; six events reach two neurons each
     assert amounts["spike"].tolist() == [[3, 2]]
     assert amounts["packet"].tolist() == amounts["hop_east_west"].tolist() == [[3, 0]]
@@ -297,20 +281,3 @@ def test_amounts_of_a_core_are_its_own():
     assert amounts["synaptic_operation_dense"].tolist() == [[12, 3]]
     assert amounts["neuron_active"].tolist() == updates.tolist()
     assert amounts["neuron_idle"].tolist() == [[12 - updates[0, 0], 6 - updates[0, 1]]]
-    fed = amounts_of(input_tiles=(0,))
-    assert fed["packet"].tolist() == [[3, 0, 6]]
-    assert fed["hop_north_south"].tolist() == [[0, 0, 6]]
-    assert fed["neuron_idle"][:, 2:].tolist() == [[0]]
-    sparse = amounts_of(dense=np.zeros(netlist.n_synapses, np.bool_))
-    assert sparse["synaptic_operation_sparse"].tolist() == [[12, 3]]
-    assert not sparse["synaptic_operation_dense"].any()
-
-
-@pytest.mark.parametrize("dense", [True, False])
-def test_synapses_take_the_time_that_one_says(dense):
-    netlist = large_netlist(5, proved=True)
-    said = timing.prepare(netlist, LOIHI, SANAFE, dense=np.full(netlist.n_synapses, dense))
-    form = np.full(len(netlist.format_index_bits), 0 if dense else 10)
-    stored = timing.prepare(replace(netlist, format_index_bits=read_only(form)), LOIHI, SANAFE)
-    for ours, theirs in zip(said, stored, strict=True):
-        np.testing.assert_array_equal(ours, theirs)

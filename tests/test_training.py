@@ -10,15 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import RUNTIME
+from commands import RUNTIME, as_json, refusal, run
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
-from spikeloom.runtime.cli import main
+from spikeloom.runtime.studies import training as trainings
 from spikeloom.runtime.studies.jobs import only_one
-from spikeloom.runtime.studies.training import training as trainings
 
 ROOT = Path(__file__).resolve().parents[1]
 WORDS = ("train", "--data", "data", "--graph", "manual")
@@ -36,13 +35,8 @@ def data(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def as_json(capsys, *words):
-    assert main([*words, "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def test_one_seed_reports_both_protocols_and_stores_three_epochs(data, capsys):
-    report = as_json(capsys, "train", "--data", "data", "--graph", "manual", "--epochs", "2", "-o", "x.pt")
+def test_one_seed_reports_both_protocols_and_stores_three_epochs(data):
+    report = as_json(*WORDS, "--epochs", "2", "-o", "x.pt")
     (run,) = report["runs"]
     assert run["command"] == "spikeloom train --data data --graph manual --epochs 2 --seed 0"
     assert {name: run[name]["chosen_on"] for name in ("last", "best", "clean")} == {
@@ -63,27 +57,25 @@ def test_one_seed_reports_both_protocols_and_stores_three_epochs(data, capsys):
     assert read_checkpoint("x.pt").weights == "last"
 
 
-def test_seeds_side_by_side_equal_single_ones_and_finished_ones_are_left_alone(data, capsys):
+def test_seeds_side_by_side_equal_single_ones_and_finished_ones_are_left_alone(data):
     words = (*WORDS, "--epochs", "1")
     several = (*words, "--seeds", "2", "--seed", "4", "-o", "x.pt")
-    report = as_json(capsys, *several, "--picture", "a.png")
+    report = as_json(*several, "--picture", "a.png")
     assert [run["file"] for run in report["runs"]] == ["x-seed4.pt", "x-seed5.pt"]
     assert (data / "a.png").read_bytes()[:4] == b"\x89PNG"
-    single = as_json(capsys, *words, "--seed", "5", "-o", "y.pt")
+    single = as_json(*words, "--seed", "5", "-o", "y.pt")
     assert (data / "y.pt").read_bytes() == (data / "x-seed5.pt").read_bytes()
     accuracies = [run["last"]["accuracy"] for run in report["runs"]]
     assert report["protocols"]["last"]["mean"] == pytest.approx(np.mean(accuracies))
     assert report["protocols"]["last"]["std"] == pytest.approx(np.std(accuracies, ddof=1))
     assert single["runs"][0]["sha256"] == report["runs"][1]["sha256"]
 
-    assert main([*several, "--resume", "--picture", "b.png", "--json"]) == 0
-    out, err = capsys.readouterr()
+    _, out, err = run(*several, "--resume", "--picture", "b.png", "--json")
     assert err == "".join(f"spikeloom: x-seed{seed}.pt: is finished, not trained again\n" for seed in (4, 5))
     assert json.loads(out) == report
     assert Path("a.png").read_bytes() == Path("b.png").read_bytes()
 
-    assert main([*several, "--resume"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = run(*several, "--resume")[1].splitlines()
     assert lines[0] == "spikeloom train --data data --graph manual --epochs 1 --seed 4 --seeds 2"
     assert lines[1].split() == ["epoch", "correct", "accuracy", "95", "%", "interval"]
     assert [line.split(", ")[0].strip() for line in lines[2:8]] == ["seed 4"] * 3 + ["seed 5"] * 3
@@ -110,9 +102,8 @@ def test_seeds_side_by_side_equal_single_ones_and_finished_ones_are_left_alone(d
         ),
     ],
 )
-def test_wrong_options(data, capsys, words, told):
-    assert main(["train", "--data", "data", "--graph", "manual", "-o", "x.pt", *words]) == 2
-    assert told in capsys.readouterr().err
+def test_wrong_options(data, words, told):
+    assert told in refusal(*WORDS, "-o", "x.pt", *words)
     assert [file.name for file in data.iterdir()] == ["data"]
 
 
@@ -130,12 +121,6 @@ def started(*words, until):
         time.sleep(0.01)
     assert process.poll() is None, process.communicate()[1]
     return process
-
-
-def refused(capsys, *words) -> str:
-    capsys.readouterr()
-    assert main([*WORDS, *words]) == 2
-    return capsys.readouterr().err.removeprefix("spikeloom: ").removesuffix("\n")
 
 
 def children(pid: int) -> list[int]:
@@ -160,7 +145,7 @@ def gone(pids: list[int]) -> bool:
     return True
 
 
-def test_interrupted_it_says_what_is_kept_and_resumes_to_the_same_bytes(data, capsys):
+def test_interrupted_it_says_what_is_kept_and_resumes_to_the_same_bytes(data):
     """The moment of a signal is not fixed: wherever it falls, the result must be the same."""
     kept, words = Path("x.pt.state.validation"), ("--epochs", "8", "-o", "x.pt")
     process = started(*words, until=kept.exists)
@@ -172,42 +157,39 @@ def test_interrupted_it_says_what_is_kept_and_resumes_to_the_same_bytes(data, ca
     )
     assert not list(data.glob(".*")), "half-written files are left"
     content = kept.read_bytes()
-    assert refused(capsys, *words) == (
+    assert refusal(*WORDS, *words) == (
         f"{kept}: an interrupted training is kept here; go on with --resume, or delete it to train anew"
     )
-    assert refused(capsys, "--epochs", "2", "-o", "x.pt", "--resume") == (
+    assert refusal(*WORDS, "--epochs", "2", "-o", "x.pt", "--resume") == (
         f"{kept}: belongs to a training with other epochs; give the same options and data, or delete it to train anew"
     )
     assert kept.read_bytes() == content
-    as_json(capsys, *WORDS, *words, "--resume")
-    as_json(capsys, *WORDS, "--epochs", "8", "-o", "whole.pt")
+    as_json(*WORDS, *words, "--resume")
+    as_json(*WORDS, "--epochs", "8", "-o", "whole.pt")
     assert Path("x.pt").read_bytes() == Path("whole.pt").read_bytes()
 
 
-def test_one_process_works_on_a_file(data, capsys):
+def test_one_process_works_on_a_file(data):
     pytest.importorskip("fcntl")
     with only_one(Path("x.pt")):
         assert Path("x.pt.lock").exists()
         for options in ([], ["--resume"]):
-            assert refused(capsys, "--epochs", "1", "-o", "x.pt", *options) == (
+            assert refusal(*WORDS, "--epochs", "1", "-o", "x.pt", *options) == (
                 "x.pt: another process is working on it; wait for it, or give another output"
             )
-        as_json(capsys, *WORDS, "--epochs", "1", "-o", "y.pt")
+        as_json(*WORDS, "--epochs", "1", "-o", "y.pt")
     Path("x.pt.lock").write_bytes(b"")  # as a killed process leaves it
-    as_json(capsys, *WORDS, "--epochs", "1", "-o", "x.pt")
+    as_json(*WORDS, "--epochs", "1", "-o", "x.pt")
     assert sorted(file.name for file in data.glob("*.pt*")) == ["x.pt", "y.pt"]
 
 
-def test_resume_does_not_take_another_training_for_this_one(data, capsys):
-    as_json(capsys, *WORDS, "--epochs", "1", "--keep", "best", "-o", "x.pt")
-    assert refused(capsys, "--epochs", "2", "--seed", "3", "-o", "x.pt", "--resume") == (
+def test_resume_does_not_take_another_training_for_this_one(data):
+    as_json(*WORDS, "--epochs", "1", "--keep", "best", "-o", "x.pt")
+    assert refusal(*WORDS, "--epochs", "2", "--seed", "3", "-o", "x.pt", "--resume") == (
         "x.pt: holds another training (other epochs, seed); give its options, or another -o"
     )
-    assert refused(capsys, "--epochs", "1", "-o", "x.pt", "--resume", "--picture", "x.png") == (
-        "x.pt: was written without its last epoch, which --picture draws; omit --picture"
-    )
     Path("x.pt").write_bytes(b"old")
-    assert refused(capsys, "--epochs", "1", "-o", "x.pt", "--resume").startswith("x.pt: ")
+    assert refusal(*WORDS, "--epochs", "1", "-o", "x.pt", "--resume").startswith("x.pt: ")
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes under /proc")

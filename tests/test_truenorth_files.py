@@ -1,32 +1,41 @@
-"""Files of crossbar cores: round trip, what is refused, and the commands that take them."""
+"""Files of crossbar cores: round trip, what is refused, the commands that take them; and those for RANC's simulator,
+with equal spikes where its binary is named by ``RANC_SIM``.
+"""
 
 import json
+import os
 import re
+import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from commands import as_json, refusal, run
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from random_crossbars import CHIP, crossbars
+from made_files import recordings_folder
+from random_crossbars import CHIP, WEIGHTS, alone, crossbars, events
 
 from spikeloom.compiler import archive
 from spikeloom.compiler.archive import is_netlist
-from spikeloom.compiler.errors import FormatError
+from spikeloom.compiler.errors import FormatError, ModelError
 from spikeloom.compiler.fixedpoint import read_only
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.targets.truenorth.builder import Draft, history_free
+from spikeloom.compiler.formats import ranc
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
+from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
 from spikeloom.compiler.targets.truenorth.legalize import faults
 from spikeloom.compiler.targets.truenorth.netlist import (
     FILE,
+    RESET_LINEAR,
+    RESET_NONE,
     CrossbarNetlist,
     crossbar_bytes,
     inconsistencies,
     read_crossbars,
     write_crossbars,
 )
-from spikeloom.runtime import cli
-from spikeloom.runtime.machines.truenorth import engine
+from spikeloom.runtime.machines.truenorth import engine, spec
 
 ARRAYS = FILE.arrays
 
@@ -127,29 +136,13 @@ def place(path, tmp_path):
     for sample, (taxel, touches) in enumerate([(0, 2), (1, 3), (1, 1), (2, 4)]):
         recordings[sample, taxel, 0, :touches] = 1
         recordings[sample, taxel, 1, 0] = 1  # the same axon in the same tick
-    for split in ("train", "test"):
-        (tmp_path / "data" / split).mkdir(parents=True)
-        for sample, label in enumerate([0, 1, 0, 1]):
-            np.save(tmp_path / "data" / split / f"sample_{sample}_label_{label}.npy", recordings[sample])
+    recordings_folder(tmp_path / "data", train=recordings, test=recordings, classes=2)
     return tmp_path
 
 
-@pytest.fixture
-def command(place, capsys):
-    """Run a command on a netlist, with recordings where it takes them; its JSON object, or its error."""
-
-    def run(words: str, code: int = 0):
-        name, *options = words.split()
-        data = [] if name == "inspect" else ["--data", f"{place}/data"]
-        assert cli.main([name, f"{place}/net.loom", *data, *options, "--json"]) == code
-        out, err = capsys.readouterr()
-        return err if code else json.loads(out)
-
-    return run
-
-
-def test_run(place, command):
-    report = command(f"run --spikes {place}/s.npz --detail counts")
+def test_four_touches_counted_by_hand(place):
+    words = (place / "net.loom", "--data", place / "data")
+    report = as_json("run", *words, "--spikes", place / "s.npz", "--detail", "counts")
     assert report["predictions"] == [0, 1, 1, 0]
     assert report["counts"] == [[2, 0], [0, 3], [0, 1], [0, 0]]
     assert report["accuracy"] == 0.5
@@ -158,9 +151,7 @@ def test_run(place, command):
         assert spikes["out"].shape == (4, 6, 2)
         assert spikes["out"].sum(axis=1).tolist() == report["counts"]
 
-
-def test_estimate(place, command, capsys):
-    report = command("estimate")
+    report = as_json("estimate", *words)
     # every arrival meets one crossing point: 2, 3, 1 and 0 of them, and one of two polarities is merged in each
     found = {name: report["per_inference"][name] for name in ("synaptic_events", "spikes", "merged_spikes", "ticks")}
     assert found == {"synaptic_events": 1.5, "spikes": 1.5, "merged_spikes": 0.75, "ticks": 6}
@@ -172,16 +163,150 @@ def test_estimate(place, command, capsys):
     assert marginal["floor_of_used_cores_j"] == pytest.approx(0.0644 * 6e-3 / 4096)
     assert marginal["total_j"] == pytest.approx(0.0644 * 6e-3 + 1.5 * 2.3e-12)
     assert report["pace"]["real_time"] is True
-    assert cli.main(["estimate", f"{place}/net.loom", "--data", f"{place}/data"]) == 0
-    out = capsys.readouterr().out
+    out = run("estimate", *words)[1]
     assert "per inference on 1 of 4,096 cores, over 4 recordings:" in out
     assert "a data step takes 1 ms: keeps the sensor's pace of 20 ms a step" in out
 
 
 @pytest.mark.parametrize("name", ["inspect", "run", "estimate"])
-def test_every_broken_rule_is_named(place, command, name):
-    zero = dict.fromkeys(("clock_core", "clock_line", "clock_period", "clock_phase"), read_only([0]))
-    write_crossbars(replace(network(), leak=read_only([300, 0]), **zero), place / "net.loom")
-    leak, clock = command(name, code=2).splitlines()
+def test_every_broken_rule_is_named(place, name):
+    write_crossbars(replace(network(), leak=read_only([300, 0]), reset=read_only([0, 300])), place / "net.loom")
+    data = [] if name == "inspect" else ["--data", place / "data"]
+    leak, reset = run(name, place / "net.loom", *data)[2].splitlines()
     assert "core 0, neuron 0: leak 300, -256 … 255 allowed (truenorth.neuron.leak_bits)" in leak
-    assert "clock 0: a period of 0 ticks, 1 or more allowed (truenorth.clock)" in clock
+    assert "core 0, neuron 1: reset value 300, -256 … 255 allowed (truenorth.neuron.reset_bits)" in reset
+
+
+# -- RANC --------------------------------------------------------------------------------------------------------------
+SHARED_WITH_RANC = st.builds(
+    Neuron,
+    weights=st.tuples(WEIGHTS, WEIGHTS, WEIGHTS, WEIGHTS),
+    leak=st.integers(-5, 5),
+    threshold=st.integers(0, 20),
+    reset_mode=st.integers(0, 1),
+    reset=st.integers(-4, 4),
+    negative_threshold=st.integers(0, 20),
+    initial=st.integers(-9, 9),
+)
+
+
+def small(**changes):
+    """Two cores with a corner of the mesh at (5, 2); the second neuron votes, the third has no target."""
+    draft = Draft()
+    draft.core(5, 2)
+    draft.core(6, 3)
+    draft.neuron(0, Neuron(weights=(0, 4, 0, 0), threshold=3, negative_threshold=2, **changes), layer="layer0")
+    for number in range(2):
+        draft.neuron(1, Neuron(weights=(0, 0, 0, 1), reset_mode=RESET_LINEAR), layer="layer1", number=number)
+    draft.axon(0, 1, [0])
+    draft.axon(1, 3, [0, 1], line=2)
+    draft.feed(0, 0, 0, tick=1)
+    draft.clock(1, 2, period=3, phase=1)
+    draft.wire((0, 0), 1, 2, 15)
+    draft.vote((1, 0), 0, first=1)
+    return draft.netlist(taxels=1, polarities=1, classes=1, bin_ticks=2)
+
+
+def test_the_schema_of_ranc():
+    written = json.loads("\n".join(ranc.export(small(), np.array([[1, 0]], np.uint8))))
+    assert {key: value for key, value in written.items() if key.startswith(("num", "max", "neuron_r"))} == {
+        "num_neurons": 256,
+        "num_axons": 256,
+        "num_weights": 4,
+        "num_cores_x": 2,
+        "num_cores_y": 3,
+        "max_tick_offset": 16,
+        "neuron_reset_type": 0,
+    }
+    assert written["output_bus"] == {"coordinates": [0, 2], "num_outputs": 2}
+    packet = {"destination_core": [1, 1], "destination_axon": 2, "destination_tick": 0}
+    fed = {"destination_core": [0, 0], "destination_axon": 0, "destination_tick": 0}
+    assert written["packets"] == [[], [fed, packet], [], [], [packet]]
+    first, second = written["cores"]
+    assert first == {
+        "axons": [1],
+        "connections": [[1]],
+        "coordinates": [0, 0],
+        "neurons": [
+            {
+                "weights": [0, 4, 0, 0],
+                "leak": 0,
+                "positive_threshold": 3,
+                "negative_threshold": -2,
+                "reset_potential": 0,
+                "reset_mode": 0,
+                "current_potential": 0,
+                "destination_core_offset": [1, 1],
+                "destination_axon": 2,
+                "destination_tick": 14,
+            }
+        ],
+    }
+    assert second["axons"] == [0, 0, 3]
+    assert second["connections"] == [[0, 0, 1], [0, 0, 1]]
+    voter, lost = second["neurons"]
+    assert (voter["destination_core_offset"], voter["destination_axon"], voter["destination_tick"]) == ([-1, 1], 0, 0)
+    assert (lost["destination_core_offset"], lost["destination_axon"]) == ([-1, 1], 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"leak": -1, "leak_reversal": True}, "a leak with reversal (1 neurons)"),
+        ({"reset_mode": RESET_NONE}, "a reset that does nothing (1 neurons)"),
+        ({"negative_saturates": True}, "a negative threshold that saturates (1 neurons)"),
+    ],
+)
+def test_what_ranc_has_not(changes, what):
+    with pytest.raises(ModelError, match=f"RANC has no {re.escape(what)}"):
+        list(ranc.export(small(**changes)))
+
+
+def test_the_command_for_ranc(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    draft = alone(Neuron(), channels=0)
+    draft.feed(3, 0, 0)
+    draft.vote((0, 0), 0, first=2)
+    write_crossbars(draft.netlist(taxels=2, polarities=2, classes=2), "net.loom")
+    recordings = np.zeros((2, 2, 2, 5), np.uint8)
+    recordings[0, 1, 1, [0, 4]] = recordings[1, 1, 1, [1, 4]] = 1
+    recordings_folder(tmp_path / "data", train=recordings, test=recordings)
+    words = ["export", "net.loom", "--to", "ranc", "-o", "net.json"]
+    first, second = run(*words)[1].splitlines()
+    assert json.loads(Path("net.json").read_text("utf-8"))["packets"] == [[]]
+    assert "1 neurons and 1 synapses for ranc" in first
+    assert second.startswith("run: ranc_sim net.json net.out net.json TICKS")
+    words += ["--data", "data", "--recording"]
+    assert as_json(*words, "1")["ticks"] == 5 + 2 + 1
+    packets = json.loads(Path("net.json").read_text("utf-8"))["packets"]
+    assert [len(tick) for tick in packets] == [0, 1, 0, 0, 1, 0, 0]
+    assert "--recording 2: --data has recordings 0 to 1" in refusal(*words, "2")
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    path = os.environ.get("RANC_SIM")
+    if not path:
+        pytest.skip("RANC's simulator is not named by RANC_SIM")
+    return path
+
+
+def outputs_of(text, voters):
+    """Spikes of the voters, (ticks, voters), from RANC's output of a run of one tick more."""
+    rows = [[word == "1" for word in line.split()] for line in text.splitlines() if line.strip()]
+    assert {len(row) for row in rows} == {voters + 1}  # the last is the share of all others
+    return np.array(rows[1:], np.bool_).reshape(-1, voters + 1)[:, :voters]
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(crossbars(SHARED_WITH_RANC), st.integers(0, 2**31))
+def test_ranc_spikes_the_same(simulator, tmp_path, netlist, seed):
+    recording = events(seed, 3, 20)
+    expected = spec.simulate(netlist, recording)
+    voters = np.flatnonzero(netlist.readout_class >= 0)
+    source, result = tmp_path / "in.json", tmp_path / "out.txt"
+    source.write_text("\n".join(ranc.export(netlist, recording)), "utf-8")
+    ticks = str(int(expected.counts.ticks) + 1)
+    done = subprocess.run([simulator, source, result, source, ticks], capture_output=True, text=True, check=True)
+    assert "ERROR" not in done.stdout
+    np.testing.assert_array_equal(outputs_of(result.read_text("utf-8"), len(voters)), expected.spikes[:, voters])

@@ -1,13 +1,15 @@
-"""Training for TrueNorth: neurons and gradients, whole numbers in every pass, and the commands from end to end."""
+"""Training for TrueNorth: neurons and gradients, whole numbers in every pass; its commands, its networks in a chart."""
 
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from made_files import CLASSES, TAXELS, own_file
+from commands import as_json, refusal
+from made_files import CLASSES, STEPS, TAXELS, events, own_file, recordings_folder
 from random_crossbars import random_network
 from zoo import specimen
 
@@ -18,6 +20,8 @@ from spikeloom.compiler.targets.truenorth.native import faults
 from spikeloom.compiler.targets.truenorth.native_file import PARTS, is_trained, read_trained, write_trained
 from spikeloom.compiler.targets.truenorth.netlist import read_crossbars, write_crossbars
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, Surrogate
+from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.evtouch import data_digest
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.models.systems import propagation_of
@@ -25,13 +29,12 @@ from spikeloom.models.truenorth.kind import CROSSBARS
 from spikeloom.models.truenorth.network import (
     NativeArchitecture,
     native_network,
-    predict,
     run_layers,
     run_network,
     sized,
+    votes_by_step,
 )
 from spikeloom.models.truenorth.neurons import block_sums, integrate
-from spikeloom.runtime.cli import main
 
 SMOOTH = Surrogate(shape=FAST_SIGMOID, width=0.5, reset=False)
 SIZES = NativeArchitecture(taxels=6, classes=3, features=4, groups=2, hidden=(6, 4), clocks=clocks_over(2, 9))
@@ -201,39 +204,28 @@ def test_files_that_are_refused(tmp_path, change, said):
 TRAIN = "train --system tactilesgnet-truenorth --data data --graph manual --features 2 --epochs 1"
 
 
-def as_json(capsys, words):
-    assert main([*words.split(), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def mistake(capsys, words):
-    assert main(words.split()) == 2
-    return capsys.readouterr().err.removeprefix("spikeloom: ").rstrip("\n")
-
-
-def test_from_recordings_to_the_chip(tmp_path, monkeypatch, capsys):
+def test_from_recordings_to_the_chip(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     seeds = (("train", 1), ("test", 2))
     grasps = [replace(synthetic_grasps(per_class=2, steps=12, seed=seed), split=split) for split, seed in seeds]
     write_released(tmp_path / "data", grasps)
-    (run,) = as_json(capsys, f"{TRAIN} -o x.pt")["runs"]
+    (run,) = as_json(*f"{TRAIN} -o x.pt".split())["runs"]
     assert run["command"].endswith("--system tactilesgnet-truenorth --graph manual --features 2 --epochs 1 --seed 0")
     assert run["recipe"] == CROSSBARS.to_json() | {"features": 2}
-    shown = as_json(capsys, "inspect x.pt")
+    shown = as_json("inspect", "x.pt")
     assert (shown["copies"], shown["levels"], shown["sets"]) == (3, 7, ["last", "best", "clean"])
-    made = as_json(capsys, "compile x.pt --target truenorth -o x.loom")
+    made = as_json("compile", "x.pt", "--target", "truenorth", "-o", "x.loom")
     assert made["provenance"]["checkpoint_sha256"] == shown["sha256"] == run["sha256"]
-    found = as_json(capsys, "verify x.loom --data data --checkpoint x.pt --spec-samples 1")
+    found = as_json("verify", "x.loom", "--data", "data", "--checkpoint", "x.pt", "--spec-samples", "1")
     assert found["exact"]
-    assert found["correct"] == run["last"]["correct"] == predict_correct("x.pt", grasps[1])
+    network = read_trained("x.pt").network
+    votes = [votes_by_step(network, events[None]).sum(axis=0) for events in grasps[1].events]
+    right = np.count_nonzero(np.argmax(votes, axis=1) == grasps[1].labels)
+    assert found["correct"] == run["last"]["correct"] == right
     # what was finished is not trained again
-    (again,) = as_json(capsys, f"{TRAIN} -o x.pt --resume")["runs"]
+    (again,) = as_json(*f"{TRAIN} -o x.pt --resume".split())["runs"]
     assert again == run
-    assert "x.pt: holds another training (other seed)" in mistake(capsys, f"{TRAIN} --seed 1 --resume -o x.pt")
-
-
-def predict_correct(path, recordings):
-    return int(np.count_nonzero(predict(read_trained(path).network, recordings) == recordings.labels))
+    assert "x.pt: holds another training (other seed)" in refusal(*f"{TRAIN} --seed 1 --resume -o x.pt".split())
 
 
 @pytest.fixture
@@ -260,27 +252,87 @@ VERIFY = "verify net.loom --data data --checkpoint"
         ("compile net.pt -o z.loom", "--target loihi1: net.pt was trained for TrueNorth"),
         ("compile net.pt --target truenorth --planes 2 -o z.loom", "--planes 2: is not for"),
         ("inspect net.pt --beta 0.3", "--beta 0.3: net.pt is a network for TrueNorth and says that itself"),
-        ("export net.pt --to onnx-float -o x.onnx", "net.pt: is a network trained for TrueNorth"),
         (f"{VERIFY} net.pt --require E3=1", "--require E3=1: a network for TrueNorth has one model"),
         (f"{VERIFY} two.pt", "--checkpoint two.pt: net.loom was compiled from another file"),
         ("verify two.loom --data data --checkpoint two.pt", "--weights last: two.loom was compiled from best"),
         ("join net.pt own.pt -o z.pt", "net.pt: holds whole numbers of a chip"),
-        ("compile own.pt --target truenorth -o z.loom", "conv1, all 30 neurons: keep 0.2 of their membranes a step"),
+        ("compile own.pt --target truenorth -o z.loom", "fc3, all 4 neurons: keep 0.2 of their membranes a step"),
     ],
 )
 @pytest.mark.usefixtures("native")
-def test_mistakes(capsys, words, said):
-    as_json(capsys, "compile two.pt --weights best --target truenorth -o two.loom")
-    assert said in mistake(capsys, words)
+def test_mistakes(words, said):
+    as_json("compile", "two.pt", "--weights", "best", "--target", "truenorth", "-o", "two.loom")
+    assert said in refusal(*words.split())
     assert not list(Path().glob("z.*"))
 
 
 @pytest.mark.usefixtures("native")
-def test_a_spike_that_differs_fails(capsys):
+def test_a_spike_that_differs_fails():
     netlist = read_crossbars("net.loom")
     write_crossbars(replace(netlist, threshold=netlist.threshold + 9), "other.loom")
-    words = f"{VERIFY.replace('net.loom', 'other.loom')} net.pt --spec-samples 0 --json"
-    assert main(words.split()) == 1
-    report = json.loads(capsys.readouterr().out)
+    words = VERIFY.replace("net.loom", "other.loom").split()
+    report = as_json(*words, "net.pt", "--spec-samples", 0, codes=(1,))
     assert report["E1"]["differences"] > 0
     assert not report["exact"]
+
+
+NATIVE = "native.pt"
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with recordings and a network."""
+    folder = tmp_path_factory.mktemp("chart")
+    train = np.concatenate([events(1, samples=12), events(3, samples=4, rate=0.05)])
+    recordings_folder(folder / "data", train=train, test=events(2, samples=8))
+    digest = data_digest(load_data(folder / "data", "train"), load_data(folder / "data", "test"))
+    known = {"data_sha256": digest, "validation": {"correct": 3, "samples": 4}, "command": "spikeloom train …"}
+    network = random_network(4, taxels=TAXELS, classes=CLASSES, steps=STEPS)
+    write_trained(folder / NATIVE, {"last": network}, graph="ring", edges=np.zeros((0, 2), int), training=known)
+    return folder
+
+
+def test_a_network_for_truenorth_has_a_point_for_each_window(spikeloom, place):
+    grid = "bits=8,window=50-100%:50"
+    code, out, err = spikeloom("chart", NATIVE, "--data", "data", "--grid", grid, "--jobs", "1", "-o", "out")
+    assert (code, err) == (0, "")
+    report = json.loads((place / "out" / "chart.json").read_text())
+    points = report["points"]
+    assert [(point["storage"], point["window"]) for point in points] == [("7 levels", 50), ("7 levels", 100)]
+    assert report["target"] == "truenorth"
+    assert set(report["tables"]["energy"]) == {"all_in", "marginal"}
+    assert set(report["tables"]["time"]) == {"tick"}
+    (charted,) = report["networks"]
+    assert charted["expected"] == 0.75
+    assert "energy (all_in)" in out
+    assert "time (tick)" in out
+    for point in points:
+        # chip and model decide alike, in every part of a recording
+        assert [point[split]["equal"] for split in ("train", "test")] == [16, 8]
+        assert point["test"]["float"]["accuracy"] == point["test"]["accuracy"]
+        kept = point["train"]["accuracy"] / charted["float_training"]
+        assert point["expected"] == pytest.approx(0.75 * kept)
+        # its commands give its netlist and its figures
+        compiled, ran = (shlex.split(command) for command in point["commands"])
+        assert spikeloom(*compiled[1:])[0] == 0
+        assert (place / compiled[-1]).read_bytes() == (place / "out" / point["netlist"]).read_bytes()
+        found = json.loads(spikeloom(*ran[1:], "--json")[1])
+        assert found["accuracy"] == point["test"]["accuracy"]
+        mean = found["costs"]["per_inference"]
+        assert mean["energy_j"] == pytest.approx(point["test"]["energy_j"], rel=1e-12)
+        assert mean["synaptic_events"] == point["test"]["synaptic_operations"]
+        ticks = STEPS * point["window"] // 100 + 3
+        assert point["test"]["time_s"] == {"tick": pytest.approx(ticks * 1e-3)}
+        assert point["test"]["step_s"] == {"tick": pytest.approx(1e-3)}
+
+
+@pytest.mark.parametrize("command", ["run n.loom", "estimate n.loom", f"verify n.loom --checkpoint {NATIVE}"])
+def test_a_part_of_every_recording(spikeloom, command):
+    assert spikeloom("compile", NATIVE, "--target", "truenorth", "-o", "n.loom")[0] == 0
+    words = [*command.split(), "--data", "data", "--json", "--window"]
+    code, out, _ = spikeloom(*words, "50%")
+    assert code == 0
+    assert "per_inference" not in out or json.loads(out)["per_inference"]["ticks"] == STEPS // 2 + 3
+    code, out, err = spikeloom(*words, "0%")
+    assert (code, out) == (2, "")
+    assert "--window 0%: not a part of a recording" in err

@@ -1,10 +1,8 @@
-"""The command ``watch`` decides as ``run`` does, whatever the order, codes, pace and breaks of its lines."""
+"""A live stream is a run of the whole recording, bit for bit; ``watch`` decides so, whatever its lines are like."""
 
-import argparse
 import io
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -13,59 +11,42 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import commands
 import numpy as np
 import pytest
-from random_netlists import Axon, Neuron, build
-from random_netlists import lively as lively_netlist
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import refused
+from random_netlists import Axon, Neuron, build, lively, netlists, recordings, voting
 
-from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.errors import DataError, NumericRangeError
 from spikeloom.compiler.fixedpoint import read_only
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, write_netlist
 from spikeloom.models.recordings.events import load_data
+from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.commands.exchange import watch
 from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.stream import Step, Stream
 from spikeloom.runtime.machines.votes import class_counts
-from spikeloom.runtime.report.encode import encode
-from spikeloom.runtime.report.sections import terminal
 from spikeloom.runtime.studies.anytime import exits
 
 HEADER = "time_s,taxel,polarity"
+LIVELY = lively()
 
 
-def command(*words: object) -> tuple[dict, str]:
-    """Run the command; its summary as values and as text."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--json", action="store_true")
-    watch.add_arguments(parser)
-    found = watch.run(parser.parse_args([str(word) for word in words]))
-    assert found.code == 0
-    return encode(found.result), terminal(found.sections(found.result))
+def objects(*words: object) -> dict[str, list[dict]]:
+    """All objects that the command prints, by kind."""
+    code, out, err = commands.run("watch", *words, "--json")
+    assert (code, err) == (0, "")
+    values = [json.loads(line) for line in out.splitlines()]
+    return {kind: [v for v in values if v["kind"] == kind] for kind in ("bin", "grasp", "end")}
 
 
 @pytest.fixture
-def objects(capsys):
-    """Run the command with --json; all objects by kind."""
-
-    def run(*words: object) -> dict[str, list[dict]]:
-        report, _ = command(*words, "--json")
-        values = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-        return {kind: [v for v in values if v["kind"] == kind] for kind in ("bin", "grasp")} | {"end": [report]}
-
-    return run
-
-
-@pytest.fixture(scope="module")
-def lively() -> Netlist:
-    return lively_netlist()
-
-
-@pytest.fixture(scope="module")
-def lively_file(lively, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("lively") / "net.loom"
-    write_netlist(lively, path)
-    return path
+def lively_file(tmp_path) -> Path:
+    write_netlist(LIVELY, tmp_path / "net.loom")
+    return tmp_path / "net.loom"
 
 
 @pytest.fixture
@@ -119,21 +100,21 @@ def random_events(seed: int, length: int = 40) -> np.ndarray:
 
 @pytest.mark.parametrize("low", [0, -1])
 @pytest.mark.parametrize("inside", [0, 19_999])
-def test_any_recording_is_a_run(lively, lively_file, lines, objects, low, inside):
+def test_any_recording_is_a_run(lively_file, lines, low, inside):
     for seed in range(2):
         events = random_events(seed)
         found = objects(lively_file, lines(as_lines(events, seed, low=low, inside=inside)))
-        assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(lively, events)]
+        assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(LIVELY, events)]
         assert len(found["bin"]) == 40
         total = {"kind": "end", "grasps": 1, "bins": 40, "events": int(events.sum()), "repeated": 0, "late": 0}
         assert found["end"] == [total | {"interrupted": False}]
 
 
-def test_every_bin_is_printed(lively, lively_file, lines, objects):
+def test_every_bin_is_printed(lively_file, lines):
     events = random_events(7)
     found = objects(lively_file, lines(as_lines(events)))
-    trace = engine.simulate(lively, events.reshape(1, 20, -1), spikes=True, threads=1)
-    counts = class_counts(lively, np.cumsum(trace.spikes[0], axis=0))
+    trace = engine.simulate(LIVELY, events.reshape(1, 20, -1), spikes=True, threads=1)
+    counts = class_counts(LIVELY, np.cumsum(trace.spikes[0], axis=0))
     for t, shown in enumerate(found["bin"]):
         best = np.sort(counts[t])
         assert shown == {
@@ -147,7 +128,7 @@ def test_every_bin_is_printed(lively, lively_file, lines, objects):
         }
 
 
-def test_several_grasps_are_runs_of_their_own(lively, lively_file, lines, objects):
+def test_several_grasps_are_runs_of_their_own(lively_file, lines):
     grasps = [random_events(seed, length) for seed, length in ((1, 40), (2, 25), (3, 33))]
     first, second, third = (as_lines(events) for events in grasps)
     header = f"{HEADER.upper()}\n"
@@ -157,11 +138,11 @@ def test_several_grasps_are_runs_of_their_own(lively, lively_file, lines, object
     for text in (content, content.replace("\n", "\r\n"), content.replace(",", " ,  ")):
         found = objects(lively_file, lines(text))
         shown = [(grasp["grasp"], grasp["bins"], grasp["counts"]) for grasp in found["grasp"]]
-        votes = [votes_of_run(lively, events) for events in grasps]
+        votes = [votes_of_run(LIVELY, events) for events in grasps]
         assert shown == list(zip([1, 2, 3], [40, 25, 33], votes, strict=True))
 
 
-def test_exact_edges_of_bins(pair_file, lines, objects):
+def test_exact_edges_of_bins(pair_file, lines):
     # 0.58 / 0.02 is below 29 in binary floating point
     found = objects(pair_file, lines("0.579999,0,0\n0.58,0,0\n5.8e-1,0,1\n0.60,0,1\n"))
     assert [each["counts"] for each in found["bin"][28:]] == [[1, 0], [2, 1], [2, 2]]
@@ -171,7 +152,7 @@ def test_exact_edges_of_bins(pair_file, lines, objects):
     assert [each["counts"] for each in found["bin"]] == [[0, 0], [0, 0], [1, 0], [1, 1]]
 
 
-def test_a_file_is_read_as_recordings_are(lively, lively_file, lines, objects):
+def test_a_file_is_read_as_recordings_are(lively_file, lines):
     # a sensor that counts in binary floating point misses half of the edges by a little
     rng = np.random.default_rng(0)
     rows = sorted((k * 0.01 * (1 - e), *rng.integers([10, 2])) for k in range(200) for e in (0, 1e-15, 1e-10, 1e-7))
@@ -179,42 +160,42 @@ def test_a_file_is_read_as_recordings_are(lively, lively_file, lines, objects):
     read = load_data(path.removeprefix("--input="), taxels=10)
     found = objects(lively_file, path)
     assert found["grasp"][0]["bins"] == read.steps == 100
-    assert found["grasp"][0]["counts"] == votes_of_run(lively, read.events[0])
+    assert found["grasp"][0]["counts"] == votes_of_run(LIVELY, read.events[0])
     assert found["end"][0]["late"] == 0
 
 
-def test_late_and_repeated_events_are_counted_and_not_used(lively, lively_file, lines, objects):
+def test_late_and_repeated_events_are_counted_and_not_used(lively_file, lines):
     events = random_events(4)
     rows = as_lines(events).splitlines()
     rows.insert(len(rows) // 2, "0.0,3,1")
     rows.insert(len(rows) * 3 // 4, "0.01,3,0")
     rows[-1:] = rows[-1:] * 3
     found = objects(lively_file, lines("\n".join(rows)))
-    assert found["grasp"][0]["counts"] == votes_of_run(lively, events)
+    assert found["grasp"][0]["counts"] == votes_of_run(LIVELY, events)
     end = found["end"][0]
     assert (end["late"], end["repeated"], end["events"]) == (2, 2, events.sum() + 4)
 
 
-def test_grasps_of_a_given_length(lively, lively_file, lines, objects):
+def test_grasps_of_a_given_length(lively_file, lines):
     long, short = random_events(5, 40), random_events(6, 20)
     path = lines(as_lines(long) + "\n" + as_lines(short))
     found = objects(lively_file, path, "--bins", 30)
     padded = np.concatenate([short, np.zeros((10, 2, 10), np.uint8)], axis=2)
     assert [grasp["counts"] for grasp in found["grasp"]] == [
-        votes_of_run(lively, long[:, :, :30]),
-        votes_of_run(lively, padded),
+        votes_of_run(LIVELY, long[:, :, :30]),
+        votes_of_run(LIVELY, padded),
     ]
     assert found["end"][0]["late"] == long[:, :, 30:].sum()
     assert found["end"][0]["bins"] == 60
 
 
-def test_origin(lively, lively_file, lines, objects):
+def test_origin(lively_file, lines):
     events = random_events(8)
     events[0, 0, 0] = 1
     moved = np.concatenate([np.zeros((10, 2, 50), np.uint8), events], axis=2)
     path = lines(as_lines(moved))
     counts = [objects(lively_file, path, "--origin", o)["grasp"][0]["counts"] for o in ("zero", "first")]
-    assert counts == [votes_of_run(lively, moved), votes_of_run(lively, events)]
+    assert counts == [votes_of_run(LIVELY, moved), votes_of_run(LIVELY, events)]
     assert counts[0] != counts[1]
 
 
@@ -233,7 +214,7 @@ def feed(descriptor: int, *parts: tuple[str, float]) -> threading.Thread:
 
 
 @pytest.mark.parametrize("speed", ["real", "full"])
-def test_silence(pair_file, objects, speed):
+def test_silence(pair_file, speed):
     read_end, write_end = os.pipe()
     thread = feed(write_end, ("0.0,0,1\n", 0.1), ("# nothing\n0.0", 0.3), ("1,0,1\n", 0))
     found = objects(pair_file, "--input", f"/dev/fd/{read_end}", "--speed", speed)
@@ -266,30 +247,24 @@ def test_silence(pair_file, objects, speed):
     ],
 )
 def test_bad_lines(lively_file, lines, content, line, said):
-    with pytest.raises(DataError, match=rf"events\.csv, line {line}: .*{re.escape(said)}"):
-        command(lively_file, lines(content))
+    told = commands.refusal("watch", lively_file, lines(content))
+    assert f"events.csv, line {line}: " in told
+    assert said in told
 
 
 @pytest.mark.parametrize(
-    ("words", "error", "said"),
+    ("words", "said"),
     [
-        (["--input", "none.csv"], DataError, r"none\.csv: No such file"),
-        (["--until-sure"], OptionError, r"--until-sure: .* --bins"),
-        (["--bins", 5, "--until-sure", "-1"], OptionError, "--until-sure -1: "),
-        *(
-            ([f"--{name}", value], OptionError, f"^--{name} {value}: ")
-            for name, value in (("bin", "nan"), ("bins", "0"))
-        ),
+        (["--input", "none.csv"], "none.csv: No such file"),
+        (["--until-sure"], "--until-sure: | --bins"),
+        (["--bins", 5, "--until-sure", "-1"], "--until-sure -1: "),
+        *(([f"--{name}", value], f"--{name} {value}: ") for name, value in (("bin", "nan"), ("bins", "0"))),
+        ([], "events.csv: empty stream"),
     ],
 )
-def test_what_cannot_be_watched(lively_file, lines, words, error, said):
-    with pytest.raises(error, match=said):
-        command(lively_file, lines("0,0,1\n"), *words)
-
-
-def test_empty_stream(lively_file, lines):
-    with pytest.raises(DataError, match=r"events\.csv: empty stream"):
-        command(lively_file, lines("# nothing\n"))
+def test_what_cannot_be_watched(lively_file, lines, words, said):
+    told = commands.refusal("watch", lively_file, lines("0,0,1\n" if words else "# nothing\n"), *words)
+    assert all(part in told for part in said.split("|"))
 
 
 def test_a_reader_that_goes_away_ends_it(pair_file, lines, monkeypatch):
@@ -299,8 +274,7 @@ def test_a_reader_that_goes_away_ends_it(pair_file, lines, monkeypatch):
 
     path = lines("0,0,0\n0.02,0,0\nnot reached\n")
     monkeypatch.setattr(sys, "stdout", Gone())
-    report, _ = command(pair_file, path)
-    assert report["interrupted"]
+    assert watch.run(build_parser("watch").parse_args(["watch", str(pair_file), path])).result.interrupted
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, None])
@@ -331,15 +305,15 @@ def test_standard_input_and_interruption(pair_file, end):
 
 
 @pytest.mark.parametrize("factor", [None, 1.5, 0.0])
-def test_a_grasp_ends_as_soon_as_it_is_sure(lively, lively_file, lines, objects, factor):
+def test_a_grasp_ends_as_soon_as_it_is_sure(lively_file, lines, factor):
     ended = 0
     for seed in range(2):
         events = random_events(seed)
         given = () if factor is None else (factor,)
         found = objects(lively_file, lines(as_lines(events, seed)), "--bins", 40, "--until-sure", *given)
-        votes = integer_machine_of(lively).cumulative(events.reshape(1, 20, 1, 40), np.array([40])).votes
+        votes = integer_machine_of(LIVELY).cumulative(events.reshape(1, 20, 1, 40), np.array([40])).votes
         at = exits.standing(votes, np.array([40]))
-        sure = exits.proven(votes, at, exits.most_votes(integer_machine_of(lively), 40))
+        sure = exits.proven(votes, at, exits.most_votes(integer_machine_of(LIVELY), 40))
         end = int(exits.exits(sure, at, np.inf if factor is None else factor)[0])
         early = end + 3 < 39  # the read-out lags three steps
         bins = end + 4 if early else 40
@@ -350,3 +324,123 @@ def test_a_grasp_ends_as_soon_as_it_is_sure(lively, lively_file, lines, objects,
         assert found["end"][0]["late"] == events[..., bins + 1 :].sum() + (events[..., bins].sum() if early else 0)
         ended += early
     assert ended or factor is None
+
+
+def events_of(netlist: Netlist, seed: int, length: int = 30) -> np.ndarray:
+    return (np.random.default_rng(seed).random((netlist.n_inputs, length)) < 0.15).astype(np.uint8)
+
+
+def play(stream: Stream, events: np.ndarray) -> list[Step]:
+    """All steps of a recording (n_inputs, T), to its end."""
+    return [*(stream.step(column) for column in events.T), *stream.finish()]
+
+
+def assert_is_run(netlist: Netlist, steps: list[Step], events: np.ndarray) -> None:
+    """Spikes of every layer, votes and decisions of all chip steps are those of the engine."""
+    trace = engine.simulate(netlist, events[None], spikes=True, threads=1)
+    assert [step.index for step in steps] == list(range(events.shape[1] + netlist.max_depth))
+    for layer in range(len(netlist.layers)):
+        found = np.array([step.spikes[layer] for step in steps], np.bool_)
+        found = found.reshape(len(steps), netlist.layers[layer].neurons)
+        expected = np.zeros_like(found)
+        ids = netlist.compartments_of(layer)
+        expected[:, netlist.neuron[ids]] = trace.spikes[0][:, ids]
+        np.testing.assert_array_equal(found, expected, strict=True)
+    so_far = np.cumsum(trace.spikes[0], axis=0)
+    votes = class_counts(netlist, so_far)
+    np.testing.assert_array_equal(
+        np.array([s.counts for s in steps], np.int64).reshape(votes.shape), votes, strict=True
+    )
+    assert [step.decision for step in steps] == votes.argmax(axis=1).tolist()
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(st.data())
+def test_any_network(data):
+    netlist = voting(data.draw(netlists(weight_exponents=(-1, 0, 0, 3))), data.draw(st.integers(1, 3)))
+    events = data.draw(recordings(netlist, max_length=12))
+    stream = Stream(engine.prepare(netlist, stepwise=True))
+    expected = None
+    try:
+        engine.simulate(netlist, events[None], threads=1)
+    except NumericRangeError as error:
+        expected = str(error)
+    if expected is None:
+        assert_is_run(netlist, play(stream, events), events)
+    else:
+        assert refused(NumericRangeError, "", play, stream, events) == expected
+        refused(DataError, "", stream.step, events[:, 0] * 0)
+
+
+FORMS = {
+    "list": lambda column: column.tolist(),
+    "float32": lambda column: column.astype(np.float32),
+    "bool": lambda column: column.astype(np.bool_),
+    "int64": lambda column: column.astype(np.int64),
+    "sensor": lambda column: column.reshape(10, 2),
+    "fortran": lambda column: np.asfortranarray(column.reshape(10, 2)),
+}
+
+
+@pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
+def test_forms_of_events(form):
+    netlist, events = LIVELY, events_of(LIVELY, 4)
+    stream, steps = Stream(engine.prepare(netlist, stepwise=True)), []
+    for column in events.T:
+        given_events = form(column)
+        steps.append(stream.step(given_events))
+        if isinstance(given_events, np.ndarray) and not np.shares_memory(given_events, events):
+            given_events[:] = 1  # is not kept
+    assert_is_run(netlist, [*steps, *stream.finish()], events)
+
+
+@pytest.mark.parametrize(
+    ("counts", "decision", "margin"),
+    [([0, 0, 0], 0, 0), ([1, 4, 2], 1, 2), ([3, 5, 5], 1, 0), ([7], 0, 7), ([2, 9], 1, 7)],
+)
+def test_decision_and_margin(counts, decision, margin):
+    step = Step(index=0, spikes=(), counts=np.array(counts))
+    assert (step.decision, step.margin) == (decision, margin)
+
+
+def test_a_network_without_lag_is_final_at_once():
+    netlist = voting(build([Neuron(), Neuron()], [Axon(source=0, targets=((1, 110),))], n_inputs=1, depths=[0]), 1)
+    stream = Stream(engine.prepare(netlist, stepwise=True))
+    assert stream.step([1]).counts.tolist() == [1]
+    assert stream.finish() == ()
+
+
+@pytest.mark.parametrize(
+    ("events", "found"),
+    [
+        (np.zeros(19), "shape (19,) found, allowed are (10, 2) (taxels, polarities) and (20,)"),
+        (1, "shape () found"),
+        (["1"] * 20, "type <U1 found, allowed are numbers and bool"),
+        ([0] * 19 + [2], "the value 2 found, allowed are 0 and 1"),
+    ],
+)
+def test_events_that_are_none(events, found):
+    netlist = LIVELY
+    stream = Stream(engine.prepare(netlist, stepwise=True))
+    refused(DataError, f"stream: a bin |{found}", stream.step, events)
+    # nothing has happened: the grasp goes on
+    good = events_of(netlist, 6)
+    assert_is_run(netlist, play(stream, good), good)
+
+
+def test_nothing_after_the_end():
+    stream = Stream(engine.prepare(LIVELY, stepwise=True))
+    stream.finish()
+    refused(DataError, "a step after the end found|call reset()", stream.step, np.zeros(20))
+    refused(DataError, "a second end found|call reset()", stream.finish)
+
+
+def test_an_overflow_ends_the_stream_until_reset():
+    axons = [Axon(source=0, exponent=7, targets=((0, 254), (0, 254))), Axon(source=1, targets=((0, 110),))]
+    netlist = build([Neuron()], axons, n_inputs=2, depths=[0])
+    stream = Stream(engine.prepare(netlist, stepwise=True))
+    refused(NumericRangeError, "", stream.step, [1, 0])
+    refused(DataError, "", stream.step, [0, 0])
+    refused(DataError, "", stream.finish)
+    stream.reset()
+    assert stream.step([0, 1]).spikes[0].tolist() == [True]

@@ -5,7 +5,7 @@ Both must agree on every figure, exactly. All times are picoseconds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -13,8 +13,10 @@ from scipy.sparse import csr_array
 
 from spikeloom.compiler.formats.sanafe import dense_neurons
 from spikeloom.compiler.targets.base import Target, TimeTable
+from spikeloom.compiler.targets.loihi1.layout.place import hops
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray
+from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.engine import EventArray
 from spikeloom.runtime.machines.loihi1.timing import SimpleTimes, simple_times
 from spikeloom.runtime.machines.loihi1.timing_kernel import Tables
@@ -57,7 +59,10 @@ class StepTimes:
 class Chip:
     """Where everything is and what it takes."""
 
-    def __init__(self, netlist: Netlist, target: Target, table: TimeTable, input_tiles: tuple[int, ...] = ()) -> None:
+    def __init__(
+        self, netlist: Netlist, target: Target, table: TimeTable, input_tiles: tuple[int, ...] = (), dense=None
+    ) -> None:
+        """SANA-FE has the channels on cores of certain tiles, and says itself which synapses are `dense`."""
         self.netlist = netlist
         self.table = table
         self.inputs_on_core = bool(input_tiles)
@@ -71,12 +76,12 @@ class Chip:
         ] + [list(range(netlist.n_inputs))[i * room : (i + 1) * room] for i in range(len(input_tiles))]
         core_of_axon = netlist.core_of_axon().tolist()
         self.deliveries: dict[int, list[tuple[int, int]]] = {}
+        if dense is None:
+            dense = netlist.format_index_bits[netlist.axon_format[netlist.axon_of_synapse()]] == 0
+        costs = [table.picoseconds(f"synaptic_operation_{form}") for form in ("sparse", "dense")]
         for axon, source in enumerate(netlist.axon_source.tolist()):
-            dense = netlist.format_index_bits[netlist.axon_format[axon]] == 0
-            synapses = int(netlist.axon_synapses[axon + 1] - netlist.axon_synapses[axon])
-            work = table.picoseconds("axon_in") + synapses * table.picoseconds(
-                "synaptic_operation_dense" if dense else "synaptic_operation_sparse"
-            )
+            synapses = dense[netlist.axon_synapses[axon] : netlist.axon_synapses[axon + 1]]
+            work = table.picoseconds("axon_in") + sum(costs[int(each)] for each in synapses)
             self.deliveries.setdefault(source, []).append((core_of_axon[axon], work))
         for deliveries in self.deliveries.values():
             # messages of one spike go out in the order of columns, rows and cores of a tile
@@ -200,34 +205,47 @@ class Chip:
 def simple(tables: Tables, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps=None) -> SimpleTimes:
     """Times of the simple model from spikes and updates (samples, chip steps, compartments), as matrix products."""
     length, n = spikes.shape[1:]
-    cores, slots, channels = len(tables.access), len(tables.sender), len(tables.channel_first) - 1
+    cores, channels = len(tables.start) - 1, len(tables.channel_first) - 1
     ran = np.full(len(spikes), length) if steps is None else steps
     within = np.arange(length) < ran[:, None]
     seen = np.zeros((*spikes.shape[:2], channels), np.int64)
     fired, works = spikes.astype(np.int64), updated.astype(np.int64)
-    if slots > n:  # channels on cores send in the step before
-        ahead = (events[:, :, 1 : length + 1] != 0).transpose(0, 2, 1)
-        seen[:, : ahead.shape[1]] = ahead
-        fired, works = np.concatenate([fired, seen], 2), np.concatenate([works, seen], 2)
-    else:
-        now = (events[:, :, :length] != 0).transpose(0, 2, 1)
-        seen[:, : now.shape[1]] = now
+    now = (events[:, :, :length] != 0).transpose(0, 2, 1)
+    seen[:, : now.shape[1]] = now
 
     def by(sender, receiver, cost, size):
         matrix = np.zeros((size, cores), np.int64)
         np.add.at(matrix, (sender, receiver), cost)
         return matrix
 
-    own = np.arange(slots)
-    generation = fired @ by(own, tables.sender, tables.sending, slots)
-    generation += works @ by(own, tables.sender, tables.update[tables.sender], slots)
-    slot = np.repeat(own, np.diff(tables.first))
-    processing = fired @ by(slot, tables.destination, tables.processing, slots)
-    if slots == n:
-        channel = np.repeat(np.arange(channels), np.diff(tables.channel_first))
-        processing += seen @ by(channel, tables.channel_destination, tables.channel_processing, seen.shape[2])
+    own = np.arange(n)
+    generation = fired @ by(own, tables.sender, tables.sending, n)
+    generation += works @ by(own, tables.sender, tables.update, n)
+    sender = np.repeat(own, np.diff(tables.first))
+    processing = fired @ by(sender, tables.destination, tables.processing, n)
+    channel = np.repeat(np.arange(channels), np.diff(tables.channel_first))
+    processing += seen @ by(channel, tables.channel_destination, tables.channel_processing, channels)
     sums = np.concatenate([generation, processing], axis=2) * within[..., None]
     return simple_times(tables, sums, ran)
+
+
+def parts_of_energy(netlist, target, counts, updates, steps, tiles, dense=None):
+    """Joules of the table ``sanafe`` by part, (samples, 1), if channels are neurons of cores on certain tiles.
+
+    `updates` are (samples,), `dense` says which synapses are priced as such.
+    """
+    amounts = cost.count(cost.prepare(netlist, target, "whole"), replace(counts, updates=updates[:, None]), steps)
+    sent = netlist.axon_source < netlist.n_inputs
+    source, end = netlist.axon_source[sent], netlist.core_tile[netlist.core_of_axon()[sent]]
+    way = hops(np.array(tiles)[source // target.limit("core.compartments")], end, target.limit("mesh.width"))
+    for name, each in zip(("packet", "hop_east_west", "hop_north_south"), (np.ones_like(end), *way), strict=True):
+        amounts[name] = amounts[name] + (counts.inputs[:, source] @ each)[:, None]
+    if dense is not None:
+        sources = np.concatenate([counts.inputs, counts.spikes], axis=1)
+        visited = sources[:, netlist.axon_source[netlist.axon_of_synapse()]]
+        for form, which in (("dense", dense), ("sparse", ~dense)):
+            amounts[f"synaptic_operation_{form}"] = visited[:, which].sum(axis=1, keepdims=True).astype(np.float64)
+    return cost.by_part(target, amounts)["sanafe"]
 
 
 def dense_synapses(netlist):

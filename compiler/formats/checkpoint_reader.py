@@ -53,7 +53,7 @@ from spikeloom.compiler.dynamics import MOST_STEPS, PLAIN, Dynamics, dynamics_fr
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import read_whole
 from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, plane_distance, read_only
-from spikeloom.compiler.formats.tensors import Arrays, apart, faults_of, size, taxel_faults, tower_faults, wanted_dense
+from spikeloom.compiler.formats.tensors import Arrays, apart, faults_of, taxel_faults, tower_faults, wanted_dense
 from spikeloom.compiler.formats.torch_checkpoint import DAMAGED, GIVE, NOT_A_CHECKPOINT, read_torch
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS, TITLES, Grid, grid_from_json, shape_faults
@@ -249,11 +249,10 @@ def _forms(entries: list[dict[str, Any]], checkpoint: Checkpoint) -> tuple[Form,
 def _tower_faults(arrays: Arrays, taxels: int, classes: int, kind: tuple[str, Grid | None, Dynamics]) -> list[str]:
     system, grid, dynamics = kind
     stages = max((int(m[1]) for key in arrays if (m := re.fullmatch(r"fc([1-9]\d?)\.weight", key))), default=1)
-    features = size(arrays, "conv1.hops", 3, 1, "features")
-    wanted = {"conv1.hops": ("K + 1", features, "channels"), "conv1.bias": (features,)} | wanted_dense(arrays, stages)
+    wanted = {"conv1.hops": ("K + 1", "features", "channels"), "conv1.bias": ("features",)} | wanted_dense(stages)
     faults = faults_of(arrays, wanted, TITLES[system])
     if not faults:
-        assert isinstance(features, int)
+        features = len(arrays["conv1.bias"])
         faults = taxel_faults(arrays, features, dynamics.clocks.channels)
         received = arrays["fc1.weight"].shape[1] - dynamics.clocks.channels
         places, made_classes = received // features, len(arrays[f"fc{stages}.bias"])

@@ -9,8 +9,8 @@ The file serves as input and as configuration: ``ranc_sim NET.json OUT.txt NET.j
   the output after the last, for RANC has no neuron without one.
 - Its schema asks for ``destination_core_offset``; the examples in its repository are older and have another name.
 - The negative threshold is compared by ``<`` only in reset type 0, and is written with its sign.
-- Its membranes have no width, and it has neither leak reversal, random thresholds, a reset that does nothing nor a
-  negative threshold that saturates: networks that need them are refused. A linear reset below adds the threshold.
+- Its membranes have no width, and it has neither leak reversal, a reset that does nothing nor a negative threshold that
+  saturates: networks that need them are refused. A linear reset below adds the threshold.
 """
 
 from __future__ import annotations
@@ -38,7 +38,6 @@ def _require_supported(netlist: CrossbarNetlist) -> None:
     resets = (netlist.reset_mode == RESET_TO) & (netlist.reset == netlist.negative_threshold)
     used = {
         "a leak with reversal": (netlist.leak_reversal > 0) & (netlist.leak != 0),
-        "a random threshold": netlist.mask_bits > 0,
         "a reset that does nothing": netlist.reset_mode == RESET_NONE,
         "a negative threshold that saturates": (netlist.negative_saturates > 0) & ~resets,
     }

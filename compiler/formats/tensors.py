@@ -12,8 +12,8 @@ from spikeloom.compiler.formats.names import printable
 
 Arrays = dict[str, npt.NDArray[Any]]
 
-Shape = tuple[int | str, ...]
-"""A wanted shape; a word stands for any size from 1."""
+Shape = tuple[str, ...]
+"""A wanted shape; a word stands for any size from 1, the same wherever it occurs."""
 
 
 def faults_of(
@@ -23,32 +23,35 @@ def faults_of(
 
     Examples
     --------
-    >>> faults_of({"a": np.ones((2, 3)), "c": np.ones(1)}, {"a": (2, 4), "b": (2,)})
-    ['a is (2, 3), wanted (2, 4)', 'b is missing', 'c is not part of a TactileSGNet']
+    >>> faults_of({"a": np.ones(2), "b": np.ones((2, 3)), "d": np.ones(1)}, {"a": ("n",), "b": ("m", "n"), "c": ("n",)})
+    ['b is (2, 3), wanted (2, 2)', 'c is missing', 'd is not part of a TactileSGNet']
     >>> faults_of({"a": np.array([1.0, np.nan])}, {"a": ("features",)})
     ['a has 1 of 2 values NaN or infinite']
     """
     faults = []
+    sizes: dict[str, int] = {}
     for name, shape in wanted.items():
         array = arrays.get(name)
         if array is None:
             faults.append(f"{name} is missing")
-        elif not _fits(array.shape, shape):
-            faults.append(f"{name} is {array.shape}, wanted {_shown(shape)}")
+            continue
+        if array.ndim == len(shape) and array.size:
+            sizes = dict(zip(shape, array.shape, strict=True)) | sizes
+        expected = tuple(sizes.get(word, word) for word in shape)
+        if array.shape != expected:
+            faults.append(f"{name} is {array.shape}, wanted {_shown(expected)}")
         elif bad := int(np.count_nonzero(~np.isfinite(array))):
             faults.append(f"{name} has {bad} of {array.size} values NaN or infinite")
     return faults + [f"{printable(name)} is not part of {title}" for name in arrays if name not in wanted]
 
 
-def wanted_dense(
-    arrays: Mapping[str, npt.NDArray[Any]], stages: int, inputs: int | str = "taxels * features"
-) -> dict[str, Shape]:
-    """Shapes of ``fc1`` … as their weights announce them: each takes what the one before gives."""
+def wanted_dense(stages: int) -> dict[str, Shape]:
+    """Shapes of ``fc1`` …: each takes what the one before gives."""
     wanted: dict[str, Shape] = {}
+    inputs = "taxels * features"
     for stage in range(1, stages + 1):
-        outputs = size(arrays, f"fc{stage}.weight", 2, 0, "outputs")
-        wanted[f"fc{stage}.weight"] = (outputs, inputs)
-        wanted[f"fc{stage}.bias"] = (outputs,)
+        outputs = f"outputs of fc{stage}"
+        wanted |= {f"fc{stage}.weight": (outputs, inputs), f"fc{stage}.bias": (outputs,)}
         inputs = outputs
     return wanted
 
@@ -94,16 +97,5 @@ def _tower_axis(name: str) -> int:
     return 1 if name == "conv1.hops" else 0
 
 
-def size(arrays: Mapping[str, npt.NDArray[Any]], name: str, dimensions: int, axis: int, word: str) -> int | str:
-    """Length of one axis of a tensor, or `word` where the tensor cannot say."""
-    array = arrays.get(name)
-    return array.shape[axis] if array is not None and array.ndim == dimensions and array.size else word
-
-
-def _fits(found: tuple[int, ...], wanted: Shape) -> bool:
-    pairs = zip(found, wanted, strict=False)
-    return len(found) == len(wanted) and all(a == b if isinstance(b, int) else a >= 1 for a, b in pairs)
-
-
-def _shown(shape: Shape) -> str:
+def _shown(shape: tuple[int | str, ...]) -> str:
     return f"({', '.join(str(length) for length in shape)}{',' if len(shape) == 1 else ''})"

@@ -25,7 +25,7 @@ import numpy as np
 from spikeloom.compiler.checkpoint import Checkpoint, layers_of
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.formats.tensors import Arrays, Shape, faults_of, size, taxel_faults, wanted_dense
+from spikeloom.compiler.formats.tensors import Arrays, Shape, faults_of, taxel_faults, wanted_dense
 from spikeloom.compiler.types import JsonObject
 
 CHANNELS = 2
@@ -132,22 +132,15 @@ def _tensor_fault(value: Any, file_size: int) -> str | None:
 def _unified(arrays: Arrays) -> Arrays:
     """Check everything and bring both key styles to the names of our own format."""
     hops = [int(match[1]) for key in arrays if (match := re.fullmatch(r"conv1\.lins\.(0|[1-9]\d?)\.weight", key))]
-    features: int | str
     wanted: dict[str, Shape]
     if not hops and "conv1.lin.weight" in arrays:
         bias = "conv1.lin.bias"
-        features = size(arrays, "conv1.lin.weight", 2, 0, "features")
-        wanted = {"conv1.lin.weight": (features, f"hops * {CHANNELS}"), bias: (features,)}
+        wanted = {"conv1.lin.weight": ("features", f"hops * {CHANNELS}"), bias: ("features",)}
     else:
         bias = "conv1.bias"
-        first = f"conv1.lins.{min(hops, default=0)}.weight"
-        features, channels = (size(arrays, first, 2, axis, word) for axis, word in enumerate(("features", "channels")))
-        wanted = {f"conv1.lins.{k}.weight": (features, channels) for k in range(max(hops, default=0) + 1)}
-        wanted[bias] = (features,)
-    faults = faults_of(arrays, wanted | wanted_dense(arrays, DENSE_STAGES))
-    if not faults:
-        assert isinstance(features, int)
-        faults = taxel_faults(arrays, features)
+        wanted = {f"conv1.lins.{k}.weight": ("features", "channels") for k in range(max(hops, default=0) + 1)}
+        wanted[bias] = ("features",)
+    faults = faults_of(arrays, wanted | wanted_dense(DENSE_STAGES)) or taxel_faults(arrays, len(arrays[bias]))
     if not faults and not hops and arrays["conv1.lin.weight"].shape[1] % CHANNELS:
         columns = arrays["conv1.lin.weight"].shape[1]
         faults = [f"conv1.lin.weight has {columns} columns, not a whole number of hops with {CHANNELS} channels each"]

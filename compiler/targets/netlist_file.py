@@ -16,14 +16,16 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from spikeloom.compiler import invariants
 from spikeloom.compiler.archive import CLOCKS, Array, Kind, archive_bytes, entry_faults, read_archive, write_archive
 from spikeloom.compiler.dynamics import Clocks
-from spikeloom.compiler.errors import FormatError
+from spikeloom.compiler.errors import FormatError, VerifyError
 from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
+from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.targets.base import known_targets
 from spikeloom.compiler.types import IntArray
 
@@ -38,40 +40,46 @@ COMMON: dict[str, Kind] = {
 """Entries of every manifest."""
 
 
-class Netlist(Protocol):
-    """A placed network, whatever its chip."""
+class Netlist:
+    """A placed network, whatever its chip: what all have."""
+
+    __slots__ = ()
+
+    target: str  # Name of the chip
+    # taxels, polarities, classes: Sensor size and number of classes
+    taxels: int
+    polarities: int
+    classes: int
+    core_axons: IntArray  # (cores + 1,) int64; range bounds into the axons
+    axon_synapses: IntArray  # (axons + 1,) int64; range bounds into the synapses
+    readout_class: IntArray  # (neurons,) int64; class that a spike votes for, -1 for none
+    provenance: Mapping[str, Any]  # JSON values only: what it was compiled from
+    clocks: Clocks  # Input channels that tell the time, after those of the sensor, see :mod:`compiler.dynamics`
+    bins: int = 1  # Bins of the recordings that make a data step
 
     @property
-    def target(self) -> str:
-        """Name of the chip."""
+    def n_inputs(self) -> int:
+        """Number of input channels."""
+        return self.taxels * self.polarities + self.clocks.channels
 
-    @property
-    def taxels(self) -> int:
-        """Of the sensor."""
+    def core_of_axon(self) -> IntArray:
+        """Core of each axon; shape (axons,)."""
+        return part_of(self.core_axons)
 
-    @property
-    def polarities(self) -> int:
-        """Input channels of a taxel."""
+    def axon_of_synapse(self) -> IntArray:
+        """Axon of each synapse; shape (synapses,)."""
+        return part_of(self.axon_synapses)
 
-    @property
-    def bins(self) -> int:
-        """Bins of the recordings that make a data step."""
 
-    @property
-    def classes(self) -> int:
-        """What it tells apart."""
+def part_of(bounds: IntArray) -> IntArray:
+    """Part of each entry, of range bounds (parts + 1,).
 
-    @property
-    def readout_class(self) -> IntArray:
-        """Class that each neuron of the chip votes for, -1 for none."""
-
-    @property
-    def clocks(self) -> Clocks:
-        """Channels after those of the sensor."""
-
-    @property
-    def provenance(self) -> Mapping[str, Any]:
-        """What it was compiled from."""
+    Examples
+    --------
+    >>> part_of(np.array([0, 2, 2, 3])).tolist()
+    [0, 0, 2]
+    """
+    return np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +102,13 @@ class NetlistFile(Generic[N]):
         """Array members in file order."""
         kind: Any = self.netlist
         return tuple(field.name for field in fields(kind) if field.name not in COMMON | self.entries)
+
+    def verify(self, made: object) -> None:
+        """Check every rule of what a pass made, a network or a netlist; VerifyError if it broke one."""
+        if isinstance(made, Network | IntegerNetwork):
+            invariants.verify(made)
+        elif isinstance(made, self.netlist) and (faults := self.inconsistencies(made)):
+            raise VerifyError("; ".join(faults))
 
     def content(self, netlist: N) -> bytes:
         """File content of a netlist; equal netlists give equal bytes."""
@@ -149,32 +164,31 @@ class NetlistFile(Generic[N]):
         return read_only_float(array) if name in self.floats else read_only(array)
 
 
-def bounds_faults(netlist: Any, bounds: Mapping[str, tuple[int, int]]) -> list[str]:
-    """Arrays of range bounds that do not divide all entries; by name, with the numbers of parts and of entries."""
+def column_faults(
+    netlist: Any,
+    bounds: Mapping[str, tuple[int, int]],
+    lengths: Mapping[str, int],
+    ranges: Mapping[str, tuple[int, int]],
+) -> list[str]:
+    """What is wrong about single arrays of a netlist, by their names; values are looked at where all sizes are right.
+
+    Range `bounds` must divide so many entries in so many parts (parts, entries); `lengths` are those of the other
+    arrays; `ranges` of values do not hold their upper end.
+    """
     found = []
     for name, (parts, total) in bounds.items():
         ends = getattr(netlist, name)
         if len(ends) != parts + 1 or ends[0] != 0 or ends[-1] != total or np.any(np.diff(ends) < 0):
             found.append(f"{name} does not divide {total} entries in {parts} parts")
-    return found
-
-
-def length_faults(netlist: Any, lengths: Mapping[str, int]) -> list[str]:
-    """Arrays, by name with their lengths, that have another one."""
-    return [
-        f"{name} has {len(getattr(netlist, name))} entries, {length} are needed"
-        for name, length in lengths.items()
-        if len(getattr(netlist, name)) != length
-    ]
-
-
-def range_faults(netlist: Any, ranges: Mapping[str, tuple[int, int]]) -> list[str]:
-    """Arrays, by name with their ranges (the upper end is not in it), that have values outside."""
-    return [
+    for name, length in lengths.items():
+        if (held := len(getattr(netlist, name))) != length:
+            found.append(f"{name} has {held} entries, {length} are needed")
+    outside = (
         f"{name} has values outside {low} … {high - 1}"
         for name, (low, high) in ranges.items()
         if is_outside(getattr(netlist, name), low, high)
-    ]
+    )
+    return found or list(outside)
 
 
 def is_outside(array: Array, low: int, high: int) -> bool:

@@ -86,8 +86,6 @@ def lif(current: Tensor, beta: float, theta: float, surrogate: Surrogate = RECTA
     derivative of the spike. Returns zeros and ones, and the membrane that was compared with `theta`, both (steps, ...);
     no gradient flows from the membrane.
     """
-    if current.device.type != "cpu":
-        return lif_steps(current, beta, theta, surrogate)
     spikes, membrane = _Lif.apply(current, beta, theta, surrogate)  # type: ignore[no-untyped-call]
     return spikes, membrane
 
@@ -135,18 +133,6 @@ class Spike(torch.autograd.Function):
         return gradients[0] * (distance < surrogate.width), None, None
 
 
-def lif_steps(current: Tensor, beta: float, theta: float, surrogate: Surrogate = RECTANGLE) -> tuple[Tensor, Tensor]:
-    """As :func:`lif` in torch operations, one step at a time: for devices without the kernels."""
-    spike: Tensor = torch.zeros_like(current[0])
-    u, spikes, membranes = spike, list[Tensor](), list[Tensor]()
-    for drive in current:
-        u = beta * u * (1 - (spike if surrogate.reset else spike.detach())) + drive
-        spike = Spike.apply(u, theta, surrogate)  # type: ignore[no-untyped-call]
-        spikes.append(spike)
-        membranes.append(u.detach())
-    return torch.stack(spikes), torch.stack(membranes)
-
-
 def lasting_current(drive: Tensor, alpha: float) -> Tensor:
     """Synaptic currents along the first axis, from rest: ``i_t = alpha * i_{t-1} + drive_t``.
 
@@ -172,19 +158,8 @@ class _LastingCurrent(torch.autograd.Function):
 
 def _accumulated(steps: Tensor, alpha: float, *, backwards: bool) -> Tensor:
     found = steps.clone(memory_format=torch.contiguous_format)
-    if found.device.type == "cpu":
-        accumulate(rows_of(found), kind_of(found)(alpha), backwards)
-    else:
-        accumulate_steps(found, alpha, backwards=backwards)
+    accumulate(rows_of(found), kind_of(found)(alpha), backwards)
     return found
-
-
-def accumulate_steps(current: Tensor, alpha: float, *, backwards: bool) -> None:
-    """What :func:`accumulate` does, in torch operations: for devices without the kernels."""
-    steps = range(len(current) - 2, -1, -1) if backwards else range(1, len(current))
-    before = 1 if backwards else -1
-    for t in steps:
-        current[t] += alpha * current[t + before]
 
 
 def spike_linear(spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -194,8 +169,6 @@ def spike_linear(spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     is (inputs, outputs), transposed against torch's ``Linear``, so that the weights of one input lie side by side; the
     bias starts each sum, the inputs follow in ascending order.
     """
-    if spikes.device.type != "cpu":
-        return spikes @ weight + bias
     out: Tensor = _SpikeLinear.apply(spikes, weight, bias)  # type: ignore[no-untyped-call]
     return out
 
@@ -231,7 +204,7 @@ def rates_of(spikes: Tensor, lengths: Tensor | None) -> Tensor:
     """Spikes per step of (steps, samples, neurons), without the steps by which shorter recordings were filled up."""
     if lengths is None:
         return spikes.mean(0)
-    inside = torch.arange(len(spikes), device=spikes.device)[:, None] < lengths
+    inside = torch.arange(len(spikes))[:, None] < lengths
     return torch.sum(spikes * inside[..., None], dim=0) / lengths[:, None]
 
 
@@ -269,27 +242,19 @@ def _integrate(current: Any, beta: Any, theta: Any, spikes: Any, membrane: Any) 
 
 @numba.njit(cache=True)
 def _differentiate_step(
-    from_above: Any, membrane: Any, later: Any, beta: Any, theta: Any, half_width: Any, reset: Any, out: Any
-) -> None:
-    zero = membrane.dtype.type(0)
-    for i in range(len(membrane)):
-        u = membrane[i]
-        through_spike = from_above[i] - reset * (later[i] * (u * beta))
-        through_decay = zero if u > theta else later[i] * beta
-        out[i] = through_decay + (through_spike if abs(u - theta) < half_width else zero)
-
-
-@numba.njit(cache=True)
-def _differentiate_smooth_step(
-    from_above: Any, membrane: Any, later: Any, beta: Any, theta: Any, width: Any, reset: Any, out: Any
+    from_above: Any, membrane: Any, later: Any, beta: Any, theta: Any, width: Any, reset: Any, smooth: Any, out: Any
 ) -> None:
     zero, one = membrane.dtype.type(0), membrane.dtype.type(1)
     for i in range(len(membrane)):
         u = membrane[i]
         through_spike = from_above[i] - reset * (later[i] * (u * beta))
         through_decay = zero if u > theta else later[i] * beta
-        far = one + abs(u - theta) / width
-        out[i] = through_decay + through_spike / (far * far)
+        away = abs(u - theta)
+        if smooth:
+            far = one + away / width
+            out[i] = through_decay + through_spike / (far * far)
+        else:
+            out[i] = through_decay + (through_spike if away < width else zero)
 
 
 def differentiate(
@@ -308,10 +273,7 @@ def _differentiate(
     steps, size = membrane.shape
     later = np.zeros(size, membrane.dtype)
     for t in range(steps - 1, -1, -1):
-        if smooth:
-            _differentiate_smooth_step(spikes_gradient[t], membrane[t], later, beta, theta, width, reset, out[t])
-        else:
-            _differentiate_step(spikes_gradient[t], membrane[t], later, beta, theta, width, reset, out[t])
+        _differentiate_step(spikes_gradient[t], membrane[t], later, beta, theta, width, reset, smooth, out[t])
         later = out[t]
 
 

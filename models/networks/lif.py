@@ -1,12 +1,11 @@
-"""Spiking neurons as a torch module, one step a call, and the form in which a network of them is exported.
+"""Spiking neurons as a torch module, one step a call.
 
 A network is any ``nn.Module`` with :class:`LIF` layers in it; whatever lies between two of them must be affine to be
-compiled (:func:`module.compile_module`). How it is trained is its own affair.
+compiled (:func:`module.module_network`). How it is trained is its own affair.
 """
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor, nn
 
 from spikeloom.models.networks.layers import Spike
@@ -53,45 +52,6 @@ class LIF(nn.Module):
 
 def reset(net: nn.Module) -> None:
     """Bring all neurons of a network to rest."""
-    for layer in _lif_layers(net):
-        layer.reset()
-
-
-def _lif_layers(net: nn.Module) -> list[LIF]:
-    return [module for module in net.modules() if isinstance(module, LIF)]
-
-
-class OneStep(nn.Module):
-    """One step of a network as a function: ``(x, state …) -> (output, state …)``, the form to export.
-
-    The `example`, an input of one step, is for the shapes of the states.
-
-    Examples
-    --------
-    >>> step = OneStep(nn.Sequential(nn.Linear(4, 3), LIF()), torch.zeros(1, 4))
-    >>> output, *state = step(torch.ones(1, 4), *step.rest)
-    >>> len(state)
-    2
-    """
-
-    def __init__(self, net: nn.Module, example: Tensor) -> None:
-        super().__init__()
-        self.net = net
-        reset(net)
-        with torch.no_grad():
-            net(example)
-        self.rest = tuple(torch.zeros_like(tensor) for tensor in self._state())
-        reset(net)
-
-    def forward(self, x: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """Output and new state, membranes and spikes of each layer in turn."""
-        for index, layer in enumerate(_lif_layers(self.net)):
-            layer.membrane, layer.spikes = state[2 * index], state[2 * index + 1]
-        output: Tensor = self.net(x)
-        after = self._state()
-        reset(self.net)
-        return output, *after
-
-    def _state(self) -> tuple[Tensor, ...]:
-        both = ((layer.membrane, layer.spikes) for layer in _lif_layers(self.net))
-        return tuple(tensor for pair in both for tensor in pair if tensor is not None)
+    for module in net.modules():
+        if isinstance(module, LIF):
+            module.reset()

@@ -1,21 +1,18 @@
-"""Compile any torch module made of affine stages and :class:`lif.LIF` layers.
+"""Lower any torch module made of affine stages and :class:`lif.LIF` layers.
 
-A stage is read by probing it in float64, so the compiler need not know its layers: unit vectors give its weights,
-random combinations tell whether it is affine at all. New layer types need nothing but a ``forward``.
+A stage is read in float64, so the compiler need not know its layers: torch's derivative gives its weights, random
+combinations tell whether it is affine at all. New layer types need nothing but a ``forward``.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
 from scipy import sparse
 from torch import Tensor, nn
 
-from spikeloom.compiler import DEFAULT_TARGET, Compilation, Options, compile_network
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.assemble import Layer, assemble, class_of_each
 from spikeloom.compiler.formats.names import unique_names
@@ -27,153 +24,101 @@ from spikeloom.models.networks.lif import LIF, reset
 AFFINE_TOLERANCE = 1e-9
 """Largest deviation from affinity, relative to the stage's largest response, that rounding in float64 explains."""
 
-PROBES = 512
-"""Unit vectors that run together."""
-
-AMPLITUDE = 2.0**20
-"""Of a unit vector: so large that the bias costs no digits of a weight, and a power of two."""
+ROWS = 256
+"""Neurons whose weights are read together."""
 
 NOTHING = 2.0**-50
-"""Share of a stage's largest response that is rounding."""
+"""Share of a neuron's largest weight that is rounding: what a differently ordered sum leaves of nothing."""
 
 
-class _Probe:
+class _Stages:
     """A network whose spikes are given from outside, so that only its stages are left."""
 
     def __init__(self, net: nn.Module, example: Tensor) -> None:
         reset(net)
-        self.net = copy.deepcopy(net).double().eval()
-        self.names = {id(module): name for name, module in self.net.named_modules() if isinstance(module, LIF)}
+        self.net = copy.deepcopy(net).double().eval().requires_grad_(False)
+        names = {id(module): name for name, module in self.net.named_modules() if isinstance(module, LIF)}
         self.order: list[LIF] = []
         self.currents: list[Tensor] = []
-        self.forced: list[Tensor] | None = None
+        self.forced: list[Tensor] = []
         for module in self.net.modules():
             if isinstance(module, LIF):
                 module.register_forward_hook(self._record)
-        self.example = example.detach().double()
-        first, _ = self._forward(self.example, None)
-        calls = [id(layer) for layer in self.order]
-        for layer in self.order:
-            if calls.count(id(layer)) > 1:
+        first = example.detach().double()
+        self.batched = first.dim() > 1 and self._is_batch(first)
+        responses = self.respond([first[:1] if self.batched else first])
+        self.names = tuple(names[id(layer)] or type(layer).__name__ for layer in self.order)
+        for layer, name in zip(self.order, self.names, strict=True):
+            if (calls := sum(each is layer for each in self.order)) > 1:
                 raise ModelError(
-                    f"module {self._name(layer)}: is called {calls.count(id(layer))} times in a step, each LIF layer "
-                    "holds the neurons of one place; use one for each"
+                    f"module {name}: is called {calls} times in a step, each LIF layer holds the neurons of one place; "
+                    "use one for each"
                 )
-        if not first:
+        if not self.order:
             raise ModelError("module: has no LIF layer, so nothing spikes; put spikeloom.LIF between its stages")
-        self.shapes = [tuple(current.shape) for current in first]
-        self.batched = self._is_batched()
-
-    def _name(self, layer: LIF) -> str:
-        return self.names[id(layer)] or type(layer).__name__
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """Names of the LIF layers, in the order of their calls."""
-        return tuple(self._name(layer) for layer in self.order)
-
-    @property
-    def step_shape(self) -> tuple[int, ...]:
-        """Shape of the input of one recording in one step."""
-        return tuple(self.example.shape[1:] if self.batched else self.example.shape)
-
-    def sizes(self) -> list[int]:
-        """Elements of the input, then of each layer, for one recording."""
-        shapes = [self.example.shape, *self.shapes]
-        return [int(np.prod(shape[1:] if self.batched else shape)) for shape in shapes]
+        self.shapes = [tuple((first[:1] if self.batched else first).shape), *(tuple(r.shape) for r in responses[:-1])]
 
     def _record(self, layer: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> Tensor:
         assert isinstance(layer, LIF)
-        place = len(self.currents)
+        self.order.append(layer)
         self.currents.append(inputs[0])
-        if self.forced is None:
-            self.order.append(layer)
-            return output
-        return self.forced[place]
+        return self.forced[len(self.order) - 1] if self.forced else output
 
-    def _forward(self, x: Tensor, forced: list[Tensor] | None) -> tuple[list[Tensor], Tensor]:
-        self.currents, self.forced = [], forced
+    def _is_batch(self, example: Tensor) -> bool:
+        """Whether the first axis numbers recordings: one of them goes through all layers."""
+        try:
+            responses = self.respond([example[:1]])
+        except (IndexError, RuntimeError):
+            return False
+        return all(response.shape[:1] == (1,) for response in responses)
+
+    def respond(self, sources: list[Tensor]) -> list[Tensor]:
+        """Currents of each layer and then the output, for the input and, if they are given, spikes of each layer."""
+        self.order, self.currents, self.forced = [], [], sources[1:]
         reset(self.net)
-        with torch.no_grad():
-            output = self.net(x)
+        output = self.net(sources[0])
         if not isinstance(output, Tensor):
             raise ModelError(f"module: returns a {type(output).__name__}, wanted one tensor, the spikes of its classes")
-        return self.currents, output
-
-    def _is_batched(self) -> bool:
-        """Whether two inputs stacked along the first axis give two responses stacked."""
-        if self.example.dim() < 2:
-            return False
-        generator = torch.Generator().manual_seed(0)
-        one, other = (
-            [torch.randn((1, *shape[1:]), generator=generator, dtype=torch.float64) for shape in
-             (self.example.shape, *self.shapes)] for _ in range(2)
-        )  # fmt: skip
-        try:
-            single = [self._forward(side[0], side[1:]) for side in (one, other)]
-            both = self._forward(
-                torch.cat([one[0], other[0]]), [torch.cat(p) for p in zip(one[1:], other[1:], strict=True)]
-            )
-        except (IndexError, RuntimeError):
-            return False  # a layer that knows how many rows there are takes no second recording
-        expected = [[*currents, output] for currents, output in single]
-        return all(
-            a.shape[0] == 1 and c.shape == (2, *a.shape[1:]) and torch.allclose(c, torch.cat([a, b]))
-            for a, b, c in zip(*expected, [*both[0], both[1]], strict=True)
-        )
-
-    def respond(self, sources: Sequence[FloatArray]) -> list[FloatArray]:
-        """Currents of each layer and then the output, (probes, size), for the input and spikes of each layer."""
-        tensors = [torch.from_numpy(np.ascontiguousarray(values)) for values in sources]
-        shapes = [tuple(self.example.shape), *self.shapes]
-        if self.batched:
-            shaped = [tensor.reshape(-1, *shape[1:]) for tensor, shape in zip(tensors, shapes, strict=True)]
-            currents, output = self._forward(shaped[0], shaped[1:])
-            return [current.reshape(len(sources[0]), -1).numpy() for current in [*currents, output]]
-        rows = []
-        for row in range(len(sources[0])):
-            shaped = [tensor[row].reshape(shape) for tensor, shape in zip(tensors, shapes, strict=True)]
-            currents, output = self._forward(shaped[0], shaped[1:])
-            rows.append([current.reshape(-1).numpy() for current in [*currents, output]])
-        return [np.stack(parts) for parts in zip(*rows, strict=True)]
+        return [*self.currents, output]
 
 
-def _weights(probe: _Probe) -> tuple[list[list[Sparse]], list[FloatArray]]:
+def _weights(stages: _Stages) -> tuple[list[list[Sparse]], list[FloatArray]]:
     """Weights from each source into each layer and the output, ``[target][source]``, and the biases."""
-    sizes = probe.sizes()
-    silent = [np.zeros((1, size)) for size in sizes]
-    bias = [response[0] for response in probe.respond(silent)]
-    weights: list[list[Sparse]] = [[] for _ in bias]
-    for source, size in enumerate(sizes):
-        parts: list[list[Sparse]] = [[] for _ in bias]
-        for start in range(0, size, PROBES):
-            units = np.eye(min(PROBES, size - start), size, start) * AMPLITUDE
-            given = [units if place == source else np.zeros((len(units), other)) for place, other in enumerate(sizes)]
-            for target, response in enumerate(probe.respond(given)):
-                change = response - bias[target]
-                # What a differently ordered sum leaves of nothing is no synapse.
-                change[np.abs(change) <= NOTHING * max(np.abs(response).max(initial=0), AMPLITUDE * NOTHING)] = 0
-                parts[target].append(sparse.csr_array((change / AMPLITUDE).T))
-        for target, columns in enumerate(parts):
-            weights[target].append(sparse.hstack(columns, format="csr"))
-    return weights, bias
+    sources = [torch.zeros(shape, dtype=torch.float64, requires_grad=True) for shape in stages.shapes]
+    nothing = sum(source.sum() * 0 for source in sources)  # so that every response depends on every source
+    weights, biases = [], []
+    for response in stages.respond(sources):
+        flat = response.reshape(-1) + nothing
+        rows: list[list[Sparse]] = [[] for _ in sources]
+        for start in range(0, len(flat), ROWS):
+            units = torch.from_numpy(np.eye(min(ROWS, len(flat) - start), len(flat), start))
+            found = torch.autograd.grad(flat, sources, units, retain_graph=True, is_grads_batched=True)
+            for part, gradient in zip(rows, found, strict=True):
+                block = gradient.reshape(len(units), -1).numpy()
+                least = NOTHING * np.abs(block).max(axis=1, keepdims=True, initial=0)
+                part.append(sparse.csr_array(np.where(np.abs(block) > least, block, 0)))
+        weights.append([sparse.vstack(part, format="csr") for part in rows])
+        biases.append(flat.detach().numpy())
+    return weights, biases
 
 
-def _require_affine(probe: _Probe, weights: list[list[Sparse]], bias: list[FloatArray]) -> None:
+def _require_affine(stages: _Stages, weights: list[list[Sparse]], biases: list[FloatArray]) -> None:
     """Random combinations of all sources, small and large, must give the same combinations of the weights."""
     rng = np.random.default_rng(0)
-    given = [rng.normal(size=(8, size)) * 10.0 ** np.arange(-2, 6)[:, None] for size in probe.sizes()]
-    named = [f"the stage before {name}" for name in probe.layers] + ["the output"]
-    for what, found, parts, shift in zip(named, probe.respond(given), weights, bias, strict=True):
-        expected = sum((values @ part.T for values, part in zip(given, parts, strict=True)), start=shift)
-        worst = np.abs(found - expected).max(axis=1, initial=0) / np.maximum(
-            np.abs(expected).max(axis=1, initial=0), 1e-300
-        )
-        if not np.all(worst <= AFFINE_TOLERANCE):
-            raise ModelError(
-                f"module: {what} is not affine (a random combination of inputs is off by {worst.max():.2g} of the "
-                f"response, {AFFINE_TOLERANCE:g} allowed); only affine stages between LIF layers can become synapses"
+    named = [f"the stage before {name}" for name in stages.names] + ["the output"]
+    for size in 10.0 ** np.arange(-2, 6):
+        given = [rng.normal(size=shape) * size for shape in stages.shapes]
+        found = stages.respond([torch.from_numpy(values) for values in given])
+        for what, response, parts, bias in zip(named, found, weights, biases, strict=True):
+            expected = sum((part @ values.ravel() for part, values in zip(parts, given, strict=True)), start=bias)
+            off = np.abs(response.numpy().ravel() - expected).max(initial=0) / max(
+                np.abs(expected).max(initial=0), 1e-300
             )
+            if not off <= AFFINE_TOLERANCE:
+                raise ModelError(
+                    f"module: {what} is not affine (a random combination of inputs is off by {off:.2g} of the "
+                    f"response, {AFFINE_TOLERANCE:g} allowed); only affine stages between LIF layers become synapses"
+                )
 
 
 def module_network(
@@ -183,8 +128,8 @@ def module_network(
 
     The ``forward`` of `net` takes the input of one step and calls :class:`lif.LIF` layers; it returns the spikes of the
     last one, or a sum of them for each class. It is copied and brought to rest. The `example` is an input of one step;
-    its first axis may be a batch, else the module is probed one input at a time. For `polarities` and
-    `polarities_first` see :func:`sensor_layout.sensor_layout`.
+    its first axis may number recordings. For `polarities` and `polarities_first` see
+    :func:`sensor_layout.sensor_layout`.
 
     ModelError if a stage is not affine, or the chip cannot have the network.
 
@@ -194,13 +139,14 @@ def module_network(
     >>> [(population.name, population.size) for population in module_network(net, torch.zeros(1, 4)).populations]
     [('1', 3), ('3', 2)]
     """
-    probe = _Probe(net, example)
-    weights, bias = _weights(probe)
-    _require_affine(probe, weights, bias)
-    sensor, positions, _ = sensor_layout(probe.step_shape, polarities=polarities, polarities_first=polarities_first)
+    stages = _Stages(net, example)
+    weights, bias = _weights(stages)
+    _require_affine(stages, weights, bias)
+    shape = stages.shapes[0][stages.batched :]
+    sensor, positions, _ = sensor_layout(shape, polarities=polarities, polarities_first=polarities_first)
     layers = []
-    names = unique_names(probe.layers)
-    for index, (layer, name) in enumerate(zip(probe.order, names, strict=True)):
+    names = unique_names(stages.names)
+    for index, (layer, name) in enumerate(zip(stages.order, names, strict=True)):
         sources = {source - 1: part for source, part in enumerate(weights[index]) if part.nnz}
         if INPUT in sources:
             sources[INPUT] = sources[INPUT][:, positions]
@@ -215,19 +161,3 @@ def module_network(
             "over a group of neurons for each class"
         )
     return assemble(layers, sensor, given[0] - 1, label)
-
-
-def compile_module(
-    net: nn.Module,
-    example: Tensor,
-    *,
-    polarities: int | None = None,
-    polarities_first: bool | None = None,
-    target: str = DEFAULT_TARGET,
-    options: Options | None = None,
-) -> Compilation:
-    """Compile a module: :func:`module_network`, then :func:`compiler.compile_network`."""
-    network = module_network(net, example, polarities=polarities, polarities_first=polarities_first)
-    options = options or Options()
-    provenance = {"module": type(net).__name__, **options.provenance}
-    return compile_network(network, replace(options, provenance=provenance), target=target)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -34,26 +33,6 @@ from spikeloom.models.systems import HOPS, filters_of
 Weights = dict[str, NDArray[np.float32]]
 """Arrays by name: ``conv1.hops`` (filters, features, channels), ``conv1.bias``, then ``fc1.weight`` (outputs, inputs),
 ``fc1.bias`` and so on; see :mod:`compiler.systems`."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Architecture:
-    """Sizes and neuron constants of a `SpikingNet`; the defaults are those of [1]_."""
-
-    taxels: int  # Sensor points
-    classes: int  # Output neurons
-    channels: int = 2  # Inputs per taxel (polarities)
-    hops: int = HOPS  # K of the graph convolution of a TactileSGNet, which has K + 1 filters
-    features: int = 64  # Outputs of the first layer per place
-    hidden: tuple[int, ...] = (128, 256)  # Neurons of each dense layer before the last
-    beta: float = 0.2  # Membrane decay per step
-    theta: float = 0.5  # Threshold of every neuron
-    system: str = TACTILESGNET  # One of :data:`spikeloom.compiler.systems.SYSTEMS`
-    dynamics: Dynamics = PLAIN  # Decays of single layers, and clocks
-
-    def network(self, propagation: NDArray[np.float64], *, seed: int = 0, surrogate: Surrogate) -> SpikingNet:
-        """An untrained network."""
-        return SpikingNet(self, propagation, seed=seed, surrogate=surrogate)
 
 
 class Affine(nn.Module):
@@ -96,23 +75,34 @@ class TrainedModule(nn.Module):
         raise NotImplementedError
 
 
-class Sizes(Protocol):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sizes:
     """Sizes of a network that can be trained."""
 
-    @property
-    def taxels(self) -> int:
-        """Sensor points."""
-
-    @property
-    def channels(self) -> int:
-        """Inputs per taxel."""
-
-    @property
-    def classes(self) -> int:
-        """Outputs."""
+    taxels: int  # Sensor points
+    classes: int  # Outputs of the vote
+    channels: int = 2  # Inputs per taxel (polarities)
+    hops: int = HOPS  # K of the graph convolution of a TactileSGNet, which has K + 1 filters
 
     def network(self, propagation: NDArray[np.float64], *, seed: int, surrogate: Surrogate) -> TrainedModule:
         """An untrained network."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Architecture(Sizes):
+    """Sizes and neuron constants of a `SpikingNet`; the defaults are those of [1]_."""
+
+    features: int = 64  # Outputs of the first layer per place
+    hidden: tuple[int, ...] = (128, 256)  # Neurons of each dense layer before the last
+    beta: float = 0.2  # Membrane decay per step
+    theta: float = 0.5  # Threshold of every neuron
+    system: str = TACTILESGNET  # One of :data:`spikeloom.compiler.systems.SYSTEMS`
+    dynamics: Dynamics = PLAIN  # Decays of single layers, and clocks
+
+    def network(self, propagation: NDArray[np.float64], *, seed: int = 0, surrogate: Surrogate) -> SpikingNet:
+        """An untrained network."""
+        return SpikingNet(self, propagation, seed=seed, surrogate=surrogate)
 
 
 class SpikingNet(TrainedModule):
@@ -202,7 +192,7 @@ class SpikingNet(TrainedModule):
             inputs, outputs = self.get_submodule(layer).get_parameter("weight").shape
             spikes = layers[source][0]
             share = spikes.mean() if lengths is None else rates_of(spikes, lengths).mean()
-            used = used + share.cpu() * (inputs * outputs)
+            used = used + share * (inputs * outputs)
             there += inputs * outputs
         return used / there
 
@@ -213,7 +203,7 @@ class SpikingNet(TrainedModule):
             state |= {
                 n: self._scaled(index, p) for n, p in state.items() if n.startswith(f"{layer}.") and "bias" not in n
             }
-        arrays = {name: p.cpu().numpy() for name, p in state.items()}
+        arrays = {name: p.numpy() for name, p in state.items()}
         found = {name: (array.T if _turned(name) else array) for name, array in arrays.items()}
         if self.architecture.system == MLP:
             weight = found.pop("conv1.weight")
@@ -221,17 +211,6 @@ class SpikingNet(TrainedModule):
         if feature_major(self.architecture.system):
             found["fc1.weight"] = found["fc1.weight"][:, self._order()]
         return {name: array.copy(order="C") for name, array in found.items()}
-
-    def load_weights(self, weights: Mapping[str, NDArray[np.float32]]) -> None:
-        """Take over what `export_weights` returned, as it is: the parameters are the weights from now on."""
-        self.gains = ()
-        given = dict(weights)
-        if self.architecture.system == MLP:
-            hops = given.pop("conv1.hops")
-            given["conv1.weight"] = hops.swapaxes(0, 1).reshape(hops.shape[1], -1)
-        if feature_major(self.architecture.system):
-            given["fc1.weight"] = given["fc1.weight"][:, np.argsort(self._order())]
-        self.load_state_dict({n: torch.tensor(array.T if _turned(n) else array) for n, array in given.items()})
 
     def _order(self) -> NDArray[np.int64]:
         """Neuron of ours that is the first, second … one in the order of the system."""

@@ -11,32 +11,24 @@ GAP_S = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EventCounts:
-    """What was counted while recordings were put into bins; the fields are keys in JSON.
-
-    Recordings are either `shorter` than the longest, or were `padded` to one length.
-    """
+    """What was counted while recordings were put into bins; the fields are keys in JSON."""
 
     events: int  # Events read, duplicates included
     out_of_order: int  # Events with a time before that of an event that came earlier
     duplicates: int  # Events whose taxel already had one of the same polarity in the same bin; they count once
     gaps: int  # Silences longer than `gap_s` between two events of a recording
     gap_s: float = GAP_S
-    shorter: int | None = field(default=None, metadata={"optional": True})
-    padded: int | None = field(default=None, metadata={"optional": True})
+    shorter: int = 0  # Recordings shorter than the longest
     # What is worth a second look: times that look like another unit, taxels that seem to count from 1, a table of
     # labels
     notes: tuple[str, ...] = field(default=(), metadata={"hidden": True})
 
     def __str__(self) -> str:
         """Counts for people."""
-        if self.shorter is None:
-            lengths = f"{number(self.padded or 0, 'recording')} padded at the end"
-        else:
-            lengths = f"{number(self.shorter, 'recording')} shorter than the longest"
         return (
             f"{number(self.events, 'event')} read, {self.out_of_order:,} out of order, "
             f"{number(self.duplicates, 'duplicate')} in a bin, {number(self.gaps, 'gap')} over {self.gap_s:g} s, "
-            f"{lengths}"
+            f"{number(self.shorter, 'recording')} shorter than the longest"
         )
 
 

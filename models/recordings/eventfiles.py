@@ -23,12 +23,6 @@ from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name, opene
 
 MAX_LABEL = 999_999
 
-UNITS = (("nanoseconds", 5e5), ("microseconds", 5e2), ("milliseconds", 0.5))
-"""Units that times may have by mistake, and what half of the events then leave between them, at least."""
-
-UNIT_EVENTS, UNIT_SPAN = 8, 60.0
-"""Different times, and what lies between first and last, below which no unit is guessed."""
-
 _REQUIRED = ("time_s", "taxel", "polarity")
 
 
@@ -81,24 +75,6 @@ def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, wher
         label=_label(where, path.name, columns.get("label")),
         at=at,
     )
-
-
-def likely_unit(times: NDArray[np.float64]) -> str | None:
-    """Unit that times seem to have if it is not seconds.
-
-    A sensor that is touched sends several events a second. Times that are further apart, over a minute or more, are
-    some smaller unit: that in which they are half a millisecond to half a second apart.
-
-    Examples
-    --------
-    >>> likely_unit(np.arange(0, 3000, 7.0)), likely_unit(np.arange(0, 3, 0.007)), likely_unit(np.array([0.0, 90.0]))
-    ('milliseconds', None, None)
-    """
-    distinct = np.unique(times)
-    if len(distinct) < UNIT_EVENTS or distinct[-1] - distinct[0] < UNIT_SPAN:
-        return None
-    apart = float(np.median(np.diff(distinct)))
-    return next((unit for unit, least in UNITS if apart > least), None)
 
 
 def _polarity(where: str, values: FloatArray, at: Callable[[int], str]) -> NDArray[np.uint8]:

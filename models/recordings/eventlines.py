@@ -24,9 +24,8 @@ GIVE = "give one event 'time_s,taxel,polarity' a line"
 
 
 class Mark(enum.Enum):
-    """What a line can be that is no event."""
+    """What can come that is no event."""
 
-    NOTHING = enum.auto()
     END_OF_GRASP = enum.auto()
     END_OF_STREAM = enum.auto()
 
@@ -54,52 +53,50 @@ class EventLines:
         self._widths = [3, 4]  # numbers of columns that a line may have
         self._low: int | None = None  # the code of the falling polarity, once there was one
 
-    def arrived(self, deadline: float) -> bool:
-        """Wait for a line, or the end, at most until `deadline` on the monotonic clock; return whether there is one."""
+    def read(self, deadline: float | None = None) -> Event | Mark | None:
+        """What comes next, or None if nothing came until `deadline` on the monotonic clock.
+
+        DataError if a line is nothing that may stand in one.
+        """
+        while self._arrived(deadline):
+            if not self._buffer:
+                return Mark.END_OF_STREAM
+            line = self._line()
+            if line in ("", "reset"):
+                self._header_allowed = True
+                return Mark.END_OF_GRASP
+            header = self._header_allowed and self._is_header(line)
+            content, _, _ = line.partition("#")
+            self._header_allowed &= not (header or content)
+            if content and not header:
+                return self._event(content)
+        return None
+
+    def _arrived(self, deadline: float | None) -> bool:
+        """Wait for a line, or the end; return whether there is one."""
         while not self._ended and b"\n" not in self._buffer:
-            if not select.select([self._file], [], [], max(0.0, deadline - time.monotonic()))[0]:
+            left = None if deadline is None else max(0.0, deadline - time.monotonic())
+            if not select.select([self._file], [], [], left)[0]:
                 return False
-            self._fill()
+            if len(self._buffer) > MAX_LINE_BYTES:
+                self._number += 1
+                raise self.complain(f"longer than {MAX_LINE_BYTES} bytes", GIVE)
+            more = self._file.read(MAX_LINE_BYTES)
+            self._ended = not more
+            self._buffer += more
         return True
 
-    def read(self) -> Event | Mark:
-        """Read one line, whenever it comes; DataError if it is nothing that may stand in one."""
-        while not self._ended and b"\n" not in self._buffer:
-            self._fill()
-        if not self._buffer:
-            return Mark.END_OF_STREAM
+    def _line(self) -> str:
+        """Take a line from what has arrived."""
         end = self._buffer.find(b"\n")
         raw = bytes(self._buffer[:end] if end >= 0 else self._buffer)
         del self._buffer[: len(raw) + 1]
         self._number += 1
-        line = raw.decode("utf-8", "replace").removeprefix("\ufeff").strip()
-        if line in ("", "reset"):
-            self._header_allowed = True
-            return Mark.END_OF_GRASP
-        if self._header_allowed and self._is_header(line):
-            self._header_allowed = False
-            return Mark.NOTHING
-        content, _, _ = line.partition("#")
-        if not content:
-            return Mark.NOTHING
-        self._header_allowed = False
-        return self._event(content)
+        return raw.decode("utf-8", "replace").removeprefix("\ufeff").strip()
 
     def complain(self, found: str, remedy: str) -> DataError:
         """Error of the line that was read last."""
         return DataError(f"{self._name}, line {self._number}: {found}; {remedy}")
-
-    def _fill(self) -> None:
-        """Read what there is, or wait for it."""
-        if len(self._buffer) > MAX_LINE_BYTES:
-            self._number += 1
-            raise self.complain(f"longer than {MAX_LINE_BYTES} bytes", GIVE)
-        more = self._file.read(MAX_LINE_BYTES)
-        if more is None:  # somebody made the file non-blocking, and there is nothing yet
-            select.select([self._file], [], [])
-            return
-        self._ended = not more
-        self._buffer += more
 
     def _is_header(self, line: str) -> bool:
         """Whether a line, perhaps a comment, names the columns; if so, note where they stand."""

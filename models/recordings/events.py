@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings.counts import GAP_S, EventCounts
 from spikeloom.models.recordings.csvtable import LABELS, is_table, labels_beside
-from spikeloom.models.recordings.eventfiles import EventStream, likely_unit, read_stream
+from spikeloom.models.recordings.eventfiles import EventStream, read_stream
 from spikeloom.models.recordings.evtouch import (
     SUFFIXES,
     UNLABELLED,
@@ -40,6 +40,9 @@ BIN_S = 0.02
 """Width of a time bin in the released recordings, seconds."""
 
 MAX_STEPS = 1_000_000
+
+UNIT_SPAN_S = 60.0
+"""Up to this length of a recording no unit is doubted."""
 
 # Times typed in decimals fall on edges, and 0.58 / 0.02 is 28.999999999999996. Of a bin; three roundings of a
 # quotient below MAX_STEPS are off by a third of it at most.
@@ -183,14 +186,14 @@ def bin_events(
     DataError if an event is later than `MAX_STEPS` bins.
     """
     latest = int(np.argmax(stream.time_s))
-    unit = likely_unit(stream.time_s)
-    if float(stream.time_s[latest]) / bin_s >= MAX_STEPS:
-        mend = "count from the start of the recording or use wider bins"
-        if unit:
-            mend = f"the times look like {unit}, write seconds"
+    last = float(stream.time_s[latest])
+    # A sensor that is touched sends several events a second: fewer than one, for a minute, are in a smaller unit.
+    odd = last > UNIT_SPAN_S and len(np.unique(stream.time_s)) < last - stream.time_s.min()
+    if last / bin_s >= MAX_STEPS:
+        mend = "write seconds" if odd else "count from the start of the recording or use wider bins"
         raise DataError(
-            f"{stream.at(latest)}: time {stream.time_s[latest]:g} s is past {MAX_STEPS} bins of {bin_s:g} s, the limit "
-            f"of a recording; {mend}"
+            f"{stream.at(latest)}: time {last:g} s is past {MAX_STEPS} bins of {bin_s:g} s, the limit of a recording; "
+            f"{mend}"
         )
     step = np.floor(stream.time_s / bin_s + _EDGE).astype(np.int64)
     steps = int(step.max()) + 1
@@ -204,7 +207,7 @@ def bin_events(
         out_of_order=int(np.count_nonzero(stream.time_s < np.maximum.accumulate(stream.time_s))),
         duplicates=sent - int(np.count_nonzero(grid)),
         gaps=int(np.count_nonzero(np.diff(np.sort(stream.time_s)) > GAP_S)),
-        notes=(f"times up to {stream.time_s[latest]:g} look like {unit}; write seconds",) if unit else (),
+        notes=(f"times up to {last:g} s with less than an event a second; write seconds",) if odd else (),
     )
 
 

@@ -8,6 +8,7 @@ import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from spikeloom.compiler.errors import DataError, OptionError
 
@@ -46,10 +47,14 @@ DATA_SETS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fetched:
-    """A data set on this machine, and whether it was transferred now."""
+    """Where a released data set is, whether it was transferred now, and what to give to ``--data``."""
 
+    name: str
     path: Path
     new: bool
+    bytes: int
+    sha256: str
+    data: str
 
 
 def data_folder() -> Path:
@@ -75,10 +80,10 @@ def find_data(name: str) -> Path:
     return path
 
 
-def fetch_data(name: str, *, url: str | None = None, folder: str | os.PathLike[str] | None = None) -> Fetched:
+def fetch_data(name: str, *, url: str | None = None) -> Fetched:
     """Download one of `DATA_SETS` unless it is there; its name appears when the hash is that of the released file.
 
-    `url` is another address of the same file; the `folder`, `data_folder` by default, is made if needed.
+    `url` is another address of the same file; the `data_folder` is made if needed.
 
     OptionError, DataError if there is no such data set, or the address does not serve the released file, after
     `RETRIES` more attempts.
@@ -87,11 +92,18 @@ def fetch_data(name: str, *, url: str | None = None, folder: str | os.PathLike[s
     url = url or data.url
     if not re.match(r"https?://[^/]", url):
         raise OptionError(f"--url {url}: not a web address; give one that starts with http:// or https://")
-    path = (data_folder() if folder is None else Path(folder)) / data.file
+    path = data_folder() / data.file
+    facts: dict[str, Any] = {
+        "name": name,
+        "path": path,
+        "sha256": data.sha256,
+        "bytes": data.size,
+        "data": name,
+    }
     if path.exists():
         if not _is_released(path, data):
-            raise DataError(f"{path}: exists and is not the released file; move it away, or give another --dir")
-        return Fetched(path=path, new=False)
+            raise DataError(f"{path}: exists and is not the released file; move it away")
+        return Fetched(**facts, new=False)
     import pooch  # a tenth of a second that other commands need not wait
     import requests
 
@@ -108,7 +120,7 @@ def fetch_data(name: str, *, url: str | None = None, folder: str | os.PathLike[s
         raise DataError(
             f"{url}: serves another file, the released one has sha256 {data.sha256}; give its address with --url"
         ) from error
-    return Fetched(path=path, new=True)
+    return Fetched(**facts, new=True)
 
 
 def _known(name: str) -> DataSet:

@@ -1,4 +1,4 @@
-"""What a network decides and by how much it misses, a few recordings at a time."""
+"""By how much a network misses, a few recordings at a time."""
 
 from __future__ import annotations
 
@@ -25,19 +25,10 @@ def evaluate(network: torch.nn.Module, recordings: Recordings, recipe: Recipe = 
     with torch.no_grad():
         for chosen, events in _batches(recordings):
             labels = recordings.labels[chosen]
-            rates = _rates(network, events)
+            rates: Tensor = network(time_first(events))
             loss += float(loss_of(recipe, rates, labels)) * len(labels)
             correct += int(np.sum(rates.numpy().argmax(axis=1) == labels))
     return loss / len(recordings), correct
-
-
-def predict(network: torch.nn.Module, recordings: Recordings) -> NDArray[np.int64]:
-    """Class of each recording; equal top rates count for the lowest one."""
-    found = []
-    with torch.no_grad(), one_thread():
-        for _, events in _batches(recordings):
-            found.append(_rates(network, events).numpy().argmax(axis=1))
-    return np.concatenate(found)
 
 
 def _batches(recordings: Recordings) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
@@ -64,12 +55,6 @@ def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
     target = torch.zeros_like(rates)
     target[torch.arange(len(labels)), torch.tensor(labels)] = 1.0
     return torch.nn.functional.mse_loss(rates, target)
-
-
-def _rates(network: torch.nn.Module, events: NDArray[np.uint8]) -> Tensor:
-    """Spike rates on the CPU, computed where the network is."""
-    rates: Tensor = network(time_first(events).to(next(network.parameters()).device)).cpu()
-    return rates
 
 
 @contextmanager

@@ -24,6 +24,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from spikeloom.compiler import Packing, check_packings
 from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
@@ -85,22 +86,6 @@ class Tuned:
     after: int
 
 
-def check_bits(bits: Sequence[int], layers: int, target: Target) -> tuple[int, ...]:
-    """One width for each layer; OptionError if the chip does not store one, or they are as many as neither."""
-    if len(bits) not in (1, layers):
-        raise OptionError(
-            f"--weight-bits: {len(bits)} widths, the network has {layers} layers; give one, or one for each"
-        )
-    allowed = target.choices["synapse.weight_bits"]
-    for width in bits:
-        if width not in allowed:
-            raise OptionError(
-                f"--weight-bits {width}: {target.title} does not store that width; "
-                f"allowed: {', '.join(map(str, allowed))}"
-            )
-    return tuple(bits) if len(bits) == layers else tuple(bits) * layers
-
-
 def finetune(
     checkpoint: Checkpoint,
     adjacency: NDArray[np.float64],
@@ -125,13 +110,11 @@ def finetune(
     OptionError, ModelError or DataError if options, network or recordings cannot be used, or the loss is no longer a
     number.
     """
-    widths = check_bits(bits, 1 + len(checkpoint.dense), target)
+    packings = check_packings([Packing(bits=width, groups=groups) for width in bits], 1 + len(checkpoint.dense), target)
+    widths = tuple(packing.bits for packing in packings)
     for name, value, least in (("--epochs", epochs, 1), ("--seed", seed, 0)):
         if value < least:
             raise OptionError(f"{name} {value}: allowed are {least} or more; choose another")
-    slots = target.limit("core.threshold_slots")
-    if not 1 <= groups <= slots:
-        raise OptionError(f"--scale-groups {groups}: allowed are 1 to {slots}, the thresholds of a core; choose one")
     network = expand(checkpoint, adjacency)
     calibration = calibrate(network, evenly_spaced(channels_last(training.events)))
     forms = initial_forms(network, calibration, widths, groups, target.choices["synapse.exponent"])

@@ -1,4 +1,4 @@
-"""The kinds of network that are trained: what sizes each has, how it is stored, read back and asked for decisions.
+"""The kinds of network that are trained: what sizes each has, how it is stored and read back.
 
 The usual kind is :mod:`training.usual`; a chip that needs its own has a module ``models/CHIP/kind.py``.
 """
@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from spikeloom import models
 from spikeloom.compiler.systems import SYSTEMS, TACTILESGNET, Grid
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import FloatArray
 from spikeloom.models.graphs import Graph
-from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import HOPS, filters_of, propagation_of
 from spikeloom.models.training.recipes import Recipe
 
@@ -72,12 +71,6 @@ class Kind(Protocol):
 
     def differing(self, found: Any, plan: Plan) -> list[str]:
         """In what a checkpoint is of another plan."""
-
-    def predict_stored(self, found: Any, plan: Plan, test: Recordings) -> IntArray:
-        """Decisions of the last epoch in a checkpoint."""
-
-    def predict(self, weights: Mapping[str, Any], plan: Plan, test: Recordings) -> IntArray:
-        """Decisions of weights that `train` returned."""
 
 
 def kinds() -> list[Kind]:

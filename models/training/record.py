@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spikeloom.compiler import __version__
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
 
@@ -58,7 +59,7 @@ class TrainingRecord:
     torch: str
     numpy: str
     spikeloom: str
-    device: str
+    device: str = "cpu"
     recipe: Mapping[str, Any] | None = field(default=None, metadata={"optional": True})
 
     def to_json(self) -> JsonObject:
@@ -80,11 +81,9 @@ def training_record(
     *,
     command: str,
     seed: int,
-    version: str = "",
-    device: str = "cpu",
     recipe: Mapping[str, Any] | None = None,
 ) -> TrainingRecord:
-    """Record of a training; `recipe` where it is not the released one, `version` of this package.
+    """Record of a training; `recipe` where it is not the released one.
 
     The best epoch is chosen on the test split, as the published figures are; the clean one on a part of the training
     split; the last one is not chosen at all.
@@ -117,7 +116,6 @@ def training_record(
         history=[[e.training_loss, e.test_loss, e.correct] for e in history],
         torch=torch.__version__,
         numpy=np.__version__,
-        spikeloom=version,
-        device=device,
+        spikeloom=__version__,
         recipe=recipe,
     )

@@ -41,8 +41,6 @@ from spikeloom.models.training.evaluate import evaluate, loss_of, one_thread, re
 from spikeloom.models.training.recipes import ADAMW, COSINE, RELEASED, Recipe
 from spikeloom.models.training.resume import restore, set_rate, write_state
 
-DEVICES = ("cpu", "cuda")
-
 MOST_SEED = 2**63 - 1
 """What a torch generator takes."""
 
@@ -88,7 +86,6 @@ def train(
     epochs: int = RELEASED.epochs,
     seed: int = 0,
     recipe: Recipe = RELEASED,
-    device: str = "cpu",
     keep_epoch: int | None = None,
     state: Path | None = None,
     resume: bool = False,
@@ -101,13 +98,13 @@ def train(
     `propagation` is what the first layer sees, see :func:`systems.propagation_of`; the sizes and dynamics of the
     `recipe` are already in the architecture. The `seed` is that of the initial weights and of the order of recordings.
     The weights after epoch `keep_epoch`, counted from 1, are kept too. The file `state` holds the state after each
-    epoch, which the caller removes when the result is safe; `resume` goes on from it, on the CPU to the same weights as
+    epoch, which the caller removes when the result is safe; `resume` goes on from it, to the same weights as
     without interruption. `label` and `position` are name and row of the progress bar.
 
-    OptionError if a number is too small, there is no such device, or `state` is another training's. DataError if
+    OptionError if a number is too small, or `state` is another training's. DataError if
     recordings and architecture disagree, or the loss is no longer a number.
     """
-    _require_options(epochs, recipe.decay_epochs, seed, device)
+    _require_options(epochs, recipe.decay_epochs, seed)
     for recordings in (training, test):
         _require_suited(recordings, architecture)
     options = {
@@ -118,15 +115,14 @@ def train(
         "epochs": epochs,
         "seed": seed,
         "recipe": recipe.to_json(),
-        "device": device,
         "kept epoch": keep_epoch,
     }
     order = np.random.default_rng(seed)
     history: list[Epoch] = []
     weights: dict[str, Weights] = {}
     with one_thread():
-        network = architecture.network(propagation, seed=seed, surrogate=recipe.surrogate).to(device)
-        optimizer = _optimizer_of(recipe, network, device)
+        network = architecture.network(propagation, seed=seed, surrogate=recipe.surrogate)
+        optimizer = _optimizer_of(recipe, network)
         if resume and state is not None and state.exists():
             epochs_before, weights = restore(state, options, network, optimizer, order)
             history = [Epoch(**epoch) for epoch in epochs_before]
@@ -174,14 +170,12 @@ def train(
     )
 
 
-def _optimizer_of(recipe: Recipe, network: torch.nn.Module, device: str) -> torch.optim.Optimizer:
+def _optimizer_of(recipe: Recipe, network: torch.nn.Module) -> torch.optim.Optimizer:
     """Optimizer of a recipe on the parameters of a network."""
-    rate, fused = recipe.learning_rate, device == "cpu"
+    rate, parameters = recipe.learning_rate, network.parameters()
     if recipe.optimizer == ADAMW:
-        return torch.optim.AdamW(
-            network.parameters(), lr=rate, weight_decay=recipe.weight_decay, amsgrad=True, fused=fused
-        )
-    return torch.optim.Adam(network.parameters(), lr=rate, amsgrad=True, fused=fused)
+        return torch.optim.AdamW(parameters, lr=rate, weight_decay=recipe.weight_decay, amsgrad=True, fused=True)
+    return torch.optim.Adam(parameters, lr=rate, amsgrad=True, fused=True)
 
 
 def _course_of(recipe: Recipe, epoch: int, epochs: int) -> Callable[[float], float] | None:
@@ -201,7 +195,7 @@ def _train_epoch(
     *,
     epoch: int,
 ) -> float:
-    total, device = 0.0, network.adjacency.device
+    total = 0.0
     for step, start in enumerate(range(0, len(order), recipe.batch), 1):
         chosen = order[start : start + recipe.batch]
         if course is not None:
@@ -210,14 +204,14 @@ def _train_epoch(
         lengths = np.array([recordings.steps_of(int(index)) for index in chosen])
         events = recordings.events[chosen][..., : lengths.max()]
         filled = lengths if lengths.min() < lengths.max() else None
-        inside = None if filled is None else torch.tensor(filled, device=device)
-        shown = time_first(events).to(device)
+        inside = None if filled is None else torch.tensor(filled)
+        shown = time_first(events)
         if isinstance(network, SpikingNet) and recipe.penalty:
             layers = network.layers(shown)
-            loss = loss_of(recipe, network.rates(layers, inside).cpu(), recordings.labels[chosen])
+            loss = loss_of(recipe, network.rates(layers, inside), recordings.labels[chosen])
             loss = loss + recipe.penalty * network.activity(layers, inside)
         else:
-            loss = loss_of(recipe, network(shown, inside).cpu(), recordings.labels[chosen])
+            loss = loss_of(recipe, network(shown, inside), recordings.labels[chosen])
         found = float(loss.detach())
         loss.backward()  # type: ignore[no-untyped-call]
         require_finite(network, found, epoch, step)
@@ -226,17 +220,13 @@ def _train_epoch(
     return total / len(order)
 
 
-def _require_options(epochs: int, decay_epochs: int, seed: int, device: str) -> None:
-    """Refuse numbers that are too small, and a device that is unknown or not there."""
+def _require_options(epochs: int, decay_epochs: int, seed: int) -> None:
+    """Refuse numbers that are too small or large."""
     for name, value, least in (("epochs", epochs, 1), ("decay-epochs", decay_epochs, 1), ("seed", seed, 0)):
         if value < least:
             raise OptionError(f"--{name} {value}: allowed are {least} or more; choose another")
     if seed > MOST_SEED:
         raise OptionError(f"--seed {seed}: allowed are 0 to {MOST_SEED}; choose another")
-    if device not in DEVICES:
-        raise OptionError(f"--device {device}: unknown; allowed: {', '.join(DEVICES)}")
-    if device == "cuda" and not torch.cuda.is_available():
-        raise OptionError("--device cuda: this machine has no usable GPU; omit --device")
 
 
 def _require_suited(recordings: Recordings, architecture: Sizes) -> None:
@@ -295,7 +285,6 @@ def train_both(
     epochs: int,
     seed: int,
     recipe: Recipe = RELEASED,
-    device: str = "cpu",
     state: Path | None = None,
     resume: bool = False,
     position: int = 0,
@@ -312,7 +301,6 @@ def train_both(
         epochs=epochs,
         seed=seed,
         recipe=recipe,
-        device=device,
         resume=resume,
         position=position,
     )

@@ -11,14 +11,9 @@ from spikeloom.compiler import systems
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.towers import arrays_of
-from spikeloom.compiler.types import IntArray
 from spikeloom.models.networks.checkpoint import save_checkpoint
-from spikeloom.models.networks.networks import Architecture, SpikingNet
-from spikeloom.models.recordings.events import joined_bins
-from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.training import evaluate
-from spikeloom.models.training.kinds import Plan, same_graph, seen_by
+from spikeloom.models.networks.networks import Architecture
+from spikeloom.models.training.kinds import Plan, same_graph
 from spikeloom.models.training.recipes import LAYERS, RECIPES, Recipe
 
 SYSTEMS = systems.SYSTEMS
@@ -75,15 +70,3 @@ def differing(found: Checkpoint, plan: Plan) -> list[str]:
         "bins": found.bins == plan.bins,
     }
     return [name for name, equal in same.items() if not equal]
-
-
-def predict_stored(found: Checkpoint, plan: Plan, test: Recordings) -> IntArray:
-    """Decisions of the last epoch in a checkpoint."""
-    return predict(arrays_of(found), plan, test)
-
-
-def predict(weights: Mapping[str, Any], plan: Plan, test: Recordings) -> IntArray:
-    """Decisions of some weights."""
-    network = SpikingNet(architecture(plan), seen_by(plan))
-    network.load_weights(weights)
-    return evaluate.predict(network, joined_bins(test, plan.bins))

@@ -10,9 +10,7 @@ from spikeloom.compiler.dynamics import clocks_over
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.truenorth.native import BASES, SYSTEM, USUAL_COPIES
 from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained, write_trained
-from spikeloom.compiler.types import IntArray
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, Surrogate
-from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.kinds import Plan, same_graph
 from spikeloom.models.training.recipes import ADAMW, COSINE, CROSS_ENTROPY, Recipe
 from spikeloom.models.truenorth import network
@@ -43,7 +41,6 @@ REFUSED = {
     "--current-decay": "has no currents that decay",
     "--membrane-decay": "has no membranes that decay",
     "--join": "takes bins as they are; train on what spikeloom data convert --join makes",
-    "--device": "is trained on the CPU",
     "--spike-penalty": "is trained without",
 }
 
@@ -79,13 +76,3 @@ def differing(found: Trained, plan: Plan) -> list[str]:
     """In what a file is of another plan."""
     same = {"graph": same_graph(found, plan), "copies": found.network.copies == (plan.copies or USUAL_COPIES)}
     return [name for name, equal in same.items() if not equal]
-
-
-def predict_stored(found: Trained, plan: Plan, test: Recordings) -> IntArray:  # noqa: ARG001 -- the file knows it all
-    """Decisions of the last epoch in a file."""
-    return network.predict(found.network, test)
-
-
-def predict(weights: Mapping[str, Any], plan: Plan, test: Recordings) -> IntArray:
-    """Decisions of some weights."""
-    return network.predict(network.native_network(architecture(plan), weights), test)

@@ -31,9 +31,8 @@ from spikeloom.compiler.targets.truenorth.native import (
     Stage,
     highest_level,
 )
-from spikeloom.models.networks.networks import TrainedModule
+from spikeloom.models.networks.networks import Sizes, TrainedModule
 from spikeloom.models.networks.surrogate import RECTANGLE, Surrogate
-from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.truenorth.neurons import block_sums, integrate
 
 CONV_GAIN, GAIN = 4.0, 2.7
@@ -59,14 +58,9 @@ VECTORS = ("threshold", "floor", "leak")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NativeArchitecture:
+class NativeArchitecture(Sizes):
     """Sizes of a `NativeNet`."""
 
-    # taxels, classes: Sensor points and classes
-    taxels: int
-    classes: int
-    channels: int = 2  # Inputs per taxel (polarities)
-    hops: int = 3  # K of the graph convolution
     features: int = 16  # Of the convolution, per taxel; a multiple of `groups`
     groups: int = 8  # Blocks of each dense layer
     hidden: tuple[int, ...] = (80, 80)  # Neurons of each group before the last layer; multiples of `groups`
@@ -269,15 +263,6 @@ def native_network(architecture: NativeArchitecture, arrays: Mapping[str, NDArra
             for name, inputs in zip(architecture.layers, [channels, *architecture.inputs()], strict=True)
         ),
     )
-
-
-def predict(network: NativeNetwork, recordings: Recordings) -> NDArray[np.int64]:
-    """Class of each recording; equal votes count for the lowest class."""
-    found = []
-    for index in range(len(recordings)):
-        events = recordings.events[index : index + 1, ..., : recordings.steps_of(index)]
-        found.append(votes_by_step(network, events).sum(axis=0).argmax())
-    return np.array(found, np.int64)
 
 
 def votes_by_step(network: NativeNetwork, events: NDArray[np.uint8]) -> NDArray[np.int64]:

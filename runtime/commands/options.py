@@ -76,11 +76,16 @@ def add_system(parser: argparse.ArgumentParser, default: str, *more: str) -> Non
     options.add_argument("--system", choices=(*SYSTEMS, *more), help=f"{', '.join((*SYSTEMS, *more))} ({default})")
 
 
+def add_data(parser: argparse.ArgumentParser) -> None:
+    """Add the options that name recordings, all splits of them."""
+    group(parser, "recordings").add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
+    add_bin_option(parser)
+
+
 def add_recordings(parser: argparse.ArgumentParser, *, window: bool = False) -> None:
     """Add the options that name recordings to run; with `window` also the one that names a part of each."""
+    add_data(parser)
     options = group(parser, "recordings")
-    options.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
-    add_bin_option(parser)
     options.add_argument("--split", default="test", help="split to read (default: test)")
     options.add_argument("--limit", type=int, metavar="N", help="first N recordings only")
     if window:
@@ -103,6 +108,14 @@ def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], defaul
     depths = "; ".join(f"{choice}: {what[choice]}" for choice in choices)
     options.add_argument("--detail", choices=choices, default=default, help=f"{depths} (default: {default})")
     options.add_argument("--table", metavar="NAME|FILE.toml", help="price and time by this table only, or by your own")
+    add_explain_cost(parser)
+
+
+def add_check(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a comparison of chip and float model."""
+    parser.add_argument(
+        "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
+    )
     add_explain_cost(parser)
 
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.costs.simulated import Part
 from spikeloom.runtime.equivalence.breakdowns import Breakdown
 from spikeloom.runtime.equivalence.certificates import Certificate
 from spikeloom.runtime.equivalence.rounding import Rounding
+from spikeloom.runtime.machines.simulated import Part
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Block, Section, Table, Text
@@ -89,8 +89,8 @@ class Verdict:
 
     Predictions are (samples,) int64 and votes (samples, classes) int64. The specification ran beside the engine on
     `spec_samples` recordings; `spec_equals_engine` says whether every spike, membrane and count was equal there, and,
-    with onnxruntime beside, whether its spikes, membranes after the reset and votes were so too, and its spikes our
-    engine's on all recordings: `engine_different` counts those that are not. `quantised_different` counts spikes in
+    with onnxruntime beside, whether its spikes and votes are our engine's on all recordings: `engine_different` counts
+    those that are not. `quantised_different` counts spikes in
     which a fine-tuned checkpoint's torch model, on chip integers, and the chip differ. `not_compared` are neurons of
     each layer that the chip omits because their spikes reach no neuron. Of the levels the shares `required` have to be
     reached, and the weights always have to be the checkpoint's.

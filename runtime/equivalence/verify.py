@@ -81,7 +81,7 @@ def verify(
     machine = integer_machine_of(netlist)
     network, integer, names = float_network(model), machine.integer, machine.layers
     machine.require_sensor(events)
-    machine.require_engine(engine_name)
+    beside = machine.beside(engine_name)
     tuned = isinstance(source, Factored) and source.checkpoint.forms is not None
     origin = network if original is None else float_network(source)
     weights = check_rounding(machine, origin, fine_tuned=tuned)
@@ -112,7 +112,7 @@ def verify(
     begin("specification")
     checked = min(spec_samples, len(events))
     equal = machine.check(events[:checked], lengths=lengths) == 0
-    beside = None if engine_name == ENGINES[0] else machine.beside(events, lengths=lengths, samples=checked)
+    engine_different = None if beside is None else beside(events, lengths)
 
     def rung(stage: str, spikes: list[BoolArray]) -> Rung:
         differ = {name: int(np.count_nonzero(a != b)) for name, a, b in zip(names, reference, spikes, strict=True)}
@@ -146,7 +146,7 @@ def verify(
             for i, name in enumerate(names)
         },
         spec_samples=checked,
-        spec_equals_engine=equal and (beside is None or beside.equal),
+        spec_equals_engine=equal and not engine_different,
         weights=weights,
         first_divergence=divergence,
         ladder=tuple(ladder),
@@ -155,7 +155,7 @@ def verify(
         not_compared={name: int(out.sum()) for name, out in zip(names, machine.unread, strict=True) if out.any()},
         certificate=certificate,
         engine=engine_name,
-        engine_different=None if beside is None else beside.different,
+        engine_different=engine_different,
         required={} if required is None else required,
     )
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.archive import FORMATS, TRAINED, stated
+from spikeloom.compiler.archive import FORMATS, TRAINED, is_netlist, stated
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
@@ -145,7 +145,7 @@ def _require_fit(path: str, suffix: str | None, arguments: argparse.Namespace) -
 
 
 def load_graph(arguments: argparse.Namespace, system: str = TACTILESGNET) -> Graph | None:
-    """Graph that the options name, or None if they name none; warnings go to stderr.
+    """Graph that the options name, or None if they name none; a warning goes to stderr.
 
     Raises OptionError or ModelError if there is no such graph, its files are wrong, or the system has no graph at all.
     """
@@ -154,10 +154,11 @@ def load_graph(arguments: argparse.Namespace, system: str = TACTILESGNET) -> Gra
         return None
     if not (arguments.graph or arguments.taxels or arguments.edges or arguments.directed):
         return None
-    graph, warnings = sensor_graph(
+    graph, warning = sensor_graph(
         graph=arguments.graph, taxels=arguments.taxels, edges=arguments.edges, directed=arguments.directed
     )
-    sys.stderr.writelines(f"spikeloom: warning: {warning}\n" for warning in warnings)
+    if warning is not None:
+        sys.stderr.write(f"spikeloom: warning: {warning}\n")
     return graph
 
 
@@ -201,6 +202,8 @@ def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
     progress("reading the checkpoint")
     if (kind := stated(Path(shipped(path)), "format")) == TRAINED:
         raise ModelError(f"{path}: is {FORMATS[kind]}; compile, verify, inspect and join take it, this is for others")
+    if Path(shipped(path)).is_file() and is_netlist(shipped(path)):
+        raise ModelError(f"{path}: is a netlist, its weights are rounded; give the checkpoint that it was made from")
     return read_checkpoint(
         shipped(path),
         run=arguments.run,

@@ -9,9 +9,8 @@ from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.models.recordings.counts import show_counts
 from spikeloom.models.recordings.events import BIN_S, MAX_STEPS, joined_bins, load_data, need_labels, require_events
-from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.evtouch import Recordings, first_part, parse_window
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
-from spikeloom.models.recordings.windows import first_part, parse_window
 from spikeloom.runtime.report.console import progress
 
 

@@ -2,21 +2,21 @@
 
 A machine is found by the target that its netlist names: the module ``machines/NAME/machine.py`` of the target
 ``compiler/targets/NAME``. What only some chips do in their own way stands in modules beside it, see
-:func:`chip_commands`, :func:`chip_chart` and :func:`export_formats`.
+:func:`chip_module`.
 """
 
 from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,11 +27,14 @@ from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime import machines
-from spikeloom.runtime.machines.export_format import Format
+from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
 
 EventArray = npt.NDArray[np.uint8 | np.bool_]
+
+T = TypeVar("T", bound=np.generic)
 
 DEFAULT = "loihi1"
 """Whose reader says what is wrong with a file that names no target."""
@@ -68,14 +71,6 @@ class Price:
     step_s: Mapping[str, float]  # Seconds of the longest data step
     outcome: Outcome  # All that the chip's own price model knows, with its layout
     time_ns: Mapping[str, FloatArray] = field(default_factory=dict)  # Not rounded to seconds, where counted
-
-
-@dataclass(frozen=True, slots=True)
-class Beside:
-    """Another program against our simulator: spikes that differ, and whether all that was compared is equal."""
-
-    different: int
-    equal: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -159,6 +154,25 @@ class Machine(ABC):
         """Hold the netlist against every limit of the chip; the SpikeloomError names each that it breaks."""
 
     @abstractmethod
+    def of_layer(self, array: npt.NDArray[T], index: int) -> npt.NDArray[T]:
+        """Cut one layer out of spikes or membranes of a trace, (samples, steps, neurons)."""
+
+    def _run(self, trace: Any, voting: IntArray) -> Run:
+        """What a trace comes to; `voting` are the spikes of each neuron that count as votes."""
+
+        def by_layer(array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]] | None:
+            if array is None:
+                return None
+            return {name: self.of_layer(array, index) for index, name in enumerate(self.layers)}
+
+        return Run(
+            votes=class_counts(self.netlist, voting),
+            counts=trace.counts.spikes,
+            spikes=by_layer(trace.spikes),
+            membranes=by_layer(trace.membranes),
+        )
+
+    @abstractmethod
     def run(
         self,
         events: EventArray,
@@ -166,9 +180,8 @@ class Machine(ABC):
         lengths: IntArray | None = None,
         spikes: bool = False,
         membranes: bool = False,
-        threads: int | None = None,
     ) -> Run:
-        """Run recordings, each from rest, some `threads` at a time (by default one per processor).
+        """Run recordings, each from rest.
 
         `events` are (samples, taxels, polarities, steps), any value but zero an event; the network's clocks tick by
         themselves. `lengths` (samples,) are the data steps of each; `spikes` and `membranes` say what to keep. Raises
@@ -198,14 +211,14 @@ class Machine(ABC):
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Spikes, membranes and counts in which simulator and specification differ; events and lengths as for `run`."""
 
-    def require_engine(self, engine: str) -> None:
-        """Make ready what :meth:`beside` will run; OptionError or ModelError if it cannot."""
+    def beside(self, engine: str) -> Callable[[EventArray, IntArray | None], int] | None:
+        """Make one of ``ENGINES`` ready to run recordings of some lengths; None for our own.
+
+        It gives the spikes and votes in which it and our simulator differ. OptionError or ModelError if there is none.
+        """
         if engine != ENGINES[0]:
             raise OptionError(f"--engine {engine}: is not for {self.target.title}; omit it")
-
-    def beside(self, events: EventArray, *, lengths: IntArray | None = None, samples: int) -> Beside:
-        """Run the other program that is ready; all it keeps is compared on the first `samples` recordings."""
-        raise NotImplementedError
+        return None
 
     def require_sensor(self, events: EventArray) -> None:
         """Refuse recordings with another number of input channels: a DataError."""
@@ -227,6 +240,62 @@ class Machine(ABC):
     @abstractmethod
     def stream(self) -> Stream:
         """State of one grasp that runs bin after bin; OptionError if the simulator runs whole recordings only."""
+
+
+# -- formats of other programs -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Request:
+    """What a format is written from; options that were not given are None.
+
+    source, output: file of the network, and the one to be written.
+    recordings: reads recordings for a network of some classes, taxels and bins of a step, where a format has a use
+        for them.
+    recording: which of them.
+    form: which form of the format.
+    dt: seconds of a step.
+    strict: whether to write nothing that had to be rounded.
+    """
+
+    source: str
+    output: str
+    recordings: Callable[[int, int, int], Recordings] | None = None
+    recording: int | None = None
+    form: str | None = None
+    dt: float | None = None
+    strict: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Export:
+    """Content of a file, a dataclass of facts about it with ``neurons`` and ``synapses``, and lines for people.
+
+    `form` is which of several forms of the format it has.
+    """
+
+    content: Iterable[bytes]
+    facts: Any
+    form: str | None = None
+    lines: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Format:
+    """A format by its name on the command line.
+
+    name, title: value of ``--to``, and what it is.
+    write: raises OptionError and ModelError where the format cannot hold the network.
+    options: options that it takes beside the network.
+    """
+
+    name: str
+    title: str
+    write: Callable[[Request], Export]
+    options: tuple[str, ...] = ()
+
+
+# -- where chips are found ---------------------------------------------------------------------------------------------
 
 
 def _module(name: str) -> Any:
@@ -252,48 +321,31 @@ def machine_for(path: str | os.PathLike[str]) -> Machine:
     return machine
 
 
-def chip_commands(name: str) -> Any | None:
-    """What a chip does in its own way: its module ``commands``, if it has one.
+def chip_module(name: str, part: str) -> Any:
+    """What only some chips do in their own way: a module in the folder of a chip, or None if it has none of the name.
 
-    ``compile_network(arguments)`` and ``verify(arguments)`` for all networks; for checkpoints that were trained for the
-    chip, which ``takes(path)`` knows, ``inspect(arguments)``.
+    - ``commands``: ``compile_network(arguments)`` and ``verify(arguments)`` for all networks; for checkpoints that were
+      trained for the chip, which ``takes(path)`` knows, ``inspect(arguments)`` and what a chart needs of them.
+    - ``compiled``: ``outcome(compilation, sha256, facts)``, what the target's ``compile`` chose, proved and removed;
+      `sha256` is of the netlist's file, `facts` are what was read from a file of another format.
+    - ``exports``: ``FORMATS`` of other programs that can be written.
     """
-    return _own_module(name, "commands")
-
-
-def chip_chart(name: str) -> Any | None:
-    """What a chart asks of networks that were trained for a chip: its module ``charted``, if it has one."""
-    return _own_module(name, "charted")
-
-
-def _own_module(name: str, what: str) -> Any | None:
-    module = f"{__package__}.{name}.{what}"
+    module = f"{__package__}.{name}.{part}"
     return import_module(module) if has_machine(name) and find_spec(module) else None
 
 
-def trained_for(path: object) -> Any | None:
+def _chip_modules(part: str) -> list[Any]:
+    chips = [each.name for each in iter_modules(machines.__path__) if each.ispkg]
+    return [module for name in chips if (module := chip_module(name, part)) is not None]
+
+
+def trained_for(path: object) -> Any:
     """Commands of the chip that a checkpoint was trained for; None for any other network."""
     if not isinstance(path, str):
         return None
-    chips = map(chip_commands, _chips())
-    return next((chip for chip in chips if chip is not None and chip.takes(path)), None)
+    return next((chip for chip in _chip_modules("commands") if chip.takes(path)), None)
 
 
 def export_formats() -> list[Format]:
-    """Formats of other programs that the machines can write: ``FORMATS`` of each chip's module ``exports``."""
-    modules = [_own_module(name, "exports") for name in _chips()]
-    return [each for module in modules if module is not None for each in module.FORMATS]
-
-
-def _chips() -> list[str]:
-    return [each.name for each in iter_modules(machines.__path__) if each.ispkg]
-
-
-def compiled(compilation: Any, sha256: str, facts: Sequence[str]) -> Outcome:
-    """What the target's ``compile`` chose, proved and removed, as the chip's module ``compiled`` shows it.
-
-    `sha256` is of the netlist's file; `facts` are what was read from a file of another format.
-    """
-    own: Any = _own_module(compilation.netlist.target, "compiled")
-    outcome: Outcome = own.outcome(compilation, sha256, facts)
-    return outcome
+    """Formats of other programs that the machines can write."""
+    return [each for module in _chip_modules("exports") for each in module.FORMATS]

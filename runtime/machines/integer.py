@@ -15,8 +15,9 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.machines.base import EventArray, Machine, machine_for, machine_of
-from spikeloom.runtime.machines.page_parts import BatchParts
+from spikeloom.runtime.machines.base import EventArray, Machine, Price, machine_for, machine_of
+from spikeloom.runtime.machines.core_map import CoreMap
+from spikeloom.runtime.report.sections import Block
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -71,8 +72,12 @@ class IntegerMachine(Machine):
         """
 
     @abstractmethod
-    def page_parts(self, events: EventArray, *, lengths: IntArray | None, bin_s: float) -> BatchParts:
-        """Run recordings for the page of the netlist; events, lengths and `bin_s` as for `price`."""
+    def core_map(self, events: EventArray, lengths: IntArray, counts: IntArray) -> CoreMap:
+        """Where the cores lie, and their traffic in recordings that gave these ``counts`` of a :class:`Run`."""
+
+    @abstractmethod
+    def figures(self, price: Price) -> list[Block]:
+        """What a price looks like, for the page of the netlist."""
 
     @property
     def absent(self) -> tuple[BoolArray, ...]:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from spikeloom.compiler.types import FloatArray
-from spikeloom.runtime.machines.page_parts import Core, Cores, Way
+from spikeloom.runtime.machines.core_map import Core, CoreMap, Way
 from spikeloom.runtime.page.recording import Trace
 from spikeloom.runtime.page.results import Taxels
 from spikeloom.runtime.report.drawing import CHIP, COLOURS, DASHES, FLOAT, GREY, Drawing, sheet, styled
@@ -28,7 +28,7 @@ Place = tuple[float, float]
 
 
 @styled
-def mesh(cores: Cores) -> Drawing:
+def mesh(cores: CoreMap) -> Drawing:
     """Used part of each chip's mesh: tiles, their cores, how full the fullest limit is, and who sends how much."""
     from matplotlib.patches import FancyArrowPatch, Rectangle
 
@@ -80,7 +80,7 @@ def mesh(cores: Cores) -> Drawing:
     return drawing
 
 
-def _places(cores: Cores) -> tuple[dict[int, Place], Place, dict[Place, int], dict[float, int]]:
+def _places(cores: CoreMap) -> tuple[dict[int, Place], Place, dict[Place, int], dict[float, int]]:
     """Place of each core, the size of all, tiles by place, and chips by their upper end, from top to bottom."""
     fullest = max(Counter(core.tile for core in cores.cores).values())
     columns = min(fullest, 2)
@@ -130,16 +130,16 @@ def fingertip(taxels: Taxels) -> Drawing:
     if taxels.spikes is not None:
         panels[f"{taxels.layer} spikes on the chip"] = taxels.spikes
     drawing = sheet("Taxels, the graph over them and their activity", 4.6)
-    reach = _reach(points)
+    largest = _reach(points)
     for axes, (name, values) in zip(np.ravel(drawing.figure.subplots(1, len(panels))), panels.items(), strict=True):
         if n <= DETAILED:
             for a, b in sorted({(min(pair), max(pair)) for pair in taxels.edges.tolist()}):
                 axes.plot(points[[a, b], 0], points[[a, b], 1], color=GREY, lw=0.8, alpha=0.6, zorder=1)
-        radii = reach * (0.25 + 0.75 * np.sqrt(values / (values.max() or 1.0)))
-        for taxel, ((x, y), radius, value) in enumerate(zip(points.tolist(), radii, values.tolist(), strict=True)):
-            axes.add_patch(Circle((x, y), radius, facecolor=COLOURS[1], edgecolor=GREY, alpha=0.7, lw=0.6, zorder=2))
-            if n <= DETAILED:
+            for taxel, ((x, y), value) in enumerate(zip(points.tolist(), values.tolist(), strict=True)):
                 drawing.tips.append((axes, x, y, f"taxel {taxel}: {value:,.1f} {name} in a mean recording"))
+        radii = largest * (0.25 + 0.75 * np.sqrt(values / (values.max() or 1.0)))
+        for taxel, ((x, y), radius) in enumerate(zip(points.tolist(), radii, strict=True)):
+            axes.add_patch(Circle((x, y), radius, facecolor=COLOURS[1], edgecolor=GREY, alpha=0.7, lw=0.6, zorder=2))
             if n <= 100:
                 axes.text(x, y, str(taxel), ha="center", va="center", fontsize=6, zorder=3)
         axes.set(title=f"{name}, mean recording", aspect="equal")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -24,10 +24,12 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.verdict import Verdict
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.network import LoadedNetwork, sensor_places
-from spikeloom.runtime.machines.page_parts import BatchParts, Cores
+from spikeloom.runtime.machines.base import Price
+from spikeloom.runtime.machines.core_map import CoreMap
+from spikeloom.runtime.machines.integer import IntegerMachine
 from spikeloom.runtime.page.recording import Recording
 from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL, key
-from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.report.sections import Block, Outcome
 from spikeloom.runtime.studies.stress.results import Stress
 
 PACKAGES = ("numpy", "scipy", "torch", "numba", "networkx")
@@ -96,7 +98,7 @@ class Report:
     verify: Verdict
     decisions: Decisions
     netlist: object
-    cores: Cores
+    cores: CoreMap
     taxels: Taxels
     recording: Recording
     costs: object
@@ -105,24 +107,20 @@ class Report:
     explained_cost: Any = field(default=None, metadata=OPTIONAL)
     output: str
     described: Outcome = field(metadata=HIDDEN)
-    chip: BatchParts = field(metadata=HIDDEN)
+    price: Price = field(metadata=HIDDEN)
+    figures: Sequence[Block] = field(metadata=HIDDEN)
 
 
 def taxels(
-    netlist: Netlist,
-    loaded: LoadedNetwork,
-    data: Recordings,
-    mean_spikes: Mapping[str, FloatArray],
-    sensor: str | None,
+    machine: IntegerMachine, loaded: LoadedNetwork, data: Recordings, counts: IntArray, sensor: str | None
 ) -> Taxels:
     """Taxels, the graph over them where there is one, and what each sends and its neurons fire in a mean recording.
 
-    `mean_spikes` are those of each neuron on the chip, by layer; `sensor` is what the user named by ``--taxels``.
+    `counts` are those of the chip's :class:`Run`; `sensor` is what the user named by ``--taxels``.
     """
-    places = sensor_places(sensor)
+    netlist, places = machine.netlist, sensor_places(sensor)
     known = len(places) == netlist.taxels and places.shape[1] > 1
     checkpoint = loaded.checkpoint
-    layer, of_neurons = next(iter(mean_spikes.items()))
     edges: IntArray = np.zeros((0, 2), np.int64)
     spikes: FloatArray | None = None
     has_graph = checkpoint is not None and checkpoint.system in GRAPH_SYSTEMS
@@ -130,8 +128,9 @@ def taxels(
         seen = loaded.adjacency.reshape(-1, netlist.taxels, netlist.taxels)[0]
         target, source = np.nonzero(seen)
         edges = np.stack([source, target], axis=1)[source != target]
-        taxel = np.arange(len(of_neurons)) // checkpoint.hops.shape[1]  # those of clocks come after the last
-        fired = np.bincount(taxel, of_neurons, netlist.taxels)
+        ids = netlist.compartments_of(0)
+        taxel = netlist.neuron[ids] // checkpoint.hops.shape[1]  # those of clocks come after the last
+        fired = np.bincount(taxel, counts.mean(axis=0)[ids], netlist.taxels)
         spikes = fired[: netlist.taxels].astype(np.float64)
     return Taxels(
         sensor="NeuTouch" if sensor is None and known and np.array_equal(places, NEUTOUCH) else None,
@@ -139,7 +138,7 @@ def taxels(
         graph=loaded.graph if has_graph else None,
         edges=edges,
         events=data.events.sum(axis=(2, 3), dtype=np.int64).mean(axis=0),
-        layer=layer,
+        layer=machine.layers[0],
         spikes=spikes,
     )
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.runtime.equivalence.verdict import sections as verdict_sections
-from spikeloom.runtime.machines.page_parts import Cores
+from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.page import pictures
 from spikeloom.runtime.page.recording import LayerRaster, Recording, Trace
 from spikeloom.runtime.page.results import Decisions, Provenance, Report, Taxels
@@ -37,7 +37,7 @@ def sections(report: Report) -> list[Section]:
         Section("Cores", [*_of_chip(report.described), *_cores(report.cores)]),
         Section("Taxels", _taxels(report.taxels)),
         Section("One recording", _recording(report.recording)),
-        Section("Energy and time", [*_of_chip(report.chip.costs)]),
+        Section("Energy and time", [*_of_chip(report.price.outcome), Section("", report.figures)]),
         Section("Stability", [] if report.stress is None else stability(report.stress)),
         Section("Provenance", _provenance(report.provenance)),
     ]
@@ -58,7 +58,7 @@ def about(report: Report) -> str:
 
 
 def _cards(report: Report) -> dict[str, tuple[str, str]]:
-    verdict, costs = report.verify, report.chip
+    verdict, price = report.verify, report.price
     cards = {}
     for side, share in verdict.accuracy.items():
         value, _, note = percent(round(share * verdict.samples), verdict.samples).partition(" (")
@@ -67,12 +67,12 @@ def _cards(report: Report) -> dict[str, tuple[str, str]]:
     cards["decisions equal"] = f"{equal} of {verdict.samples}", "chip and float model"
     exact = f"every spike, membrane and count of {verdict.spec_samples} recordings"
     cards["specification = engine"] = "yes" if verdict.spec_equals_engine else "NO", exact
-    if costs.energy_j:
-        ends = sorted(costs.energy_j.values())
+    if price.energy_j:
+        ends = sorted(float(each.mean()) for each in price.energy_j.values())
         shown = dict.fromkeys(si(value, "J") for value in (ends[0], ends[-1]))
-        cards["energy an inference"] = " … ".join(shown), ", ".join(costs.energy_j)
-    for table, seconds in list(costs.time_s.items())[:1]:
-        cards["time an inference"] = si(seconds, "s"), f"at full speed, {table}, simple model"
+        cards["energy an inference"] = " … ".join(shown), ", ".join(price.energy_j)
+    for table, seconds in list(price.time_s.items())[:1]:
+        cards["time an inference"] = si(float(seconds.mean()), "s"), f"at full speed, {table}, simple model"
     held = sum(core.compartments for core in report.cores.cores)
     return cards | {"cores": (str(len(report.cores.cores)), f"{held:,} neurons on the chip")}
 
@@ -113,7 +113,7 @@ def _decisions(found: Decisions) -> list[Block]:
 # -- cores and taxels --------------------------------------------------------------------------------------------------
 
 
-def _cores(found: Cores) -> list[Block]:
+def _cores(found: CoreMap) -> list[Block]:
     limits = list(dict.fromkeys(name for core in found.cores for name in core.fill))
     short = [name.removeprefix("core.").replace("_", " ") for name in limits]
     places = [

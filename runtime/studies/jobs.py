@@ -1,4 +1,4 @@
-"""Many measurements side by side, each kept as soon as it is there: on this machine, or on a cluster of Dask.
+"""Many measurements side by side, each kept as soon as it is there.
 
 A sweep can be ended at any time, by Ctrl-C, a kill or a loss of power. What was measured is in its store, by keys that
 name everything that decides a result; the same command goes on from there. joblib does the work.
@@ -10,7 +10,6 @@ import _thread
 import hashlib
 import json
 import os
-import platform
 import signal
 import sqlite3
 import sys
@@ -18,13 +17,12 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, UnfinishedError
 from spikeloom.compiler.types import JsonObject
 
@@ -32,16 +30,10 @@ APayload = TypeVar("APayload")
 AResult = TypeVar("AResult")
 AJob = TypeVar("AJob", bound="Job")
 
-CONNECT_S = 5.0
-"""How long a scheduler may take to answer."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """One measurement of a sweep; what is measured are the fields of a subclass.
-
-    It may travel to another machine: absolute paths and options, no large arrays.
-    """
+    """One measurement of a sweep; what is measured are the fields of a subclass: paths and options, no large arrays."""
 
     key: str  # Of everything that decides the result, see `content_key`
     label: str  # For messages
@@ -71,7 +63,6 @@ def sweep(
     store: Path,
     *,
     jobs: int | None = None,
-    scheduler: str | None = None,
     fresh: bool = False,
     label: str,
 ) -> JsonObject:
@@ -80,10 +71,10 @@ def sweep(
     They are begun in this order; of those with equal keys the first is measured. `measure` makes JSON values of a job,
     a function of a module, since it crosses process borders. `store` is an SQLite file in a folder that exists; with
     `fresh` what it holds is forgotten. `jobs` are processes at a time (one a core), whose libraries use one thread
-    each, `scheduler` is the address of a Dask scheduler instead; `label` is that of the progress bar.
+    each; `label` is that of the progress bar.
 
-    What a measurement raises is raised with a note that names it; UnfinishedError, which carries the results that are
-    there, if a process died. The text of a KeyboardInterrupt says what is kept.
+    What a measurement raises is raised with a note that names it; UnfinishedError, if a process died. The text of a
+    KeyboardInterrupt says what is kept.
     """
     from tqdm import tqdm  # here, since commands load this module before they know whether they measure
 
@@ -99,9 +90,9 @@ def sweep(
         there = tqdm(total=len(keys), initial=len(keys) - len(waiting), desc=label, unit="point", disable=None)
         with there as bar, ended_by_signal():
             try:
-                for index, found in side_by_side(waiting, measure, jobs=jobs, scheduler=scheduler):
+                for index, found in side_by_side(waiting, measure, jobs=jobs):
                     if isinstance(found, ProcessDied):
-                        raise UnfinishedError(f"{found}\n{standing()}", results)
+                        raise UnfinishedError(f"{found}\n{standing()}")
                     if isinstance(found, Exception):
                         found.add_note(waiting[index].label)
                         raise found
@@ -135,39 +126,28 @@ def _opened(store: Path, *, fresh: bool) -> sqlite3.Connection:
 
 
 def side_by_side(
-    payloads: Sequence[APayload],
-    run: Callable[[APayload], AResult],
-    *,
-    jobs: int | None = None,
-    scheduler: str | None = None,
+    payloads: Sequence[APayload], run: Callable[[APayload], AResult], *, jobs: int | None = None
 ) -> Iterator[tuple[int, AResult | Exception]]:
-    """Work on payloads, begun in this order, in processes of their own or on a cluster; on a single one here.
+    """Work on payloads, begun in this order, in processes of their own in this folder; on a single one here.
 
     Yields the place of a payload and what `run`, a function of a module, made of it, as they come: its value, the
     exception that it raised, or `ProcessDied`, after which nothing comes.
     """
     if jobs is not None and jobs < 1:
         raise OptionError(f"--jobs {jobs}: allowed are 1 or more; choose another")
-    if jobs is not None and scheduler is not None:
-        raise OptionError(f"--jobs {jobs}: counts processes on this machine, --scheduler has its own; omit one")
     processes = min(jobs or os.cpu_count() or 1, len(payloads))
-    if scheduler is None and processes <= 1:
+    if processes <= 1:
         with _one_thread():
             yield from (_attempt(run, index, payload) for index, payload in enumerate(payloads))
         return
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    place: AbstractContextManager[Any]
-    if scheduler is None:
-        place = parallel_config("loky", n_jobs=processes, inner_max_num_threads=1)
-    else:
-        place = _cluster(scheduler)
-    with place:
+    attempt = delayed(partial(_in_child, os.getpid(), Path.cwd(), run))
+    with parallel_config("loky", n_jobs=processes, inner_max_num_threads=1):
         work = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
         try:
-            attempt = partial(_in_child, os.getpid()) if scheduler is None else _attempt
-            yield from work(delayed(attempt)(run, index, payload) for index, payload in enumerate(payloads))
+            yield from work(attempt(index, payload) for index, payload in enumerate(payloads))
         except TerminatedWorkerError:
             yield -1, ProcessDied("a process ended early, perhaps for lack of memory; go on with fewer --jobs")
 
@@ -197,10 +177,11 @@ def _attempt(run: Callable[[APayload], AResult], index: int, payload: APayload) 
 
 
 def _in_child(
-    parent: int, run: Callable[[APayload], AResult], index: int, payload: APayload
+    parent: int, folder: Path, run: Callable[[APayload], AResult], index: int, payload: APayload
 ) -> tuple[int, AResult | Exception]:
     """As :func:`_attempt`, in a process that does not outlive the one that started it, even where that is killed."""
     _end_with(parent)
+    os.chdir(folder)  # the process may be left from earlier work in another one
     try:
         return _attempt(run, index, payload)
     except KeyboardInterrupt:
@@ -222,36 +203,6 @@ def _end_with(parent: int) -> None:
 
     signal.signal(signal.SIGINT, signal.default_int_handler)
     threading.Thread(target=watch, daemon=True).start()
-
-
-@contextmanager
-def _cluster(scheduler: str) -> Iterator[None]:
-    """Make joblib work on a cluster whose workers have the same versions as this machine."""
-    try:
-        from distributed import Client
-        from joblib import parallel_config
-    except ImportError:
-        raise OptionError(
-            f"--scheduler {scheduler}: needs Dask, which is not installed; install distributed, or omit it"
-        ) from None
-    try:
-        client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise OptionError(
-            f"--scheduler {scheduler}: no answer within {CONNECT_S:g} s ({error}); give one as in tcp://10.0.0.1:8786"
-        ) from None
-    with client:
-        for worker, versions in sorted(client.run(_versions).items()):
-            if versions != _versions():
-                raise OptionError(f"--scheduler {scheduler}: worker {worker} has {versions}, here it is {_versions()}")
-        with parallel_config("dask", client=client):
-            yield
-
-
-def _versions() -> str:
-    import numpy as np
-
-    return f"spikeloom {__version__}, Python {platform.python_version()}, numpy {np.__version__}"
 
 
 @contextmanager

@@ -21,17 +21,15 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
-from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, kept_shares
+from spikeloom.compiler.formats.affine import convolution
 from spikeloom.compiler.formats.assemble import ReadNetwork
 from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, read_hdf5
-from spikeloom.compiler.formats.kernels import convolution
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.ir import (
     INPUT,
     MANTISSA,
-    Input,
     IntegerNetwork,
     IntegerPopulation,
     IntegerProjection,
@@ -51,10 +49,16 @@ LAYER_LIMIT = 1000
 
 NEURONS = ("CUBA", "LOIHI")
 
-ALLOWED = "input, flatten, dense, dense_rec and conv"
+REGISTERS = {
+    "iDecay": (1, 4096),
+    "vDecay": (0, 4095),
+    "vThMant": (0, THRESHOLD_MANTISSA_MAX),
+    "refDelay": (1, 1),
+    "wgtExp": (0, 0),
+}
+"""Least and largest value of an entry of a neuron; it may lack the last two."""
 
-OWN = "spikeloom"
-"""Group of what our writer adds; others do not read it."""
+ALLOWED = "input, flatten, dense, dense_rec and conv"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -121,12 +125,7 @@ def integers_of(
     """Integer network of the content of a file, and facts; raises as :func:`read_netx`."""
     blocks = blocks_of(tree)
     shape = _input_shape(blocks[0])
-    own = _own(tree, math.prod(shape), math.prod(blocks[-1].sizes()))
-    if own is None:
-        sensor, positions, words = sensor_layout(shape, polarities=polarities, polarities_first=polarities_first)
-    else:
-        sensor, positions = own[0], np.arange(own[0].size)
-        words = f"{sensor.taxels} taxels, {sensor.polarities} polarities"
+    sensor, positions, words = sensor_layout(shape, polarities=polarities, polarities_first=polarities_first)
     facts = [f"netx, {len(blocks)} layers, read as they stand", f"input: {words}"]
     populations: list[IntegerPopulation] = []
     projections: list[IntegerProjection] = []
@@ -153,14 +152,13 @@ def integers_of(
     if not populations:
         raise ModelError(f"has no layer of neurons; {AGAIN}")
     voters = populations[-1].size
-    label = np.arange(voters) if own is None else own[1]
-    facts.append(f"classes: the spikes of {populations[-1].name}, {'a neuron each' if own is None else 'in groups'}")
+    facts.append(f"classes: the spikes of {populations[-1].name}, a neuron each")
     network = IntegerNetwork(
         input=sensor,
         populations=tuple(populations),
         projections=tuple(projections),
-        readout=Readout(population=len(populations) - 1, label=label),
-        classes=int(label.max()) + 1,
+        readout=Readout(population=len(populations) - 1, label=np.arange(voters)),
+        classes=voters,
     )
     return network, facts
 
@@ -259,17 +257,11 @@ def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopul
     bits = entries.get("messageBits")
     if any(isinstance(value, np.ndarray) and np.any(value) for value in (graded, bits)):
         raise block.fail("sends graded spikes, which Loihi 1 does not have; train without")
-    for key, allowed in (("refDelay", 1), ("wgtExp", 0)):
-        if key in entries and neuron.few(key)[0] != allowed:
-            raise block.fail(f"{key} is {neuron.few(key)[0]}, allowed is {allowed}; train it so")
-    decay_u, decay_v = neuron.few("iDecay")[0] - 1, neuron.few("vDecay")[0]
-    if not (0 <= decay_u <= 4095 and 0 <= decay_v <= 4095):
-        raise block.fail(
-            f"has iDecay {decay_u + 1} and vDecay {decay_v}, allowed are 1 to 4096 and 0 to 4095; train it again"
-        )
-    threshold = neuron.few("vThMant")[0]
-    if not 0 <= threshold <= THRESHOLD_MANTISSA_MAX:
-        raise block.fail(f"vThMant is {threshold}, allowed are 0 to {THRESHOLD_MANTISSA_MAX}; train it again")
+    for key, (least, most) in REGISTERS.items():
+        if (key in entries or key not in ("refDelay", "wgtExp")) and not least <= neuron.few(key)[0] <= most:
+            allowed = f"allowed are {least} to {most}" if least < most else f"allowed is {least}"
+            raise block.fail(f"{key} is {neuron.few(key)[0]}, {allowed}; train it so")
+    decay_u, decay_v, threshold = neuron.few("iDecay")[0] - 1, neuron.few("vDecay")[0], neuron.few("vThMant")[0]
     bias = _bias(block, size, shape)
     alpha, beta = kept_shares(decay_u, decay_v)
     return IntegerPopulation(
@@ -299,29 +291,6 @@ def _bias(block: Block, size: int, shape: tuple[int, ...]) -> IntArray:
         )
     each: IntArray = np.repeat(values, size // values.size)
     return each
-
-
-def _own(tree: Tree, inputs: int, voters: int) -> tuple[Input, IntArray] | None:
-    """Sensor and vote that our own writer tells beside the layers, or None; ModelError if they do not fit these."""
-    entries = tree.get(OWN)
-    if not isinstance(entries, dict):
-        return None
-    said = Block(number=-1, type=OWN, values=entries)
-    limits = {"taxels": 2**20, "polarities": 2**20, "clocks": MOST_CLOCKS}
-    limits |= {"clock_steps": MOST_STEPS, "bins": MOST_STEPS}
-    stated = {"bins": 1} | {key: said.few(key)[0] for key in limits if key in entries or key != "bins"}
-    if any(not (key != "clocks") <= stated[key] <= most for key, most in limits.items()):
-        raise ModelError(f"group {OWN} describes no sensor; {AGAIN}")
-    taxels, polarities, channels, steps, bins = (stated[key] for key in limits)
-    clocks = Clocks(channels=channels, steps=steps) if channels else NO_CLOCKS
-    sensor = Input(taxels=taxels, polarities=polarities, clocks=clocks, bins=bins)
-    label = said.integers("label").ravel()
-    if sensor.size != inputs or label.size != voters or label.min() < 0 or label.max() >= voters:
-        raise ModelError(
-            f"group {OWN} is for {sensor.size} inputs and {label.size} voting neurons, the layers have {inputs} and "
-            f"{voters}; {AGAIN}"
-        )
-    return sensor, label
 
 
 def _fact(block: Block, population: IntegerPopulation, planes: int) -> str:

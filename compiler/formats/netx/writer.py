@@ -4,8 +4,7 @@ The format keeps one threshold for a layer, weights of 8 bits without an exponen
 where the chip counts 64ths of them. Layers follow each other and may be recurrent; convolutions are written out as
 dense layers. A layer whose weights are stored with an exponent is rescaled by a power of two, its threshold with it.
 
-What netx does not read, but our own reader does, is in a group of its own: sensor, clocks and the classes that neurons
-vote for.
+It says nothing of the sensor, of clocks, which are inputs as others, and of classes for which several neurons vote.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import numpy as np
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, THRESHOLD_MANTISSA_MAX, round_half_even
 from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes, tree_of
-from spikeloom.compiler.formats.netx.reader import OWN, integers_of
+from spikeloom.compiler.formats.netx.reader import integers_of
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation
 from spikeloom.compiler.types import BoolArray, IntArray
@@ -26,21 +25,39 @@ from spikeloom.compiler.types import BoolArray, IntArray
 MOST_SHIFT = 8
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rounding:
+    """What the format changes in a layer; empty as words if nothing."""
+
+    name: str  # Layer of the netlist
+    biases: int
+    biases_rounded: int
+    furthest_steps: float  # Largest change of a bias, in weight steps of the netlist
+    threshold_rounded: bool
+    rescaled_by: float  # Power of two that everything was multiplied by
+
+    def __str__(self) -> str:
+        words = []
+        if self.biases_rounded:
+            words.append(
+                f"{self.biases_rounded} of {self.biases} biases rounded, by {self.furthest_steps:.3g} steps at most"
+            )
+        words += ["threshold rounded"] if self.threshold_rounded else []
+        words += [f"rescaled by {self.rescaled_by:g}"] if self.rescaled_by != 1 else []
+        return f"{self.name}: {', '.join(words)}" if words else ""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DenseLayer:
     """One dense layer of the file, ``dense_rec`` if it is recurrent; weights and biases in whole weight steps."""
 
-    name: str  # Layer of the netlist
     weight: IntArray  # (neurons, inputs) int64
     own: IntArray | None  # (neurons, neurons) int64; from itself
     bias: IntArray  # (neurons,) int64, rounded
     threshold: int
     decay_u: int
     decay_v: int
-    shift: int  # Power of two that everything was multiplied by
-    rounded: int  # Biases that are no whole steps
-    threshold_rounded: bool
-    furthest: float  # Largest change of a bias, in weight steps of the netlist
+    rounding: Rounding
 
     @property
     def synapses(self) -> int:
@@ -93,17 +110,20 @@ def _block(population: IntegerPopulation, weight: IntArray, inputs: int, thresho
             "smaller biases"
         )
     return DenseLayer(
-        name=name,
         weight=shifted[:, :inputs],
         own=shifted[:, inputs:] if weight.shape[1] > inputs else None,
         bias=whole,
         threshold=max(1, int(np.rint(scaled))),
         decay_u=population.decay_u,
         decay_v=population.decay_v,
-        shift=shift,
-        rounded=int(np.count_nonzero(whole != steps)),
-        threshold_rounded=bool(scaled != np.rint(scaled)),
-        furthest=float(np.ldexp(np.abs(whole - steps).max(initial=0), -shift)),
+        rounding=Rounding(
+            name=name,
+            biases=len(whole),
+            biases_rounded=int(np.count_nonzero(whole != steps)),
+            furthest_steps=float(np.ldexp(np.abs(whole - steps).max(initial=0), -shift)),
+            threshold_rounded=bool(scaled != np.rint(scaled)),
+            rescaled_by=2.0**shift,
+        ),
     )
 
 
@@ -146,24 +166,16 @@ def file_bytes(network: IntegerNetwork, blocks: Sequence[DenseLayer]) -> bytes:
                 "gradedSpike": np.array(False),
             },
         }
-    own = {
-        "taxels": np.array(network.input.taxels),
-        "polarities": np.array(network.input.polarities),
-        "clocks": np.array(network.input.clocks.channels),
-        "clock_steps": np.array(network.input.clocks.steps),
-        **({"bins": np.array(network.input.bins)} if network.input.bins > 1 else {}),
-        "label": network.readout.label,
-    }
-    return hdf5_bytes({"layer": layers, OWN: own})
+    return hdf5_bytes({"layer": layers})
 
 
 def moved_spikes(
     network: IntegerNetwork, blocks: Sequence[DenseLayer], events: BoolArray
 ) -> dict[str, tuple[int, int]]:
     """Spikes of each layer that the rounding moves, and how many the netlist has; events (samples, steps, channels)."""
-    written, _ = integers_of(tree_of(file_bytes(network, blocks)))
+    written, _ = integers_of(tree_of(file_bytes(network, blocks)), polarities=1)
     before, after = (run_integer(one, events).spikes for one in (network, written))
     return {
-        block.name: (int(np.count_nonzero(a != b)), int(np.count_nonzero(a)))
+        block.rounding.name: (int(np.count_nonzero(a != b)), int(np.count_nonzero(a)))
         for block, a, b in zip(blocks, before, after, strict=True)
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,21 +13,39 @@ from scipy import sparse
 
 from spikeloom.compiler.dynamics import MOST_STEPS, RELAY_WEIGHT, Clocks
 from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.fixedpoint import decay_registers, kept_shares
+from spikeloom.compiler.formats.affine import scaled, shifted
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble, class_of_each, in_order
 from spikeloom.compiler.formats.hdf5 import read_hdf5
 from spikeloom.compiler.formats.names import printable, unique_names
 from spikeloom.compiler.formats.nir import CONVENTIONS
 from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, graph_of, loops
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
-from spikeloom.compiler.formats.nir.neurons import Neurons, facts_of, neurons_of
-from spikeloom.compiler.formats.nir.stages import KNOWN, STAGES, Value, added, rows_of, scaled, spikes_of
-from spikeloom.compiler.formats.nir.steps import Steps, require_step, stated_step, written_step
+from spikeloom.compiler.formats.nir.stages import (
+    ALWAYS,
+    KNOWN,
+    STAGES,
+    TOLERANCE,
+    Steps,
+    Value,
+    added,
+    filtered,
+    require_step,
+    shared,
+    spikes_of,
+    spread,
+    stated_step,
+    written_step,
+)
 from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.types import FloatArray, IntArray
 
 AXES, ELEMENTS = 8, 2**20
 """Of an input."""
+
+SOFT = ("subtract", "soft")
+"""Words by which exporters tell a reset that leaves what exceeds the threshold."""
 
 
 def read_nir(
@@ -40,7 +58,7 @@ def read_nir(
 ) -> ReadNetwork[Network]:
     """Read a network, in steps of `dt` seconds, by default those that the metadata of the file tell.
 
-    The `convention` (``euler`` by default) says how time constants become decays, see :mod:`nir.neurons`; polarities
+    The `convention` (``euler`` by default) says how time constants become decays, see :mod:`nir.stages`; polarities
     are those of :func:`sensor_layout.sensor_layout`.
 
     Raises ModelError if the file cannot be read, or holds something else than a network that spikes, feed-forward but
@@ -75,10 +93,9 @@ def network_of(
         raise ModelError("has no spiking neurons, so nothing can be counted; export a spiking network")
     voters, label = _readout(end, result, spiking)
     layers, held = _layers(spiking, positions)
-    place = sum(len(other.groups) for other in spiking[:voters])
     layers, sensor = _with_held(layers, held, sensor)
-    network = assemble(layers, sensor, place, label)
-    facts = facts_of(graph, steps, spiking, f"input {printable(entry.name)}: {words}", sensor)
+    network = assemble(layers, sensor, voters, label)
+    facts = _facts(graph, steps, spiking, f"input {printable(entry.name)}: {words}", sensor)
     facts.append(f"classes: the spikes of {printable(spiking[voters].node.name)} in output {printable(end.name)}")
     return ReadNetwork(network=network, facts=tuple(facts), sha256=graph.sha256, read_as=asdict(steps))
 
@@ -103,7 +120,7 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Neur
             value = added([values[source] for source in received[name] if source not in late.get(name, ())])
         if node.type in SPIKING:
             values[name] = spikes_of(len(spiking), value.shape)
-            spiking.append(neurons_of(node, value, steps))
+            spiking.append(_neurons(node, value, steps))
             forward.append(value)
         elif node.type in STAGES:
             values[name] = STAGES[node.type](node, value, steps)
@@ -114,78 +131,60 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Neur
         if one.node.name in late:
             with one.node.named():
                 value = added([forward[place], *(values[source] for source in late[one.node.name])])
-            spiking[place] = neurons_of(one.node, value, steps)
-            if len(one.groups) > 1:
-                raise one.node.fail(
-                    f"is recurrent and has {len(one.groups)} membrane time constants, which are layers of their own; "
-                    "give it one"
-                )
+            spiking[place] = _neurons(one.node, value, steps)
     return spiking, values[graph.one(OUTPUT_NODE).name]
 
 
-def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer], list[FloatArray]]:
-    """A layer for each decay of each node, and what flows into the currents of its neurons in every step."""
-    first = np.cumsum([0, *(len(one.groups) for one in spiking)]).tolist()
-    named = unique_names([one.node.name for one in spiking])
+def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer], list[Sparse | None]]:
+    """A layer for each node, and what flows into its currents in every step, (neurons, 1)."""
     layers: list[Layer] = []
     held = []
-    for one, name in zip(spiking, named, strict=True):
-        for number, rows in enumerate(one.groups, 1):
-            # Neurons of other thresholds are those of one, with their weights and biases in its units.
-            theta = float(one.theta[rows[0]])
-            value = scaled(rows_of(one.value, rows), theta / one.theta[rows])
-            sources: dict[int, Sparse] = {}
-            for source, weight in value.terms.items():
-                weight.eliminate_zeros()
-                if source == INPUT:
-                    sources[INPUT] = weight[:, positions]
-                    continue
-                for group, columns in enumerate(spiking[source].groups):
-                    sources[first[source] + group] = weight[:, columns]
-            reached = {source: weight for source, weight in sources.items() if weight.nnz}
-            layers.append(
-                Layer(
-                    name=name if len(one.groups) == 1 else f"{name}_{number}",
-                    beta=float(one.beta[rows[0]]),
-                    theta=theta,
-                    bias=value.bias,
-                    sources=reached if reached.keys() - {len(layers)} else sources,
-                    alpha=value.alpha,
-                )
-            )
-            held.append(value.held)
+    for place, (one, name) in enumerate(zip(spiking, unique_names([one.node.name for one in spiking]), strict=True)):
+        # Neurons of other thresholds are those of one, with their weights and biases in its units.
+        theta = float(one.theta[0])
+        value = scaled(one.value, theta / one.theta)
+        sources = dict(value.terms)
+        always = sources.pop(ALWAYS, None)
+        held.append(always if always is not None and always.count_nonzero() else None)
+        for weight in sources.values():
+            weight.eliminate_zeros()
+        if INPUT in sources:
+            sources[INPUT] = sources[INPUT][:, positions]
+        reached = {source: weight for source, weight in sources.items() if weight.nnz}
+        sources = reached if reached.keys() - {place} else sources
+        layers.append(Layer(name=name, beta=one.beta, theta=theta, bias=value.bias, sources=sources, alpha=value.alpha))
     return layers, held
 
 
-def _with_held(layers: list[Layer], held: list[FloatArray], sensor: Input) -> tuple[list[Layer], Input]:
+def _with_held(layers: list[Layer], held: list[Sparse | None], sensor: Input) -> tuple[list[Layer], Input]:
     """Let a channel that always has an event bring biases that go through a synaptic filter.
 
     The chip adds a bias past the current, where it acts in full from the first step on.
     """
-    lasting = [index for index, values in enumerate(held) if np.any(values)]
+    lasting = [index for index, channel in enumerate(held) if channel is not None]
     if not lasting:
         return layers, sensor
     depth: dict[int, int] = {INPUT: -1}
     for index in in_order(layers):
         depth[index] = max((depth[source] + 1 for source in layers[index].sources if source != index), default=0)
 
-    def with_channel(weight: Sparse | None, channel: FloatArray) -> Sparse:
-        """Weights of the input, if there are any, and beside them those of the channel."""
-        own = sparse.csr_array((len(channel), sensor.size)) if weight is None else weight
-        return sparse.hstack([own, sparse.csr_array(channel[:, None])], format="csr")
+    def with_channel(size: int, weight: Sparse | None, channel: Sparse | None) -> Sparse:
+        """Weights of the input into so many neurons, if there are any, and beside them those of the channel."""
+        own = sparse.csr_array((size, sensor.size)) if weight is None else weight
+        return sparse.hstack([own, sparse.csr_array((size, 1)) if channel is None else channel], format="csr")
 
     found = []
     for index, layer in enumerate(layers):
         sources, deep = dict(layer.sources), depth[index]
         if not deep or INPUT in sources:
-            sources[INPUT] = with_channel(sources.get(INPUT), held[index] * (not deep))
-        if deep and index in lasting:
-            sources[len(layers) + deep - 1] = sparse.csr_array(held[index][:, None])
+            sources[INPUT] = with_channel(layer.size, sources.get(INPUT), None if deep else held[index])
+        if deep and held[index] is not None:
+            sources[len(layers) + deep - 1] = held[index]
         found.append(replace(layer, sources=sources))
-    relay = np.array([RELAY_WEIGHT])
+    relay = sparse.csr_array([[RELAY_WEIGHT]])
     for step in range(max(depth[index] for index in lasting)):  # one a depth, on the way to the deepest
         source = len(layers) + step - 1 if step else INPUT
-        weight = sparse.csr_array(relay[:, None]) if step else with_channel(None, relay)
+        weight = relay if step else with_channel(1, None, relay)
         name = f"always{step + 1}"
         found.append(Layer(name=name, beta=0.0, theta=1.0, bias=np.zeros(1), sources={source: weight}, relays=1))
     return found, replace(sensor, clocks=Clocks(channels=1, steps=MOST_STEPS))
@@ -202,9 +201,109 @@ def _readout(end: Node, result: Value, spiking: Sequence[Neurons]) -> tuple[int,
     label = class_of_each(counts)
     if label is None or (result.bias.size and np.ptp(result.bias) > 0):
         raise end.fail(f"gets weighted spikes of {printable(spiking[source].node.name)}, a vote counts them; {remedy}")
-    node = spiking[source].node
-    if len(spiking[source].groups) > 1:
-        raise node.fail(
-            f"votes, and has {len(spiking[source].groups)} membrane time constants; give the last layer one"
-        )
     return source, label
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Neurons:
+    """A spiking node in steps, reset to 0; all arrays (neurons,) float64.
+
+    ``u <- beta * u * (1 - s) + value``, ``s = u > theta``. An IF neuron keeps its whole membrane and gets ``dt * r *
+    I``. A neuron that resets to `v_reset` is one that resets to 0, with its threshold, leak and start shifted by it.
+    """
+
+    node: Node  # As the file has it
+    value: Value  # What it gets, scaled to its membrane, with its leak
+    beta: float
+    gain: FloatArray  # By which its input was scaled
+    theta: FloatArray
+    reset: FloatArray
+
+
+def _neurons(node: Node, value: Value, steps: Steps) -> Neurons:
+    """Neurons of a node of a type in ``SPIKING`` that gets a value; ModelError if the chip has no such neurons."""
+    size, shape = value.size, value.shape
+    if not size:
+        raise node.fail("has no neurons; export it again")
+    _require_reset(node)
+
+    def each(key: str) -> FloatArray:
+        return spread(node, key, size, shape)
+
+    nothing, alpha, beta = np.zeros(size), 0.0, 0.0
+    gain, drive = np.ones(size), nothing
+    reset = each("v_reset") if node.has("v_reset") else nothing
+    theta = each("threshold" if node.type == "Threshold" else "v_threshold") - reset
+    if node.type == "IF":
+        beta, gain = 1.0, each("r") * steps.dt
+    elif node.type in ("LIF", "CubaLIF"):
+        key = "tau" if node.type == "LIF" else "tau_mem"
+        kept = steps.keeps(node, key, size, shape)
+        beta = shared(node, key, kept)
+        drive = (1 - kept) * (each("v_leak") - reset)
+        gain = each("r") * (1 - kept)
+        if node.type == "CubaLIF":
+            alpha = shared(node, "tau_syn", steps.keeps(node, "tau_syn", size, shape))
+            gain = gain * (each("w_in") if node.has("w_in") else np.ones(size)) * (1 - alpha)
+        # r = tau / dt, stored in float32, makes a gain of 1 that is not quite one
+        gain = np.where(np.abs(gain - 1) < TOLERANCE, 1.0, gain)
+    if np.any(theta <= 0):
+        raise node.fail(f"fires {theta.min():g} above its reset, allowed are thresholds above it; train it again")
+    with node.named():
+        own = shifted(filtered(value, alpha, gain, nothing), drive)  # a leak acts past the current
+    return Neurons(node=node, value=own, beta=beta, gain=gain, theta=theta, reset=reset)
+
+
+def _require_reset(node: Node) -> None:
+    for key, value in (node.metadata | {k: v for k, v in node.values.items() if "reset" in k}).items():
+        if "reset" in key.lower() and isinstance(value, str) and any(word in value.lower() for word in SOFT):
+            raise node.fail(
+                f"resets by subtraction ({key} = {value!r}), which a neuron of this chip cannot; train with a reset "
+                "to a value"
+            )
+
+
+def _facts(graph: Graph, steps: Steps, spiking: Sequence[Neurons], sensor: str, clocked: Input) -> list[str]:
+    """How a file was read, its layers, what its input (`sensor`, in words) was taken for, and what files may lose."""
+    version = printable(graph.version) or "of no version"
+    facts = [f"NIR {version}, read in steps of {steps.dt:g} s ({steps.convention})", sensor]
+    for one in spiking:
+        fact = f"layer {printable(one.node.name)} ({one.node.type}): {one.value.size} neurons, {_decay_words(one.beta)}"
+        fact += f", current {one.value.alpha:.6g}" if one.value.alpha else ""
+        fact += f", fires at v > {_span(one.theta + one.reset)}, then v = {_span(one.reset)}"
+        if np.any(np.abs(one.gain - 1) > 1e-4):
+            fact += f"; a step adds {_span(one.gain)} of its input"
+        facts.append(fact)
+    facts.append(
+        "v goes to its reset as NIR says; a framework that subtracts the threshold instead means another network"
+    )
+    if any(one.node.type == "CubaLIF" for one in spiking):
+        facts.append(
+            "a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them"
+        )
+    if looped := [printable(one.node.name) for place, one in enumerate(spiking) if place in one.value.terms]:
+        facts.append(
+            f"{', '.join(looped)}: is recurrent, fed by its own spikes of the step before; snnTorch's RLeaky with "
+            "reset 'zero' means this with reset_delay=False, else it loses the input of the step after each spike"
+        )
+    written = written_step(graph)
+    if written is not None and not math.isclose(written, steps.dt, rel_tol=1e-4):
+        facts.append(
+            f"drift: r is tau / {written:g} in every neuron, as of a file written in steps of {written:g} s; in steps "
+            f"of {steps.dt:g} s its decays and gains are others than there"
+        )
+    if clocked.clocks.channels:
+        facts.append("biases that go through a synaptic current come from a channel that always has an event")
+    return facts
+
+
+def _decay_words(beta: float) -> str:
+    """A membrane decay, and what the chip makes of it where that differs."""
+    _, realised = kept_shares(*decay_registers(beta))
+    same = math.isclose(beta, realised, abs_tol=TOLERANCE)
+    return f"decay {beta:.6g}" + ("" if same else f" ({realised:.6g} on the chip)")
+
+
+def _span(values: FloatArray) -> str:
+    low, high = float(values.min()), float(values.max())
+    return f"{low:.6g}" if math.isclose(low, high, rel_tol=1e-6, abs_tol=1e-12) else f"{low:.6g} … {high:.6g}"

@@ -1,99 +1,34 @@
-"""What flows along the edges of a NIR graph, and what each node that is no spiking neuron makes of it."""
+"""What flows along the edges of a NIR graph, and what each node that is no spiking neuron makes of it.
+
+NIR neurons are differential equations and a file has no time step. In steps of `dt` a membrane with time constant tau
+keeps ``beta``, and the rest, ``1 - beta``, comes from ``v_leak + r * I``:
+
+``euler``
+    ``beta = 1 - dt / tau``, the forward Euler method, which snnTorch, Norse and SpikingJelly mean;
+``exponential``
+    ``beta = exp(-dt / tau)``, exact for an input that is constant over the step, which sinabs means.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 
-from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.kernels import Padding, block_diagonal, convolution
-from spikeloom.compiler.formats.nir.file import Node
-from spikeloom.compiler.formats.nir.steps import Steps, shared, spread
-from spikeloom.compiler.ir import Sparse
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.formats import affine
+from spikeloom.compiler.formats.affine import Affine, Padding, block_diagonal, convolution, scaled, shifted, through
+from spikeloom.compiler.formats.nir.file import SPIKING, Graph, Node
+from spikeloom.compiler.types import FloatArray
 
+ALWAYS = -2
+"""Atom of what flows into a filter in every step, beside the sources of spikes; (1,)."""
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Value:
-    """``f + bias`` with ``f <- alpha * f + (sum of terms) + held`` in every step."""
-
-    shape: tuple[int, ...]  # Of one step; its elements lie flat in C order
-    terms: Mapping[int, Sparse]  # (size, neurons of the source); weights of the spikes of each source
-    bias: FloatArray  # (size,); what is added past the filter
-    alpha: float  # Share of the current that a step keeps; 0 without a filter
-    held: FloatArray  # (size,); what flows into the filter in every step; zero without one
-
-    @property
-    def size(self) -> int:
-        """Number of elements."""
-        return math.prod(self.shape)
-
-
-def spikes_of(source: int, shape: tuple[int, ...]) -> Value:
-    """The spikes of a source, or the events of the input."""
-    size = math.prod(shape)
-    nothing = np.zeros(size)
-    own = sparse.csr_array(sparse.identity(size, format="csr"))
-    return Value(shape=shape, terms={source: own}, bias=nothing, alpha=0.0, held=nothing)
-
-
-def scaled(value: Value, gain: FloatArray) -> Value:
-    """Each element times its own factor; `gain` is (size,)."""
-    rows = sparse.diags_array(gain, format="csr")
-    terms = {source: sparse.csr_array(rows @ own) for source, own in value.terms.items()}
-    return replace(value, terms=terms, bias=value.bias * gain, held=value.held * gain)
-
-
-def rows_of(value: Value, rows: IntArray) -> Value:
-    """Some elements of a value, flat."""
-    terms = {source: own[rows] for source, own in value.terms.items()}
-    return replace(value, shape=(len(rows),), terms=terms, bias=value.bias[rows], held=value.held[rows])
-
-
-def through(value: Value, matrix: Sparse, shape: tuple[int, ...]) -> Value:
-    """A linear stage, ``matrix`` (size of `shape`, size of the value)."""
-    terms = {source: sparse.csr_array(matrix @ own) for source, own in value.terms.items()}
-    return Value(shape=shape, terms=terms, bias=matrix @ value.bias, alpha=value.alpha, held=matrix @ value.held)
-
-
-def added(values: Sequence[Value]) -> Value:
-    """The sum of several, as a node with several edges gets; ModelError if their shapes or their filters differ."""
-    first = values[0]
-    if len(values) == 1:
-        return first
-    if any(value.shape != first.shape for value in values):
-        shown = " and ".join(str(list(value.shape)) for value in values)
-        raise ModelError(f"gets values of different shapes, {shown}; export it again")
-    filtered = [value for value in values if value.terms or np.any(value.held)]
-    if len({value.alpha for value in filtered}) > 1:
-        raise ModelError("gets currents with different time constants; a neuron of the chip has one")
-    terms: dict[int, Sparse] = {}
-    for value in values:
-        for source, own in value.terms.items():
-            terms[source] = sparse.csr_array(terms[source] + own) if source in terms else own
-    return Value(
-        shape=first.shape,
-        terms=terms,
-        bias=np.sum([value.bias for value in values], axis=0),
-        alpha=filtered[0].alpha if filtered else 0.0,
-        held=np.sum([value.held for value in values], axis=0),
-    )
-
-
-def filtered(value: Value, alpha: float, gain: FloatArray, drive: FloatArray) -> Value:
-    """The state of a leaky integrator: ``f <- alpha * f + gain * value + drive``; `gain` and `drive` are (size,).
-
-    ModelError if the value went through one before.
-    """
-    if value.alpha:
-        raise ModelError("filters a current that is filtered before; a neuron of the chip has one current")
-    own = scaled(value, gain)
-    return replace(own, alpha=alpha, held=own.bias + drive, bias=np.zeros(value.size))
-
+TOLERANCE = 1e-6
+"""What float32 leaves of equal numbers."""
 
 DENSE_LIMIT = 2**28
 """Weights of a matrix that is written out once for each place of an axis."""
@@ -104,6 +39,134 @@ KNOWN = {
     "I": "integrates without leak and never spikes; use IF",
 }
 """Why nodes that NIR knows have no place here."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Steps:
+    """How time constants become decays."""
+
+    dt: float  # Seconds of a step
+    convention: str  # see the module
+
+    def keeps(self, node: Node, key: str, size: int, shape: tuple[int, ...]) -> FloatArray:
+        """Share that a step keeps, of a time constant, (size,); ModelError if there is none in this convention."""
+        tau = spread(node, key, size, shape)
+        if np.any(tau <= 0):
+            raise node.fail(f"{key} is {tau.min():g}, allowed are numbers above 0; train it again")
+        if self.convention == "exponential":
+            return np.asarray(np.exp(-self.dt / tau))
+        kept = 1 - self.dt / tau
+        if np.any(kept < -TOLERANCE):
+            step = _written_for(node)
+            hint = "" if step is None else f" (its r is tau / {step:g}, so it was written in steps of that)"
+            raise node.fail(
+                f"{key} is {tau.min():g} s, shorter than the step of {self.dt:g} s, which the Euler convention cannot "
+                f"have{hint}; give another --dt, or --convention exponential"
+            )
+        return np.maximum(kept, 0)
+
+
+def require_step(dt: float) -> None:
+    """Refuse a time step that is none."""
+    if not 0 < dt < math.inf:
+        raise OptionError(f"--dt {dt:g}: is no time step; give seconds above 0")
+
+
+def stated_step(graph: Graph) -> float | None:
+    """Seconds of a step, where the metadata of a file say so."""
+    said = graph.metadata.get("dt")
+    return float(said.ravel()[0]) if isinstance(said, np.ndarray) and said.size == 1 else None
+
+
+def written_step(graph: Graph) -> float | None:
+    """Step that a file was written in, as far as all of its neurons say the same."""
+    found = [_written_for(node) for node in graph.nodes.values() if node.type in SPIKING and node.type != "Threshold"]
+    steps = [step for step in found if step is not None]
+    same = len(steps) == len(found) and all(math.isclose(step, steps[0], rel_tol=1e-4) for step in steps)
+    return steps[0] if steps and same else None
+
+
+def _written_for(node: Node) -> float | None:
+    """The same by a neuron, where its parameters tell: `r` is tau over the step, and not 1.
+
+    Then a step adds its input as it is; snnTorch and SpikingJelly write so.
+    """
+    if not node.has("r"):
+        return None
+    key = {"LIF": "tau", "LI": "tau", "CubaLIF": "tau_mem"}.get(node.type)
+    r = node.numbers("r").ravel()
+    tau = node.numbers(key).ravel() if key and node.has(key) else np.ones(1)
+    if 0 in (tau.size, r.size) or (tau.size != r.size and 1 not in (tau.size, r.size)) or np.all(r == 1):
+        return None
+    with np.errstate(all="ignore"):
+        step = tau / r
+    same = step[0] > 0 and np.ptp(step) <= TOLERANCE * step[0]
+    return float(f"{step[0]:.6g}") if same else None
+
+
+def spread(node: Node, key: str, size: int, shape: tuple[int, ...]) -> FloatArray:
+    """A parameter for each neuron, (size,): one for all, one each, or one that broadcasts against `shape`."""
+    values = node.numbers(key)
+    if values.size == size:
+        return values.ravel()
+    try:
+        return np.array(np.broadcast_to(values.ravel() if values.size == 1 else values, shape)).ravel()
+    except ValueError:
+        raise node.fail(
+            f"{key} has the shape {list(values.shape)}, it gets {list(shape)}; the shapes must be equal, export it "
+            "again"
+        ) from None
+
+
+def shared(node: Node, key: str, decay: FloatArray) -> float:
+    """The decay that all neurons of a node share; ModelError if they have several."""
+    if np.ptp(decay) > TOLERANCE:
+        raise node.fail(f"{key} is different from neuron to neuron, allowed is one for a layer; use one node for each")
+    return float(decay[0]) if decay.size else 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Value(Affine):
+    """``f + bias`` with ``f <- alpha * f + (sum of terms)`` in every step, of spikes and of ``ALWAYS``."""
+
+    alpha: float = 0.0  # Share of the current that a step keeps; 0 without a filter
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return len(self.bias)
+
+
+def spikes_of(source: int, shape: tuple[int, ...]) -> Value:
+    """The spikes of a source, or the events of the input."""
+    size = math.prod(shape)
+    return Value(shape=shape, terms={source: sparse.eye_array(size, format="csr")}, bias=np.zeros(size))
+
+
+def added(values: Sequence[Value]) -> Value:
+    """The sum of several, as a node with several edges gets; ModelError if their shapes or their filters differ."""
+    first = values[0]
+    if any(value.shape != first.shape for value in values):
+        shown = " and ".join(str(list(value.shape)) for value in values)
+        raise ModelError(f"gets values of different shapes, {shown}; export it again")
+    alphas = {value.alpha for value in values if value.terms} or {0.0}
+    if len(alphas) > 1:
+        raise ModelError("gets currents with different time constants; a neuron of the chip has one")
+    return replace(affine.added([(1.0, value) for value in values], first.shape), alpha=alphas.pop())
+
+
+def filtered(value: Value, alpha: float, gain: FloatArray, drive: FloatArray) -> Value:
+    """The state of a leaky integrator: ``f <- alpha * f + gain * value + drive``; `gain` and `drive` are (size,).
+
+    ModelError if the value went through one before.
+    """
+    own = shifted(scaled(value, gain), drive)
+    if not alpha:
+        return own
+    if value.alpha:
+        raise ModelError("filters a current that is filtered before; a neuron of the chip has one current")
+    held = {ALWAYS: sparse.csr_array(own.bias[:, None])} if np.any(own.bias) else {}
+    return replace(own, alpha=alpha, terms={**own.terms, **held}, bias=np.zeros(value.size))
 
 
 def _linear(node: Node, value: Value, _steps: Steps) -> Value:
@@ -117,10 +180,10 @@ def _linear(node: Node, value: Value, _steps: Steps) -> Value:
     copies = math.prod(value.shape[:-1])
     if copies * weight.size > DENSE_LIMIT:
         raise node.fail(f"has {copies * weight.size:,} weights, {DENSE_LIMIT:,} are allowed; this fits no chip")
-    result = through(value, block_diagonal(sparse.csr_array(weight), copies), (*value.shape[:-1], rows))
+    result = through(block_diagonal(sparse.csr_array(weight), copies), value, (*value.shape[:-1], rows))
     if node.type == "Linear":
         return result
-    return replace(result, bias=result.bias + np.tile(_each(node, "bias", rows), copies))
+    return shifted(result, np.tile(_each(node, "bias", rows), copies))
 
 
 def _each(node: Node, key: str, size: int) -> FloatArray:
@@ -175,10 +238,10 @@ def _conv(node: Node, value: Value, _steps: Steps) -> Value:
     padding, groups = _padding(node, kernel, dilation, stride), node.few("groups")[0]
     with node.named():
         matrix, out = convolution(shape, weight, stride=stride, padding=padding, dilation=dilation, groups=groups)
-    result = through(value, matrix, out)
+    result = through(matrix, value, out)
     if not node.has("bias"):
         return result
-    return replace(result, bias=result.bias + np.repeat(_each(node, "bias", out[0]), math.prod(out[1:])))
+    return shifted(result, np.repeat(_each(node, "bias", out[0]), math.prod(out[1:])))
 
 
 def _pool(node: Node, value: Value, _steps: Steps) -> Value:
@@ -191,7 +254,7 @@ def _pool(node: Node, value: Value, _steps: Steps) -> Value:
     weight = np.full((shape[0], 1, *kernel), share)  # zeros of the padding count
     with node.named():
         matrix, out = convolution(shape, weight, stride=stride, padding=padding, dilation=(1, 1), groups=shape[0])
-    return through(value, matrix, out)
+    return through(matrix, value, out)
 
 
 def _flatten(node: Node, value: Value, _steps: Steps) -> Value:
@@ -214,9 +277,6 @@ def _integrator(node: Node, value: Value, steps: Steps) -> Value:
     alpha = shared(node, "tau", kept)
     gain = (1 - kept) * spread(node, "r", value.size, value.shape)
     drive = (1 - kept) * spread(node, "v_leak", value.size, value.shape)
-    if not alpha:
-        own = scaled(value, gain)
-        return replace(own, bias=own.bias + drive)
     with node.named():
         return filtered(value, alpha, gain, drive)
 

@@ -23,7 +23,7 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes
 from spikeloom.compiler.formats.names import plain_names
-from spikeloom.compiler.formats.nir.steps import require_step
+from spikeloom.compiler.formats.nir.stages import require_step
 from spikeloom.compiler.ir import INPUT, IntegerPopulation, Sparse
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import FORGETS

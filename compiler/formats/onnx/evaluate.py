@@ -16,8 +16,8 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.kernels import block_diagonal, convolution
-from spikeloom.compiler.formats.onnx.affine import COEFFICIENT_LIMIT, Table
+from spikeloom.compiler.formats.affine import block_diagonal, convolution
+from spikeloom.compiler.formats.onnx.atoms import COEFFICIENT_LIMIT, Table
 from spikeloom.compiler.formats.onnx.file import BOOL, Array, Node, decimal
 from spikeloom.compiler.ir import Sparse
 
@@ -93,7 +93,7 @@ def shapes_of(node: Node, table: Table, operands: Operands) -> list[tuple[int, .
     """
     from onnx import defs, helper, numpy_helper, shape_inference
 
-    proto = _operator(node, table).onnx_node
+    proto = _proto(node)
     given = {name: operand for name, operand in zip(proto.input, operands, strict=True) if operand is not None}
     types = {
         name: helper.make_tensor_type_proto(helper.np_dtype_to_tensor_dtype(array.dtype), array.shape)
@@ -115,26 +115,27 @@ def shapes_of(node: Node, table: Table, operands: Operands) -> list[tuple[int, .
     return found
 
 
-def _operator(node: Node, table: Table) -> Any:
-    """ONNX's reference of an operator, with numbers of the program's text as the decimals that were meant."""
+def _proto(node: Node) -> Any:
     from onnx import helper, numpy_helper
-    from onnx.reference.ops import load_op
 
-    if id(node) in table.operators:
-        return table.operators[id(node)][1]
     attributes = {
         name: numpy_helper.from_array(value) if isinstance(value, np.ndarray) else value
         for name, value in node.attributes.items()
     }
     inputs = [f"i{place}" if given else "" for place, given in enumerate(node.inputs)]
     outputs = [f"o{place}" for place in range(len(node.outputs))]
-    proto = helper.make_node(node.op, inputs, outputs, **attributes)
+    return helper.make_node(node.op, inputs, outputs, **attributes)
+
+
+def _operator(node: Node, table: Table) -> Any:
+    """ONNX's reference of an operator, with numbers of the program's text as the decimals that were meant."""
+    from onnx.reference.ops import load_op
+
     settings = {"log": lambda *_: None, "opsets": {"": table.opset}, "new_ops": None}
-    operator = load_op("", node.op, table.opset)(proto, settings)
+    operator = load_op("", node.op, table.opset)(_proto(node), settings)
     for name in operator.attributes_names_:
         if isinstance(value := getattr(operator, name), float):
             setattr(operator, name, decimal(value))
-    table.operators[id(node)] = node, operator
     return operator
 
 
@@ -246,8 +247,7 @@ def _conv_matrix(node: Node, table: Table, operands: Sequence[Any], _which: int)
 
 def _pool_matrix(node: Node, table: Table, operands: Sequence[Any], _which: int) -> Sparse:
     data = operands[0]
-    everywhere = node.op == "GlobalAveragePool"
-    kernel = data.shape[2:] if everywhere else [int(n) for n in node.attributes["kernel_shape"]]
+    kernel = [int(n) for n in node.attributes.get("kernel_shape", data.shape[2:])]  # all, of GlobalAveragePool
     ones = np.ones(table.room([data.shape[1], 1, *kernel]))
     depthwise = replace(node, attributes={**node.attributes, "group": data.shape[1]})
     matrix = _conv_matrix(depthwise, table, [data, ones], 0)

@@ -8,8 +8,9 @@ that float32 (0.2, not 0.200000003); the float32 model is the same, the float64 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -28,16 +29,13 @@ OPSETS = range(9, 27)
 
 NODE_LIMIT = 200_000
 DIMENSIONS = 16
-"""Nodes of a file and dimensions of a value; how deep graphs lie in graphs is limited by protobuf."""
+"""Nodes of a file and dimensions of a value."""
 
 BOOL, DOUBLE = 9, 11
 NUMBERS = range(1, 14)
 """Element types by their number in the format."""
 
 STRING = 8
-
-SAME = {"MatMulInteger": "MatMul"}
-"""Operators that are another one once their numbers are widened."""
 
 DAMAGED = "is truncated or damaged; export it again"
 
@@ -53,7 +51,7 @@ class Declared:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Node:
-    """One operator. Attributes are int, float, str, arrays, lists of these, or a :class:`Graph`."""
+    """One operator. Attributes are int, float, str, arrays, or lists of these."""
 
     name: str
     op: str
@@ -67,16 +65,15 @@ class Node:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Graph:
-    """A graph of operators; `constants` are its initialisers."""
+    """The operators of a file; `constants` are its initialisers."""
 
     nodes: tuple[Node, ...]
     inputs: tuple[Declared, ...]
     outputs: tuple[str, ...]
     constants: Mapping[str, Array]
-    # of the outermost graph, about the file
-    opset: int = 0  # version of its operators
-    producer: str = ""
-    sha256: str = ""  # of all its bytes
+    opset: int  # version of its operators
+    producer: str
+    sha256: str  # of all its bytes
 
 
 def decimal(value: Any) -> float:
@@ -119,11 +116,18 @@ def read_graph(path: Path) -> Graph:
             f"has operators of version {opset}, allowed are {OPSETS.start} to {OPSETS.stop - 1}; "
             "export it with opset_version=20"
         )
+    graph = proto.graph
+    if len(graph.node) > NODE_LIMIT:
+        raise ModelError(f"has more than {NODE_LIMIT} nodes; export one step of the network instead of all")
     digest = hashlib.sha256(content)
-    _bring_data(proto.graph, path.absolute().parent, digest)
+    _bring_data(graph, path.absolute().parent, digest)
     _check(proto)
-    return replace(
-        _graph(proto.graph),
+    constants = {_text(tensor.name): _array(tensor) for tensor in graph.initializer}
+    return Graph(
+        nodes=tuple(map(_node, graph.node)),
+        inputs=tuple(_declared(value) for value in graph.input if _text(value.name) not in constants),
+        outputs=tuple(_text(value.name) for value in graph.output),
+        constants=constants,
         opset=opset,
         producer=printable(_text(proto.producer_name)),
         sha256=digest.hexdigest(),
@@ -135,7 +139,8 @@ def _bring_data(graph: Any, folder: Path, digest: Any) -> None:
     from onnx.external_data_helper import load_external_data_for_tensor
 
     total = 0
-    for tensor in _tensors(graph, [NODE_LIMIT]):
+    held = (attribute.t for node in graph.node for attribute in node.attribute if attribute.HasField("t"))
+    for tensor in chain(graph.initializer, held):
         if tensor.data_location != tensor.EXTERNAL:
             continue
         location = next((entry.value for entry in tensor.external_data if entry.key == "location"), "")
@@ -153,20 +158,6 @@ def _bring_data(graph: Any, folder: Path, digest: Any) -> None:
         digest.update(tensor.raw_data)
 
 
-def _tensors(graph: Any, left: list[int]) -> Iterator[Any]:
-    """Tensors of a graph and of those in it, which may have so many nodes together."""
-    left[0] -= len(graph.node)
-    if left[0] < 0:
-        raise ModelError(f"has more than {NODE_LIMIT} nodes; export one step of the network instead of all")
-    yield from graph.initializer
-    for node in graph.node:
-        for attribute in node.attribute:
-            if attribute.HasField("t"):
-                yield attribute.t
-            if attribute.HasField("g"):
-                yield from _tensors(attribute.g, left)
-
-
 def _check(proto: Any) -> None:
     """Refuse what ONNX's own checker does: names that nothing makes, operators out of order, tensors cut short."""
     from onnx import checker
@@ -177,16 +168,6 @@ def _check(proto: Any) -> None:
         checker.check_model(proto)
     except Exception as error:
         raise ModelError(f"is no graph as ONNX defines it ({one_line(error)}); export it again") from error
-
-
-def _graph(proto: Any) -> Graph:
-    constants = {_text(tensor.name): _array(tensor) for tensor in proto.initializer}
-    return Graph(
-        nodes=tuple(map(_node, proto.node)),
-        inputs=tuple(_declared(value) for value in proto.input if _text(value.name) not in constants),
-        outputs=tuple(_text(value.name) for value in proto.output),
-        constants=constants,
-    )
 
 
 def _declared(proto: Any) -> Declared:
@@ -207,7 +188,7 @@ def _node(proto: Any) -> Node:
     named = _text(proto.name or (proto.output[0] if proto.output else "?"))
     node = Node(
         name=named,
-        op=SAME.get(_text(proto.op_type), _text(proto.op_type)),
+        op=_text(proto.op_type),
         inputs=tuple(map(_text, proto.input)),
         outputs=tuple(map(_text, proto.output)),
         attributes={},
@@ -223,7 +204,7 @@ def _node(proto: Any) -> Node:
     return replace(node, attributes=attributes)
 
 
-def _attribute(entry: Any, node: Node) -> Any:  # noqa: PLR0911 a kind each
+def _attribute(entry: Any, node: Node) -> Any:
     match entry.type:
         case entry.FLOAT:
             return decimal(entry.f)
@@ -234,7 +215,7 @@ def _attribute(entry: Any, node: Node) -> Any:  # noqa: PLR0911 a kind each
         case entry.TENSOR:
             return _array(entry.t)
         case entry.GRAPH:
-            return _graph(entry.g)
+            raise ModelError(f"{node}: holds a graph, a loop or a choice; export one step, or unroll all of them")
         case entry.FLOATS:
             return [decimal(number) for number in entry.floats]
         case entry.INTS:

@@ -1,4 +1,4 @@
-"""Operators on values that vary: which stay affine, and what their coefficients are.
+"""Run a graph on values that vary: operators in order, membranes set apart as they are met.
 
 Nothing here looks for patterns. A sum, a gather, a convolution with constant weights give new coefficients; a
 comparison of a membrane with a threshold gives a spike; a product of a membrane with its own spikes is kept as what it
@@ -8,34 +8,35 @@ is, since it is how a membrane is reset. Everything else is refused by name.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.onnx.affine import (
+from spikeloom.compiler.formats.affine import Affine, added, diagonal, picked_of_all, scaled, shifted, spread, through
+from spikeloom.compiler.formats.names import one_line, printable
+from spikeloom.compiler.formats.onnx.atoms import (
     INPUT_ATOM,
     MEMBRANE,
     NOT_AFFINE,
-    Affine,
     Table,
     Value,
-    added,
     as_affine,
-    diagonal,
     is_binary,
     is_whole,
     multiplied,
-    picked_of_all,
-    scaled,
-    scaled_and_shifted,
-    spread,
-    through,
+    require_finite,
 )
 from spikeloom.compiler.formats.onnx.evaluate import FLOATING, LINEAR, MOVES, NUMERIC, evaluate, shapes_of
-from spikeloom.compiler.formats.onnx.file import BOOL, Node
+from spikeloom.compiler.formats.onnx.file import BOOL, Graph, Node
+
+NODE_WORK = 2**14
+"""What running one operator counts for beside its elements."""
+
+_SHIFTS = frozenset(("Add", "Cast", "Div", "Identity", "Mul", "Sub"))
+"""Operators that may stand between a membrane and its comparison, as in ``u - theta > 0``."""
 
 MIRRORED = {
     "Greater": "Less",
@@ -51,12 +52,106 @@ STATEFUL = ("GRU", "LSTM", "RNN")
 CONSTANT = "is computed from constants by an operator that is not known here; fold constants before the export"
 
 
+def run(graph: Graph, given: Mapping[str, Value], table: Table) -> list[Value]:
+    """Values of a graph's outputs from those `given` for its inputs.
+
+    Raises ModelError naming the operator that cannot be evaluated, or is not affine, and why.
+    """
+    values: dict[str, Value] = {**given, **graph.constants}
+    order = needed(graph)
+    held = membranes(order, graph.outputs, set(given))
+    last = {name: index for index, node in enumerate(order) for name in reads(node)}
+    for index, node in enumerate(order):
+        try:
+            table.spend(NODE_WORK)
+            results = apply(node, table, [values[name] if name else None for name in node.inputs])
+            for name, result in zip(node.outputs, results, strict=False):
+                values[name] = _set_apart(node, name, result, table) if name in held else result
+        except ModelError as error:
+            raise ModelError(f"{node}: {error}") from error
+        except Exception as error:  # onnx, numpy and scipy raise nearly anything on operands that do not fit each other
+            raise ModelError(f"{node}: cannot be evaluated ({one_line(error)}); export it again") from error
+        for name in reads(node):
+            if last[name] == index and name not in graph.outputs:
+                values.pop(name, None)
+    for name in graph.outputs:
+        if name not in values:
+            raise ModelError(f"output {printable(name)}: nothing makes it; export it again")
+    return [values[name] for name in graph.outputs]
+
+
+def _set_apart(node: Node, name: str, value: Value, table: Table) -> Value:
+    """Make a membrane an atom of its own, and remember what it is made of."""
+    if not isinstance(value, Affine):
+        return value
+    require_finite(value)
+    only = next(iter(value.terms), -1)
+    known = len(value.terms) == 1 and diagonal(value.terms[only]) == 1 and not np.any(value.bias)
+    if known and table.atoms[only].kind in (INPUT_ATOM, MEMBRANE):
+        return value
+    return table.value(table.atom(MEMBRANE, name, len(value.bias), definition=value, node=str(node)), value.shape)
+
+
+def reads(node: Node) -> list[str]:
+    """Values that an operator needs, without the operands that it omits."""
+    return [name for name in node.inputs if name]
+
+
+def needed(graph: Graph) -> list[Node]:
+    """Operators that the outputs need; a file has each after those that it needs itself."""
+    wanted, found = set(graph.outputs), []
+    for node in reversed(graph.nodes):
+        if wanted & set(node.outputs):
+            wanted |= set(reads(node))
+            found.append(node)
+    return found[::-1]
+
+
+def membranes(order: list[Node], outputs: tuple[str, ...], varying: set[str]) -> set[str]:
+    """Values that vary and are held against a threshold; a shift just before the comparison is looked through."""
+    makers = {name: node for node in order for name in node.outputs}
+    users: dict[str, list[Node]] = {}
+    for node in order:
+        for name in reads(node):
+            users.setdefault(name, []).append(node)
+    moving = set(varying)
+    for node in order:
+        if moving & set(reads(node)):
+            moving |= set(node.outputs)
+    found = set()
+    for node in order:
+        if node.op not in MIRRORED:
+            continue
+        for name in node.inputs:
+            place = name
+            while place in moving and place in makers and makers[place].op in _SHIFTS:
+                before = [other for other in makers[place].inputs if other in moving]
+                only_compared = place not in outputs and all(user.op in MIRRORED for user in users[place])
+                if len(before) != 1 or not only_compared:
+                    break
+                if len(users[before[0]]) < 2 and before[0] not in outputs:
+                    break
+                place = before[0]
+            if place in moving:
+                found.add(place)
+    return found
+
+
 def apply(node: Node, table: Table, operands: Sequence[Value | None]) -> list[Value]:
     """Results of an operator, whatever its operands are.
 
     Raises ModelError if it is not known, or not affine in what varies; without its name.
     """
     op, varying = node.op, [place for place, operand in enumerate(operands) if isinstance(operand, Affine)]
+    if op == "Constant":
+        numbers = [value for value in node.attributes.values() if not isinstance(value, str)]
+        if not numbers:
+            raise ModelError("holds no number")
+        return [np.asarray(numbers[0])]
+    if op in ("Shape", "Size"):
+        shape = np.array(as_affine(operands[0]).shape, np.int64)
+        cut = shape[node.attributes.get("start", 0) : node.attributes.get("end", len(shape))]
+        return [cut if op == "Shape" else np.array(np.prod(shape))]
     if not varying:
         return _constant(node, table, operands)
     if op in MOVES and not (op == "Where" and 0 in varying) and node.attributes.get("reduction") != "add":
@@ -107,7 +202,7 @@ def _compared(node: Node, table: Table, operands: Sequence[Value | None]) -> Aff
 
 def _opposite(spikes: Affine) -> Affine:
     size = len(spikes.bias)
-    return scaled_and_shifted(spikes, np.full(size, -1.0), np.ones(size))
+    return shifted(scaled(spikes, np.full(size, -1.0)), np.ones(size))
 
 
 def _chosen(table: Table, operands: Sequence[Value | None]) -> Affine:
@@ -198,7 +293,7 @@ def _normalised(node: Node, table: Table, operands: Sequence[Value | None]) -> A
         evaluate(node, table, [np.full(value.shape, x), *operands[1:]])[0].ravel()  # type: ignore[list-item]
         for x in (0.0, high)
     )
-    return scaled_and_shifted(value, (at_high - at_zero) / high, at_zero)
+    return shifted(scaled(value, (at_high - at_zero) / high), at_zero)
 
 
 def _elementwise(node: Node, table: Table, operands: Sequence[Value | None], varying: list[int]) -> Affine:

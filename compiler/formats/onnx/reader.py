@@ -16,18 +16,15 @@ from pathlib import Path
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.affine import Affine
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble
 from spikeloom.compiler.formats.names import printable, unique_names
-from spikeloom.compiler.formats.onnx.affine import INPUT_ATOM, Affine, Table, as_affine, require_finite
+from spikeloom.compiler.formats.onnx.atoms import INPUT_ATOM, Table, as_affine, require_finite
 from spikeloom.compiler.formats.onnx.file import BOOL, DOUBLE, Declared, Graph, read_graph
-from spikeloom.compiler.formats.onnx.lif import Neurons, is_output, neurons_of
-from spikeloom.compiler.formats.onnx.run import inner, run
-from spikeloom.compiler.formats.onnx.steps import Unrolled, group, readout
+from spikeloom.compiler.formats.onnx.lif import Neurons, Unrolled, group, is_output, neurons_of, readout
+from spikeloom.compiler.formats.onnx.operators import run
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.sensor_layout import sensor_layout
-
-OPEN_STEPS = 3
-"""Steps that are run where a file leaves their number open: two show what carries on, a third that it goes on so."""
 
 
 def read_onnx(
@@ -52,14 +49,13 @@ def _network(file: Graph, polarities: int | None, polarities_first: bool | None)
     table = Table(opset=file.opset)
     facts: list[str] = []
     graph = _undecided(file, facts)
-    loops = any(node.op == "Scan" for node in graph.nodes)
     shapes: dict[int, tuple[int, ...]] = {}
     given = {}
     for declared in graph.inputs:
-        shape = _fixed(declared, graph, facts, loops=loops)
+        shape = _fixed(declared, facts)
         atom = table.atom(INPUT_ATOM, declared.name, math.prod(table.room(shape)), binary=declared.kind == BOOL)
         shapes[atom], given[declared.name] = shape, table.value(atom, shape)
-    results = zip(graph.outputs, run(graph, {}, given, table), strict=True)
+    results = zip(graph.outputs, run(graph, given, table), strict=True)
     outputs = {name: as_affine(value) for name, value in results}
     for name, value in outputs.items():
         require_finite(value, f"output {printable(name)}: ")
@@ -84,24 +80,17 @@ def _network(file: Graph, polarities: int | None, polarities_first: bool | None)
     return ReadNetwork(network=network, facts=tuple(facts), sha256=file.sha256)
 
 
-def _fixed(declared: Declared, graph: Graph, facts: list[str], *, loops: bool) -> tuple[int, ...]:
-    """Shape of an input; an open size in front is the batch's, or time and batch of a graph that loops over steps."""
-    meanings = (f"time, read as {OPEN_STEPS} steps", "the batch's, read as 1") if loops else ("the batch's, read as 1",)
-    shape: list[int] = []
-    for axis, size in enumerate(declared.shape):
-        if isinstance(size, int):
-            shape.append(size)
-            continue
-        alone = all(size not in (*other.shape[:axis], *other.shape[axis + 1 :]) for other in graph.inputs)
-        if axis >= len(meanings) or (size and not alone):
-            raise ModelError(
-                f"input {printable(declared.name)}: has an open size {size or '?'!r}, allowed are fixed ones; export "
-                "without dynamic axes"
-            )
-        fact = f"the open size {size or '?'!r} is {meanings[axis]}"
-        facts += [] if fact in facts else [fact]
-        shape.append(OPEN_STEPS if loops and axis == 0 else 1)
-    return tuple(shape)
+def _fixed(declared: Declared, facts: list[str]) -> tuple[int, ...]:
+    """Shape of an input; an open size in front is the batch's."""
+    if unknown := [size or "?" for size in declared.shape[1:] if not isinstance(size, int)]:
+        raise ModelError(
+            f"input {printable(declared.name)}: has an open size {unknown[0]!r}, allowed are fixed ones; export "
+            "without dynamic axes"
+        )
+    for size in declared.shape[:1]:
+        fact = f"the open size {size or '?'!r} is the batch's, read as 1"
+        facts += [] if isinstance(size, int) or fact in facts else [fact]
+    return tuple(size if isinstance(size, int) else 1 for size in declared.shape)
 
 
 def _undecided(graph: Graph, facts: list[str]) -> Graph:
@@ -128,11 +117,8 @@ def _threshold(neurons: Neurons, *, double: bool) -> float:
 
 def _names(graph: Graph, table: Table, found: Unrolled) -> tuple[str, ...]:
     """Names of the modules that the layers' weights belong to, as far as the file keeps them."""
-    graphs, makers = [graph], {}
-    for each in graphs:
-        makers.update({name: node for node in each.nodes for name in node.outputs})
-        graphs += [part for node in each.nodes for part in inner(node)]
-    parameters = {name for each in graphs for name in each.constants if re.search(r"[./]", name)}
+    makers = {name: node for node in graph.nodes for name in node.outputs}
+    parameters = {name for name in graph.constants if re.search(r"[./]", name)}
     ends = {table.atoms[n.membrane].label for layer in found.layers for n in layer}
     names = []
     for layer in found.layers:

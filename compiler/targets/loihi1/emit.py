@@ -17,37 +17,29 @@ from spikeloom.compiler.ir import INPUT, MANTISSA, IntegerNetwork, depths, fan_i
 from spikeloom.compiler.passes.prune import Masks, none_of
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import (
-    Chunk,
     Cores,
     Lists,
     Needs,
+    SynapseFormat,
     choose_dense,
     index_bits,
-    lists_into,
 )
 from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
 from spikeloom.compiler.types import IntArray
 
 
-def _entries(
-    network: IntegerNetwork, chunk: Chunk, lists: Lists, dense: IntArray, base: int
-) -> tuple[IntArray, npt.NDArray[np.int32], npt.NDArray[np.int16]]:
-    """Synapses of a chunk's lists: entries per list, targets on the core, mantissas (``MANTISSA``)."""
-    part = network.projections[lists.projection].weight[chunk.first : chunk.last].tocoo()
-    keep = part.data != 0
-    (row, column), data = (coordinate[keep] for coordinate in part.coords), part.data[keep]
-    order = np.argsort(column, kind="stable")  # rows ascend already
-    row, data = row[order], data[order]
+def _entries(lists: Lists, dense: IntArray, base: int) -> tuple[npt.NDArray[Any], ...]:
+    """Synapses of lists: entries of each list, targets on a core where the chunk starts at `base`, mantissas."""
     length = np.where(dense, lists.last - lists.first + 1, lists.nonzero)
     start = np.cumsum(length) - length
     each = np.repeat(np.arange(len(length)), lists.nonzero)  # list of each synapse that is not zero
-    rank = np.arange(len(row)) - np.repeat(np.cumsum(lists.nonzero) - lists.nonzero, lists.nonzero)
-    place = start[each] + np.where(dense[each], row - lists.first[each], rank)
+    rank = np.arange(len(each)) - np.repeat(np.cumsum(lists.nonzero) - lists.nonzero, lists.nonzero)
+    place = start[each] + np.where(dense[each], lists.row - lists.first[each], rank)
     within = np.arange(length.sum()) - np.repeat(start, length)
     target = (np.repeat(lists.first, length) + within + base).astype(np.int32)  # right for dense lists
-    target[place] = base + row
+    target[place] = base + lists.row
     weight = np.zeros(len(target), MANTISSA)
-    weight[place] = data
+    weight[place] = lists.mantissa
     return length, target, weight
 
 
@@ -85,50 +77,43 @@ def emit(
     Where neurons were left out, `origin` is the network with all of them, `identity` says for each population which of
     them are held, and `unread` which were removed although they fire, because their spikes reach no neuron.
     """
-    identity = identity or tuple(np.arange(population.size) for population in network.populations)
-    compartment_id = [np.zeros(population.size, np.int64) for population in network.populations]
-    placed: list[tuple[Chunk, int, int]] = []  # chunk, core, base on it
-    counts: list[int] = []
-    for core, chunks in enumerate(cores):
-        base = 0
-        for chunk in chunks:
-            placed.append((chunk, core, base))
-            ids = sum(counts) + base + np.arange(chunk.size)
-            compartment_id[chunk.population][chunk.first : chunk.last] = ids
-            base += chunk.size
-        counts.append(base)
+    order = [chunk for chunks in cores for chunk in chunks]
+    layer = np.concatenate([np.full(chunk.size, chunk.population) for chunk in order])
+    numbers = np.concatenate([np.arange(chunk.first, chunk.last) for chunk in order])
+    compartment = np.lexsort((numbers, layer))  # of all neurons, population after population
+    sizes = np.cumsum([population.size for population in network.populations])
+    compartment_id = np.split(compartment, sizes[:-1])
 
-    formats: dict[tuple[int, int, int], int] = {}
+    def column(name: str) -> npt.NDArray[Any]:
+        """A field of the populations, of each compartment."""
+        return np.concatenate([getattr(network.populations[c.population], name)[c.first : c.last] for c in order])
+
+    formats: dict[SynapseFormat, int] = {}
     axons_per_core = np.zeros(len(cores), np.int64)
     parts: dict[str, list[npt.NDArray[Any]]] = {key: [] for key in ("source", "format", "length", "target", "weight")}
-    lean = [Needs(network, target).lean(chunks) for chunks in cores]
-    for chunk, core, base in placed:
-        for lists in lists_into(network, chunk):
-            projection = network.projections[lists.projection]
-            dense, _ = choose_dense(lists, projection, base, chunk.size, lean=lean[core], target=target)
-            length, targets, weights = _entries(network, chunk, lists, dense, base)
-            sparse_bits = index_bits(base + chunk.size - 1, target)
-            form = [
-                formats.setdefault((projection.bits, projection.exponent, 0 if flag else sparse_bits), len(formats))
-                for flag in dense
-            ]
-            source = lists.source
-            if projection.pre != INPUT:
-                source = network.input.size + compartment_id[projection.pre][source]
-            axons_per_core[core] += len(source)
-            found: list[npt.NDArray[Any]] = [source, np.array(form), length, targets, weights]
-            for part, values in zip(parts.values(), found, strict=True):
-                part.append(values)
+    needs = Needs(network, target)
+    for core, chunks in enumerate(cores):
+        base, lean = 0, needs.lean(chunks)
+        for chunk in chunks:
+            index = index_bits(base + chunk.size - 1, target)
+            for lists in needs.lists(chunk):
+                projection = network.projections[lists.projection]
+                dense, _ = choose_dense(lists, projection, base, chunk.size, lean=lean, target=target)
+                keys = [(projection.bits, projection.exponent, 0 if flag else index) for flag in dense]
+                form = np.array([formats.setdefault(key, len(formats)) for key in keys])
+                source = lists.source
+                if projection.pre != INPUT:
+                    source = network.input.size + compartment_id[projection.pre][source]
+                axons_per_core[core] += len(source)
+                for part, values in zip(parts.values(), (source, form, *_entries(lists, dense, base)), strict=True):
+                    part.append(values)
+            base += chunk.size
 
-    order = [chunk for chunk, _, _ in placed]
-    populations = [network.populations[chunk.population] for chunk in order]
-    neurons = [np.arange(chunk.first, chunk.last) for chunk in order]
-    rows = list(zip(populations, neurons, strict=True))
-    votes = [
-        network.readout.label[n] if chunk.population == network.readout.population else np.full(chunk.size, -1)
-        for chunk, n in zip(order, neurons, strict=True)
-    ]
-    columns = sorted(formats, key=lambda key: formats[key])
+    decays = np.array([(population.decay_u, population.decay_v) for population in network.populations])[layer]
+    voting = layer == network.readout.population
+    votes = np.full(len(layer), -1)
+    votes[voting] = network.readout.label[numbers[voting]]
+    known = numbers if identity is None else np.concatenate([identity[c.population][c.first : c.last] for c in order])
     return Netlist(
         target=target.name,
         taxels=network.input.taxels,
@@ -136,25 +121,25 @@ def emit(
         classes=network.classes,
         layers=_layers(origin or network, unread or none_of(network)),
         core_tile=read_only(tiles),
-        core_compartments=read_only(np.concatenate([[0], np.cumsum(counts)])),
-        core_axons=read_only(np.concatenate([[0], np.cumsum(axons_per_core)])),
-        layer=read_only(np.concatenate([np.full(chunk.size, chunk.population) for chunk in order])),
-        neuron=read_only(np.concatenate([identity[c.population][n] for c, n in zip(order, neurons, strict=True)])),
-        decay_u=read_only(np.concatenate([np.full(len(n), p.decay_u) for p, n in rows])),
-        decay_v=read_only(np.concatenate([np.full(len(n), p.decay_v) for p, n in rows])),
-        threshold=read_only(np.concatenate([p.threshold[n] for p, n in rows])),
-        bias_mantissa=read_only(np.concatenate([p.bias_mantissa[n] for p, n in rows])),
-        bias_exponent=read_only(np.concatenate([p.bias_exponent[n] for p, n in rows])),
-        scale=read_only_float(np.concatenate([p.scale[n] for p, n in rows])),
-        readout_class=read_only(np.concatenate(votes)),
+        core_compartments=read_only(np.cumsum([0, *(sum(chunk.size for chunk in chunks) for chunks in cores)])),
+        core_axons=read_only(np.cumsum([0, *axons_per_core])),
+        layer=read_only(layer),
+        neuron=read_only(known),
+        decay_u=read_only(decays[:, 0]),
+        decay_v=read_only(decays[:, 1]),
+        threshold=read_only(column("threshold")),
+        bias_mantissa=read_only(column("bias_mantissa")),
+        bias_exponent=read_only(column("bias_exponent")),
+        scale=read_only_float(column("scale")),
+        readout_class=read_only(votes),
         axon_source=read_only(np.concatenate(parts["source"])),
         axon_format=read_only(np.concatenate(parts["format"])),
         axon_synapses=read_only(np.concatenate([[0], np.cumsum(np.concatenate(parts["length"]))])),
         synapse_target=frozen(np.concatenate(parts.pop("target"))),
         synapse_weight=frozen(np.concatenate(parts.pop("weight"))),
-        format_weight_bits=read_only([key[0] for key in columns]),
-        format_exponent=read_only([key[1] for key in columns]),
-        format_index_bits=read_only([key[2] for key in columns]),
+        format_weight_bits=read_only([bits for bits, _, _ in formats]),
+        format_exponent=read_only([exponent for _, exponent, _ in formats]),
+        format_index_bits=read_only([index for _, _, index in formats]),
         provenance=dict(provenance),
         clocks=network.input.clocks,
         bins=network.input.bins,

@@ -98,10 +98,9 @@ def measure(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
     return (*uses, LimitUse(name="chip.cores", used=int(chips.max()), allowed=target.limit("chip.cores"), core=None))
 
 
-def violation(use: LimitUse, owner: str, target: Target) -> Violation:
+def violation(target: Target, owner: str, rule: str, used: int) -> Violation:
     """Turn a use that is too large into the line that a user reads."""
-    rule = f"{target.name}.{use.name}"
-    return Violation(owner=owner, rule=rule, used=use.used, allowed=use.allowed, remedy=REMEDIES[use.name])
+    return target.exceeded(owner, rule, used, REMEDIES[rule])
 
 
 def require_legal(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
@@ -115,7 +114,7 @@ def require_legal(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
                 first, last = netlist.core_compartments[use.core : use.core + 2]
                 names = [netlist.layers[i].name for i in np.unique(netlist.layer[first:last])]
                 owner = f"core {use.core} ({', '.join(names)})"
-            violations.append(violation(use, owner, target))
+            violations.append(violation(target, owner, use.name, use.used))
     if violations:
         raise CapacityError(tuple(violations))
     return uses

@@ -1,4 +1,4 @@
-"""The netlist: cores, compartments, axons and synapses as flat integer arrays.
+"""The netlist: cores, compartments, axons and synapses as flat integer arrays, and its file.
 
 Ids
 ---
@@ -24,15 +24,18 @@ compartment spiked in chip step ``t - 1``. A compartment of a layer of depth ``d
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
+from spikeloom.compiler.archive import Kind
+from spikeloom.compiler.dynamics import MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, in_units, largest_current
-from spikeloom.compiler.text import digest, sensor, span
+from spikeloom.compiler.targets import netlist_file
+from spikeloom.compiler.targets.base import COMPARTMENTS
+from spikeloom.compiler.targets.netlist_file import NetlistFile, column_faults, is_outside, part_of
 from spikeloom.compiler.types import FloatArray, IntArray
 
 PER_COMPARTMENT = (
@@ -60,11 +63,10 @@ class Layer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Netlist:
+class Netlist(netlist_file.Netlist):
     """A placed integer network; see the module docstring for ids and time."""
 
-    target: str  # Name of the chip
-    # taxels, polarities, classes: Sensor size and number of classes; ``n_inputs = taxels * polarities``, and the clocks
+    target: str
     taxels: int
     polarities: int
     classes: int
@@ -104,15 +106,9 @@ class Netlist:
     format_weight_bits: IntArray
     format_exponent: IntArray
     format_index_bits: IntArray
-    provenance: Mapping[str, Any]  # JSON values only: checkpoint hash, graph, options, version
-    # Input channels beyond those of the sensor, whose events :func:`dynamics.with_clocks` makes
+    provenance: Mapping[str, Any]  # checkpoint hash, graph, options, version
     clocks: Clocks = NO_CLOCKS
-    bins: int = 1  # Bins of the recordings that a step joins
-
-    @property
-    def n_inputs(self) -> int:
-        """Number of input channels."""
-        return self.taxels * self.polarities + self.clocks.channels
+    bins: int = 1
 
     @property
     def n_cores(self) -> int:
@@ -154,11 +150,7 @@ class Netlist:
 
     def core_of_compartment(self) -> IntArray:
         """Core of each compartment; shape (compartments,)."""
-        return np.repeat(np.arange(self.n_cores), np.diff(self.core_compartments))
-
-    def core_of_axon(self) -> IntArray:
-        """Core of each axon; shape (axons,)."""
-        return np.repeat(np.arange(self.n_cores), np.diff(self.core_axons))
+        return part_of(self.core_compartments)
 
     def synapses_of(self, core: int) -> tuple[IntArray, IntArray, IntArray]:
         """Synapses of one core: source, compartment and effective weight of each; all (synapses of the core,) int64."""
@@ -171,10 +163,6 @@ class Netlist:
             self.synapse_target[held] + self.core_compartments[core],
             in_units(self.synapse_weight[held], exponent),
         )
-
-    def axon_of_synapse(self) -> IntArray:
-        """Axon of each synapse; shape (synapses,)."""
-        return np.repeat(np.arange(self.n_axons), np.diff(self.axon_synapses))
 
     def effective_weight(self) -> IntArray:
         """``mantissa * 2**exponent`` of each synapse; shape (synapses,). Exact: at exponent -1 mantissas are even."""
@@ -230,40 +218,74 @@ def reach(netlist: Netlist) -> Reach:
     )
 
 
-def netlist_text(netlist: Netlist) -> str:
-    """Print a netlist without its provenance; equal text means equal content (arrays appear as ranges and hashes)."""
-    return "\n".join(_netlist_lines(netlist)) + "\n"
+LAYER: Kind = {
+    "name": str,
+    "unread": [(0, 2**31)],
+    **dict.fromkeys(("neurons", "depth", "weight_bits", "synapses", "max_fan_in"), (0, 2**62)),
+    **dict.fromkeys(("beta", "theta", "alpha"), float),
+}
+"""Entries of :class:`Layer` in a file."""
 
 
-def _netlist_lines(netlist: Netlist) -> Iterator[str]:
-    given = sensor(netlist.taxels, netlist.polarities, netlist.clocks)
-    yield f"(netlist {netlist.target} (input {given}) (classes {netlist.classes})"
-    for layer in netlist.layers:
-        alpha = f"(alpha {layer.alpha!r}) " if layer.alpha else ""
-        yield (
-            f"  (layer {layer.name} (neurons {layer.neurons}) (depth {layer.depth}) (beta {layer.beta!r}) "
-            f"(theta {layer.theta!r}) {alpha}(bits {layer.weight_bits}) "
-            f"(synapses {layer.synapses}) (fan_in {layer.max_fan_in}))"
-        )
-    formats = zip(netlist.format_weight_bits, netlist.format_exponent, netlist.format_index_bits, strict=True)
-    for i, (bits, exponent, index_bits) in enumerate(formats):
-        yield f"  (format {i} (bits {bits}) (exponent {exponent}) (index_bits {index_bits}))"
-    for core in range(netlist.n_cores):
-        first, last = netlist.core_compartments[core : core + 2]
-        axons = slice(*netlist.core_axons[core : core + 2])
-        synapses = slice(*netlist.axon_synapses[list(netlist.core_axons[core : core + 2])])
-        held = [
-            f"{netlist.layers[i].name} {span(netlist.neuron[first:last][netlist.layer[first:last] == i])}"
-            for i in np.unique(netlist.layer[first:last])
-        ]
-        inside = [getattr(netlist, name)[first:last] for name in ("layer", *PER_COMPARTMENT)]
-        ends = netlist.axon_synapses[axons.start : axons.stop + 1]
-        yield (
-            f"  (core {core} (tile {netlist.core_tile[core]}) "
-            f"(compartments {last - first}: {', '.join(held)} #{digest(*inside)}) "
-            f"(axons {axons.stop - axons.start} "
-            f"#{digest(netlist.axon_source[axons], netlist.axon_format[axons], ends)}) "
-            f"(synapses {synapses.stop - synapses.start} "
-            f"#{digest(netlist.synapse_target[synapses], netlist.synapse_weight[synapses])}))"
-        )
-    yield ")"
+def inconsistencies(netlist: Netlist) -> list[str]:
+    """Say what in a netlist points nowhere: a file can match its hash and still be nonsense."""
+    compartments, axons, synapses = netlist.n_compartments, netlist.n_axons, netlist.n_synapses
+    formats = len(netlist.format_exponent)
+    bounds = {
+        "core_compartments": (netlist.n_cores, compartments),
+        "core_axons": (netlist.n_cores, axons),
+        "axon_synapses": (axons, synapses),
+    }
+    lengths = dict.fromkeys(PER_COMPARTMENT, compartments) | {"axon_format": axons, "synapse_target": synapses}
+    lengths |= {"format_weight_bits": formats, "format_index_bits": formats}
+    ranges = {
+        "layer": (0, len(netlist.layers)),
+        "axon_source": (0, netlist.n_inputs + compartments),
+        "axon_format": (0, formats),
+        "readout_class": (-1, netlist.classes),
+        "decay_u": (0, 4096),
+        "decay_v": (0, 4096),
+        "threshold": (0, 2**17),
+        "bias_mantissa": (-4096, 4096),
+        "bias_exponent": (0, 8),
+        "synapse_weight": (-256, 256),
+        "format_weight_bits": (1, 9),
+        "format_exponent": (-1, 8),
+        "format_index_bits": (0, 13),
+        "core_tile": (0, 2**31),
+    }
+    if found := column_faults(netlist, bounds, lengths, ranges):
+        return found
+    if not np.all(np.isfinite(netlist.scale) & (netlist.scale > 0)):
+        found.append("scale has values that are not positive numbers")
+    on_core = np.diff(netlist.core_compartments)[netlist.core_of_axon()][netlist.axon_of_synapse()]
+    if is_outside(netlist.synapse_target, 0, 2**31) or np.any(netlist.synapse_target >= on_core):
+        found.append("synapse_target points beyond its core")
+    for index, layer in enumerate(netlist.layers):
+        neurons = np.sort(netlist.neuron[netlist.layer == index])
+        if np.intersect1d(neurons, layer.unread).size or max(layer.unread, default=0) >= layer.neurons:
+            found.append(f"layer {layer.name} holds neurons that it leaves out, or leaves out some that are not there")
+        if is_outside(neurons, 0, layer.neurons) or len(np.unique(neurons)) != len(neurons) or not len(neurons):
+            found.append(
+                f"layer {layer.name} holds none of its {layer.neurons} neurons, one twice or one that is not there"
+            )
+    return found
+
+
+def _layer(entry: dict[str, Any]) -> Layer:
+    return Layer(**(entry | {"unread": tuple(entry["unread"])}))
+
+
+FILE = NetlistFile(
+    format="spikeloom-netlist",
+    version=5,
+    cores=COMPARTMENTS,
+    netlist=Netlist,
+    entries={"layers": [LAYER, ...], "bins": (1, MOST_STEPS)},
+    layer=_layer,
+    inconsistencies=inconsistencies,
+    floats=frozenset({"scale"}),
+    as_stored=frozenset({"synapse_target", "synapse_weight"}),
+)
+
+netlist_bytes, write_netlist, read_netlist = FILE.content, FILE.write, FILE.read

@@ -51,41 +51,33 @@ class Options:
 
     def require_consistent(self, *, calibrated: bool) -> None:
         """Refuse options that contradict each other; `calibrated` where there are, or will be, training events."""
-        fine_tuned = self.forms is not None
-        if self.prune_unused and (not calibrated or self.keep_all or fine_tuned):
-            raise OptionError(
-                "--prune-unused: needs --calibrate, and neither --keep-all nor a fine-tuned checkpoint; "
-                "change the options"
-            )
-        if fine_tuned and (self.packings is not None or self.spike_exact):
-            raise OptionError(
+        fine_tuned, packings = self.forms is not None, self.packings or (Packing(),)
+        plain = len(packings) == 1 and packings[0] == Packing(bits=packings[0].bits)
+        without_evidence = not calibrated or self.keep_all or fine_tuned
+        goal, searched = f"--optimize {self.optimize}", self.optimize != "cores"
+        for refused, why in (
+            (
+                self.prune_unused and without_evidence,
+                "--prune-unused: needs --calibrate; omit it with --keep-all and for a fine-tuned checkpoint",
+            ),
+            (
+                fine_tuned and (self.packings is not None or self.spike_exact),
                 "compile: the checkpoint was fine-tuned for its own storage; omit --weight-bits, --planes, "
-                "--scale-groups and --spike-exact"
-            )
-        if self.spike_exact and not calibrated:
-            raise OptionError("--spike-exact: nothing to be exact on; give --calibrate")
-        packings = self.packings or (Packing(),)
-        if self.spike_exact and (len(packings) > 1 or packings[0] != Packing(bits=packings[0].bits)):
-            raise OptionError(
-                "--spike-exact: finds planes and scales itself; give one width, no --planes or --scale-groups"
-            )
-        self._require_goal(calibrated)
-
-    def _require_goal(self, calibrated: bool) -> None:
-        """Refuse a goal that is unknown or cannot be judged, and a number of chips that is none."""
-        if self.optimize not in GOALS:
-            raise OptionError(f"--optimize {self.optimize}: no such goal; give one of {', '.join(GOALS)}")
-        if self.chips < 1:
-            raise OptionError(f"--chips {self.chips}: not a number of chips; give 1 or more")
-        why = ""
-        if self.chips > 1:
-            why = "links between chips are not modelled; omit --chips"
-        elif self.cores_for:
-            why = "chooses the cores of every layer itself; omit --cores-for"
-        elif not calibrated:
-            why = "needs firing rates; give --calibrate"
-        if why and self.optimize != "cores":
-            raise OptionError(f"--optimize {self.optimize}: {why}")
+                "--scale-groups and --spike-exact",
+            ),
+            (self.spike_exact and not calibrated, "--spike-exact: nothing to be exact on; give --calibrate"),
+            (
+                self.spike_exact and not plain,
+                "--spike-exact: finds planes and scales itself; give one width, no --planes or --scale-groups",
+            ),
+            (self.optimize not in GOALS, f"{goal}: no such goal; give one of {', '.join(GOALS)}"),
+            (self.chips < 1, f"--chips {self.chips}: not a number of chips; give 1 or more"),
+            (searched and self.chips > 1, f"{goal}: links between chips are not modelled; omit --chips"),
+            (searched and self.cores_for, f"{goal}: chooses the cores of every layer itself; omit --cores-for"),
+            (searched and not calibrated, f"{goal}: needs firing rates; give --calibrate"),
+        ):
+            if refused:
+                raise OptionError(why)
 
 
 def check_packings(packings: Sequence[Packing], layers: int, target: Target) -> tuple[Packing, ...]:

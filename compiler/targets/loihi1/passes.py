@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
-from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.interpret import channels_last
-from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes import calibrate as calibration
 from spikeloom.compiler.passes import expand, prune
@@ -15,19 +12,17 @@ from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.passes.prune import Masks, Removal
 from spikeloom.compiler.passes.range_proof import RangeProof, prove_ranges
-from spikeloom.compiler.pipeline import Pass, run
+from spikeloom.compiler.pipeline import LATER, Pass, run
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.choose import Layout, lay_out
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, require_legal
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, netlist_text
-from spikeloom.compiler.targets.loihi1.netlist_file import inconsistencies
+from spikeloom.compiler.targets.loihi1.netlist import FILE, Netlist
 from spikeloom.compiler.targets.loihi1.options import Options, Packing, check_packings, require_stored
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice, choose_storage, round_to_forms
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness, make_exact
-from spikeloom.compiler.text import text
 from spikeloom.compiler.types import FloatArray, IntArray
 
 __all__ = [
@@ -43,10 +38,6 @@ __all__ = [
     "to_integers",
     "without",
 ]
-
-
-LATER: Any = None
-"""Of a field that a pass fills in."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -89,30 +80,14 @@ class Compilation:
         return core_bound(self.held, self.target)
 
     @property
-    def newest(self) -> Network | IntegerNetwork | Netlist:
-        """The network as the last pass left it."""
-        stages = (self.netlist, self.held, self.integer, self.connected, self.network)
+    def newest(self) -> Network | IntegerNetwork | Layout | Netlist:
+        """What the last pass made that changed anything."""
+        stages = (self.netlist, self.layout, self.held, self.integer, self.connected, self.network)
         return next(stage for stage in stages if stage is not LATER)
 
     def verify(self) -> None:
         """Check every rule of the newest artefact; VerifyError if a pass broke one."""
-        newest = self.newest
-        if not isinstance(newest, Netlist):
-            verify(newest)
-        elif faults := inconsistencies(newest):
-            raise VerifyError("; ".join(faults))
-
-    def text(self) -> str:
-        """The newest artefact in print."""
-        newest = self.newest
-        if isinstance(newest, Netlist):
-            return netlist_text(newest)
-        lines = [text(newest)]
-        for core, chunks in enumerate(() if self.layout is LATER else self.layout.cores):
-            named = ((self.held.populations[chunk.population].name, chunk) for chunk in chunks)
-            names = ", ".join(f"{name} {chunk.first}…{chunk.last - 1}" for name, chunk in named)
-            lines.append(f"(core {core} (tile {self.placement.tiles[core]}) (neurons {names}))\n")
-        return "".join(lines)
+        FILE.verify(self.newest)
 
 
 def _expand(done: Compilation) -> Compilation:
@@ -164,10 +139,11 @@ def _prove(done: Compilation) -> Compilation:
     return replace(done, proofs=prove_ranges(done.integer))
 
 
-def _remove(done: Compilation) -> Compilation:
+def _remove(done: Compilation, gone: Masks | None = None) -> Compilation:
     integer, network = done.integer, done.network
     none = prune.none_of(integer)
     silent, unread = (none, none) if done.options.keep_all else prune.removable(integer)
+    silent = prune.either(silent, gone or none)
     removals = () if network is LATER else prune.removals(network, silent, unread, done.quiet)
     held, identity = prune.compact(integer, prune.either(silent, unread))
     return replace(done, held=held, identity=identity, silent=silent, unread=unread, removals=removals)
@@ -303,14 +279,12 @@ def lay_out_again(done: Compilation, options: Options) -> Compilation:
     return run(LAYOUT, replace(done, options=options))
 
 
-def without(done: Compilation, gone: prune.Masks, *, rates: tuple[FloatArray, ...] | None = None) -> Netlist:
+def without(done: Compilation, gone: Masks, *, rates: tuple[FloatArray, ...] | None = None) -> Netlist:
     """Remove more neurons, (neurons,) bool by population, and lay out the rest on the fewest cores of one chip.
 
     Weights and thresholds are the same integers: on any recording on which none of these neurons fires, every other
     spike is as before. Each population must keep a neuron; `rates` are spikes per step of all, for the placement.
     """
-    silent, unread = prune.removable(done.integer)
-    silent = prune.either(silent, gone)
-    held, identity = prune.compact(done.integer, prune.either(silent, unread))
-    removed = replace(done, held=held, identity=identity, silent=silent, unread=unread, calibration=None, rates=rates)
-    return lay_out_again(removed, Options(provenance=done.netlist.provenance)).netlist
+    options = Options(provenance=done.netlist.provenance)
+    removed = _remove(replace(done, options=options, calibration=None, rates=rates), gone)
+    return lay_out_again(removed, options).netlist

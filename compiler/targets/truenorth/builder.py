@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
-from spikeloom.compiler.errors import CapacityError, Violation
+from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_TO, CrossbarNetlist
@@ -32,7 +32,6 @@ class Neuron:
     leak: int = 0
     leak_reversal: bool = False
     threshold: int = 1
-    mask_bits: int = 0
     reset_mode: int = RESET_TO
     reset: int = 0
     negative_threshold: int = 0
@@ -195,12 +194,7 @@ def place_cores(draft: Draft, chip: Target, remedy: str) -> None:
     """Give cores their places, line by line in a square as they were made; CapacityError if there are too many."""
     count = len(draft.cores)
     if count > chip.limit("chip.cores"):
-        raise CapacityError((exceeded(chip, "chip", "chip.cores", count, remedy),))
+        raise CapacityError((chip.exceeded("chip", "chip.cores", count, remedy),))
     side = max(int(np.ceil(np.sqrt(count))), -(-count // chip.limit("mesh.height")))
     for number, core in enumerate(draft.cores):
         core.y, core.x = divmod(number, side)
-
-
-def exceeded(chip: Target, owner: str, rule: str, used: int, remedy: str) -> Violation:
-    """A limit of the chip that is exceeded, by its rule."""
-    return Violation(owner=owner, rule=f"{chip.name}.{rule}", used=used, allowed=chip.limit(rule), remedy=remedy)

@@ -33,7 +33,6 @@ from spikeloom.compiler.targets.truenorth.builder import (
     Neuron,
     Place,
     crossing_points,
-    exceeded,
     history_free,
     place_cores,
 )
@@ -159,7 +158,7 @@ class _Placing:
         if a_core < 1:
             remedy = f"partial sums of {groups} groups and the clocks beside; use fewer inputs or copies"
             used = 2 * groups + lifts + pulls
-            raise CapacityError((exceeded(self.chip, f"{layer.name}, a neuron", "core.axons", used, remedy),))
+            raise CapacityError((self.chip.exceeded(f"{layer.name}, a neuron", "core.axons", used, remedy),))
         start, found = self.starts[depth], list[list[Place]]()
         for first in range(0, len(layer.level), a_core):
             core, numbers = self.draft.core(), range(first, min(first + a_core, len(layer.level)))

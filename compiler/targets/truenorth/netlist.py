@@ -29,8 +29,9 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
+from spikeloom.compiler.targets import netlist_file
 from spikeloom.compiler.targets.base import CROSSBARS
-from spikeloom.compiler.targets.netlist_file import NetlistFile, bounds_faults, length_faults, range_faults
+from spikeloom.compiler.targets.netlist_file import NetlistFile, column_faults, part_of
 from spikeloom.compiler.types import IntArray
 
 RESET_TO, RESET_LINEAR, RESET_NONE = 0, 1, 2
@@ -40,7 +41,7 @@ AXON_TYPES = 4
 """Columns of ``CrossbarNetlist.weight``."""
 
 PER_NEURON = (
-    *("leak", "leak_reversal", "threshold", "mask_bits", "reset_mode", "reset", "negative_threshold"),
+    *("leak", "leak_reversal", "threshold", "reset_mode", "reset", "negative_threshold"),
     *("negative_saturates", "initial", "layer", "neuron", "readout_class", "readout_first"),
 )
 """Arrays with one entry a neuron, beside ``weight``."""
@@ -49,19 +50,18 @@ MOST_TICKS = 2**20
 """Ticks that a data step may take, or that a feed or a vote may come late."""
 
 TABLES = {
-    "wire": ("wire_neuron", "wire_x", "wire_y", "wire_line", "wire_delay"),
     "feed": ("feed_channel", "feed_core", "feed_line", "feed_tick"),
     "clock": ("clock_core", "clock_line", "clock_period", "clock_phase"),
+    "wire": ("wire_neuron", "wire_x", "wire_y", "wire_line", "wire_delay"),
 }
 """Columns of each table of rows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CrossbarNetlist:
+class CrossbarNetlist(netlist_file.Netlist):
     """A placed network of crossbar cores; see the module docstring for ids and time."""
 
-    target: str  # Name of the chip
-    # taxels, polarities, classes: Sensor size and number of classes
+    target: str
     taxels: int
     polarities: int
     classes: int
@@ -83,13 +83,11 @@ class CrossbarNetlist:
     # (neurons,) int64; 1 where the leak takes the sign of the membrane; a membrane that it would carry past zero is
     # then zero
     leak_reversal: IntArray
-    threshold: IntArray  # (neurons,) int64; A spike needs a membrane of at least this, and the masked random number
-    mask_bits: IntArray  # (neurons,) int64; random bits that are added to both thresholds in every tick; 0 for none
+    threshold: IntArray  # (neurons,) int64; a spike needs a membrane of at least this
     # reset_mode, reset: (neurons,) int64; ``RESET_TO``, ``RESET_LINEAR`` or ``RESET_NONE``, and the value of the first
     reset_mode: IntArray
     reset: IntArray
-    # (neurons,) int64; magnitude. A membrane below ``-negative_threshold`` (and the random number) is reset, too.
-    negative_threshold: IntArray
+    negative_threshold: IntArray  # (neurons,) int64; magnitude; a membrane below ``-negative_threshold`` is reset, too
     negative_saturates: IntArray  # (neurons,) int64; 1 where it stays at ``-negative_threshold`` instead of being reset
     initial: IntArray  # (neurons,) int64; membrane before the first tick
     # layer, neuron: (neurons,) int64; which neuron of which layer it is; copies of one share the numbers
@@ -117,18 +115,8 @@ class CrossbarNetlist:
     clock_line: IntArray
     clock_period: IntArray
     clock_phase: IntArray
-    provenance: Mapping[str, Any]  # JSON values only
-    clocks: Clocks = NO_CLOCKS  # Input channels that tell the time, see :mod:`compiler.dynamics`
-
-    @property
-    def bins(self) -> int:
-        """Bins of the recordings that make a data step."""
-        return 1
-
-    @property
-    def n_inputs(self) -> int:
-        """Number of input channels."""
-        return self.taxels * self.polarities + self.clocks.channels
+    provenance: Mapping[str, Any]
+    clocks: Clocks = NO_CLOCKS
 
     @property
     def n_cores(self) -> int:
@@ -162,15 +150,7 @@ class CrossbarNetlist:
 
     def core_of_neuron(self) -> IntArray:
         """Core of each neuron; shape (neurons,)."""
-        return np.repeat(np.arange(self.n_cores), np.diff(self.core_neurons))
-
-    def core_of_axon(self) -> IntArray:
-        """Core of each axon; shape (axons,)."""
-        return np.repeat(np.arange(self.n_cores), np.diff(self.core_axons))
-
-    def axon_of_synapse(self) -> IntArray:
-        """Axon of each crossing point; shape (synapses,)."""
-        return np.repeat(np.arange(self.n_axons), np.diff(self.axon_synapses))
+        return part_of(self.core_neurons)
 
     def neuron_of_synapse(self) -> IntArray:
         """Neuron id of each crossing point; shape (synapses,)."""
@@ -201,11 +181,16 @@ class CrossbarNetlist:
 
 def _places(held: tuple[IntArray, IntArray], wanted: tuple[IntArray, IntArray]) -> IntArray:
     """First index at which each wanted pair is held, -1 where it is not."""
-    index: dict[tuple[int, int], int] = {}
-    for at, pair in enumerate(zip(*(column.tolist() for column in held), strict=True)):
-        index.setdefault(pair, at)
-    pairs = zip(*(column.tolist() for column in wanted), strict=True)
-    return np.array([index.get(pair, -1) for pair in pairs], np.int64)
+    pairs, index = np.unique(_codes(held), return_index=True)
+    if not len(pairs):
+        return np.full(len(wanted[0]), -1)
+    at = np.minimum(np.searchsorted(pairs, _codes(wanted)), len(pairs) - 1)
+    return np.where(pairs[at] == _codes(wanted), index[at], -1)
+
+
+def _codes(pair: tuple[IntArray, IntArray]) -> IntArray:
+    """Pairs of 32-bit numbers as one number each."""
+    return pair[0] * 2**32 + pair[1]
 
 
 def inconsistencies(netlist: CrossbarNetlist) -> list[str]:
@@ -218,11 +203,6 @@ def inconsistencies(netlist: CrossbarNetlist) -> list[str]:
     }
     lengths = {"core_y": cores, "axon_type": axons, **dict.fromkeys(PER_NEURON, neurons)}
     lengths |= {name: len(getattr(netlist, columns[0])) for columns in TABLES.values() for name in columns}
-    found = bounds_faults(netlist, bounds) + length_faults(netlist, lengths)
-    if netlist.weight.shape != (neurons, AXON_TYPES):
-        found.append(f"weight is {' by '.join(map(str, netlist.weight.shape))}, not {neurons} by {AXON_TYPES}")
-    if found:
-        return found
     ranges = {
         "layer": (0, len(netlist.layers)),
         "neuron": (0, 2**31),
@@ -230,16 +210,30 @@ def inconsistencies(netlist: CrossbarNetlist) -> list[str]:
         "readout_first": (0, MOST_TICKS),
         "wire_neuron": (0, neurons),
         "feed_channel": (0, netlist.n_inputs),
-        "feed_tick": (-MOST_TICKS, MOST_TICKS),
+        "feed_tick": (0, MOST_TICKS),
+        "clock_period": (1, 2**31),
+        "clock_phase": (0, 2**31),
+        "reset_mode": (RESET_TO, RESET_NONE + 1),
+        "leak_reversal": (0, 2),
+        "negative_saturates": (0, 2),
     }
     registers = [name for name in FILE.arrays if name not in ranges and name not in bounds]
     ranges |= dict.fromkeys(registers, (-(2**31), 2**31))
-    found = range_faults(netlist, ranges)
+    if found := column_faults(netlist, bounds, lengths, ranges):
+        return found
+    if netlist.weight.shape != (neurons, AXON_TYPES):
+        found.append(f"weight is {' by '.join(map(str, netlist.weight.shape))}, not {neurons} by {AXON_TYPES}")
     on_core = np.diff(netlist.core_neurons)[netlist.core_of_axon()][netlist.axon_of_synapse()]
     if netlist.n_synapses and (netlist.synapse_neuron.min() < 0 or np.any(netlist.synapse_neuron >= on_core)):
         found.append("synapse_neuron points beyond its core")
     if np.any((np.diff(netlist.synapse_neuron) <= 0) & (np.diff(netlist.axon_of_synapse()) == 0)):
         found.append("synapse_neuron does not rise along an axon")
+    for what, aims in zip(TABLES, netlist.aims(), strict=True):
+        found += [f"{what} {row} leads to no axon" for row in np.flatnonzero(aims < 0)[:1]]
+    if np.any(netlist.cores_at(netlist.core_x, netlist.core_y) != np.arange(cores)):
+        found.append("two cores are at one place")
+    if np.any(netlist.axons_at(netlist.core_of_axon(), netlist.axon_line) != np.arange(axons)):
+        found.append("two axons are on one line of a core, which has one type")
     return found
 
 

@@ -10,18 +10,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from spikeloom.compiler.errors import CapacityError, ModelError, OptionError, VerifyError
-from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.errors import CapacityError, ModelError, OptionError
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes import expand
-from spikeloom.compiler.pipeline import Pass
+from spikeloom.compiler.pipeline import LATER, Pass
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.codebook import COPIES, LevelNetwork, in_levels
 from spikeloom.compiler.targets.truenorth.in_time import lower_in_time
 from spikeloom.compiler.targets.truenorth.legalize import needs, require_legal
 from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork, lower
-from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, inconsistencies
-from spikeloom.compiler.text import digest, span, text
+from spikeloom.compiler.targets.truenorth.netlist import FILE, CrossbarNetlist
 
 WAYS = (
     f"two ways lead to the chip: --in-time N, N of {', '.join(map(str, COPIES))}, for networks that forget within a "
@@ -45,33 +43,18 @@ class Compilation:
     source: NativeNetwork | expand.Factored | Network
     options: Options
     target: Target
-    network: Network | None = None
-    levels: LevelNetwork | None = None
-    netlist: CrossbarNetlist | None = None
+    network: Network = LATER
+    levels: LevelNetwork = LATER
+    netlist: CrossbarNetlist = LATER
+
+    @property
+    def newest(self) -> Network | LevelNetwork | CrossbarNetlist:
+        """What the last pass made that changed anything."""
+        return self.netlist or self.levels or self.network
 
     def verify(self) -> None:
         """Check every rule of the newest artefact; VerifyError if a pass broke one."""
-        if self.netlist is not None:
-            if wrong := inconsistencies(self.netlist):
-                raise VerifyError("; ".join(wrong))
-        elif self.levels is None and self.network is not None:
-            verify(self.network)
-
-    def text(self) -> str:
-        """The newest artefact in print."""
-        if self.netlist is not None:
-            made = self.netlist
-            head = f"netlist ({made.n_cores} cores) (neurons {made.n_neurons}) (synapses {made.n_synapses})"
-            arrays = digest(made.weight, made.threshold, made.leak, made.synapse_neuron, made.axon_type)
-            return f"{head} (wires {len(made.wire_neuron)}) #{arrays}\n"
-        if self.levels is not None:
-            return "".join(
-                f"{layer.name} (level {span(layer.level.reshape(-1))} #{digest(layer.level)}) "
-                f"(threshold {span(layer.threshold)} #{digest(layer.threshold)}) (copies {layer.copies})\n"
-                for layer in self.levels.layers
-            )
-        assert self.network is not None, "there is a first pass"
-        return text(self.network)
+        FILE.verify(self.newest)
 
 
 def _expand(done: Compilation) -> Compilation:
@@ -88,10 +71,10 @@ def _expand(done: Compilation) -> Compilation:
 
 
 def _levels(done: Compilation) -> Compilation:
-    assert done.network is not None, "made by the pass before"
-    assert done.options.in_time is not None, "asked for there"
+    copies = done.options.in_time
+    assert copies is not None, "refused by the pass before"
     try:
-        return replace(done, levels=in_levels(done.network, done.options.in_time, done.target))
+        return replace(done, levels=in_levels(done.network, copies, done.target))
     except ModelError as error:
         raise ModelError(f"{error}; {FORGET}") from error
 
@@ -100,12 +83,10 @@ def _place(done: Compilation) -> Compilation:
     provenance = done.options.provenance
     if isinstance(done.source, NativeNetwork):
         return replace(done, netlist=lower(done.source, done.target, provenance=provenance))
-    assert done.levels is not None, "made by the pass before"
     return replace(done, netlist=lower_in_time(done.levels, done.target, provenance=provenance))
 
 
 def _legalize(done: Compilation) -> Compilation:
-    assert done.netlist is not None, "made by the pass before"
     require_legal(done.netlist, done.target)
     return done
 

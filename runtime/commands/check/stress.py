@@ -12,7 +12,7 @@ from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.stress.bench import NAMES
 from spikeloom.runtime.studies.stress.sections import picture, sections
-from spikeloom.runtime.studies.stress.study import Plan, study
+from spikeloom.runtime.studies.stress.study import study
 from spikeloom.runtime.studies.stress.verdicts import parse_requirement
 
 NOTES = """\
@@ -47,16 +47,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; exit code 1 where a requirement is missed."""
-    result = study(arguments, _plan(arguments))
-    if arguments.picture is not None:
-        with write_atomically(arguments.picture) as file:
-            file.write(picture(result))
-    write_json(arguments.output, result)
-    return Outcome(result, sections, 1 if result.missed else 0)
-
-
-def _plan(arguments: argparse.Namespace) -> Plan:
-    """Refuse options that cannot be meant; what is to be measured."""
     require_place(arguments.output, "-o", arguments)
     require_place(arguments.picture, "--picture", arguments)
     for name in ("seeds", "jobs"):
@@ -67,9 +57,13 @@ def _plan(arguments: argparse.Namespace) -> Plan:
     for name in chosen:
         if name not in NAMES:
             raise OptionError(f"--only {name}: no such perturbation; choose from {', '.join(NAMES)}")
-    requirements = tuple(map(parse_requirement, arguments.require))
+    requirements = list(map(parse_requirement, arguments.require))
     for wanted in requirements:
         if wanted.name not in chosen:
             raise OptionError(f"--require {wanted}: --only leaves {wanted.name} out; add it there")
-    names = tuple(name for name in NAMES if name in chosen)
-    return Plan(names=names, requirements=requirements, seeds=arguments.seeds, full=arguments.full, jobs=arguments.jobs)
+    result = study(arguments, [name for name in NAMES if name in chosen], requirements)
+    if arguments.picture is not None:
+        with write_atomically(arguments.picture) as file:
+            file.write(picture(result))
+    write_json(arguments.output, result)
+    return Outcome(result, sections, 1 if result.missed else 0)

@@ -5,14 +5,11 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from spikeloom.compiler.archive import is_netlist
-from spikeloom.compiler.errors import ModelError
 from spikeloom.runtime.commands.options import add_checkpoint, add_recordings
-from spikeloom.runtime.costs import yardsticks
-from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.studies import yardsticks
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,10 +22,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     from spikeloom.models.networks.reference import float_spikes  # torch, so only here
 
-    path = shipped(arguments.checkpoint)
-    if is_netlist(path):
-        raise ModelError(f"{path}: is a netlist, estimate says what it costs; give the checkpoint it was made from")
-    checkpoint = load_checkpoint(path, arguments)
+    checkpoint = load_checkpoint(arguments.checkpoint, arguments)
     graph, adjacency = propagation(checkpoint, load_graph(arguments, checkpoint.system), arguments.checkpoint)
     data = recordings(
         arguments.data,

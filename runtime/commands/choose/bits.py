@@ -6,10 +6,8 @@ import argparse
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 from spikeloom.compiler import DEFAULT_TARGET, WidthPoint, WidthSearch, check_widths, search_widths, widths_front
-from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.passes.expand import expand
@@ -18,7 +16,7 @@ from spikeloom.runtime.commands.main_job import compile as compile_command
 from spikeloom.runtime.commands.options import add_bin_option, add_checkpoint
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import whole_numbers
-from spikeloom.runtime.inputs.files import require_place, shipped
+from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.report.console import progress
@@ -110,12 +108,11 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise OptionError(f"--samples {arguments.samples}: give 1 or more")
     require_place(arguments.output, "-o", arguments)
     target, given = load_target(arguments.target, COMPARTMENTS), whole_numbers(arguments.widths, "--widths")
-    path = shipped(arguments.checkpoint)
-    if Path(path).is_file() and is_netlist(path):
-        raise ModelError(f"{path}: is a netlist, its widths are decided; give the checkpoint that it was made from")
-    checkpoint = load_checkpoint(path, arguments)
+    checkpoint = load_checkpoint(arguments.checkpoint, arguments)
     if checkpoint.forms is not None:
-        raise ModelError(f"{path}: was fine-tuned for its own widths; give the network that it was made from")
+        raise ModelError(
+            f"{arguments.checkpoint}: was fine-tuned for its own widths; give the network that it was made from"
+        )
     layers = ("conv1", *(dense.name for dense in checkpoint.dense))
     widths = check_widths(given, arguments.scale_groups, len(layers), target)
     _, adjacency = propagation(checkpoint, load_graph(arguments, checkpoint.system), arguments.checkpoint)
@@ -141,8 +138,18 @@ def run(arguments: argparse.Namespace) -> Outcome:
         tell=progress,
     )
     progress("")
-    choice = choose(
-        made, figure, wanted, layers=layers, widths=widths, groups=arguments.scale_groups, available=len(training)
+    front = [_built(made, point) for point in widths_front(made.built, FIGURES[figure])]
+    choice = WidthChoice(
+        layers=layers,
+        widths=widths,
+        scale_groups=arguments.scale_groups,
+        combinations=len(made.points),
+        recordings=made.samples,
+        available=len(training),
+        wanted={figure: wanted},
+        float_accuracy=None if made.float_right is None else made.float_right / made.samples,
+        front=front,
+        recommended=next((point for point in front if point.share(figure) >= wanted - 1e-9), None),
     )
     if choice.recommended is None:
         return Outcome(choice, sections, 1)
@@ -150,6 +157,16 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if arguments.output is not None:
         choice = replace(choice, netlist=_compiled(str(choice.command)))
     return Outcome(choice, sections)
+
+
+def _built(made: WidthSearch, point: WidthPoint) -> BuiltPoint:
+    return BuiltPoint(
+        weight_bits=point.bits,
+        words=point.words,
+        cores=point.cores,
+        accuracy=None if point.right is None else point.right / made.samples,
+        agreement=point.equal / made.samples,
+    )
 
 
 def _command(arguments: argparse.Namespace, widths: Sequence[int]) -> str:
@@ -166,42 +183,6 @@ def _compiled(command: str) -> WrittenNetlist:
     compile_command.add_arguments(parser)
     arguments = parser.parse_args(shlex.split(command)[2:])
     return WrittenNetlist(file=arguments.output, sha256=compile_command.run(arguments).result.netlist.sha256)
-
-
-def choose(
-    made: WidthSearch,
-    figure: str,
-    wanted: float,
-    *,
-    layers: Sequence[str],
-    widths: Sequence[int],
-    groups: int,
-    available: int,
-) -> WidthChoice:
-    """The front of a search by one of `FIGURES`, and its point of least memory that reaches the wanted share."""
-
-    def built(point: WidthPoint) -> BuiltPoint:
-        return BuiltPoint(
-            weight_bits=point.bits,
-            words=point.words,
-            cores=point.cores,
-            accuracy=None if point.right is None else point.right / made.samples,
-            agreement=point.equal / made.samples,
-        )
-
-    front = [built(point) for point in widths_front(made.built, FIGURES[figure])]
-    return WidthChoice(
-        layers=layers,
-        widths=widths,
-        scale_groups=groups,
-        combinations=len(made.points),
-        recordings=made.samples,
-        available=available,
-        wanted={figure: wanted},
-        float_accuracy=None if made.float_right is None else made.float_right / made.samples,
-        front=front,
-        recommended=next((point for point in front if point.share(figure) >= wanted - 1e-9), None),
-    )
 
 
 def sections(choice: WidthChoice) -> Iterator[Section]:

@@ -3,34 +3,28 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.recordings.evtouch import data_digest
-from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_model
+from spikeloom.runtime.commands.options import add_data, add_model
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.machines.base import DEFAULT
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.chart.choices import parse_budgets
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
-from spikeloom.runtime.studies.chart.networks import given_networks, require_grid, require_suited
-from spikeloom.runtime.studies.chart.work import Data, Facts, Work
-from spikeloom.runtime.studies.jobs import sweep
-
-STORE = "points.sqlite"
+from spikeloom.runtime.studies.chart.networks import read_networks, require_grid, require_suited
+from spikeloom.runtime.studies.chart.results import Data
 
 NOTES = """\
 Axes of the grid: bits (2-6, 8, or one a layer as in 8+4+4+8), planes (1-3), groups (1-8), prune (0, 1), cores (cores,
 latency, or LAYER:N as in fc1:6+conv1:4), window (per cent of each recording, 25-100% is every quarter,
 25-100%:5 every twentieth). Choices are made on the training split, the test split is reported. A chart that was
-interrupted goes on with the same command; netlists and figures are kept in FOLDER. Networks for different chips stand
-beside each other by the prices of their own: fronts and choices are among the points of the chip of the first network.
-The exit code is 1 if no point fits a budget.
+interrupted goes on with the same command; netlists and figures are kept in FOLDER. The exit code is 1 if no point fits
+a budget.
 """
 
 
@@ -38,8 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
     parser.add_argument("checkpoints", nargs="+", metavar="CKPT", help="trained networks of one data set")
     add_model(parser)
-    parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
-    add_bin_option(parser)
+    add_data(parser)
     parser.add_argument(
         "--grid",
         metavar="AXIS=V,V,…",
@@ -55,9 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--table", metavar="NAME", help="energy table to choose and draw by (default: the first)")
     sweeps = parser.add_argument_group("sweep")
     sweeps.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
-    sweeps.add_argument(
-        "--scheduler", metavar="tcp://HOST:PORT", help="work on the workers of this Dask scheduler instead"
-    )
     sweeps.add_argument("--fresh", action="store_true", help="measure anew what an earlier run left")
     parser.add_argument("-o", "--output", required=True, metavar="FOLDER")
     parser.epilog = NOTES
@@ -65,49 +55,44 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; exit code 1 if no point fits a budget."""
-    from spikeloom.runtime.studies.chart import work
     from spikeloom.runtime.studies.chart.sections import printed, write_chart
     from spikeloom.runtime.studies.chart.study import chart
+    from spikeloom.runtime.studies.chart.work import read_splits
 
     stores = load_target(DEFAULT)
     grid = Grid() if arguments.grid is None else parse_grid(arguments.grid, stores)
     budgets = parse_budgets(arguments.budget)
     folder = _folder(arguments.output)
-    networks = given_networks(arguments)
-    targets = {network.target: load_target(network.target) for network in networks}
-    target = targets[networks[0].target]
+    networks = read_networks(arguments)
+    target = load_target(networks[0].target)
     tables = [table.name for table in target.energy]
     energy = tables[0] if arguments.table is None else arguments.table
     if energy not in tables:
         raise OptionError(f"--table {energy}: {target.title} has no such energy table; give {' or '.join(tables)}")
-    data = Data(path=arguments.data, bin_s=arguments.bin)
     progress("reading the recordings")
-    splits = work.both_splits(data, networks[0].taxels, networks[0].classes)
-    digest = data_digest(splits["train"], splits["test"])
-    require_suited(networks, splits, digest)
+    splits = read_splits(arguments.data, arguments.bin, networks[0])
+    data = Data(
+        path=arguments.data,
+        bin_s=arguments.bin,
+        sha256=data_digest(splits["train"], splits["test"]),
+        train=len(splits["train"]),
+        test=len(splits["test"]),
+        steps=splits["test"].steps,
+    )
+    require_suited(networks, splits, data.sha256)
     require_grid(networks, grid, stores)
     folder.mkdir(exist_ok=True)
-
-    def measured(jobs: Sequence[Work], label: str) -> Mapping[str, Any]:
-        return sweep(
-            jobs,
-            work.measure,
-            folder / STORE,
-            jobs=arguments.jobs,
-            scheduler=arguments.scheduler,
-            fresh=arguments.fresh and label == "compiling",  # what the first half measured is not to be forgotten
-            label=label,
-        )
-
     charted = chart(
         networks,
+        target,
+        data,
         grid,
         budgets,
-        splits,
-        Facts(data=Data(path=data.path, bin_s=data.bin_s, sha256=digest), targets=targets, folder=folder),
+        folder,
         energy=energy,
         command=_command(arguments),
-        sweep=measured,
+        jobs=arguments.jobs,
+        fresh=arguments.fresh,
     )
     write_chart(folder, charted)
     fits = charted.budget is None or charted.budget.fits

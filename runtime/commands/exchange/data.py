@@ -5,40 +5,78 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
-from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.types import FloatArray
-from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.counts import EventCounts, number, show_notes
 from spikeloom.models.recordings.events import data_splits, joined_bins, load_data, require_events
-from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.recordings.fetch import DATA_SETS, data_folder, fetch_data
+from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
+from spikeloom.models.recordings.fetch import DATA_SETS, Fetched, fetch_data
 from spikeloom.models.recordings.grasps import SPLITS, SYNTHETIC, synthetic_split
 from spikeloom.models.recordings.release import SOURCES, write_event_lines, write_released
 from spikeloom.models.sensors import read_layout
-from spikeloom.runtime.commands.exchange.described import describe, described_sections, picture
 from spikeloom.runtime.commands.options import add_bin_option, add_common
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import require_bins
-from spikeloom.runtime.report.sections import Outcome, Section, Text
+from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 
 Arguments = argparse.Namespace
 
+HOT = 5.0
+"""A taxel is hot if its rate is above this many times the median over taxels that are not dead."""
+
+RULES = {
+    "dead": "no event in any of these recordings",
+    "one-sided": "events of one polarity only",
+    "hot": f"more than {HOT:g} times the median rate of the taxels that are not dead",
+}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FetchedData:
-    """Where released recordings are, and what to give to ``--data``."""
+class Duration:
+    """Of recordings, in seconds."""
 
-    name: str
-    path: Path
-    new: bool
-    bytes: int
-    sha256: str
-    data: str
+    shortest: float
+    median: float
+    longest: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rate:
+    """Events per second by polarity."""
+
+    falling: float
+    rising: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorRate(Rate):
+    """Events per second by polarity, of the sensor and of each taxel, over the time that was recorded."""
+
+    taxels: tuple[Rate, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Described:
+    """Statistics of one split under the keys that scripts rely on; polarity 0 is falling, 1 is rising."""
+
+    source: str
+    split: str
+    recordings: int
+    taxels: int
+    bin_s: float
+    steps: int
+    duration_s: Duration
+    events: int  # Those that share taxel, polarity and bin count once
+    found: EventCounts | None
+    labels: Mapping[int, int]
+    unlabelled: int
+    rate: SensorRate
+    dead: tuple[int, ...]
+    one_sided: tuple[int, ...]
+    hot: tuple[int, ...]
+    rules: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,12 +112,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     sub = command("fetch", _fetch, "download released recordings; --data then takes their name")
     sub.add_argument("name", choices=tuple(DATA_SETS))
     sub.add_argument("--url", help="another address of the same file")
-    sub.add_argument("--dir", help="where to put it (default: $SPIKELOOM_DATA, or spikeloom in the user's cache)")
 
     sub = command("describe", _describe, "counts, rates by taxel and polarity, duration, dead and hot taxels")
     _source(sub)
     sub.add_argument("--split", default="test", help="split to read (default: test)")
-    sub.add_argument("--picture", metavar="OUT.png", help="draw it")
 
     sub = command("convert", _convert, "write the released layout: SPLIT/sample_N_label_L.npy")
     _source(sub)
@@ -105,21 +141,10 @@ def _source(parser: argparse.ArgumentParser) -> None:
 
 
 def _fetch(arguments: Arguments) -> Outcome:
-    fetched = fetch_data(arguments.name, url=arguments.url, folder=arguments.dir)
-    data = DATA_SETS[arguments.name]
-    default = fetched.path == data_folder() / data.file
-    result = FetchedData(
-        name=arguments.name,
-        path=fetched.path,
-        new=fetched.new,
-        bytes=data.size,
-        sha256=data.sha256,
-        data=arguments.name if default else str(fetched.path),
-    )
-    return Outcome(result, _fetch_sections)
+    return Outcome(fetch_data(arguments.name, url=arguments.url), _fetch_sections)
 
 
-def _fetch_sections(result: FetchedData) -> Iterable[Section]:
+def _fetch_sections(result: Fetched) -> Iterable[Section]:
     state = "fetched" if result.new else "already there"
     yield Section(
         "Fetched",
@@ -131,20 +156,72 @@ def _fetch_sections(result: FetchedData) -> Iterable[Section]:
 
 
 def _describe(arguments: Arguments) -> Outcome:
-    if arguments.picture is not None:
-        if Path(arguments.picture).suffix.lower() != ".png":
-            raise OptionError(f"--picture {arguments.picture}: allowed is a PNG; give a name that ends in .png")
-        require_place(arguments.picture, "--picture", arguments)
-    count, places = _layout(arguments.taxels)
+    count, _ = _layout(arguments.taxels)
     recordings = _load(arguments.source, arguments.split, arguments.bin, count)
     show_notes(recordings.counts)
-    result = describe(recordings, arguments.bin, arguments.picture)
-    if places is None and recordings.taxels == len(NEUTOUCH):
-        places = NEUTOUCH
-    if arguments.picture is not None:
-        with write_atomically(arguments.picture) as file:
-            file.write(picture(result, places).file("png"))
-    return Outcome(result, described_sections)
+    return Outcome(describe(recordings, arguments.bin), described_sections)
+
+
+def describe(recordings: Recordings, bin_s: float) -> Described:
+    """Count the events of one split, whose bins are so many seconds wide."""
+    lengths = recordings.step_counts
+    per_taxel = recordings.events.sum(axis=(0, 3), dtype=np.int64)
+    total = per_taxel.sum(axis=1)
+    alive = total > 0
+    middle = float(np.median(total[alive])) if alive.any() else 0.0
+    rate = per_taxel / (lengths.sum() * bin_s)
+    falling, rising = (float(rate[:, polarity].sum()) for polarity in (0, 1))
+    labels = dict(zip(*(found.tolist() for found in np.unique(recordings.labels, return_counts=True)), strict=True))
+    shortest, median, longest = (float(of(lengths) * bin_s) for of in (np.min, np.median, np.max))
+    return Described(
+        source=recordings.source,
+        split=recordings.split,
+        recordings=len(recordings),
+        taxels=recordings.taxels,
+        bin_s=bin_s,
+        steps=recordings.steps,
+        duration_s=Duration(shortest=shortest, median=median, longest=longest),
+        events=int(total.sum()),
+        found=recordings.counts,
+        unlabelled=labels.pop(UNLABELLED, 0),
+        labels=labels,
+        rate=SensorRate(
+            falling=falling,
+            rising=rising,
+            taxels=tuple(Rate(falling=low, rising=high) for low, high in rate.tolist()),
+        ),
+        dead=tuple(np.flatnonzero(~alive).tolist()),
+        one_sided=tuple(np.flatnonzero((per_taxel > 0).sum(axis=1) == 1).tolist()),
+        hot=tuple(np.flatnonzero(total > HOT * middle).tolist()),
+        rules=RULES,
+    )
+
+
+def described_sections(result: Described) -> Iterable[Section]:
+    """Statistics for people."""
+    duration, rate, labels = result.duration_s, result.rate, result.labels
+    short, middle, long = (f"{seconds:g}" for seconds in (duration.shortest, duration.median, duration.longest))
+    lasts = f"{long} s" if short == long else f"{short} … {long} s (median {middle} s)"
+    each = sorted(set(labels.values()))
+    spread = number(each[0], "recording") if len(each) == 1 else f"{each[0]} … {each[-1]} recordings" if each else ""
+    lines = [
+        f"{result.source}, {result.split}: {number(result.recordings, 'recording')}, "
+        f"{number(result.taxels, 'taxel')}, {lasts} in bins of {result.bin_s:g} s",
+        f"  labels: {number(len(labels), 'class') + f', {spread} each' if labels else 'none'}"
+        + (f"; {number(result.unlabelled, 'recording')} without" if labels and result.unlabelled else ""),
+        f"  events: {result.events:,} after binning; {rate.falling:.1f} falling and {rate.rising:.1f} rising "
+        "per second",
+    ]
+    lines += [] if result.found is None else [f"  found: {result.found}"]
+    broken = {"dead": result.dead, "one-sided": result.one_sided, "hot": result.hot}
+    for kind, taxels in broken.items():
+        lines.append(f"  {kind} taxels: {', '.join(map(str, taxels)) or 'none'} ({result.rules[kind]})")
+    yield Section("Recordings", [Text("\n".join(lines))])
+    rows = []
+    for taxel, one in enumerate(rate.taxels):
+        looks = ", ".join(kind for kind, taxels in broken.items() if taxel in taxels)
+        rows.append([str(taxel), f"{one.falling:.2f}", f"{one.rising:.2f}", looks])
+    yield Section("Taxels", [Table(["taxel", "falling/s", "rising/s", "looks"], rows)])
 
 
 def _convert(arguments: Arguments) -> Outcome:
@@ -166,8 +243,7 @@ def _convert(arguments: Arguments) -> Outcome:
     else:
         write_released(arguments.output, [_grown(recordings, taxels, steps) for recordings in loaded])
     splits = {
-        recordings.split: ConvertedSplit(recordings=len(recordings), found=_padded(recordings, steps))
-        for recordings in loaded
+        recordings.split: ConvertedSplit(recordings=len(recordings), found=recordings.counts) for recordings in loaded
     }
     result = Converted(
         source=arguments.source,
@@ -188,14 +264,6 @@ def _convert_sections(result: Converted) -> Iterable[Section]:
     if result.names is not None:
         lines.append(f"  names: {result.names} in it says which recording became which")
     yield Section("Converted", [Text("\n".join(lines))])
-
-
-def _padded(recordings: Recordings, steps: int) -> EventCounts | None:
-    """What was odd, and how many recordings are filled up to so many steps."""
-    if recordings.counts is None:
-        return None
-    padded = int(np.count_nonzero(recordings.step_counts < steps))
-    return replace(recordings.counts, shorter=None, padded=padded)
 
 
 def _grown(recordings: Recordings, taxels: int, steps: int) -> Recordings:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.eventlines import Event, EventLines, Mark
 from spikeloom.runtime.commands.options import add_netlist
@@ -47,68 +47,47 @@ MAX_GAP = 100_000
 EDGE = Decimal("1e-9")
 """Share of a bin by which a time may miss an edge and yet count as on it; the same as where recordings are read."""
 
-REFRESH_S = 0.05
-"""Least time between two drawings of the line on a terminal."""
 
-
+@dataclass(kw_only=True, eq=False)
 class Display:
-    """Where the running decision appears: lines, or objects as JSON, on stdout.
+    """Where the running decision appears: lines, or objects as JSON, on stdout."""
 
-    On a terminal also one line that changes, on stderr.
-    """
-
-    def __init__(self, bin_s: Decimal, *, as_json: bool) -> None:
-        self._bin_s = bin_s
-        self._json = as_json
-        self._terminal = sys.stderr.isatty() and not as_json
-        self._drawn = 0.0
-        self._shown: int | None = None
+    bin_s: Decimal
+    as_json: bool
+    shown: int | None = None  # Decision that was printed last
 
     def bin(self, grasp: int, step: Step) -> None:
-        """Show what is decided after a bin."""
-        if self._json:
+        """Show what is decided after a bin, if it is something else than before."""
+        if self.as_json:
             self._write(self._result("bin", grasp, step.index + 1, step))
-            return
-        if not step.counts.any():
-            return
-        elapsed = f"{self._bin_s * (step.index + 1):f} s"
-        if step.decision != self._shown:
-            self._shown = step.decision
+        elif step.counts.any() and step.decision != self.shown:
+            self.shown = step.decision
+            elapsed = f"{self.bin_s * (step.index + 1):f} s"
             self._write(f"{elapsed:>10}  {_standing(step)}")
-        elif self._terminal and time.monotonic() >= self._drawn + REFRESH_S:
-            sys.stderr.write(f"\r\x1b[K{elapsed:>10}  {_standing(step)}")
-            sys.stderr.flush()
-            self._drawn = time.monotonic()
 
     def grasp(self, grasp: int, bins: int, last: Step, *, early: bool | None = None) -> None:
         """Show what a grasp came to; and whether it ended before its length, where it may."""
-        self._shown = None
-        if self._json:
-            self._write(self._result("grasp", grasp, bins, last, {} if early is None else {"early": early}))
+        self.shown = None
+        if self.as_json:
+            self._write(self._result("grasp", grasp, bins, last) | ({} if early is None else {"early": early}))
         else:
-            seconds = f"{self._bin_s * bins:f}"
+            seconds = f"{self.bin_s * bins:f}"
             sure = ", sure" if early else ""
             self._write(f"grasp {grasp}: {_standing(last)}{sure}, after {number(bins, 'bin')} ({seconds} s)")
 
-    def _result(self, kind: str, grasp: int, bins: int, step: Step, more: dict[str, bool] | None = None) -> str:
-        return json.dumps(
-            {
-                "kind": kind,
-                "grasp": grasp,
-                "bins": bins,
-                "time_s": float(self._bin_s * bins),
-                "decision": step.decision,
-                "margin": step.margin,
-                "counts": step.counts.tolist(),
-                **(more or {}),
-            }
-        )
+    def _result(self, kind: str, grasp: int, bins: int, step: Step) -> JsonObject:
+        return {
+            "kind": kind,
+            "grasp": grasp,
+            "bins": bins,
+            "time_s": float(self.bin_s * bins),
+            "decision": step.decision,
+            "margin": step.margin,
+            "counts": step.counts.tolist(),
+        }
 
-    def _write(self, line: str) -> None:
-        if self._terminal:
-            sys.stderr.write("\r\x1b[K")
-            sys.stderr.flush()
-        sys.stdout.write(f"{line}\n")
+    def _write(self, line: str | JsonObject) -> None:
+        sys.stdout.write(f"{line if isinstance(line, str) else json.dumps(line)}\n")
         sys.stdout.flush()
 
 
@@ -150,13 +129,13 @@ class Watch:
         """Follow the lines to their end, or until the user, or the reader of our output, ends it before."""
         try:
             while True:
-                if self.real and self._is_open() and not self.lines.arrived(self._wall(self.stream.index + 2)):
+                waits = self.real and self._is_open()
+                entry = self.lines.read(self._wall(self.stream.index + 2) if waits else None)
+                if entry is None:
                     self._close_bin()
-                    continue
-                entry = self.lines.read()
-                if isinstance(entry, Event):
+                elif isinstance(entry, Event):
                     self._take(entry)
-                elif entry is not Mark.NOTHING:
+                else:
                     self._end_grasp()
                     if entry is Mark.END_OF_STREAM:
                         return
@@ -263,7 +242,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         session = Watch(
             stream=stream,
             lines=EventLines(file, name, netlist.taxels),
-            display=Display(bin_s, as_json=arguments.json),
+            display=Display(bin_s=bin_s, as_json=arguments.json),
             column=np.zeros(netlist.taxels * netlist.polarities, np.uint8),
             bin_s=bin_s,
             bins=arguments.bins,

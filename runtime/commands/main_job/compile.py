@@ -22,13 +22,14 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.netx import SUFFIX as NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.text import text
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_bin_option, add_network, group
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.inputs.repeat import NETWORK, ROUNDING, refuse
-from spikeloom.runtime.machines.base import chip_commands, compiled, machine_of, trained_for
+from spikeloom.runtime.machines.base import chip_module, machine_of, trained_for
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
@@ -100,7 +101,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if unknown := set(arguments.dump_after) - {step.name for step in chip.passes}:
         names = ", ".join(step.name for step in chip.passes)
         raise OptionError(f"--dump-after {', '.join(sorted(unknown))}: no such pass; allowed: {names}")
-    own = trained_for(arguments.checkpoint) or chip_commands(arguments.target)
+    own = trained_for(arguments.checkpoint) or chip_module(arguments.target, "commands")
     if own is not None:
         return own.compile_network(arguments)  # type: ignore[no-any-return]
     refuse(arguments, ("in_time",), f"{arguments.target} has no such option")
@@ -130,7 +131,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
     def dump(name: str, done: Compilation) -> None:
         if name in arguments.dump_after:
-            sys.stderr.write(done.text())
+            sys.stderr.write(text(done.newest))
 
     compilation = compile_network(
         asked.model,
@@ -144,7 +145,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
         after=dump,
     )
     sha256 = write_netlist(compilation.netlist, arguments.output)
-    return compiled(compilation, sha256, asked.facts)
+    outcome: Outcome = chip_module(arguments.target, "compiled").outcome(compilation, sha256, asked.facts)
+    return outcome
 
 
 def _compile_integers(arguments: argparse.Namespace) -> Outcome:

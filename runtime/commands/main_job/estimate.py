@@ -6,9 +6,9 @@ import argparse
 
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_detail, add_netlist, add_recordings
-from spikeloom.runtime.costs.simulated import Account, Accounted
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.base import Machine, Price, Run, machine_for
+from spikeloom.runtime.machines.simulated import Account, Accounted
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
 

@@ -7,14 +7,14 @@ import argparse
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.options import add_explain_cost, add_netlist_and_model, add_recordings
-from spikeloom.runtime.costs.simulated import Account
+from spikeloom.runtime.commands.options import add_check, add_netlist_and_model, add_recordings
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
+from spikeloom.runtime.machines.simulated import Account
 from spikeloom.runtime.page.recording import recording
 from spikeloom.runtime.page.results import Decisions, Report, provenance, taxels
 from spikeloom.runtime.page.sections import about, sections
@@ -36,12 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--recording", metavar="NAME|N", help="recording to draw, by name or from 0 (default: the first that differs)"
     )
-    parser.add_argument(
-        "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
-    )
     parser.add_argument("--stress", metavar="STRESS.json", help="show what stress -o wrote about this netlist")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.html")
-    add_explain_cost(parser)
+    add_check(parser)
     parser.epilog = NOTES
 
 
@@ -97,7 +94,7 @@ def _report(
     if chosen is None:
         chosen = 0 if verdict.first_divergence is None else data.files.index(verdict.first_divergence.file)
     account.begin("costs")
-    chip = machine.page_parts(data.events, lengths=data.lengths, bin_s=arguments.bin)
+    ran, price = machine.price(data.events, lengths=data.lengths, bin_s=arguments.bin)
     account.begin("the recording")
     origin = provenance(arguments, netlist, machine.target, loaded, data, data.files[chosen])
     described = machine.describe(origin.netlist.sha256)
@@ -111,14 +108,15 @@ def _report(
             chip=verdict.chip_predictions,
         ),
         netlist=described.result,
-        cores=chip.cores,
-        taxels=taxels(netlist, loaded, data, chip.spikes, arguments.taxels),
+        cores=machine.core_map(data.events, data.step_counts, ran.counts),
+        taxels=taxels(machine, loaded, data, ran.counts, arguments.taxels),
         recording=recording(machine, loaded, data, chosen),
-        costs=chip.costs.result,
+        costs=price.outcome.result,
         provenance=origin,
         output=arguments.output,
         described=described,
-        chip=chip,
+        price=price,
+        figures=machine.figures(price),
         stress=stress,
         explained_cost=account.explained(arguments.explain_cost),
     )

@@ -14,10 +14,10 @@ from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import UNLABELLED
 from spikeloom.runtime.commands.main_job.estimate import priced
 from spikeloom.runtime.commands.options import add_detail, add_netlist, add_recordings
-from spikeloom.runtime.costs.simulated import Account, Accounted
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.base import Price, machine_for
+from spikeloom.runtime.machines.simulated import Account, Accounted
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
 from spikeloom.runtime.report.numbers import percent

@@ -7,13 +7,13 @@ import sys
 from dataclasses import replace
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_explain_cost, add_netlist_and_model, add_recordings
-from spikeloom.runtime.costs.simulated import Account
+from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_check, add_netlist_and_model, add_recordings
 from spikeloom.runtime.equivalence.verdict import parse_requirements, sections
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
-from spikeloom.runtime.machines.base import ENGINES, chip_commands, machine_for
+from spikeloom.runtime.machines.base import ENGINES, chip_module, machine_for
+from spikeloom.runtime.machines.simulated import Account
 from spikeloom.runtime.report.sections import Outcome
 
 
@@ -23,9 +23,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_recordings(parser, window=True)
     parser.add_argument(
         "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"
-    )
-    parser.add_argument(
-        "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
     )
     parser.add_argument(
         "--engine",
@@ -44,13 +41,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="E0,E2=X,E3=X",
         help="levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
     )
-    add_explain_cost(parser)
+    add_check(parser)
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     machine = machine_for(arguments.netlist)
-    if (own := chip_commands(machine.netlist.target)) is not None:
+    if (own := chip_module(machine.netlist.target, "commands")) is not None:
         return own.verify(arguments)  # type: ignore[no-any-return]
     agreement = MIN_AGREEMENT if arguments.min_agreement is None else arguments.min_agreement
     if not 0 <= agreement <= 1:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from spikeloom.compiler import DEFAULT_TARGET, round_to_forms
-from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.checkpoint import layers_of
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
@@ -18,12 +17,13 @@ from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import data_digest
 from spikeloom.models.recordings.grasps import SYNTHETIC
-from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_checkpoint
+from spikeloom.runtime.commands.options import add_checkpoint, add_data
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import whole_numbers
-from spikeloom.runtime.inputs.files import require_place, shipped
+from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.report.encode import INLINE
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 from spikeloom.runtime.studies.jobs import only_one
@@ -41,11 +41,9 @@ class Before:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Tuned:
+class Tuned(Before):
     """Test recordings that are right after the last epoch."""
 
-    correct: int
-    accuracy: float
     chosen_on: str
 
 
@@ -71,9 +69,10 @@ class FinetuneRecord:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finetuned(FinetuneRecord):
+class Finetuned:
     """A fine-tuning and the checkpoint that holds it."""
 
+    record: FinetuneRecord = field(metadata=INLINE)
     file: str
     sha256: str
 
@@ -81,8 +80,7 @@ class Finetuned(FinetuneRecord):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     add_checkpoint(parser)
-    parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
-    add_bin_option(parser)
+    add_data(parser)
     parser.add_argument("--target", default=DEFAULT_TARGET, help=f"chip (default: {DEFAULT_TARGET})")
     parser.add_argument(
         "--weight-bits", required=True, metavar="N[,N]", help="storage width, one or one a layer: 2 to 6 or 8"
@@ -120,9 +118,7 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
     state = _state(output, resume=arguments.resume)
     target = load_target(arguments.target, COMPARTMENTS)
     widths = whole_numbers(arguments.weight_bits, "--weight-bits")
-    path = shipped(arguments.checkpoint)
-    if Path(path).is_file() and is_netlist(path):
-        raise ModelError(f"{path}: is a netlist, its weights are rounded already; give the checkpoint it was made from")
+    path = arguments.checkpoint
     checkpoint = load_checkpoint(path, arguments)
     if checkpoint.forms is not None:
         raise ModelError(f"{path}: was fine-tuned already; give the network that it was made from")
@@ -189,9 +185,7 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
     save_again(output, changed, training=asdict(record))
     round_to_forms(expand(read_checkpoint(output), adjacency), tuned.forms)  # it compiles, or says why not
     state.unlink(missing_ok=True)
-    sha256 = sha256_of(output)
-    values = {each.name: getattr(record, each.name) for each in fields(record)}
-    return Finetuned(**values, file=output.name, sha256=sha256)
+    return Finetuned(record=record, file=output.name, sha256=sha256_of(output))
 
 
 def _words(arguments: argparse.Namespace, source: str) -> list[str]:
@@ -204,11 +198,12 @@ def _words(arguments: argparse.Namespace, source: str) -> list[str]:
 
 def finetune_sections(result: Finetuned) -> Iterable[Section]:
     """A finished fine-tuning for people."""
-    total, first, last = result.test_samples, result.history[0], result.history[-1]
+    record = result.record
+    total, first, last = record.test_samples, record.history[0], record.history[-1]
     rows = [
-        ["rounded", "", "", percent(result.before.correct, total)],
+        ["rounded", "", "", percent(record.before.correct, total)],
         ["epoch 1", f"{first[0]:.5f}", f"{first[1]:,}", ""],
-        [f"epoch {result.epochs}", f"{last[0]:.5f}", f"{last[1]:,}", percent(result.last.correct, total)],
+        [f"epoch {record.epochs}", f"{last[0]:.5f}", f"{last[1]:,}", percent(record.last.correct, total)],
     ]
     head = ["on chip integers", "loss", "training right", "test"]
-    yield Section("Fine-tuning", [Text(result.command), Table(head, rows), Text(f"  written: {result.file}")])
+    yield Section("Fine-tuning", [Text(record.command), Table(head, rows), Text(f"  written: {result.file}")])

@@ -16,20 +16,12 @@ from spikeloom.compiler.files import remove_leftovers, sha256_of
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.towers import join as join_networks
 from spikeloom.models.networks.checkpoint import save_again
-from spikeloom.runtime.commands.main_job.inspect import tower_line
+from spikeloom.runtime.commands.main_job.inspect import LayerSize, tower_line
 from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 
 KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "test_samples", "fine_tuned_from")
 """Parts of a network's training record that the joined one keeps, beside what the chosen weights reached."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JoinedLayer:
-    """A layer, towers side by side."""
-
-    name: str
-    neurons: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +33,7 @@ class Joined:
     system: str
     graph: str | None
     classes: int
-    layers: Sequence[JoinedLayer]
+    layers: Sequence[LayerSize]
     file: str
     sha256: str
 
@@ -76,7 +68,7 @@ def run(arguments: Namespace) -> Outcome:
         system=joined.system,
         graph=joined.graph,
         classes=joined.classes,
-        layers=[JoinedLayer(name=name, neurons=count) for name, count in joined.neurons.items()],
+        layers=[LayerSize(name=name, neurons=count) for name, count in joined.neurons.items()],
         file=output.name,
         sha256=sha256_of(output),
     )

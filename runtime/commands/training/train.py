@@ -28,22 +28,29 @@ from spikeloom.models.training.recipes import (
     check_recipe,
     decays_asked,
 )
-from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_graph_options, add_system
+from spikeloom.runtime.commands.options import add_data, add_graph_options, add_system
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_graph, sensor_places
 from spikeloom.runtime.inputs.recordings import recordings, require_bins
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
-from spikeloom.runtime.studies.training.training import Job, output_of, train_seeds
+from spikeloom.runtime.studies.training import (
+    Job,
+    TrainingReport,
+    output_of,
+    picture,
+    summary,
+    train_seeds,
+    training_sections,
+)
 
 PICTURES = (".png", ".svg", ".pdf")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
-    add_bin_option(parser)
+    add_data(parser)
     parser.add_argument(
         "--join", type=int, default=1, metavar="N", help="a step joins N bins, an event where one has any (default: 1)"
     )
@@ -87,21 +94,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights and order (default: 0)")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds side by side (default: 1)")
     parser.add_argument("--resume", action="store_true", help="go on with an interrupted training of the same options")
-    parser.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
     parser.add_argument(
         "--keep",
         action="append",
         choices=WEIGHTS,
         help="epoch to store: last, best (on test) or clean (on validation); may be repeated (default: all three)",
     )
-    parser.add_argument("--picture", metavar="OUT.png", help="draw learning curves and confusion matrix")
+    parser.add_argument("--picture", metavar="OUT.png", help="draw learning curves")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Train every seed, write the checkpoints, report."""
-    from spikeloom.runtime.studies.training.report import TrainingReport, picture, summary, training_sections
-
     if arguments.seeds < 1:
         raise OptionError(f"--seeds {arguments.seeds}: at least 1 is needed; give a positive number")
     require_bins(arguments.join)
@@ -115,13 +119,11 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 raise OptionError(f"--picture {arguments.picture}: is a network that -o names; give another name")
     graph, _ = _sensor(arguments)
     training, test = both_splits(arguments.data, graph.n_taxels, arguments.bin)
-    results = train_seeds(plan_jobs(arguments, training, test), resume=arguments.resume)
-    records = [record for record, _ in results]
+    records = train_seeds(plan_jobs(arguments, training, test), resume=arguments.resume)
     if arguments.picture is not None:
-        decided = [predicted for _, predicted in results if predicted is not None]
         kind = Path(arguments.picture).suffix.removeprefix(".")
         with write_atomically(arguments.picture) as file:
-            file.write(picture(records, test.labels, decided).file(kind))
+            file.write(picture(records).file(kind))
     return Outcome(TrainingReport(runs=records, protocols=summary(records)), training_sections)
 
 
@@ -167,12 +169,10 @@ def plan_jobs(arguments: argparse.Namespace, training: Recordings, test: Recordi
             test=test,
             epochs=epochs,
             seed=seed,
-            device=arguments.device,
             resume=arguments.resume,
             output=output_of(arguments.output, seed, arguments.seeds),
             keep=tuple(dict.fromkeys(arguments.keep or WEIGHTS)),
             command=f"{command} --seed {seed}",
-            draws=arguments.picture is not None,
             position=position,
         )
         for position, seed in enumerate(range(arguments.seed, arguments.seed + arguments.seeds))
@@ -212,7 +212,6 @@ def _named_recipe(arguments: argparse.Namespace) -> Recipe:
         "current_decay": None,
         "membrane_decay": None,
         "join": 1,
-        "device": "cpu",
         "spike_penalty": None,
         "copies": None,
     }

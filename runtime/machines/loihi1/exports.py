@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import sanafe
@@ -14,10 +14,10 @@ from spikeloom.compiler.formats.onnx.builder import port_words
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.models.recordings.events import BIN_S
-from spikeloom.runtime.machines.export_format import Export, Format, Request, port_lines
-from spikeloom.runtime.report.encode import OPTIONAL
+from spikeloom.runtime.machines.base import Export, Format, Request
+from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,12 +57,7 @@ class NirFacts:
 class NetxLayer:
     """What netx changes in a layer, and the spikes that this moves where recordings were given."""
 
-    name: str
-    biases: int
-    biases_rounded: int
-    furthest_steps: float
-    threshold_rounded: bool
-    rescaled_by: float
+    rounding: netx.Rounding = field(metadata=INLINE)
     spikes_moved: int | None = field(default=None, metadata=OPTIONAL)
     spikes: int | None = field(default=None, metadata=OPTIONAL)
 
@@ -97,7 +92,7 @@ def _sanafe(request: Request) -> Export:
     if facts.floating_currents:
         lines.append(f"currents of {', '.join(facts.floating_currents)} are floats there, so spikes may differ")
     content = (f"{line}\n".encode() for line in sanafe.export(netlist, target))
-    return Export(content=content, facts=facts, synapses=facts.synapses, lines=tuple(lines))
+    return Export(content=content, facts=facts, lines=tuple(lines))
 
 
 def _onnx(request: Request) -> Export:
@@ -107,8 +102,8 @@ def _onnx(request: Request) -> Export:
     facts = OnnxFacts(
         neurons=netlist.n_compartments, synapses=netlist.n_synapses, form=form, inputs=inputs, outputs=outputs
     )
-    lines = port_lines(inputs, outputs)
-    return Export(content=[content], facts=facts, synapses=facts.synapses, form=form, lines=lines)
+    lines = ("inputs:", *(f"  {port}" for port in inputs), "outputs:", *(f"  {port}" for port in outputs))
+    return Export(content=[content], facts=facts, form=form, lines=lines)
 
 
 def _nir(request: Request) -> Export:
@@ -121,25 +116,15 @@ def _nir(request: Request) -> Export:
         convention=CONVENTIONS[0],
     )
     lines = (f"in steps of {dt:g} s ({facts.convention})",)
-    return Export(content=[nir.export(netlist, dt)], facts=facts, synapses=facts.synapses, lines=lines)
+    return Export(content=[nir.export(netlist, dt)], facts=facts, lines=lines)
 
 
 def _netx(request: Request) -> Export:
     netlist = read_netlist(request.source)
     network = lift(netlist)
     blocks = netx.blocks_for(network)
-    layers = [
-        NetxLayer(
-            name=block.name,
-            biases=len(block.bias),
-            biases_rounded=block.rounded,
-            furthest_steps=block.furthest,
-            threshold_rounded=block.threshold_rounded,
-            rescaled_by=2.0**block.shift,
-        )
-        for block in blocks
-    ]
-    rounded = [line for layer in layers if (line := _rounding(layer))]
+    layers = [NetxLayer(rounding=block.rounding) for block in blocks]
+    rounded = [line for block in blocks if (line := str(block.rounding))]
     if request.strict and rounded:
         raise OptionError(f"--strict: netx cannot hold {request.source} as it is ({'; '.join(rounded)})")
     lines = rounded or ["biases, thresholds and weights are the netlist's"]
@@ -147,9 +132,12 @@ def _netx(request: Request) -> Export:
     if request.recordings is not None:
         data = request.recordings(netlist.classes, netlist.taxels, netlist.bins)
         moved = netx.moved_spikes(network, blocks, channels_last(data.events, netlist.clocks))
-        layers = [replace(layer, spikes_moved=moved[layer.name][0], spikes=moved[layer.name][1]) for layer in layers]
+        layers = [
+            NetxLayer(rounding=block.rounding, spikes_moved=differ, spikes=every)
+            for block, (differ, every) in zip(blocks, moved.values(), strict=True)
+        ]
         count = len(data)
-        shown = ", ".join(f"{layer.name} {layer.spikes_moved:,} of {layer.spikes:,}" for layer in layers)
+        shown = ", ".join(f"{name} {differ:,} of {every:,}" for name, (differ, every) in moved.items())
         lines.append(f"spikes that differ from the netlist's on {count} recordings: {shown}")
     elif rounded:
         lines.append("--data counts the spikes that this moves")
@@ -161,19 +149,7 @@ def _netx(request: Request) -> Export:
         recordings=count,
     )
     content = netx.file_bytes(network, blocks)
-    return Export(content=[content], facts=facts, synapses=facts.synapses, lines=tuple(lines))
-
-
-def _rounding(layer: NetxLayer) -> str:
-    """What was rounded in a layer, for people; empty if nothing."""
-    words = []
-    if layer.biases_rounded:
-        words.append(
-            f"{layer.biases_rounded} of {layer.biases} biases rounded, by {layer.furthest_steps:.3g} steps at most"
-        )
-    words += ["threshold rounded"] if layer.threshold_rounded else []
-    words += [f"rescaled by {layer.rescaled_by:g}"] if layer.rescaled_by != 1 else []
-    return f"{layer.name}: {', '.join(words)}" if words else ""
+    return Export(content=[content], facts=facts, lines=tuple(lines))
 
 
 FORMATS = (

@@ -6,8 +6,6 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
-from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,10 +15,10 @@ from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import with_tables
 from spikeloom.compiler.targets.loihi1.legalize import measure, require_legal
 from spikeloom.compiler.targets.loihi1.lift import lift
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.machines.base import Beside, EventArray, Price, Run, one_by_one
+from spikeloom.runtime.machines.base import EventArray, Price, Run, T, one_by_one
+from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import description, engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
@@ -29,15 +27,8 @@ from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.machines.loihi1.costs.sections import sections
 from spikeloom.runtime.machines.loihi1.stream import Stream
-from spikeloom.runtime.machines.loihi1.trace import Trace, aligned, differences
-from spikeloom.runtime.machines.page_parts import BatchParts
-from spikeloom.runtime.machines.votes import class_counts
-from spikeloom.runtime.report.sections import Outcome
-
-if TYPE_CHECKING:
-    from spikeloom.runtime.machines.loihi1.onnx_engine import OnnxEngine
-
-T = TypeVar("T", bound=np.generic)
+from spikeloom.runtime.machines.loihi1.trace import aligned, differences
+from spikeloom.runtime.report.sections import Block, Outcome
 
 SUMS = 1 << 24
 """Sums of the time model that are held at a time: 128 MiB."""
@@ -70,6 +61,10 @@ class Loihi(IntegerMachine):
         found = lay_out_blocks(self.netlist)
         return f"step by step: {found}" if isinstance(found, str) else "layer by layer, 64 neurons at a time"
 
+    def of_layer(self, array: npt.NDArray[T], index: int) -> npt.NDArray[T]:
+        """As the float model counts time."""
+        return aligned(self.netlist, array, index)
+
     def legal(self) -> None:
         """Refuse a netlist that uses too much of a limit."""
         require_legal(self.netlist, self.target)
@@ -81,14 +76,11 @@ class Loihi(IntegerMachine):
         lengths: IntArray | None = None,
         spikes: bool = False,
         membranes: bool = False,
-        threads: int | None = None,
     ) -> Run:
         """Decisions, and spikes as the float model counts time."""
         channels = with_clocks(events, self.netlist.clocks)
-        trace = engine.simulate(
-            self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes, threads=threads
-        )
-        return self._run(trace)
+        trace = engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
+        return self._run(trace, trace.counts.spikes)
 
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Every spike, membrane, update and count, one recording after another."""
@@ -98,27 +90,16 @@ class Loihi(IntegerMachine):
             found += differences(spec.simulate(self.netlist, sample), fast)
         return found
 
-    @cached_property
-    def _onnx(self) -> tuple[OnnxEngine, OnnxEngine]:
-        """The integer graph in both forms."""
+    def beside(self, engine: str) -> Callable[[EventArray, IntArray | None], int] | None:
+        """The integer graph in onnxruntime."""
+        if engine != "onnx":
+            return super().beside(engine)
         from spikeloom.runtime.machines.loihi1 import onnx_engine
 
-        return onnx_engine.prepare(self.netlist, form="scan"), onnx_engine.prepare(self.netlist, form="step")
-
-    def require_engine(self, name: str) -> None:
-        """Load the integer graph for onnxruntime."""
-        if name == "onnx":
-            _ = self._onnx
-
-    def beside(self, events: EventArray, *, lengths: IntArray | None = None, samples: int) -> Beside:
-        """Spikes of all recordings in the form ``scan``; of the first all that ``step`` has."""
-        from spikeloom.runtime.machines.loihi1.onnx_engine import different_spikes, same_state
-
-        scan, step = self._onnx
-        channels = with_clocks(events, self.netlist.clocks)
-        different = different_spikes(scan, self._engine, channels, lengths)
-        few = islice(one_by_one(channels, lengths), samples)
-        return Beside(different, different == 0 and all(same_state(step, self._engine, each) for each in few))
+        prepared = onnx_engine.prepare(self.netlist)
+        return lambda events, lengths: onnx_engine.differences(
+            prepared, self._engine, with_clocks(events, self.netlist.clocks), lengths
+        )
 
     @cached_property
     def integer(self) -> IntegerNetwork:
@@ -141,12 +122,19 @@ class Loihi(IntegerMachine):
         assert trace.packed is not None, "packed spikes were wanted"
         return trace.packed, trace.counts.saturations.sum(axis=1)
 
-    def page_parts(self, events: EventArray, *, lengths: IntArray | None, bin_s: float) -> BatchParts:
-        """Costs with figures, and cores on the mesh."""
+    def core_map(self, events: EventArray, lengths: IntArray, counts: IntArray) -> CoreMap:
+        """Cores on the mesh."""
         from spikeloom.runtime.machines.loihi1.costs import page
 
-        channels, step_s = with_clocks(events, self.netlist.clocks), bin_s * self.netlist.bins
-        return page.batch_parts(self._engine, self.target, channels, lengths=lengths, bin_s=step_s)
+        within = np.arange(events.shape[-1]) < lengths[:, None, None]
+        inputs = ((with_clocks(events, self.netlist.clocks) != 0) & within).sum(axis=2)
+        return page.core_map(self.netlist, self.target, np.concatenate([inputs, counts], axis=1).mean(axis=0))
+
+    def figures(self, price: Price) -> list[Block]:
+        """Energy by layer and part, time by core."""
+        from spikeloom.runtime.machines.loihi1.costs import page
+
+        return page.figures(price.outcome.result)
 
     def price(
         self,
@@ -173,7 +161,7 @@ class Loihi(IntegerMachine):
         )
         report = cost_report(self.netlist, chip, found, bin_s=bin_s * self.netlist.bins)
         time_ns = {name: times.duration_ns.sum(axis=1) for name, times in found.simple.items()}
-        return self._run(trace), Price(
+        return self._run(trace, trace.counts.spikes), Price(
             synaptic_operations=found.costs.synaptic_operations.sum(axis=1),
             energy_j={name: each.sum(axis=1) for name, each in found.costs.energy.items()},
             time_s={name: each * 1e-9 for name, each in time_ns.items()},
@@ -196,24 +184,10 @@ class Loihi(IntegerMachine):
         """One grasp, bin after bin."""
         return Stream(self._stepwise)
 
-    def _run(self, trace: Trace) -> Run:
-        counts = trace.counts.spikes
-        return Run(
-            votes=class_counts(self.netlist, counts),
-            counts=counts,
-            spikes=self._by_layer(trace.spikes),
-            membranes=self._by_layer(trace.membranes),
-        )
-
-    def _by_layer(self, array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]] | None:
-        if array is None:
-            return None
-        return {name: aligned(self.netlist, array, index) for index, name in enumerate(self.layers)}
-
 
 machine_of = Loihi
 
 
 def load(path: str | os.PathLike[str]) -> Loihi:
-    """Read a netlist file; raises as :func:`netlist_file.read_netlist` does."""
+    """Read a netlist file; raises as :func:`netlist.read_netlist` does."""
     return Loihi(read_netlist(path))

@@ -9,9 +9,7 @@ lasts until the last neuron is swept and the last message processed, then the ba
 against a plain definition, one message at a time.
 
 Spikes of a step are sent and processed within that step and act in the next. *Input events* act in the step in which
-they arrive: the receiving cores process them from its start, and nobody pays for their injection. Other simulators
-let channels be neurons of a core that cost nothing but their messages; `input_tiles` says so. An event that acts in
-step ``t`` is then sent in step ``t - 1``.
+they arrive: the receiving cores process them from its start, and nobody pays for their injection.
 
 References
 ----------
@@ -98,104 +96,68 @@ def _way(start: int, end: int, port: int, width: int, tile_links: int) -> list[i
     return links
 
 
-def prepare(
-    netlist: Netlist,
-    target: Target,
-    table: TimeTable,
-    *,
-    input_tiles: tuple[int, ...] = (),
-    dense: BoolArray | None = None,
-) -> Tables:
-    """Lay a netlist out for the time models.
-
-    `input_tiles` are tiles of cores that hold the input channels, as many on each as it has room for; empty if no core
-    holds them. `dense` (synapses,) says which synapses take the time of a dense list; by default those that are stored
-    in one. Raises OptionError if the netlist takes several chips.
-    """
+def prepare(netlist: Netlist, target: Target, table: TimeTable) -> Tables:
+    """Lay a netlist out for the time models; OptionError if it takes several chips."""
     require_one_chip(netlist.core_tile, target, "time")
-    size, n_inputs = netlist.n_compartments, netlist.n_inputs
-    core_tile = np.append(netlist.core_tile, np.array(input_tiles, np.int64))
-    extra = [min(i * target.limit("core.compartments"), n_inputs) for i in range(1, len(input_tiles) + 1)]
-    inner = np.arange(len(core_tile)) < netlist.n_cores
+    tile, n_inputs, n_cores = netlist.core_tile, netlist.n_inputs, netlist.n_cores
     latency = {event: table.picoseconds(event) for event in table.latencies}
-
-    axon = netlist.axon_of_synapse()
-    if dense is None:
-        dense = netlist.format_index_bits[netlist.axon_format[axon]] == 0
-    in_dense, in_sparse = (np.bincount(axon[form], minlength=netlist.n_axons) for form in (dense, ~dense))
-    processing = latency["axon_in"] + in_dense * latency["synaptic_operation_dense"]
-    processing += in_sparse * latency["synaptic_operation_sparse"]
+    dense = netlist.format_index_bits[netlist.axon_format] == 0
+    synapse = np.where(dense, latency["synaptic_operation_dense"], latency["synaptic_operation_sparse"])
+    processing = latency["axon_in"] + np.diff(netlist.axon_synapses) * synapse
     destination = netlist.core_of_axon()
     width, tile_cores = target.limit("mesh.width"), target.limit("mesh.tile_cores")
-    port = np.array([np.sum(core_tile[:core] == tile) for core, tile in enumerate(core_tile)])
-    is_input = netlist.axon_source < n_inputs
-    slot = np.where(is_input, netlist.axon_source + size, netlist.axon_source - n_inputs)
-    slots = size + n_inputs if input_tiles else size
+    port = np.array([np.sum(tile[:core] == tile[core]) for core in range(n_cores)])
     # the messages of a spike go out in the order of columns, rows and cores of a tile, as the reference has it
-    rank = np.lexsort((port, core_tile // width, core_tile % width)).argsort()
-    order = np.lexsort((rank[destination], slot))
-    on_core, alone = order[slot[order] < slots], order[slot[order] >= slots]
+    rank = np.lexsort((port, tile // width, tile % width)).argsort()
+    order = np.lexsort((rank[destination], netlist.axon_source))
+    from_input = netlist.axon_source[order] < n_inputs
+    injected, sent = order[from_input], order[~from_input]
 
-    start = np.append(netlist.core_compartments, size + np.array(extra, np.int64))
-    sender = np.repeat(np.arange(len(core_tile)), np.diff(start))
-    first = np.searchsorted(slot[on_core], np.arange(slots + 1))
-    spike = np.where(inner, latency["spike"], 0)
-    pairs, route = np.unique(sender[slot[on_core]] * len(core_tile) + destination[on_core], return_inverse=True)
+    slot, sender = netlist.axon_source[sent] - n_inputs, netlist.core_of_compartment()
+    first = np.searchsorted(slot, np.arange(netlist.n_compartments + 1))
+    pairs, route = np.unique(sender[slot] * n_cores + destination[sent], return_inverse=True)
     ways = [
-        _way(int(core_tile[a]), int(core_tile[b]), int(port[a]), width, PORTS + tile_cores)
-        for a, b in (divmod(int(pair), len(core_tile)) for pair in pairs)
+        _way(int(tile[a]), int(tile[b]), int(port[a]), width, PORTS + tile_cores)
+        for a, b in (divmod(int(pair), n_cores) for pair in pairs)
     ]
     tiles = [[link // (PORTS + tile_cores) for link in way] for way in ways]
     hop = {True: latency["hop_east_west"], False: latency["hop_north_south"]}
     unit = lcm(*(len(way) + 1 for way in ways))
     return Tables(
-        start=start,
-        access=np.where(inner, latency["neuron_access"], 0),
-        update=np.where(inner, latency["neuron_update"], 0),
-        spike=spike,
+        start=netlist.core_compartments,
+        access=latency["neuron_access"],
+        update=latency["neuron_update"],
+        spike=latency["spike"],
         axon_out=latency["axon_out"],
         sender=sender,
-        sending=spike[sender] + np.diff(first) * latency["axon_out"],
+        sending=latency["spike"] + np.diff(first) * latency["axon_out"],
         first=first,
-        destination=destination[on_core],
-        processing=processing[on_core],
+        destination=destination[sent],
+        processing=processing[sent],
         route=route.reshape(-1),
-        channel_first=np.searchsorted(slot[alone], np.arange(size, size + n_inputs + 1)),
-        channel_destination=destination[alone],
-        channel_processing=processing[alone],
+        channel_first=np.searchsorted(netlist.axon_source[injected], np.arange(n_inputs + 1)),
+        channel_destination=destination[injected],
+        channel_processing=processing[injected],
         route_first=np.cumsum([0, *map(len, ways)]),
         route_link=np.array([link for way in ways for link in way], np.int64),
         route_hops=np.array([sum(hop[abs(a - b) == 1] for a, b in pairwise(way)) for way in tiles], np.float64),
         route_share=np.array([unit // (len(way) + 1) for way in ways], np.int64),
         unit=unit,
         capacity=int(table.link_buffer.value),
-        barrier=table.barrier(len(np.unique(core_tile))),
+        barrier=table.barrier(len(np.unique(tile))),
     )
-
-
-def _slots(
-    tables: Tables, spikes: BoolArray, updated: BoolArray, events: EventArray
-) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Firing slots, working slots and events that nobody sends, as the kernels want them."""
-    fired, worked, seen = (np.ascontiguousarray(bits).view(np.uint8) for bits in (spikes, updated, events != 0))
-    if tables.sender.size == spikes.shape[2]:
-        return fired, worked, seen
-    sent = np.zeros((*spikes.shape[:2], seen.shape[1]), np.uint8)
-    ahead = seen[:, :, 1 : spikes.shape[1] + 1]
-    sent[:, : ahead.shape[2]] = ahead.transpose(0, 2, 1)
-    return np.concatenate([fired, sent], 2), np.concatenate([worked, sent], 2), seen[:, :, :0]
 
 
 def charges(tables: Tables) -> Charges:
     """What events add to each core's picoseconds of sweep and sending, then to those of receiving: ``2 * cores`` sums.
 
-    The engine adds them up as it runs, without spike trains. The netlist's input channels are on no core.
+    The engine adds them up as it runs, without spike trains.
     """
-    cores, slots, channels = tables.access.size, tables.sender.size, tables.channel_first.size - 1
-    sources, updates = np.zeros((channels + slots, 2 * cores), np.int64), np.zeros((slots, 2 * cores), np.int64)
-    every = np.arange(slots)
+    cores, size, channels = tables.start.size - 1, tables.sender.size, tables.channel_first.size - 1
+    sources, updates = np.zeros((channels + size, 2 * cores), np.int64), np.zeros((size, 2 * cores), np.int64)
+    every = np.arange(size)
     sources[channels + every, tables.sender] = tables.sending
-    updates[every, tables.sender] = tables.update[tables.sender]
+    updates[every, tables.sender] = tables.update
     channel = np.repeat(np.arange(channels), np.diff(tables.channel_first))
     np.add.at(sources, (channel, cores + tables.channel_destination), tables.channel_processing)
     slot = np.repeat(channels + every, np.diff(tables.first))
@@ -219,7 +181,7 @@ def simple_times(tables: Tables, charged: IntArray, steps: IntArray) -> SimpleTi
 
     `steps` (samples,) are the chip steps of each recording.
     """
-    cores = tables.access.size
+    cores = tables.start.size - 1
     spent = charged.copy()
     spent[:, :, :cores] += np.diff(tables.start) * tables.access
     spent *= (np.arange(charged.shape[1]) < steps[:, None])[:, :, None]
@@ -237,13 +199,13 @@ def detailed(
     `spikes` and `updated` (samples, chip steps, compartments) are a simulator's, see :class:`trace.Trace`, for `events`
     (samples, n_inputs, T); `steps` (samples,) are the chip steps of each recording, by default all.
     """
-    fired, worked, events = _slots(tables, spikes, updated, events)
-    cores, (samples, length) = tables.access.size, spikes.shape[:2]
+    fired, worked, seen = (np.ascontiguousarray(bits).view(np.uint8) for bits in (spikes, updated, events != 0))
+    cores, (samples, length) = tables.start.size - 1, spikes.shape[:2]
     own = np.full(samples, length) if steps is None else steps
     blocked, peak = np.zeros((2, samples, length))
     spent = np.zeros((samples, length, 2 * cores))
     for i in range(samples):
-        schedule(tables, fired[i], worked[i], events[i], int(own[i]), spent[i], blocked[i], peak[i])
+        schedule(tables, fired[i], worked[i], seen[i], int(own[i]), spent[i], blocked[i], peak[i])
     return DetailedTimes(
         **_ends(spent, own, tables.barrier),
         sent_ns=spent[:, :, :cores].max(axis=2) / PICOSECONDS,

@@ -21,28 +21,24 @@ AnyArray = npt.NDArray[Any]
 
 
 class Tables(NamedTuple):
-    """A placed netlist as the time models see it; nothing in here changes.
+    """A placed netlist as the time models see it; nothing in here changes."""
 
-    *Slots* are what a core sweeps: compartments in the order of their ids, then, where they are on a core, the input
-    channels.
-    """
-
-    start: IntArray  # (cores + 1,) int64; bounds of each core in the slots
-    # access, update, spike: (cores,) int64; picoseconds of a slot on each core
-    access: IntArray
-    update: IntArray
-    spike: IntArray
+    start: IntArray  # (cores + 1,) int64; bounds of each core in the compartments
+    # access, update, spike: Picoseconds of a compartment in the sweep of its core
+    access: int
+    update: int
+    spike: int
     axon_out: int  # Picoseconds of a message at its sender
-    # sender, sending: (slots,) int64; core of each slot, and picoseconds of a spike there, messages included
+    # sender, sending: (compartments,) int64; core of each, and picoseconds of a spike there, messages included
     sender: IntArray
     sending: IntArray
-    first: IntArray  # (slots + 1,) int64; bounds of each slot in the deliveries
+    first: IntArray  # (compartments + 1,) int64; bounds of each compartment in the deliveries
     # destination, processing, route: (deliveries,) int64; core that receives it, picoseconds that it takes there, and
     # way that it goes
     destination: IntArray
     processing: IntArray
     route: IntArray
-    # channel_first, channel_destination, channel_processing: The same for input channels that are on no core; they go
+    # channel_first, channel_destination, channel_processing: The same for input channels, which are on no core and go
     # no way
     channel_first: IntArray
     channel_destination: IntArray
@@ -60,7 +56,7 @@ class Tables(NamedTuple):
 
 @compiled
 def _inject(first: IntArray, destination: IntArray, cost: IntArray, events: AnyArray, t: int, busy: Any) -> None:
-    """Let each core process the input events of a step that nobody sends."""
+    """Let each core process the input events of a step."""
     if t < events.shape[1]:
         for channel in range(first.size - 1):
             if events[channel, t]:
@@ -84,9 +80,9 @@ def _list_messages(
 ) -> None:
     """List what each core sends in a step: delivery (-1 for work after its last message) and time it takes."""
     start, first, axon_out = tables.start, tables.first, tables.axon_out
+    access, update, spike = tables.access, tables.update, tables.spike
     n = 0
     for core in range(start.size - 1):
-        access, update, spike = tables.access[core], tables.update[core], tables.spike[core]
         queue[core] = n
         spent = 0
         for i in range(start[core], start[core + 1]):
@@ -218,7 +214,7 @@ def schedule(
     Filled are `spent` (steps, 2 * cores), from zeros: when each core has sent everything, then when it has processed
     everything; and as :func:`_send_all` says `blocked` and `peak` (steps,). Times are picoseconds.
     """
-    cores = tables.access.size
+    cores = tables.start.size - 1
     most = tables.destination.size + cores
     delivery, generation, later = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
     received, queue = np.empty(most, np.float64), np.empty(cores + 1, np.int64)

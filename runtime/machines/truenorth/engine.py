@@ -76,7 +76,6 @@ def prepare(netlist: CrossbarNetlist, *, careful: bool = False) -> Engine:
         axon_synapses=np.searchsorted(axon, np.arange(axons + 1)).astype(np.int64),
         synapse_neuron=neuron.astype(np.int32),
         synapse_weight=halves,
-        number=first.astype(np.int64),
         parameters=np.stack(columns, axis=1)[first].astype(np.int32),
         initial=netlist.initial[first].astype(np.int32),
     )
@@ -102,7 +101,7 @@ def _steady_first(
 ) -> tuple[Twins, int, IntArray]:
     """The same kinds with steady neurons first; how many are steady; and the cap of each kind.
 
-    Steady are neurons without random numbers and reversal whose registers, and all that can reach them in a tick, leave
+    Steady are neurons without reversal whose registers, and all that can reach them in a tick, leave
     the membrane within its range: those that are reset to a value, and those that are held at their negative threshold
     and reset by their threshold, as far as they begin a tick at their cap or below: the highest membrane from which a
     tick cannot leave the register.
@@ -114,7 +113,7 @@ def _steady_first(
     )
     leak, threshold, reset, lowest, under, linear = (column[first] for column in _registers(netlist))
     initial, held = netlist.initial[first], netlist.negative_saturates[first] == 1
-    simple = ((netlist.mask_bits == 0) & (netlist.leak_reversal == 0))[first]
+    simple = (netlist.leak_reversal == 0)[first]
     cap = high - positive - np.maximum(leak, 0)
     most = np.maximum.reduce([threshold - 1, reset, under, initial])
     least = np.minimum.reduce([lowest, reset, under, initial]) - negative + np.minimum(leak, 0)
@@ -165,15 +164,13 @@ def simulate(
     events: EventArray,
     *,
     lengths: IntArray | None = None,
-    seed: int = 0,
     spikes: bool = False,
     membranes: bool = False,
 ) -> Trace:
     """Run recordings (samples, n_inputs, T) through the cores, as :func:`spec.simulate` does each.
 
-    `lengths` (samples,) are their data steps where some are shorter than T. All draw the same random numbers, so that
-    none depends on its neighbours. Spikes and membranes are kept where they are wanted, at one and four bytes a neuron
-    and tick.
+    `lengths` (samples,) are their data steps where some are shorter than T. Spikes and membranes are kept where they
+    are wanted, at one and four bytes a neuron and tick.
 
     DataError if the recordings have another number of input channels than the network. NumericRangeError if they would
     take more ticks than a run can count.
@@ -201,7 +198,6 @@ def simulate(
             arriving,
             netlist.bin_ticks,
             netlist.ticks(int(steps[sample])),
-            np.uint64(seed),
             engine.low,
             engine.high,
             engine.slots,
@@ -213,7 +209,7 @@ def simulate(
         list(pool.map(one, range(samples)))
     if np.any(merged == kernel.BROKEN_OFF):
         again = prepare(netlist, careful=True)
-        return simulate(again, events, lengths=lengths, seed=seed, spikes=spikes, membranes=membranes)
+        return simulate(again, events, lengths=lengths, spikes=spikes, membranes=membranes)
     counts = Counts(
         ticks=steps * netlist.bin_ticks + netlist.drain,
         spikes=spiked[:, twins.neuron],

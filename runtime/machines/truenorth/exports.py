@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import ranc
-from spikeloom.runtime.machines.export_format import Export, Format, Request
+from spikeloom.runtime.machines.base import Export, Format, Request
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +35,6 @@ def _ranc(request: Request) -> Export:
     return Export(
         content=(f"{line}\n".encode() for line in ranc.export(netlist, events)),
         facts=RancFacts(neurons=netlist.n_neurons, synapses=netlist.n_synapses, ticks=ticks),
-        synapses=netlist.n_synapses,
         lines=(f"run: ranc_sim {path} {out} {path} TICKS ({shown})",),
     )
 

@@ -16,15 +16,13 @@ import numpy.typing as npt
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.loihi1.kernel import compiled, compiled_and_cached
-from spikeloom.runtime.machines.truenorth.spec import MIX_1, MIX_2, STEP_NEURON, STEP_TICK
 
 Int32 = npt.NDArray[np.int32]
 
 PARAMETERS = (
-    *("leak", "leak_reversal", "threshold", "mask_bits", "reset_mode", "reset", "negative_threshold"),
-    "negative_saturates",
+    *("leak", "leak_reversal", "threshold", "reset_mode", "reset", "negative_threshold", "negative_saturates"),
 )
-LEAK, REVERSAL, THRESHOLD, MASK_BITS, RESET_MODE, RESET, NEGATIVE, SATURATES, AXON, DELAY, VOTES_FROM = range(11)
+LEAK, REVERSAL, THRESHOLD, RESET_MODE, RESET, NEGATIVE, SATURATES, AXON, DELAY, VOTES_FROM = range(10)
 """Columns of the parameters of a neuron: those of the netlist, the axon that its spikes reach (-1 for none), the ticks
 until then, and the tick from which on they count as votes (-1 for never)."""
 
@@ -35,10 +33,6 @@ WORD = 8
 """Spikes of steady neurons that are looked at together."""
 
 BROKEN_OFF = -1
-
-_STEP_NEURON, _STEP_TICK = np.uint64(STEP_NEURON), np.uint64(STEP_TICK)
-_MIX_1, _MIX_2 = np.uint64(MIX_1), np.uint64(MIX_2)
-_30, _27, _31, _64, _ONE = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(64), np.uint64(1)
 
 
 class Wiring(NamedTuple):
@@ -58,8 +52,7 @@ class Wiring(NamedTuple):
     axon_synapses: IntArray  # (axons + 1,) int64; crossing points with all other neurons
     synapse_neuron: Int32  # (synapses,) int32
     synapse_weight: IntArray  # (synapses,) int64; in halves
-    number: IntArray  # (neurons,) int64; which neuron of the network it is, whose random numbers it draws
-    parameters: Int32  # (neurons, 11) int32
+    parameters: Int32  # (neurons, 10) int32
     initial: Int32  # (neurons,) int32
 
 
@@ -87,15 +80,6 @@ class Tallies(NamedTuple):
 
 
 @compiled
-def draw(seed: Any, neuron: Any, tick: Any, bits: Any) -> Any:
-    """As :func:`spec.random_bits`, of at least one bit."""
-    x = seed + (np.uint64(neuron) + _ONE) * _STEP_NEURON + (np.uint64(tick) + _ONE) * _STEP_TICK
-    x = (x ^ (x >> _30)) * _MIX_1
-    x = (x ^ (x >> _27)) * _MIX_2
-    return np.int64((x ^ (x >> _31)) >> (_64 - np.uint64(bits)))
-
-
-@compiled
 def leaked(v: Any, leak: Any, reversal: Any) -> Any:
     """Membrane with its leak, which with reversal takes the membrane's sign and stops at zero."""
     if not reversal:
@@ -106,18 +90,18 @@ def leaked(v: Any, leak: Any, reversal: Any) -> Any:
 
 
 @compiled
-def after(v: Any, spiked: Any, threshold: Any, random: Any, mode: Any, reset: Any, below: Any, saturates: Any) -> Any:
-    """Membrane after the resets; the threshold holds the random number already."""
+def after(v: Any, spiked: Any, threshold: Any, mode: Any, reset: Any, below: Any, saturates: Any) -> Any:
+    """Membrane after the resets."""
     if spiked:
         if mode == RESET_TO:
             return reset
         return v - threshold if mode == RESET_LINEAR else v
     if saturates:
         return max(v, -below)
-    if v < -(below + random):
+    if v < -below:
         if mode == RESET_TO:
             return -reset
-        return v + below + random if mode == RESET_LINEAR else v
+        return v + below if mode == RESET_LINEAR else v
     return v
 
 
@@ -172,18 +156,17 @@ def _integrate(slot: Any, wiring: Any, state: Any, axons: Any) -> None:
 
 
 @compiled
-def _update(n: Any, tick: Any, seed: Any, low: Any, high: Any, wiring: Any, state: Any, tallies: Any) -> Any:
+def _update(n: Any, low: Any, high: Any, wiring: Any, state: Any, tallies: Any) -> Any:
     """A tick of a neuron that is not steady: whether it spiked."""
     p = wiring.parameters
     leak, threshold, below = np.int64(p[n, LEAK]), np.int64(p[n, THRESHOLD]), np.int64(p[n, NEGATIVE])
-    random = draw(seed, wiring.number[n], tick, p[n, MASK_BITS]) if p[n, MASK_BITS] else np.int64(0)
     before, positive, negative = np.int64(state.membrane[n]), state.arrived[n] >> HALF, state.arrived[n] & LOWER
     state.arrived[n] = 0
     summed = min(max(before + positive - negative, low), high)
     wanted = leaked(summed, leak, p[n, REVERSAL])
     v = min(max(wanted, low), high)
-    spiked = v >= threshold + random
-    left = after(v, spiked, threshold + random, random, p[n, RESET_MODE], np.int64(p[n, RESET]), below, p[n, SATURATES])
+    spiked = v >= threshold
+    left = after(v, spiked, threshold, p[n, RESET_MODE], np.int64(p[n, RESET]), below, p[n, SATURATES])
     v = min(max(left, low), high)
     state.membrane[n] = v
     if before + positive > high or before - negative < low or wanted < low or wanted > high or left != v:
@@ -241,9 +224,7 @@ def _send_steady(
 
 
 @compiled_and_cached
-def run(
-    events: Any, bin_ticks: int, ticks: int, seed: Any, low: int, high: int, slots: int, wiring: Any, tallies: Any
-) -> int:
+def run(events: Any, bin_ticks: int, ticks: int, low: int, high: int, slots: int, wiring: Any, tallies: Any) -> int:
     """Run one recording; fills the tallies and returns the merged spikes, or ``BROKEN_OFF``.
 
     `events` is (steps, channels); `slots` is a power of two above every delay: spikes that are due in a tick wait in
@@ -270,7 +251,7 @@ def run(
             return BROKEN_OFF
         merged += _send_steady(steady, tick, ticks, window, slots, wiring, state, tallies)
         for n in range(steady, neurons):
-            if _update(n, tick, seed, low, high, wiring, state, tallies):
+            if _update(n, low, high, wiring, state, tallies):
                 merged += _send(n, tick, ticks, window, slots, wiring, state, tallies)
         if len(tallies.membranes):
             tallies.membranes[tick] = state.membrane

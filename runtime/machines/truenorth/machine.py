@@ -6,9 +6,8 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NoReturn, TypeVar
+from typing import NoReturn
 
-import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import with_clocks
@@ -17,14 +16,11 @@ from spikeloom.compiler.targets.base import with_tables
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars
 from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.machines.base import EventArray, Machine, Price, Run, one_by_one
+from spikeloom.runtime.machines.base import EventArray, Machine, Price, Run, T, one_by_one
 from spikeloom.runtime.machines.truenorth import cost, engine, spec
 from spikeloom.runtime.machines.truenorth.describe import describe
 from spikeloom.runtime.machines.truenorth.spec import Trace, differences
-from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
-
-T = TypeVar("T", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -44,6 +40,11 @@ class TrueNorth(Machine):
         """Names of the layers."""
         return self.netlist.layers
 
+    def of_layer(self, array: npt.NDArray[T], index: int) -> npt.NDArray[T]:
+        """By tick."""
+        of_layer: npt.NDArray[T] = array[:, :, self.netlist.layer == index]
+        return of_layer
+
     def legal(self) -> None:
         """Refuse a netlist that breaks a rule."""
         require_legal(self.netlist, self.target)
@@ -55,10 +56,10 @@ class TrueNorth(Machine):
         lengths: IntArray | None = None,
         spikes: bool = False,
         membranes: bool = False,
-        threads: int | None = None,
     ) -> Run:
-        """Decisions, and spikes by tick; one recording runs at a time, whatever `threads` says."""
-        return self._run(self.simulate(events, lengths, spikes=spikes, membranes=membranes))
+        """Decisions, and spikes by tick."""
+        trace = self.simulate(events, lengths, spikes=spikes, membranes=membranes)
+        return self._run(trace, trace.counts.votes)
 
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Every spike, membrane, vote and spike on an axon, one recording after another."""
@@ -83,7 +84,7 @@ class TrueNorth(Machine):
         self.require_detail(detail)
         chip = self.target if table is None else with_tables(self.target, table)
         trace = self.simulate(events, lengths, spikes=spikes)
-        return self._run(trace), cost.price(self.netlist, chip, trace.counts, bin_s)
+        return self._run(trace, trace.counts.votes), cost.price(self.netlist, chip, trace.counts, bin_s)
 
     def batch(self, steps: int) -> int:
         """Recordings whose counts are held at a time."""
@@ -105,16 +106,6 @@ class TrueNorth(Machine):
         """Everything that the engine counts and keeps; see :meth:`run`."""
         channels = with_clocks(events, self.netlist.clocks)
         return engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
-
-    def _run(self, trace: Trace) -> Run:
-        votes = class_counts(self.netlist, trace.counts.votes)
-        spikes, membranes = self._by_layer(trace.spikes), self._by_layer(trace.membranes)
-        return Run(votes=votes, counts=trace.counts.spikes, spikes=spikes, membranes=membranes)
-
-    def _by_layer(self, array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]] | None:
-        if array is None:
-            return None
-        return {name: array[:, :, self.netlist.layer == index] for index, name in enumerate(self.layers)}
 
 
 machine_of = TrueNorth

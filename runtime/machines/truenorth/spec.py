@@ -10,7 +10,7 @@ A tick
    weights are added up apart, for the order in which the chip visits its axons is not ours to rely on: a tick in
    which *some* order would leave the register of 20 bits with sign is counted. The register saturates.
 3. *Leak.* Added, or with reversal added times the sign of the membrane; what such a leak carries past zero is zero.
-4. *Threshold.* A spike where the membrane is at least the threshold and this tick's random number.
+4. *Threshold.* A spike where the membrane is at least the threshold.
 5. *Reset.* To a value, by the threshold, or not at all. Without a spike a membrane below the negative threshold is
    set to it, or reset the same way.
 
@@ -40,30 +40,6 @@ from spikeloom.compiler.types import BoolArray, IntArray
 
 MembraneArray = npt.NDArray[np.int32]
 EventArray = npt.NDArray[np.uint8 | np.bool_]
-
-MASK64 = (1 << 64) - 1
-STEP_NEURON, STEP_TICK = 0x9E3779B97F4A7C15, 0xD1B54A32D192ED03
-MIX_1, MIX_2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
-"""Constants of the random numbers, see :func:`random_bits`."""
-
-
-def random_bits(seed: int, neuron: int, tick: int, bits: int) -> int:
-    """Random number of so many bits that a neuron draws in a tick, in plain integers.
-
-    A finaliser of splitmix64 over seed, neuron and tick: the same whoever draws first. The chip's own generator is not
-    public; no network that shall be exact should use it.
-
-    Examples
-    --------
-    >>> random_bits(0, 5, 7, 0), random_bits(0, 5, 7, 8), random_bits(1, 5, 7, 8)
-    (0, 211, 201)
-    """
-    if not bits:
-        return 0
-    x = (seed + (neuron + 1) * STEP_NEURON + (tick + 1) * STEP_TICK) & MASK64
-    x = ((x ^ (x >> 30)) * MIX_1) & MASK64
-    x = ((x ^ (x >> 27)) * MIX_2) & MASK64
-    return (x ^ (x >> 31)) >> (64 - bits)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -118,7 +94,6 @@ class Neuron:
     leak: int
     leak_reversal: bool
     threshold: int
-    mask_bits: int
     reset_mode: int
     reset: int
     negative_threshold: int
@@ -138,19 +113,19 @@ def saturated(value: int, bits: int) -> int:
     return max(low, min(high, value))
 
 
-def neuron_tick(neuron: Neuron, positive: int, negative: int, random: int, bits: int) -> tuple[bool, bool]:
+def neuron_tick(neuron: Neuron, positive: int, negative: int, bits: int) -> tuple[bool, bool]:
     """Let one neuron live through a tick: its membrane is replaced.
 
-    `positive` and `negative` are the sums of the weights that arrived, as magnitudes, `random` is this tick's random
-    number under the neuron's mask, `bits` the width of the register. Returns whether it spiked, and whether the
-    register was left, or would have been in some order of arrivals.
+    `positive` and `negative` are the sums of the weights that arrived, as magnitudes, `bits` is the width of the
+    register. Returns whether it spiked, and whether the register was left, or would have been in some order of
+    arrivals.
 
     Examples
     --------
     A threshold of 3 reached exactly is a spike; a linear reset keeps what is above it.
 
-    >>> neuron = Neuron(0, False, 3, 0, RESET_LINEAR, 0, 0, False, 2)
-    >>> neuron_tick(neuron, 5, 1, 0, 20), neuron.membrane
+    >>> neuron = Neuron(0, False, 3, RESET_LINEAR, 0, 0, False, 2)
+    >>> neuron_tick(neuron, 5, 1, 20), neuron.membrane
     ((True, False), 3)
     """
     low, high = signed_range(bits)
@@ -171,23 +146,21 @@ def neuron_tick(neuron: Neuron, positive: int, negative: int, random: int, bits:
     left = left or v != leaked
 
     # threshold
-    threshold = neuron.threshold + random
-    spiked = v >= threshold
+    spiked = v >= neuron.threshold
 
     # reset
-    below = neuron.negative_threshold + (0 if neuron.negative_saturates else random)
     if spiked:
         if neuron.reset_mode == RESET_TO:
             v = neuron.reset
         elif neuron.reset_mode == RESET_LINEAR:
-            v -= threshold
-    elif v < -below:
+            v -= neuron.threshold
+    elif v < -neuron.negative_threshold:
         if neuron.negative_saturates:
             v = -neuron.negative_threshold
         elif neuron.reset_mode == RESET_TO:
             v = -neuron.reset
         elif neuron.reset_mode == RESET_LINEAR:
-            v += below
+            v += neuron.negative_threshold
     neuron.membrane = saturated(v, bits)
     return spiked, left or neuron.membrane != v
 
@@ -206,11 +179,11 @@ def injected(netlist: CrossbarNetlist, events: EventArray) -> defaultdict[int, l
     return due
 
 
-def simulate(netlist: CrossbarNetlist, events: EventArray, *, seed: int = 0) -> Trace:
+def simulate(netlist: CrossbarNetlist, events: EventArray) -> Trace:
     """Run one recording (n_inputs, T), uint8 or bool, through the cores of a network that breaks no rule of its chip.
 
-    Any value but zero is an event; the `seed` is that of the random numbers. The trace holds spikes and membranes and
-    has no leading axis. DataError if the recording has another number of input channels than the network.
+    Any value but zero is an event. The trace holds spikes and membranes and has no leading axis. DataError if the
+    recording has another number of input channels than the network.
     """
     check_channels(netlist, events.shape[0])
     bits = load_target(netlist.target).limit("neuron.membrane_bits")
@@ -252,8 +225,7 @@ def simulate(netlist: CrossbarNetlist, events: EventArray, *, seed: int = 0) -> 
                     negative[n] -= weight
 
         for n, neuron in enumerate(neurons):
-            random = random_bits(seed, n, tick, neuron.mask_bits)
-            spiked, left = neuron_tick(neuron, positive[n], negative[n], random, bits)
+            spiked, left = neuron_tick(neuron, positive[n], negative[n], bits)
             membranes[tick, n] = neuron.membrane
             overflows[n] += left
             if spiked:

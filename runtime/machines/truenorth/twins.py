@@ -41,10 +41,7 @@ class Twins:
 
 
 def find_twins(netlist: CrossbarNetlist, half: int) -> Twins:
-    """Kinds of a network that breaks no rule; positive sums are shifted by `half` bits.
-
-    A neuron that draws random numbers, which are its own, is alone.
-    """
+    """Kinds of a network that breaks no rule; positive sums are shifted by `half` bits."""
     neuron, axon, aims = netlist.neuron_of_synapse(), netlist.axon_of_synapse(), netlist.aims()
     weight = netlist.weight[neuron, netlist.axon_type[axon]]
     halves = np.where(weight > 0, weight << half, -weight)
@@ -98,8 +95,7 @@ def _registers(netlist: CrossbarNetlist, alone: BoolArray) -> IntArray:
     # to an axon that it has `alone`, with a delay; or to one that others reach, too, where two spikes of a tick merge
     leads[netlist.wire_neuron, 0] = np.where(alone, -2, netlist.wire_neuron)
     leads[netlist.wire_neuron, 1] = netlist.wire_delay
-    draws = np.where(netlist.mask_bits > 0, np.arange(netlist.n_neurons), -1)
-    columns = [*(getattr(netlist, name) for name in _REGISTERS), netlist.readout_class >= 0, *leads.T, draws]
+    columns = [*(getattr(netlist, name) for name in _REGISTERS), netlist.readout_class >= 0, *leads.T]
     rows = np.stack(columns, axis=1).astype(np.int64).reshape(netlist.n_neurons, -1)
     found: IntArray = np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
     return found

@@ -38,10 +38,10 @@ def with_expectations(
     points: Sequence[Point], networks: Sequence[ChartedNetwork]
 ) -> tuple[list[Point], list[ChartedNetwork], str]:
     """Points and networks with what they are expected to reach, and in words what that is."""
-    validated = all(network.validation is not None for network in networks)
-    reached = [network.validation if validated else network.float_training for network in networks]
+    validated = all(network.file.validation is not None for network in networks)
+    reached = [network.file.validation if validated else network.float_training for network in networks]
     known = [replace(network, expected=value or 0.0) for network, value in zip(networks, reached, strict=True)]
-    by_name = {network.name: network for network in known}
+    by_name = {network.file.name: network for network in known}
 
     def reach(point: Point) -> float:
         network = by_name[point.network]
@@ -111,7 +111,7 @@ def recommended(
     good = [point for point in points if point.expected >= reference - 1 / points[0].test.samples - NEAR]
     cheapest, fastest, time = min(good, key=_energy(by), default=None), None, by.time
     if time is not None:
-        bins = {network.name: network.bins for network in networks}
+        bins = {network.file.name: network.file.bins for network in networks}
         keeping = [point for point in good if point.train.step_s[time] <= bin_s * bins[point.network]]
         fastest = min(keeping, key=lambda point: (point.train.time_s[time], _energy(by)(point)), default=None)
     chosen = {"cheapest": cheapest, "fastest": fastest, "best": best_of(points, by)}

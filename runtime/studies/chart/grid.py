@@ -15,7 +15,7 @@ from typing import Any
 from spikeloom.compiler import GOALS, MAX_PLANES
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
-from spikeloom.models.recordings.windows import WHOLE
+from spikeloom.models.recordings.evtouch import WHOLE
 
 WINDOW_STEP = 25
 """Per cent between the windows of a range that does not say."""

@@ -1,13 +1,13 @@
-"""The networks of a chart."""
+"""The networks of a chart, and the storages that a grid asks for."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import count, product
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from spikeloom.compiler import Packing, check_packings
 from spikeloom.compiler.archive import arrays_digest, is_netlist
@@ -20,39 +20,9 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import PRETRAINED, shipped
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
-from spikeloom.runtime.machines.base import DEFAULT, chip_chart, trained_for
+from spikeloom.runtime.machines.base import DEFAULT, trained_for
+from spikeloom.runtime.report.encode import HIDDEN
 from spikeloom.runtime.studies.chart.grid import Grid
-
-
-def from_anywhere(path: str | None) -> str | None:
-    """A path that means the same in another folder; what is no file stays as it is."""
-    return str(Path(path).resolve()) if path and Path(path).exists() else path
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Source:
-    """A network's file, and how it is read; `target` is the chip of a network that was trained for one."""
-
-    path: str
-    graph: str | None = None
-    taxels: str | None = None
-    edges: str | None = None
-    directed: bool = False
-    system: str | None = None
-    run: int = 0
-    weights: str | None = None
-    beta: float | None = None
-    theta: float | None = None
-    target: str | None = None
-
-    def options(self) -> JsonObject:
-        """All but the file."""
-        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "path"}
-
-    def arguments(self) -> argparse.Namespace:
-        """As a command would have parsed them."""
-        others = dict.fromkeys(("polarities", "polarities_first", "dt", "convention"))
-        return argparse.Namespace(**self.options(), **others)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,26 +60,42 @@ class Storage:
         return " ".join([*parts, *(["pruned"] if self.prune else [])])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Given:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetworkFile:
     """A network of a chart."""
 
-    source: Source  # As typed, with the options that suit it
+    json_properties: ClassVar = ("fine_tuned", "trained_by", "validation")
+
+    path: str
     name: str  # Short, and no other network of the chart has it
     target: str  # Chip that it is compiled for
     graph: str  # That it was trained on; ``none`` of systems without
-    sees: str  # Hash over what its first layer sees
     # sha256, weights, system: Of the file, and what of it is taken
     sha256: str
     weights: str
     system: str
-    taxels: int
-    classes: int
-    layers: tuple[str, ...]  # Names
-    training: Mapping[str, Any]  # JSON values, as far as the file knows them
-    forms: tuple[Form, ...] | None = None  # Storage that it was fine-tuned for
-    levels: int | None = None  # Levels of its weights, of a network that was trained in whole numbers for its chip
     bins: int = 1  # Bins of the recordings that a step joins
+    options: tuple[tuple[str, Any], ...] = field(metadata=HIDDEN)  # How it is read: as typed, if they suit it
+    sees: str = field(default="", metadata=HIDDEN)  # Hash over what its first layer sees
+    taxels: int = field(metadata=HIDDEN)
+    classes: int = field(metadata=HIDDEN)
+    layers: tuple[str, ...] = field(metadata=HIDDEN)  # Names
+    # JSON values, as far as the file knows them
+    training: Mapping[str, Any] = field(metadata=HIDDEN, compare=False)
+    # Storage that it was fine-tuned for
+    forms: tuple[Form, ...] | None = field(default=None, metadata=HIDDEN, compare=False)
+    # Levels of its weights, of a network that was trained in whole numbers for its chip
+    levels: int | None = field(default=None, metadata=HIDDEN)
+
+    @property
+    def fine_tuned(self) -> bool:
+        """Whether it was trained for its storage."""
+        return self.forms is not None
+
+    @property
+    def trained_by(self) -> str | None:
+        """The command, where the file says so."""
+        return self.training.get("command")
 
     @property
     def validation(self) -> float | None:
@@ -123,13 +109,12 @@ class Given:
     def identity(self) -> JsonObject:
         """What tells it from others, wherever its file is."""
         about = {"checkpoint": self.sha256, "weights": self.weights, "sees": self.sees}
-        return about | {"options": self.source.options()}
+        return about | {"options": dict(self.options)}
 
-    def from_anywhere(self) -> Given:
-        """The same for a process that works in another folder."""
-        taxels, edges = from_anywhere(self.source.taxels), from_anywhere(self.source.edges)
-        source = replace(self.source, path=str(from_anywhere(self.source.path)), taxels=taxels, edges=edges)
-        return replace(self, source=source)
+    def arguments(self) -> argparse.Namespace:
+        """Its options as a command would have parsed them."""
+        others = dict.fromkeys(("polarities", "polarities_first", "dt", "convention"))
+        return argparse.Namespace(**others, **dict(self.options))
 
     def storages(self, grid: Grid) -> Iterator[Storage]:
         """Every storage that a grid asks for; of a network that was trained in one its own and no other."""
@@ -153,84 +138,87 @@ class Given:
         return grid.cores if self.levels is None else Grid().cores
 
 
-def given_networks(arguments: argparse.Namespace) -> tuple[Given, ...]:
+def read_networks(arguments: argparse.Namespace) -> tuple[NetworkFile, ...]:
     """Networks of ``checkpoints``; refused if one cannot be used, or is given twice."""
     paths: list[str] = arguments.checkpoints
-    named: dict[str, Given] = {}
+    named: dict[str, NetworkFile] = {}
     for path in paths:
         if paths.count(path) > 1:
             raise OptionError(f"{path}: is given twice; give each checkpoint once")
         network = _read(path, arguments)
-        name = next(name for name in _names(network.name) if name not in named)
+        numbered = (f"{network.name}-{number}" for number in count(2))
+        name = network.name if network.name not in named else next(name for name in numbered if name not in named)
         named[name] = replace(network, name=name)
     return tuple(named.values())
 
 
-def _names(name: str) -> Iterator[str]:
-    """Names for networks whose files have the same: counted from the second."""
-    yield name
-    yield from (f"{name}-{number}" for number in count(2))
-
-
-def _read(path: str, arguments: argparse.Namespace) -> Given:
+def _read(path: str, arguments: argparse.Namespace) -> NetworkFile:
     if path.endswith(SUFFIX):
         raise ModelError(f"{path}: is an ONNX file, a chart takes checkpoints; give the checkpoint that it was made of")
     file = shipped(path)
-    chip = trained_for(file) if Path(file).is_file() else None
-    chart = None if chip is None else chip_chart(chip.__package__.rpartition(".")[2])
+    chart = trained_for(file) if Path(file).is_file() else None
     name = Path(path.removeprefix(PRETRAINED)).stem
     if chart is not None:
         known = chart.facts(path, arguments.weights)
-        source = Source(path=path, weights=arguments.weights, target=known["target"])
-        return Given(source=source, name=name, sees="", **known)
+        options = (("weights", arguments.weights), ("target", known["target"]))
+        return NetworkFile(path=path, name=name, options=options, **known)
     if Path(file).is_file() and is_netlist(file):
         raise ModelError(f"{path}: is a netlist, a chart compiles its own; give the checkpoint that it was made from")
     checkpoint = load_checkpoint(path, arguments)
-    source = Source(path=path, **repeat.given(arguments, repeat.NETWORK))
+    typed = repeat.given(arguments, repeat.NETWORK)
     if checkpoint.edges is not None:  # one that knows its graph needs no option; others of the same call may
-        source = replace(source, graph=None, edges=None, directed=False)
-    graph, sees = propagation(checkpoint, load_graph(source.arguments(), checkpoint.system), path)
-    return Given(
-        source=source if checkpoint.edges is None else replace(source, taxels=None),
+        typed |= {"graph": None, "edges": None, "directed": False}
+    known_graph = load_graph(argparse.Namespace(**(vars(arguments) | typed)), checkpoint.system)
+    graph, sees = propagation(checkpoint, known_graph, path)
+    if checkpoint.edges is not None:
+        typed["taxels"] = None
+    return NetworkFile(
+        path=path,
         name=name,
         target=DEFAULT,
         graph=graph,
-        sees=arrays_digest({"propagation": sees}),
         sha256=checkpoint.sha256,
         weights=checkpoint.weights,
         system=checkpoint.system,
+        bins=checkpoint.bins,
+        options=tuple(typed.items()),
+        sees=arrays_digest({"propagation": sees}),
         taxels=checkpoint.taxels,
         classes=checkpoint.classes,
         layers=tuple(checkpoint.neurons),
         training=checkpoint.training or {},
         forms=checkpoint.forms,
-        bins=checkpoint.bins,
     )
 
 
-def require_suited(networks: Sequence[Given], splits: Mapping[str, Recordings], digest: str) -> None:
+def require_suited(networks: Sequence[NetworkFile], splits: Mapping[str, Recordings], digest: str) -> None:
     """Refuse networks that do not belong together, or were trained on other recordings than these of this hash."""
     first = networks[0]
     for network in networks:
+        if network.target != first.target:
+            raise ModelError(
+                f"{network.path}: is for {network.target}, {first.path} for {first.target}; prices of two chips hold "
+                "different things: make a chart of each"
+            )
         sizes = [(each.taxels, each.classes) for each in (first, network)]
         if sizes[0] != sizes[1]:
             raise ModelError(
-                f"{network.source.path}: has {sizes[1][0]} taxels and {sizes[1][1]} classes, {first.source.path} has "
+                f"{network.path}: has {sizes[1][0]} taxels and {sizes[1][1]} classes, {first.path} has "
                 f"{sizes[0][0]} and {sizes[0][1]}; chart networks of one data set at a time"
             )
         if network.training.get("data_sha256") not in (None, digest):
             raise ModelError(
-                f"{network.source.path}: was trained on other recordings ({network.training.get('data', 'others')}) "
+                f"{network.path}: was trained on other recordings ({network.training.get('data', 'others')}) "
                 f"than {splits['test'].source}; give those, or a checkpoint that was trained on these"
             )
 
 
-def require_grid(networks: Sequence[Given], grid: Grid, target: Target) -> None:
+def require_grid(networks: Sequence[NetworkFile], grid: Grid, target: Target) -> None:
     """Refuse widths and layouts by layer that do not suit a network's layers."""
     for network in networks:
         if network.levels is not None:
             continue
-        path, layers = network.source.path, network.layers
+        path, layers = network.path, network.layers
         for bits in grid.bits if network.forms is None else ():
             if len(bits) not in (1, len(layers)):
                 raise OptionError(

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import ClassVar
 
-from spikeloom.runtime.report.encode import key
+from spikeloom.runtime.report.encode import INLINE, key
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.chart.grid import Grid
-from spikeloom.runtime.studies.chart.work import FORMAT
+from spikeloom.runtime.studies.chart.networks import NetworkFile
+
+FORMAT = 2
+"""Of what is measured; goes up when a figure means something else."""
+
+SPLITS = ("train", "test")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,25 +107,21 @@ class Point(Configuration):
 class ChartedNetwork:
     """A network; accuracies of its float model by window and split, and what its points are expected to reach."""
 
-    name: str
-    path: str
-    target: str
-    sha256: str
-    system: str
-    graph: str
-    weights: str
-    fine_tuned: bool
-    trained_by: str | None
-    validation: float | None
-    bins: int
-    model: Mapping[str, Mapping[str, Share]] = field(metadata=key("float"))
-    float_training: float
+    file: NetworkFile = field(metadata=INLINE)
+    model: Mapping[int, Mapping[str, Share]] = field(metadata=key("float"))
     expected: float = 0.0
+
+    json_properties: ClassVar = ("float_training",)
+
+    @property
+    def float_training(self) -> float:
+        """Accuracy of the float model on whole training recordings, or the longest parts that were measured."""
+        return self.model[max(self.model)]["train"].accuracy
 
     @property
     def whole(self) -> Share:
-        """The float model on whole test recordings."""
-        return self.model[max(self.model, key=int)]["test"]
+        """The float model on test recordings, likewise."""
+        return self.model[max(self.model)]["test"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,8 +161,8 @@ class Pick:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ChartedData:
-    """Recordings: where they are, their bins, a hash over both splits, how many there are, and steps of the longest."""
+class Data:
+    """Recordings: where they are, their bins, a hash over both splits, how many there are, and bins of the longest."""
 
     path: str
     bin_s: float
@@ -189,7 +190,7 @@ class Chart:
     spikeloom: str
     target: str
     command: str
-    data: ChartedData
+    data: Data
     tables: Mapping[str, Mapping[str, str]]
     chosen_by: ChosenBy
     grid: Grid
@@ -216,25 +217,6 @@ class Chart:
         return names
 
 
-AnEntry = TypeVar("AnEntry", Point, ChartedNetwork)
-
-
-def by_chip(entries: Sequence[AnEntry], target: str) -> tuple[list[AnEntry], list[AnEntry]]:
-    """Points or networks of a chip, and those of others."""
-    return [entry for entry in entries if entry.target == target], [each for each in entries if each.target != target]
-
-
-def price(costs: Mapping[str, float], table: str) -> float:
-    """A cost by a table, or by the first of those of another chip, whose tables have other names.
-
-    Examples
-    --------
-    >>> price({"davies": 1.0, "sanafe": 2.0}, "sanafe"), price({"all_in": 3.0, "marginal": 4.0}, "sanafe")
-    (2.0, 3.0)
-    """
-    return costs[table] if table in costs else next(iter(costs.values()))
-
-
 @dataclass(frozen=True, slots=True)
 class Axis:
     """A cost that accuracy is drawn over: its title, the words below the axis, the unit, and the cost of a point."""
@@ -248,18 +230,10 @@ class Axis:
 def axes(chart: Chart) -> dict[str, Axis]:
     """Costs of a chart by name."""
     energy, time = chart.chosen_by.energy, chart.chosen_by.time
-    _, beside = by_chip(chart.points, chart.target)
-
-    def tables(costs: Callable[[Point], Mapping[str, float]], table: str) -> str:
-        """The table of a cost, and those by which the points of other chips are drawn."""
-        firsts = dict.fromkeys((point.target, next(iter(costs(point)))) for point in beside)
-        return "; ".join([table, *(f"{target}: {first}" for target, first in firsts if first != table)])
-
-    named = f"energy of a mean inference ({tables(lambda point: point.test.energy_j, energy)})"
-    found = {"energy": Axis("energy", named, "J", lambda point: price(point.test.energy_j, energy))}
+    found = {"energy": Axis("energy", f"energy of a mean inference ({energy})", "J", lambda p: p.test.energy_j[energy])}
     if time is not None:
-        named = f"time of a mean inference on the chip ({tables(lambda point: point.test.time_s, time)})"
-        found["latency"] = Axis("time on the chip", named, "s", lambda point: price(point.test.time_s, time))
+        named = f"time of a mean inference on the chip ({time})"
+        found["latency"] = Axis("time on the chip", named, "s", lambda point: point.test.time_s[time])
     named = "synaptic operations of a mean inference"
     found["operations"] = Axis("synaptic operations", named, "", lambda point: point.test.synaptic_operations)
     found["cores"] = Axis("cores", "cores in use", "", lambda point: float(point.n_cores))

@@ -18,7 +18,7 @@ from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Section, Table, Text
 from spikeloom.runtime.studies.chart.choices import UNITS
-from spikeloom.runtime.studies.chart.results import Axis, Chart, ChosenBy, Point, axes, by_chip, price
+from spikeloom.runtime.studies.chart.results import Axis, Chart, ChosenBy, Point, axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,11 +44,6 @@ MEANINGS = (
     "Larger marks have seen more of each recording; rings and lines: recommended points and their 95 % intervals."
 )
 
-BESIDE = (
-    "Points of another chip stand at their own prices, named in brackets; fronts and choices leave them out, since "
-    "prices of two chips hold different things."
-)
-
 
 def sections(chart: Chart) -> list[Section]:
     """All of a chart, in the order of its page."""
@@ -60,15 +55,13 @@ def sections(chart: Chart) -> list[Section]:
         f"choices are made on the training split by what is expected: {chart.expected}; test figures are reported "
         "beside"
     )
-    _, others = by_chip(chart.points, chart.target)
-    meanings = [Text(MEANINGS), *([Text(BESIDE)] if others else [])]
     saving = Section("Less energy than the usual mapping", [saved(chart)])
     return [
         Section("Networks", [Text(summary), Section("", [_networks(chart)])]),
         Section("Which one to deploy", [Facts(_cards(chart)), Section("", taken(chart)), saving, *_budget(chart)]),
         Section(
             "Accuracy against cost",
-            [*_figures(chart), *_fronts(chart), *_others(chart), Details("What is drawn", meanings, unfolded=True)],
+            [*_figures(chart), *_fronts(chart), Details("What is drawn", [Text(MEANINGS)], unfolded=True)],
         ),
         Section(
             "Every point",
@@ -174,8 +167,8 @@ def _scatter(drawing: Drawing, panel: Axes, chart: Chart, name: str, axis: Axis)
             label="front on the test split",
             zorder=2,
         )
-    network = max(by_chip(chart.networks, chart.target)[0], key=lambda each: each.expected)
-    level = f"float model of {network.name}"
+    network = max(chart.networks, key=lambda each: each.expected)
+    level = f"float model of {network.file.name}"
     panel.axhline(100 * network.whole.accuracy, color=GREY, lw=0.9, ls=":", label=level, zorder=1)
     for index, point in enumerate(point for point in points if point.number in chart.taken):
         (x, y), low, high = place(point), 100 * point.test.low, 100 * point.test.high
@@ -230,11 +223,6 @@ def _head(by: ChosenBy) -> list[str]:
 
 def _cells(by: ChosenBy, point: Point) -> list[str]:
     test = point.test
-
-    def cost(costs: Mapping[str, float], name: str, unit: str) -> str:
-        """A cost; of a chip whose tables have other names with that of its own."""
-        return f"{si(price(costs, name), unit)}{'' if name in costs else f' ({next(iter(costs))})'}"
-
     return [
         str(point.number),
         point.label,
@@ -243,8 +231,8 @@ def _cells(by: ChosenBy, point: Point) -> list[str]:
         f"{100 * test.low:.1f} … {100 * test.high:.1f}",
         f"{100 * test.model.accuracy:.2f}",
         f"{test.equal}",
-        cost(test.energy_j, by.energy, "J"),
-        "–" if by.time is None else cost(test.time_s, by.time, "s"),
+        si(test.energy_j[by.energy], "J"),
+        "–" if by.time is None else si(test.time_s[by.time], "s"),
         f"{test.synaptic_operations:,.0f}",
         str(point.n_cores),
     ]
@@ -253,9 +241,9 @@ def _cells(by: ChosenBy, point: Point) -> list[str]:
 def _networks(chart: Chart) -> Table:
     rows = [
         [
-            network.name,
-            network.graph,
-            "–" if network.validation is None else f"{100 * network.validation:.2f}",
+            network.file.name,
+            network.file.graph,
+            "–" if network.file.validation is None else f"{100 * network.file.validation:.2f}",
             f"{100 * network.float_training:.2f}",
             percent(network.whole.correct, chart.data.test),
         ]
@@ -291,16 +279,6 @@ def _fronts(chart: Chart) -> Iterator[Block]:
         if on:
             words = Text(f"front of test accuracy and {name} (a description, no choice):")
             yield Section("", [words, _table(on, chart.chosen_by, f"Front of test accuracy and {name}")])
-
-
-def _others(chart: Chart) -> Iterator[Block]:
-    """Points of other chips, each under its own names of prices and time."""
-    _, others = by_chip(chart.points, chart.target)
-    for chip in dict.fromkeys(point.target for point in others):
-        own = [point for point in others if point.target == chip]
-        words = Text(f"on {chip}, whose prices are others (no choice, no front):")
-        by = ChosenBy(energy=next(iter(own[0].test.energy_j)), time=next(iter(own[0].test.time_s), None))
-        yield Section("", [words, _table(own, by, f"Points of {chip}")])
 
 
 def _times(ratios: Mapping[str, float | None], what: str) -> str:
@@ -364,9 +342,10 @@ def _refused(chart: Chart) -> list[Block]:
 
 
 def _provenance(chart: Chart) -> list[Block]:
+    networks = [network.file for network in chart.networks]
     files = [["recordings", chart.data.path, chart.data.sha256]]
-    files += [[network.name, network.path, network.sha256] for network in chart.networks]
-    trained = [[each.name, each.system, each.trained_by or "not known"] for each in chart.networks]
+    files += [[each.name, each.path, each.sha256] for each in networks]
+    trained = [[each.name, each.system, each.trained_by or "not known"] for each in networks]
     grid = [[name, ", ".join(_value(value) for value in getattr(chart.grid, name))] for name in chart.grid.__slots__]
     titles = [[f"{kind}, {name}", title] for kind, tables in chart.tables.items() for name, title in tables.items()]
     return [

@@ -7,7 +7,6 @@ import os
 import zlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,36 +18,17 @@ from spikeloom.runtime.equivalence.breakdowns import undecided
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.stress.bench import NAMES, Bench, bench_of, by_length, whole
-from spikeloom.runtime.studies.stress.pair import SIDES, TAXELS, Inputs, Level, Outcome, Perturbation, evaluate
+from spikeloom.runtime.studies.stress.pair import SIDES, TAXELS, Inputs, Level, Outcome, evaluate
 from spikeloom.runtime.studies.stress.results import Provenance, Run, Stress
 from spikeloom.runtime.studies.stress.verdicts import Requirement, curve, unmet
 
-CHUNK = 5
-"""Seeds that are measured at a time."""
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """Perturbations in the battery's order, what is required of them, and how densely they are measured."""
-
-    names: tuple[str, ...]
-    requirements: tuple[Requirement, ...]
-    seeds: int
-    full: bool
-    jobs: int | None  # Measurements at a time; one a core
-
-    def levels(self, name: str, taxels: int) -> tuple[Level, ...]:
-        """Those of a perturbation on a sensor of so many taxels."""
-        required = [wanted.level for wanted in self.requirements if wanted.name == name]
-        return NAMES[name].levels_of(taxels, full=self.full, also=required)
-
-
-def study(arguments: argparse.Namespace, plan: Plan) -> Stress:
-    """Measure a plan on the files that a command's options name, and judge it."""
+def study(arguments: argparse.Namespace, names: Sequence[str], requirements: Sequence[Requirement]) -> Stress:
+    """Measure perturbations on the files that a command's options name, and judge them."""
     bench, loaded, data = bench_of(arguments)
     recordings, classes, taxels = len(bench.labels), bench.pair.netlist.classes, bench.sensor.taxels
-    reasons = {name: NAMES[name].why_not(bench.pair, bench.sensor) for name in plan.names}
-    for wanted in plan.requirements:
+    reasons = {name: NAMES[name].why_not(bench.pair, bench.sensor) for name in names}
+    for wanted in requirements:
         if reasons[wanted.name] is not None:
             raise OptionError(f"--require {wanted}: does not apply, {reasons[wanted.name]}; omit it")
         if NAMES[wanted.name].unit == TAXELS and float(wanted.level) > taxels:
@@ -56,28 +36,33 @@ def study(arguments: argparse.Namespace, plan: Plan) -> Stress:
     progress("clean recordings")
     reference, undisturbed = clean(bench)
     points = [
-        (name, level, range(first, min(first + CHUNK, seeds)))
-        for name, seeds in ((name, plan.seeds if NAMES[name].seeded else 1) for name in plan.names)
+        (name, level, seed)
+        for name in names
         if reasons[name] is None
-        for level in plan.levels(name, taxels)
-        for first in range(0, seeds, CHUNK)
+        for level in _levels(name, taxels, requirements, full=arguments.full)
+        for seed in range(arguments.seeds if NAMES[name].seeded else 1)
     ]
     measured: dict[str, dict[Level, list[Run]]] = {}
-    for (name, level, _), runs in zip(points, _measured(points, bench, reference, plan.jobs), strict=True):
-        measured.setdefault(name, {}).setdefault(level, []).extend(runs)
+    for (name, level, _), run in zip(points, _measured(points, bench, reference, arguments.jobs), strict=True):
+        measured.setdefault(name, {}).setdefault(level, []).append(run)
     curves = {name: curve(name, each, undisturbed, recordings, classes) for name, each in measured.items()}
     return Stress(
         recordings=recordings,
         classes=classes,
-        seeds=plan.seeds,
-        full=plan.full,
+        seeds=arguments.seeds,
+        full=arguments.full,
         clean=undisturbed,
         perturbations=curves,
         not_applicable={name: reason for name, reason in reasons.items() if reason is not None},
-        required=tuple(map(str, plan.requirements)),
-        missed=unmet(plan.requirements, curves),
+        required=tuple(map(str, requirements)),
+        missed=unmet(requirements, curves),
         provenance=_provenance(arguments, loaded, data),
     )
+
+
+def _levels(name: str, taxels: int, requirements: Sequence[Requirement], *, full: bool) -> tuple[Level, ...]:
+    """Those of a perturbation on a sensor of so many taxels, with those that are required."""
+    return NAMES[name].levels_of(taxels, full=full, also=[each.level for each in requirements if each.name == name])
 
 
 def _provenance(arguments: argparse.Namespace, loaded: LoadedNetwork, data: str) -> Provenance:
@@ -96,9 +81,9 @@ def _provenance(arguments: argparse.Namespace, loaded: LoadedNetwork, data: str)
 
 
 def _measured(
-    points: Sequence[tuple[str, Level, Sequence[int]]], bench: Bench, reference: Outcome, jobs: int | None
-) -> list[list[Run]]:
-    """Runs of each point, several at a time in threads: kernels let go of the interpreter's lock."""
+    points: Sequence[tuple[str, Level, int]], bench: Bench, reference: Outcome, jobs: int | None
+) -> list[Run]:
+    """The run of each point, several at a time in threads: kernels let go of the interpreter's lock."""
     pool = ThreadPoolExecutor(jobs or os.cpu_count())
     try:
         waiting = [pool.submit(measure, bench, *point, reference) for point in points]
@@ -122,53 +107,32 @@ def clean(bench: Bench) -> tuple[Outcome, Run]:
     """Nothing is wrong."""
     inputs = whole(bench.events, bench.pair.netlist, bench.lengths)
     outcome = evaluate(bench.pair, inputs)
-    return outcome, _run(bench, outcome, None, slice(None), inputs, outcome)
+    return outcome, _run(bench, outcome, None, inputs, outcome)
 
 
-def measure(bench: Bench, name: str, level: Level, seeds: Sequence[int], reference: Outcome) -> list[Run]:
-    """One perturbation at one level, once for each seed; one seed is enough for what has no part in chance.
-
-    Seeds run together where only recordings differ. `reference` is of the clean recordings.
-    """
-    trouble, count = NAMES[name], len(bench.events)
-    if trouble.to == "pair":
-        runs = []
-        for seed in seeds:
-            damaged = trouble.done(bench.pair, level, bench.sensor, generator(name, seed))
-            inputs = whole(bench.events, damaged.netlist, bench.lengths)
-            outcome = evaluate(damaged, inputs)
-            runs.append(_run(bench, outcome, seed, slice(None), inputs, reference))
-        return runs
-    many = [_inputs(bench, trouble, level, generator(name, seed)) for seed in seeds]
-    longest = max(inputs.events.shape[2] for inputs in many)
-    filled = [np.pad(each.events, ((0, 0), (0, 0), (0, longest - each.events.shape[2]))) for each in many]
-    inputs = Inputs(
-        events=np.concatenate(filled),
-        lengths=np.concatenate([inputs.lengths for inputs in many]),
-        begin=np.concatenate([inputs.begin for inputs in many]),
-    )
-    outcome = evaluate(bench.pair, inputs)
-    parts = [slice(i * count, (i + 1) * count) for i in range(len(seeds))]
-    return [_run(bench, outcome, seed, part, inputs, reference) for seed, part in zip(seeds, parts, strict=True)]
-
-
-def _inputs(bench: Bench, trouble: Perturbation, level: Level, rng: np.random.Generator) -> Inputs:
+def measure(bench: Bench, name: str, level: Level, seed: int, reference: Outcome) -> Run:
+    """One perturbation at one level under one seed; `reference` is of the clean recordings."""
+    trouble, rng, pair = NAMES[name], generator(name, seed), bench.pair
     if trouble.to == "bench":
         inputs: Inputs = trouble.done(bench, level, bench.sensor, rng)
-        return inputs
-    events = by_length(bench.events, bench.lengths, lambda part: trouble.done(part, level, bench.sensor, rng))
-    return whole(events, bench.pair.netlist, bench.lengths)
+    elif trouble.to == "pair":
+        pair = trouble.done(pair, level, bench.sensor, rng)
+        inputs = whole(bench.events, pair.netlist, bench.lengths)
+    else:
+        events = by_length(bench.events, bench.lengths, lambda part: trouble.done(part, level, bench.sensor, rng))
+        inputs = whole(events, pair.netlist, bench.lengths)
+    return _run(bench, evaluate(pair, inputs), seed, inputs, reference)
 
 
-def _run(bench: Bench, outcome: Outcome, seed: int | None, part: slice, inputs: Inputs, reference: Outcome) -> Run:
-    """Counts over the recordings of one seed."""
+def _run(bench: Bench, outcome: Outcome, seed: int | None, inputs: Inputs, reference: Outcome) -> Run:
+    """Counts over the recordings."""
     netlist = bench.pair.netlist
-    decided = {side: outcome.decisions(side)[part] for side in SIDES}
-    spikes = outcome.spikes[part].sum(axis=0).tolist()
-    steps = int((inputs.lengths - inputs.begin)[part].sum())
+    decided = {side: outcome.decisions(side) for side in SIDES}
+    spikes = outcome.spikes.sum(axis=0).tolist()
+    steps = int((inputs.lengths - inputs.begin).sum())
     held = np.bincount(netlist.layer, minlength=len(netlist.layers)).tolist()
     kinds = {side: np.unique_counts(values) for side, values in decided.items()}
-    signs = {side: undecided(reference.votes[side], outcome.votes[side][part], bench.files) for side in SIDES}
+    signs = {side: undecided(reference.votes[side], outcome.votes[side], bench.files) for side in SIDES}
     return Run(
         seed=seed,
         right={side: int(np.count_nonzero(values == bench.labels)) for side, values in decided.items()},
@@ -179,6 +143,6 @@ def _run(bench: Bench, outcome: Outcome, seed: int | None, part: slice, inputs: 
         },
         signs={side: {sign.kind: sign.count for sign in each} for side, each in signs.items()},
         most={side: (int(k.values[np.argmax(k.counts)]), int(k.counts.max())) for side, k in kinds.items()},
-        stopped=int(np.count_nonzero(outcome.stopped[part])),
-        saturated=int(outcome.saturated[part].sum()),
+        stopped=int(np.count_nonzero(outcome.stopped)),
+        saturated=int(outcome.saturated.sum()),
     )

@@ -12,7 +12,7 @@ import numpy as np
 
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.legalize import LimitUse, list_words
+from spikeloom.compiler.targets.loihi1.legalize import list_words
 from spikeloom.compiler.types import IntArray
 
 SPARSE_SHARE = 0.75
@@ -50,7 +50,10 @@ class Lists:
     projection: int  # Index in the network
     source: IntArray  # (lists,) int64; neuron of the source population
     nonzero: IntArray  # (lists,) int64; non-zero synapses of each list
-    # first, last: (lists,) int64; first and last neuron of the chunk (counted within it) with a non-zero weight
+    # row, mantissa: (synapses,); neuron of the chunk (counted within it, ascending in each list) and non-zero weight
+    row: IntArray
+    mantissa: IntArray
+    # first, last: (lists,) int64; first and last row of each list
     first: IntArray
     last: IntArray
 
@@ -60,18 +63,22 @@ def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
     found = []
     for index, projection in enumerate(network.projections):
         if projection.post == chunk.population:
-            part = projection.weight[chunk.first : chunk.last].tocoo()
-            keep = part.data != 0
-            row, column = part.coords[0][keep], part.coords[1][keep]
-            pre = projection.weight.shape[1]
-            nonzero = np.bincount(column, minlength=pre)
-            # rows ascend, and of repeated indices the last assignment stays
-            first, last = np.zeros((2, pre), np.int64)
-            last[column] = row
-            first[column[::-1]] = row[::-1]
-            source = np.flatnonzero(nonzero)
+            part = projection.weight[chunk.first : chunk.last].tocsc()
+            part.eliminate_zeros()
+            bounds, row = part.indptr.astype(np.int64), part.indices.astype(np.int64)
+            source = np.flatnonzero(np.diff(bounds))
+            first, last = row[bounds[source]], row[bounds[source + 1] - 1]
+            nonzero = np.diff(bounds)[source]
             found.append(
-                Lists(projection=index, source=source, nonzero=nonzero[source], first=first[source], last=last[source])
+                Lists(
+                    projection=index,
+                    source=source,
+                    nonzero=nonzero,
+                    row=row,
+                    mantissa=part.data,
+                    first=first,
+                    last=last,
+                )
             )
     return tuple(found)
 
@@ -156,16 +163,15 @@ class Needs:
             "core.compartment_configs": len(decays),
         }
 
-    def excess(self, chunks: Core, *, lean: bool = False) -> list[LimitUse]:
-        """Limits that such a core breaks."""
+    def excess(self, chunks: Core, *, lean: bool = False) -> dict[str, int]:
+        """Use of the limits that such a core breaks."""
         uses = self.uses(chunks, lean=lean).items()
-        every = [LimitUse(name=rule, used=used, allowed=self.target.limit(rule), core=None) for rule, used in uses]
-        return [use for use in every if use.used > use.allowed]
+        return {rule: used for rule, used in uses if used > self.target.limit(rule)}
 
     def lean(self, chunks: Core) -> bool:
         """Whether such a core has room for lists of few visited synapses; its output axons do not matter."""
         if chunks not in self._lean:
-            self._lean[chunks] = all(use.name == "core.axons_out" for use in self.excess(chunks, lean=True))
+            self._lean[chunks] = self.excess(chunks, lean=True).keys() <= {"core.axons_out"}
         return self._lean[chunks]
 
     def forget(self) -> None:

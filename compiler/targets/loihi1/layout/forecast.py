@@ -16,12 +16,13 @@ References
 from __future__ import annotations
 
 from bisect import bisect_left
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 
-from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.errors import CapacityError, OptionError
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, depths
 from spikeloom.compiler.passes.calibrate import Calibration, fewer
 from spikeloom.compiler.targets.base import PICOSECONDS, TimeTable
@@ -127,14 +128,10 @@ class Forecast:
             base += chunk.size
         return sweeps, receives
 
-    def charge(self, cores: Cores) -> None:
-        """Charge the sources of a layout with their output axons, as the other methods take them to be."""
-        self.needs.forget()
-        self.needs.charge(self.needs.source_axons(chunk for core in cores for chunk in core))
-
     def expect(self, cores: Cores, tiles: int) -> Expectation:
         """Time of a step of a layout on so many tiles."""
-        self.charge(cores)
+        self.needs.forget()
+        self.needs.charge(self.needs.source_axons(chunk for core in cores for chunk in core))
         sweeps, receives = map(np.array, zip(*(self.core(core) for core in cores), strict=True))
         busy = np.maximum(sweeps, receives)
         often = np.bincount(np.argmax(busy, axis=0))
@@ -206,11 +203,8 @@ class _Search:
         key = population, least, self.needs.out_axons[population].tobytes()
         if key not in self._cuts:
             self._cuts[key] = None
-            try:
-                chunks, _ = cut_layer(self.needs, population, least)
-            except OptionError:
-                chunks = []
-            if chunks:
+            with suppress(CapacityError, OptionError):
+                chunks = cut_layer(self.needs, population, least)
                 slowest = np.max([np.maximum(*self.forecast.core((chunk,))) for chunk in chunks], axis=0)
                 self._cuts[key] = chunks, slowest, self.needs.source_axons(chunks)
         return self._cuts[key]

@@ -9,8 +9,10 @@ needs some for its own chunks, so it is cut again until they are enough.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -19,37 +21,22 @@ from spikeloom.compiler.errors import CapacityError, OptionError, Violation
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Core, Cores, Needs
-from spikeloom.compiler.targets.loihi1.legalize import LimitUse, violation
+from spikeloom.compiler.targets.loihi1.layout.place import core_traffic
+from spikeloom.compiler.targets.loihi1.legalize import violation
 from spikeloom.compiler.types import FloatArray
 
 EXACT_CHUNKS = 10
 """Up to this many chunks the packing is searched exhaustively; above it, first fit."""
 
 
-def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:
-    """Largest value in ``low … high`` that fits, given that `low` does and that fitting is monotone.
-
-    For chunks it is, in every limit but the synapse formats (all lists of the larger chunk may be dense); there a
-    smaller chunk than the largest may come out, which fits as well.
-    """
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if fits(middle) else (low, middle - 1)
-    return low
-
-
-Cut = tuple[list[Chunk], list[Violation]]
-"""Chunks of a population, or why one of its neurons fits no core."""
-
-
-def cut_layer(needs: Needs, population: int, least: int | None = None) -> Cut:
-    """Cut one population into full chunks, or as evenly as possible into at least `least`; or say why it cannot be.
+def cut_layer(needs: Needs, population: int, least: int | None = None) -> list[Chunk]:
+    """Cut one population into full chunks, or as evenly as possible into at least `least`.
 
     A recurrent one is cut until its neurons have output axons for its own chunks, too; finer chunks need more.
-    OptionError if it needs more than `least` chunks.
+    CapacityError if one of its neurons fits no core, OptionError if it needs more than `least` chunks.
     """
 
-    def once() -> Cut:
+    def once() -> list[Chunk]:
         return _fill(needs, population) if least is None else _spread(needs, population, least)
 
     if not any(projection.pre == projection.post == population for projection in needs.network.projections):
@@ -59,45 +46,47 @@ def cut_layer(needs: Needs, population: int, least: int | None = None) -> Cut:
     try:
         while True:
             needs.out_axons[population] = others + charged
-            chunks, why = once()
+            chunks = once()
             own = needs.source_axons(chunks).get(population, charged)
-            if why or np.all(own <= charged):
-                return chunks, why
+            if np.all(own <= charged):
+                return chunks
             charged = np.maximum(charged, own)
     finally:
         needs.out_axons[population] = others
 
 
-def _fill(needs: Needs, population: int) -> Cut:
+def _fill(needs: Needs, population: int) -> list[Chunk]:
     size = needs.network.populations[population].size
     chunks: list[Chunk] = []
     first = 0
     while first < size:
-        one = Chunk(population=population, first=first, last=first + 1)
-        if needs.excess((one,)):
-            return [], _worst(needs, population)
 
-        def fits(last: int, first: int = first) -> bool:
+        def exceeds(last: int, first: int = first) -> bool:
             tried = Chunk(population=population, first=first, last=last)
-            fit = not needs.excess((tried,))
+            broken = bool(needs.excess((tried,)))
             needs.drop(tried)
-            return fit
+            return broken
 
-        most = min(size, first + needs.target.limit("core.compartments"))
-        chunks.append(Chunk(population=population, first=first, last=_largest(first + 1, most, fits)))
+        # A larger chunk needs more of every limit but synapse formats (all its lists may be dense); there a smaller
+        # chunk than the largest may come out, which fits as well.
+        ends = range(first + 1, min(size, first + needs.target.limit("core.compartments")) + 1)
+        fitting = bisect_left(ends, True, key=exceeds)
+        if not fitting:
+            raise CapacityError(_worst(needs, population))
+        chunks.append(Chunk(population=population, first=first, last=ends[fitting - 1]))
         first = chunks[-1].last
-    return chunks, []
+    return chunks
 
 
-def _worst(needs: Needs, population: int) -> list[Violation]:
+def _worst(needs: Needs, population: int) -> tuple[Violation, ...]:
     """For each limit that single neurons of a population break: the one that breaks it most."""
-    found: dict[str, tuple[LimitUse, int]] = {}
+    found: dict[str, tuple[int, int]] = {}
     for neuron in range(needs.network.populations[population].size):
-        for use in needs.excess((Chunk(population=population, first=neuron, last=neuron + 1),)):
-            if use.name not in found or use.used > found[use.name][0].used:
-                found[use.name] = use, neuron
+        for rule, used in needs.excess((Chunk(population=population, first=neuron, last=neuron + 1),)).items():
+            if rule not in found or used > found[rule][0]:
+                found[rule] = used, neuron
     name = needs.network.populations[population].name
-    return [violation(use, f"{name} neuron {neuron}", needs.target) for use, neuron in found.values()]
+    return tuple(violation(needs.target, f"{name} neuron {n}", rule, used) for rule, (used, n) in found.items())
 
 
 def order_on_core(needs: Needs, chunks: Core) -> Core:
@@ -120,7 +109,7 @@ def core_bound(network: IntegerNetwork, target: Target) -> int:
     return max(-(-compartments // target.limit("core.compartments")), -(-payload // memory))
 
 
-def _pack(needs: Needs, chunks: list[Chunk], traffic: Callable[[Chunk, Chunk], float]) -> list[Core]:
+def _pack(needs: Needs, chunks: list[Chunk], rates: tuple[FloatArray, ...] | None) -> list[Core]:
     """Put chunks on the fewest cores; among equals, keep most traffic within a core."""
     known: dict[frozenset[Chunk], bool] = {}
 
@@ -141,8 +130,9 @@ def _pack(needs: Needs, chunks: list[Chunk], traffic: Callable[[Chunk, Chunk], f
                 cores.append((chunk,))
         return cores
 
-    best: list[Core] = [(chunk,) for chunk in chunks]
-    best_kept = 0.0
+    alone: list[Core] = [(chunk,) for chunk in chunks]
+    traffic = core_traffic(needs.network, tuple(alone), rates)
+    best, best_kept = alone, 0.0
 
     def search(index: int, cores: list[Core], kept: float) -> None:
         nonlocal best, best_kept
@@ -155,7 +145,8 @@ def _pack(needs: Needs, chunks: list[Chunk], traffic: Callable[[Chunk, Chunk], f
         chunk = chunks[index]
         for i, core in enumerate(cores):
             if fits((*core, chunk)):
-                gained = sum(traffic(chunk, other) + traffic(other, chunk) for other in core)
+                others = [chunks.index(other) for other in core]
+                gained = float(sum(traffic[index, at] + traffic[at, index] for at in others))
                 search(index + 1, [*cores[:i], (*core, chunk), *cores[i + 1 :]], kept + gained)
         search(index + 1, [*cores, (chunk,)], kept)
 
@@ -163,22 +154,18 @@ def _pack(needs: Needs, chunks: list[Chunk], traffic: Callable[[Chunk, Chunk], f
     return best
 
 
-def _spread(needs: Needs, population: int, least: int) -> Cut:
+def _spread(needs: Needs, population: int, least: int) -> list[Chunk]:
     name, size = needs.network.populations[population].name, needs.network.populations[population].size
     for parts in range(least, size + 1):
         bounds = [i * size // parts for i in range(parts + 1)]
         chunks = [Chunk(population=population, first=first, last=last) for first, last in pairwise(bounds)]
         if not any(needs.excess((chunk,)) for chunk in chunks):
-            return chunks, []
-        if parts == least:
-            fewest, why = _fill(needs, population)
-            if why:
-                return [], why
-            if least < len(fewest):
-                raise OptionError(
-                    f"--cores-for {name}={least}: {name} needs {len(fewest)} cores at least; give {len(fewest)} or more"
-                )
-    return [], _worst(needs, population)
+            return chunks
+        if parts == least < (fewest := len(_fill(needs, population))):
+            raise OptionError(
+                f"--cores-for {name}={least}: {name} needs {fewest} cores at least; give {fewest} or more"
+            )
+    raise CapacityError(_worst(needs, population))
 
 
 def cut(needs: Needs, least: Mapping[int, int]) -> list[Chunk]:
@@ -187,15 +174,18 @@ def cut(needs: Needs, least: Mapping[int, int]) -> list[Chunk]:
     CapacityError lists every limit that a single neuron exceeds; OptionError if `least` is too few.
     """
     chunks: list[Chunk] = []
-    violations: list[Violation] = []
+    violations: tuple[Violation, ...] = ()
     needs.forget()
     for population in reversed(range(len(needs.network.populations))):
-        found, why = cut_layer(needs, population, least.get(population))
-        violations = why + violations
-        chunks += found
-        needs.charge(needs.source_axons(found))
+        try:
+            found = cut_layer(needs, population, least.get(population))
+        except CapacityError as error:
+            violations = error.violations + violations
+        else:
+            chunks += found
+            needs.charge(needs.source_axons(found))
     if violations:
-        raise CapacityError(tuple(violations))
+        raise CapacityError(violations)
     return sorted(chunks)
 
 
@@ -207,10 +197,10 @@ def chunks_of(chunks: Iterable[Chunk]) -> dict[int, int]:
 def arrange(needs: Needs, groups: Iterable[Core], chips: int = 1) -> Cores:
     """Put groups of chunks on cores, in order; CapacityError if the chips have too few cores."""
     cores = sorted((order_on_core(needs, group) for group in groups), key=min)
-    used = LimitUse(name="chip.cores", used=len(cores), allowed=chips * needs.target.limit("chip.cores"), core=None)
-    if used.used > used.allowed:
-        owner = "chip" if chips == 1 else f"{chips} chips"
-        raise CapacityError((violation(used, owner, needs.target),))
+    allowed = chips * needs.target.limit("chip.cores")
+    if len(cores) > allowed:
+        excess = violation(needs.target, "chip" if chips == 1 else f"{chips} chips", "chip.cores", len(cores))
+        raise CapacityError((replace(excess, allowed=allowed),))
     return tuple(cores)
 
 
@@ -234,14 +224,6 @@ def partition(
     least = cores_for or {}
     chunks = cut(needs, least)
 
-    def traffic(source: Chunk, receiver: Chunk) -> float:
-        total = 0.0
-        for lists in needs.lists(receiver):
-            if network.projections[lists.projection].pre == source.population:
-                inside = lists.source[(lists.source >= source.first) & (lists.source < source.last)]
-                total += float(rates[source.population][inside].sum()) if rates is not None else len(inside)
-        return total
-
     alone = [chunk for chunk in chunks if chunk.population in least]
-    groups = _pack(needs, [chunk for chunk in chunks if chunk not in alone], traffic)
+    groups = _pack(needs, [chunk for chunk in chunks if chunk not in alone], rates)
     return arrange(needs, [*groups, *((chunk,) for chunk in alone)], chips)

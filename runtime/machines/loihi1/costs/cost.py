@@ -26,24 +26,15 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1.trace import Counts
 
-EVENTS = (
-    "synaptic_operation_dense",
-    "synaptic_operation_sparse",
-    "neuron_idle",
-    "neuron_active",
-    "spike",
-    "packet",
-    "hop_east_west",
-    "hop_north_south",
-)
-"""Events that energy tables may price; ``synaptic_operation`` in a table prices both forms."""
-
 PARTS = {
     "synapse": ("synaptic_operation_dense", "synaptic_operation_sparse"),
     "soma": ("neuron_idle", "neuron_active", "spike"),
     "network": ("packet", "hop_east_west", "hop_north_south"),
 }
-"""Parts of a chip and the events that are theirs; every event belongs to one."""
+"""Parts of a chip and the events that are theirs."""
+
+EVENTS = tuple(event for events in PARTS.values() for event in events)
+"""Events that energy tables may price; ``synaptic_operation`` in a table prices both forms."""
 
 OPTIONAL = frozenset({"spike"})
 """Events that a table may leave out because it prices them elsewhere (Davies: in the active neuron update)."""
@@ -94,19 +85,8 @@ class Meter:
     neurons: IntArray
 
 
-def prepare(
-    netlist: Netlist,
-    target: Target,
-    by: Literal["layer", "core", "whole"] = "layer",
-    *,
-    input_tiles: tuple[int, ...] = (),
-    dense: BoolArray | None = None,
-) -> Meter:
-    """Look up what spikes cause on a target with energy tables, by layer, by core or all in one group.
-
-    `input_tiles` and `dense` are as for :func:`timing.prepare`: the groups of cores that hold inputs come after the
-    others, and cost only their packets and hops.
-    """
+def prepare(netlist: Netlist, target: Target, by: Literal["layer", "core", "whole"] = "layer") -> Meter:
+    """Look up what spikes cause on a target with energy tables, by layer, by core or all in one group."""
     n_inputs, size = netlist.n_inputs, netlist.n_inputs + netlist.n_compartments
     core_of = netlist.core_of_compartment()
     group, groups = {
@@ -114,9 +94,7 @@ def prepare(
         "core": (core_of, netlist.n_cores),
         "whole": (np.zeros_like(netlist.layer), 1),
     }[by]
-    extra = np.arange(n_inputs) // target.limit("core.compartments")  # of the cores that hold inputs, if any do
-    home, core = np.append(groups + extra, group), np.append(netlist.n_cores + extra, core_of)
-    neurons = np.bincount(group, minlength=groups + len(input_tiles))
+    neurons = np.bincount(group, minlength=groups)
 
     def caused(amount: IntArray | BoolArray, source: IntArray, receiver: IntArray) -> FloatArray:
         """Sums over synapses, axons or neurons; (sources, groups)."""
@@ -124,13 +102,12 @@ def prepare(
         return np.asarray(sums, np.float64).reshape(size, len(neurons))
 
     axon = netlist.axon_of_synapse()
-    if dense is None:
-        dense = netlist.format_index_bits[netlist.axon_format[axon]] == 0
+    dense = netlist.format_index_bits[netlist.axon_format[axon]] == 0
     entries = netlist.axon_source[axon], group[netlist.synapse_compartment()]
-    tile = np.append(netlist.core_tile, np.array(input_tiles, np.int64))
-    sent = np.flatnonzero(core[netlist.axon_source] < len(tile))  # a channel that is on no core sends nothing
+    sent = np.flatnonzero(netlist.axon_source >= n_inputs)  # a channel is on no core and sends nothing
     source = netlist.axon_source[sent]
-    start, end = tile[core[source]], netlist.core_tile[netlist.core_of_axon()[sent]]
+    sender = source - n_inputs
+    start, end = netlist.core_tile[core_of[sender]], netlist.core_tile[netlist.core_of_axon()[sent]]
     leaves = chip_of_core(start, target) != chip_of_core(end, target)
     east_west, north_south = np.where(leaves, 0, hops(start, end, target.limit("mesh.width")))
     compartments = np.arange(n_inputs, size)
@@ -138,10 +115,10 @@ def prepare(
         "synaptic_operation_dense": caused(dense, *entries),
         "synaptic_operation_sparse": caused(~dense, *entries),
         "spike": caused(np.ones_like(group), compartments, group),
-        "packet": caused(np.ones_like(source), source, home[source]),
-        "hop_east_west": caused(east_west, source, home[source]),
-        "hop_north_south": caused(north_south, source, home[source]),
-        BETWEEN_CHIPS: caused(leaves, source, home[source]),
+        "packet": caused(np.ones_like(source), source, group[sender]),
+        "hop_east_west": caused(east_west, source, group[sender]),
+        "hop_north_south": caused(north_south, source, group[sender]),
+        BETWEEN_CHIPS: caused(leaves, source, group[sender]),
         "zeros": caused(netlist.synapse_weight == 0, *entries),
     }
     return Meter(
@@ -160,10 +137,8 @@ def count(meter: Meter, counts: Counts, chip_steps: int | IntArray) -> dict[str,
     """
     sources = np.concatenate([counts.inputs, counts.spikes], axis=1).astype(np.float64)
     amounts = dict(zip(meter.names, np.split(sources @ meter.caused, len(meter.names), axis=1), strict=True))
-    active = np.zeros((len(sources), len(meter.neurons)))  # cores of inputs have no neuron
-    active[:, : counts.updates.shape[1]] = counts.updates
-    amounts["neuron_active"] = active
-    amounts["neuron_idle"] = meter.neurons * np.reshape(chip_steps, (-1, 1)) - active
+    amounts["neuron_active"] = counts.updates.astype(np.float64)
+    amounts["neuron_idle"] = meter.neurons * np.reshape(chip_steps, (-1, 1)) - amounts["neuron_active"]
     return amounts
 
 
@@ -205,7 +180,7 @@ def by_part(target: Target, events: Mapping[str, FloatArray]) -> dict[str, dict[
     }
 
 
-def estimate(meter: Meter, counts: Counts, chip_steps: int | IntArray) -> Costs:
+def price(meter: Meter, counts: Counts, chip_steps: int | IntArray) -> Costs:
     """Price a run with every table of its chip; `counts` and `chip_steps` as for :func:`count`."""
     amounts = count(meter, counts, chip_steps)
     events = {event: amounts[event] for event in EVENTS}

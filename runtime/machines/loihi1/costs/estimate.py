@@ -97,9 +97,9 @@ def estimate(
     cores: Mapping[str, FloatArray] = {}
     if deep:
         by_core = replace(whole.counts, updates=np.concatenate(updates))
-        cores = cost.estimate(cost.prepare(netlist, target, "core"), by_core, chip_steps).energy
+        cores = cost.price(cost.prepare(netlist, target, "core"), by_core, chip_steps).energy
     return whole, Estimate(
-        costs=cost.estimate(cost.prepare(netlist, target), whole.counts, chip_steps),
+        costs=cost.price(cost.prepare(netlist, target), whole.counts, chip_steps),
         steps=steps,
         simple={
             name: timing.simple_times(each, charged, chip_steps)

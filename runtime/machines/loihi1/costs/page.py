@@ -11,17 +11,12 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.place import chip_of_core, chip_tiles, hops
 from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.types import FloatArray, IntArray
-from spikeloom.runtime.machines.base import EventArray
-from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
-from spikeloom.runtime.machines.loihi1.costs.result import CostReport, cost_report
-from spikeloom.runtime.machines.loihi1.costs.sections import sections
-from spikeloom.runtime.machines.loihi1.engine import Engine
-from spikeloom.runtime.machines.loihi1.trace import Counts
-from spikeloom.runtime.machines.page_parts import BatchParts, Core, Cores, Fill, Mesh, Way
+from spikeloom.compiler.types import FloatArray
+from spikeloom.runtime.machines.core_map import Core, CoreMap, Fill, Mesh, Way
+from spikeloom.runtime.machines.loihi1.costs.result import CostReport
 from spikeloom.runtime.report.drawing import bars
 from spikeloom.runtime.report.numbers import si
-from spikeloom.runtime.report.sections import Block, Figure, Outcome, Section, Table
+from spikeloom.runtime.report.sections import Block, Figure, Table
 
 FILLS = ("core.compartments", "core.synapse_words", "core.axons_in", "core.axons_out")
 """Limits of which the fullest says how full a core is: those that a larger network uses up."""
@@ -30,29 +25,8 @@ AT_INPUT = -1
 """In place of a core: the input, which has no place on the mesh."""
 
 
-def batch_parts(
-    prepared: Engine, target: Target, events: EventArray, *, lengths: IntArray | None, bin_s: float
-) -> BatchParts:
-    """Run recordings (samples, channels, steps), clocks among their channels; `bin_s` is the seconds of a data step."""
-    netlist = prepared.netlist
-    trace, found = estimate(prepared, target, events, lengths=lengths)
-    report = cost_report(netlist, target, found, bin_s=bin_s)
-    fired, spikes = trace.counts.spikes.mean(axis=0), dict[str, FloatArray]()
-    for index, layer in enumerate(netlist.layers):
-        ids = netlist.compartments_of(index)
-        spikes[layer.name] = np.zeros(layer.neurons)
-        spikes[layer.name][netlist.neuron[ids]] = fired[ids]
-    return BatchParts(
-        costs=Outcome(report, lambda costs: [*sections(costs), Section("", _figures(costs))]),
-        energy_j=report.per_inference.energy_j,
-        time_s={each.table: each.inference_s["mean"] for each in report.time if each.model == "simple"},
-        cores=_cores(netlist, target, trace.counts),
-        spikes=spikes,
-    )
-
-
-def _cores(netlist: Netlist, target: Target, counts: Counts) -> Cores:
-    """Where the cores lie, how full each is of everything, and packets of the mean of the recordings in `counts`."""
+def core_map(netlist: Netlist, target: Target, fired: FloatArray) -> CoreMap:
+    """Where the cores lie, how full each is of everything, and packets if each source id fires so often."""
     width, chip = target.limit("mesh.width"), chip_of_core(netlist.core_tile, target)
     fill: dict[int, dict[str, Fill]] = {core: {} for core in range(netlist.n_cores)}
     for use in measure(netlist, target):
@@ -75,10 +49,10 @@ def _cores(netlist: Netlist, target: Target, counts: Counts) -> Cores:
                 fill=fill[core],
             )
         )
-    return Cores(
+    return CoreMap(
         mesh=Mesh(width=width, height=target.limit("mesh.height"), tile_cores=target.limit("mesh.tile_cores")),
         cores=tuple(placed),
-        traffic=_traffic(netlist, target, np.concatenate([counts.inputs, counts.spikes], axis=1).mean(axis=0)),
+        traffic=_traffic(netlist, target, fired),
     )
 
 
@@ -97,7 +71,7 @@ def _traffic(netlist: Netlist, target: Target, fired: FloatArray) -> tuple[Way, 
     return tuple(ways)
 
 
-def _figures(found: CostReport) -> list[Block]:
+def figures(found: CostReport) -> list[Block]:
     """Energy by layer and part, time by core."""
     tables = list(found.per_inference.energy_j)
     blocks: list[Block] = []

@@ -2,27 +2,64 @@
 
 from __future__ import annotations
 
+import statistics
 import sys
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from spikeloom.compiler import __version__
+import numpy as np
+
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
-from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.models.training.kinds import Plan, kind_of, seen_by
-from spikeloom.models.training.recipes import RELEASED
-from spikeloom.runtime.studies import jobs as processes
-from spikeloom.runtime.studies.jobs import ProcessDied, ended_by_signal, only_one
-from spikeloom.runtime.studies.training.report import Finished
+from spikeloom.models.training.recipes import MSE, RELEASED
+from spikeloom.models.training.record import Reached, TrainingRecord
+from spikeloom.runtime.report.drawing import COLOURS, Drawing, sheet, styled
+from spikeloom.runtime.report.numbers import wilson
+from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.studies.jobs import ProcessDied, ended_by_signal, only_one, side_by_side
 
-Result = tuple[Finished, IntArray | None]
+TITLES = {
+    "last": "last epoch",
+    "best": "paper protocol: best on test",
+    "clean": "clean protocol: epoch chosen on validation",
+}
+"""What the epochs of ``WEIGHTS`` are called where people read of them."""
+
+WIDTH = 118
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finished(TrainingRecord):
+    """A training and the checkpoint that holds it."""
+
+    file: str
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Accuracies:
+    """Over seeds; one seed has no deviation."""
+
+    mean: float
+    std: float | None
+    min: float
+    max: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingReport:
+    """All seeds, and their accuracies by protocol."""
+
+    runs: Sequence[Finished]
+    protocols: Mapping[str, Accuracies]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,12 +71,10 @@ class Job:
     test: Recordings
     epochs: int
     seed: int
-    device: str
     resume: bool
     output: Path
     keep: tuple[str, ...]  # Which of ``last``, ``best`` and ``clean`` to write
     command: str  # That repeats it
-    draws: bool  # Whether predictions are needed, for a picture
     position: int  # Row of the progress bar
 
     @property
@@ -67,8 +102,8 @@ def state_of(job: Job) -> tuple[Path, Path]:
     return state_files(job.state)
 
 
-def run_job(job: Job) -> tuple[Finished, IntArray | None]:
-    """Train one seed by both protocols and write its checkpoint; gives the decisions of the last epoch if drawn."""
+def run_job(job: Job) -> Finished:
+    """Train one seed by both protocols and write its checkpoint."""
     from spikeloom.models.training.record import training_record
     from spikeloom.models.training.train import train_both
 
@@ -81,7 +116,6 @@ def run_job(job: Job) -> tuple[Finished, IntArray | None]:
         epochs=job.epochs,
         seed=job.seed,
         recipe=plan.recipe,
-        device=job.device,
         state=job.state,
         resume=job.resume,
         position=job.position,
@@ -92,8 +126,6 @@ def run_job(job: Job) -> tuple[Finished, IntArray | None]:
         job.test,
         command=job.command,
         seed=job.seed,
-        version=__version__,
-        device=job.device,
         recipe=None if plan.recipe == RELEASED else plan.recipe.to_json(),
     )
     trained = reported.trained
@@ -103,10 +135,10 @@ def run_job(job: Job) -> tuple[Finished, IntArray | None]:
     kind.save(job.output, kept, plan, record.to_json())
     for file in state_of(job):
         file.unlink(missing_ok=True)
-    return _finished(job, record), kind.predict(trained.last, plan, job.test) if job.draws else None
+    return _finished(job, record)
 
 
-def recall(job: Job) -> tuple[Finished, IntArray | None]:
+def recall(job: Job) -> Finished:
     """What `run_job` returned when it wrote the checkpoint that is there; refused if that is of another training."""
     from spikeloom.models.training.record import read_record
 
@@ -117,7 +149,6 @@ def recall(job: Job) -> tuple[Finished, IntArray | None]:
         "epochs": job.epochs,
         "seed": job.seed,
         "data_sha256": data_digest(job.training, job.test),
-        "device": job.device,
     }
     differing = [name.removesuffix("_sha256") for name, value in wanted.items() if record.get(name) != value]
     differing += kind.differing(found, job.plan)
@@ -127,13 +158,10 @@ def recall(job: Job) -> tuple[Finished, IntArray | None]:
         raise OptionError(
             f"{job.output}: holds another training (other {', '.join(differing)}); give its options, or another -o"
         )
-    if job.draws and "last" not in found.sets:
-        raise OptionError(f"{job.output}: was written without its last epoch, which --picture draws; omit --picture")
     if not set(job.keep) <= set(found.sets):
         words = " ".join(f"--keep {which}" for which in found.sets)
         raise OptionError(f"{job.output}: holds only what {words} kept; give these, or another -o")
-    decided = kind.predict_stored(found, job.plan, job.test) if job.draws else None
-    return _finished(job, read_record(record)), decided
+    return _finished(job, read_record(record))
 
 
 def _finished(job: Job, record: Any) -> Finished:
@@ -144,7 +172,7 @@ def _finished(job: Job, record: Any) -> Finished:
 # -- all seeds ---------------------------------------------------------------------------------------------------------
 
 
-def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
+def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
     """Train several seeds, side by side on the cores where there are several; results are those of `run_job`.
 
     With `resume`, finished seeds are left alone, interrupted ones go on, and the rest is started; OptionError if there
@@ -156,8 +184,8 @@ def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
         return _train(jobs, resume=resume)
 
 
-def _train(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
-    results: dict[int, Result] = {}
+def _train(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
+    results: dict[int, Finished] = {}
     for index, job in enumerate(jobs):
         if resume and finished(job):
             results[index] = recall(job)
@@ -221,14 +249,86 @@ def _kept(done: Sequence[Job], jobs: Sequence[Job]) -> str:
     return f"{' and '.join(parts)}; go on with the same command and --resume" if parts else ""
 
 
-def _side_by_side(jobs: Sequence[Job], waiting: Sequence[int], results: dict[int, Result]) -> None:
+def _side_by_side(jobs: Sequence[Job], waiting: Sequence[int], results: dict[int, Finished]) -> None:
     """Run jobs in processes of their own; whatever ends this ends them all."""
-    there = [jobs[index] for index in waiting]
-    if len(there) > 1:  # processes may be in another folder
-        there = [replace(job, output=job.output.absolute()) for job in there]
-    for place, found in processes.side_by_side(there, run_job):
+    for place, found in side_by_side([jobs[index] for index in waiting], run_job):
         if isinstance(found, ProcessDied):
             raise OptionError(f"{found}; go on with --resume, and with fewer --seeds")
         if isinstance(found, Exception):
             raise found
         results[waiting[place]] = found
+
+
+# -- for people --------------------------------------------------------------------------------------------------------
+
+
+def reached(record: TrainingRecord, which: str) -> Reached:
+    """What the epoch of a protocol reached."""
+    found: Reached = getattr(record, which)
+    return found
+
+
+def summary(records: Sequence[TrainingRecord]) -> dict[str, Accuracies]:
+    """Accuracies over seeds by protocol."""
+    result: dict[str, Accuracies] = {}
+    for protocol in WEIGHTS:
+        values = [reached(record, protocol).accuracy for record in records]
+        spread = statistics.stdev(values) if len(values) > 1 else None
+        result[protocol] = Accuracies(mean=statistics.fmean(values), std=spread, min=min(values), max=max(values))
+    return result
+
+
+def training_sections(result: TrainingReport) -> Iterable[Section]:
+    """Every seed by every protocol, then the means."""
+    total = result.runs[0].test_samples
+    rows = []
+    for run in result.runs:
+        for which in WEIGHTS:
+            epoch = reached(run, which)
+            low, high = wilson(epoch.correct, total)
+            interval = f"{100 * low:.1f} … {100 * high:.1f}"
+            name = f"seed {run.seed}, {TITLES[which]}"
+            accuracy = f"{100 * epoch.correct / total:.2f} %"
+            rows.append([name, str(epoch.epoch), f"{epoch.correct} of {total}", accuracy, interval])
+    command, seed = result.runs[0].command.rsplit(" --seed ", 1)
+    several = [f"--seeds {len(result.runs)}"] if len(result.runs) > 1 else []
+    lines = []
+    if several:
+        means = (f"{100 * s.mean:.2f} % ± {100 * (s.std or 0.0):.2f}" for s in result.protocols.values())
+        last, paper, clean = means
+        lines.append(f"  mean of {len(result.runs)} seeds: last {last}, paper {paper}, clean {clean}")
+    files = ", ".join(run.file for run in result.runs)
+    lines += textwrap.wrap(f"written: {files}", WIDTH, initial_indent="  ", subsequent_indent="    ")
+    yield Section(
+        "Training",
+        [
+            Text(" ".join([command, f"--seed {seed}", *several])),
+            Table(["", "epoch", "correct", "accuracy", "95 % interval"], rows),
+            Text("\n".join(lines)),
+        ],
+    )
+
+
+@styled
+def picture(records: Sequence[Finished]) -> Drawing:
+    """Learning curves of all seeds."""
+    drawing = sheet("trainings", 4.2)
+    left, right = drawing.figure.subplots(1, 2)
+    for index, record in enumerate(records):
+        training, test, correct = np.array(record.history).T
+        epochs = np.arange(1, len(correct) + 1)
+        colour, marker = COLOURS[index % len(COLOURS)], "." if len(epochs) == 1 else ""  # a line of one point is none
+        left.semilogy(epochs, training, marker=marker, color=colour)
+        left.semilogy(epochs, test, marker=marker, color=colour, linestyle="--")
+        right.plot(epochs, 100 * correct / record.test_samples, color=colour, label=f"seed {record.seed}")
+        clean = record.clean
+        right.plot(clean.epoch, 100 * clean.accuracy, "o", color=colour, markeredgecolor="black")
+    loss = (records[0].recipe or {}).get("loss", MSE)
+    measured = "squared error of spike rates" if loss == MSE else loss
+    left.set(xlabel="epoch", ylabel=measured, title="loss: training solid, test dashed")
+    right.set(xlabel="epoch", ylabel="test accuracy (%)", title="accuracy; circle: epoch of the clean protocol")
+    right.legend(loc="lower right")
+    for axes in (left, right):
+        axes.locator_params(axis="x", integer=True)
+        axes.grid()
+    return drawing

@@ -1,8 +1,7 @@
 """What a value of an ONNX graph is, in terms of what varies: an array of constants, or affine in *atoms*.
 
 Atoms are the inputs of the graph, each tensor that is compared with a threshold (a membrane), the spikes that follow
-from it, and products of a membrane with its spikes (a reset). An affine value holds its coefficients on atoms as sparse
-matrices.
+from it, and products of a membrane with its spikes (a reset).
 """
 
 from __future__ import annotations
@@ -16,8 +15,9 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.affine import Affine, added, scaled
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.formats.onnx.file import Array, Node
+from spikeloom.compiler.formats.onnx.file import Array
 from spikeloom.compiler.ir import Sparse
 from spikeloom.compiler.types import FloatArray, IntArray
 
@@ -33,16 +33,6 @@ WORK_LIMIT = 2**30
 INPUT_ATOM, MEMBRANE, SPIKE, PRODUCT = "input", "membrane", "spike", "product"
 
 NOT_AFFINE = "is not affine in its input; only affine operators between two spiking layers can become synapses"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Affine:
-    """``sum_a terms[a] @ atom_a + bias``, flat; `shape` is the tensor's."""
-
-    shape: tuple[int, ...]
-    terms: dict[int, Sparse]  # (size, size of the atom)
-    bias: FloatArray  # (size,)
-
 
 Value = Array | Affine
 
@@ -74,15 +64,14 @@ class Atom:
 class Table:
     """What is met while a graph runs: atoms, and the work done so far.
 
-    Matrices of linear operators are kept with the constants that they were made from, and operators with their nodes,
-    so that nothing else can come to lie at the same address.
+    Matrices of linear operators are kept with the constants that they were made from, so that nothing else can come to
+    lie at the same address.
     """
 
     opset: int = 20
     atoms: list[Atom] = field(default_factory=list)
     known: dict[tuple[object, ...], int] = field(default_factory=dict)
     matrices: dict[tuple[object, ...], tuple[Sparse, tuple[int, ...], list[Value]]] = field(default_factory=dict)
-    operators: dict[int, tuple[Node, Any]] = field(default_factory=dict)
     done: int = 0
 
     def room(self, shape: Sequence[int], limit: int = VALUE_LIMIT) -> tuple[int, ...]:
@@ -148,73 +137,6 @@ def require_finite(value: Affine, where: str = "") -> None:
         raise ModelError(f"{where}has coefficients that are not finite; train it again")
 
 
-def picked(value: Affine, rows: IntArray, shape: tuple[int, ...]) -> Affine:
-    """Elements of a value in another order, some of them perhaps not or several times.
-
-    Where that is all of them as they are, the matrices are the very same objects.
-    """
-    same = np.array_equal(rows, np.arange(len(value.bias)))
-    terms = {atom: own if same else own[rows] for atom, own in value.terms.items()}
-    return Affine(shape=shape, terms={atom: own for atom, own in terms.items() if own.nnz}, bias=value.bias[rows])
-
-
-def picked_of_all(parts: Sequence[Affine], rows: IntArray) -> Affine:
-    """The same of several values one after the other, with a constant zero in front; `rows` has the result's shape."""
-    flat = rows.ravel()
-    if len(parts) == 1 and flat.size and flat.min() >= 1:
-        return picked(parts[0], flat - 1, rows.shape)
-    terms = {}
-    for atom in dict.fromkeys(atom for part in parts for atom in part.terms):
-        width = next(part.terms[atom].shape[1] for part in parts if atom in part.terms)
-        blocks = [part.terms.get(atom, sparse.csr_array((len(part.bias), width))) for part in parts]
-        terms[atom] = sparse.vstack([sparse.csr_array((1, width)), *blocks], format="csr")
-    bias = np.concatenate([np.zeros(1), *(part.bias for part in parts)])
-    return picked(Affine(shape=bias.shape, terms=terms, bias=bias), flat, rows.shape)
-
-
-def spread(value: Affine, shape: tuple[int, ...]) -> Affine:
-    """A value broadcast to a shape."""
-    if value.shape == shape:
-        return value
-    rows = np.broadcast_to(np.arange(math.prod(value.shape)).reshape(value.shape), shape).ravel()
-    return picked(value, rows, shape)
-
-
-def added(values: Sequence[tuple[float, Affine]], shape: tuple[int, ...]) -> Affine:
-    """Weighted sum of values of one size."""
-    terms: dict[int, Sparse] = {}
-    bias = np.zeros(math.prod(shape))
-    for factor, value in values:
-        bias = bias + factor * value.bias
-        for atom, own in value.terms.items():
-            term = own if factor == 1 else own * factor
-            terms[atom] = terms[atom] + term if atom in terms else term
-    return Affine(shape=shape, terms=terms, bias=bias)
-
-
-def scaled(value: Affine, factor: FloatArray, change: np.ufunc = np.multiply) -> Affine:
-    """Each element times a constant of its own, or divided by it."""
-    terms = {atom: own.copy() for atom, own in value.terms.items()}
-    for own in terms.values():
-        own.data = change(own.data, np.repeat(factor, np.diff(own.indptr)))
-    return Affine(shape=value.shape, terms=terms, bias=change(value.bias, factor))
-
-
-def scaled_and_shifted(value: Affine, factor: FloatArray, shift: FloatArray) -> Affine:
-    """Each element times one constant plus another."""
-    times = scaled(value, factor)
-    return Affine(shape=value.shape, terms=times.terms, bias=times.bias + shift)
-
-
-def through(matrix: Sparse, value: Affine, shape: tuple[int, ...]) -> Affine:
-    """A value after a linear operator; coefficients that an identity meets are the operator's own."""
-    terms = {}
-    for atom, own in value.terms.items():
-        terms[atom] = matrix if diagonal(own) == 1 else (matrix @ own).tocsr()
-        terms[atom].sort_indices()
-    return Affine(shape=shape, terms=terms, bias=matrix @ value.bias)
-
-
 def multiplied(table: Table, a: Affine, b: Affine) -> Affine:
     """A product of two values that vary: of a membrane with its spikes, or of two inputs that may be these."""
     size = len(a.bias)
@@ -256,15 +178,6 @@ def _one_each(terms: Sparse) -> tuple[FloatArray, IntArray]:
     coefficient, column = np.zeros(terms.shape[0]), np.full(terms.shape[0], -1, np.int64)
     coefficient[counts == 1], column[counts == 1] = terms.data, terms.indices
     return coefficient, column
-
-
-def diagonal(terms: Sparse, tolerance: float = 0.0) -> float | None:
-    """The one number on the diagonal where there is nothing else, else None."""
-    each = np.arange(terms.shape[0])
-    square = terms.shape[0] == terms.shape[1] == terms.nnz > 0
-    if not square or not np.array_equal(terms.indices, each) or not np.array_equal(terms.indptr[:-1], each):
-        return None
-    return float(terms.data[0]) if np.ptp(terms.data) <= tolerance * abs(terms.data[0]) else None
 
 
 def is_binary(table: Table, value: Affine) -> bool:

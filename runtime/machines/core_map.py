@@ -1,13 +1,11 @@
-"""What the page of a netlist shows that each chip has in its own way: where its cores lie, and what runs cost."""
+"""Where the cores of a netlist lie, how full each is, and who sends how much to whom."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.report.encode import key
-from spikeloom.runtime.report.sections import Outcome
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,24 +58,9 @@ class Mesh:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Cores:
+class CoreMap:
     """Where the cores lie, how full each is, and who sends how much to whom."""
 
     mesh: Mesh
     cores: tuple[Core, ...]
     traffic: tuple[Way, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BatchParts:
-    """Of all recordings.
-
-    Costs with the chip's layout; mean joules and seconds of an inference by table; and mean spikes of each neuron, by
-    layer.
-    """
-
-    costs: Outcome
-    energy_j: Mapping[str, float]
-    time_s: Mapping[str, float]
-    cores: Cores
-    spikes: Mapping[str, FloatArray]
