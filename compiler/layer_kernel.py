@@ -6,8 +6,8 @@ as the spikes that arrive in it, and a pass over the neurons.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
 
 import numba
 import numpy as np
@@ -19,6 +19,7 @@ from spikeloom.compiler.ir import Sparse
 from spikeloom.compiler.types import BoolArray, IntArray
 
 AnyArray = npt.NDArray[Any]
+Function = Callable[..., Any]
 
 DENORMAL = 1e-30
 """Membranes and currents below this are flushed to zero; beside a threshold they are nothing."""
@@ -76,17 +77,30 @@ def raster_of(spikes: BoolArray) -> Raster:
     return Raster((at - np.repeat(begins[:-1], np.diff(bounds))).astype(np.int32), bounds)
 
 
+def compiled(function: Function) -> Function:
+    """Compile a part of a kernel; it is cached with the whole."""
+    return cast(Function, numba.njit(nogil=True)(function))
+
+
+def compiled_and_cached(function: Function) -> Function:
+    """Compile and keep the machine code on disk, if there is any place for it."""
+    try:
+        return cast(Function, numba.njit(nogil=True, cache=True)(function))
+    except RuntimeError:  # neither the folder of this file nor the user's cache folder can be written
+        return compiled(function)
+
+
 # Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the loops.
 
 
-@numba.njit(nogil=True)
+@compiled
 def _add(total: Any, first: Any, weight: Any, begin: Any, length: Any) -> None:
     # unsigned, so that no index may count from the end: only then is the loop vectorised
     for i in range(np.uint64(length)):
         total[np.uint64(first) + i] += weight[np.uint64(begin) + i]
 
 
-@numba.njit(nogil=True)
+@compiled
 def arrive(total: Any, synapses: Any, source: Any, begin: Any, end: Any) -> None:
     """Add the weights of some sources to the sums of their targets."""
     run, target, offset, weight = synapses  # an array taken out of a tuple costs as much as some synapses
@@ -95,8 +109,9 @@ def arrive(total: Any, synapses: Any, source: Any, begin: Any, end: Any) -> None
             _add(total, target[r], weight, offset[r], offset[r + 1] - offset[r])
 
 
-@numba.njit(nogil=True)
-def _list(fired: Any, listed: Any) -> Any:
+@compiled
+def list_fired(fired: Any, listed: Any) -> Any:
+    """List who fired, and say how many."""
     n = 0
     for neuron in range(len(fired)):
         if fired[neuron]:
@@ -105,13 +120,13 @@ def _list(fired: Any, listed: Any) -> Any:
     return n
 
 
-@numba.njit(nogil=True)
+@compiled
 def _keep(values: Any, factor: Any) -> None:
     for i in range(len(values)):
         values[i] *= factor
 
 
-@numba.njit(nogil=True)
+@compiled
 def flush(values: Any, least: Any) -> None:
     """Set what is nearly zero to zero: decay ends in denormals, which cost a hundred times a normal operation."""
     zero = values.dtype.type(0)
@@ -119,14 +134,14 @@ def flush(values: Any, least: Any) -> None:
         values[i] = zero if abs(values[i]) < least else values[i]
 
 
-@numba.njit(nogil=True)
+@compiled
 def _compare(fired: Any, wanted: Any, moved: Any, more: Any) -> None:
     for i in range(len(moved)):
         moved[i] += fired[i] != wanted[i]
         more[i] += np.int32(fired[i]) - np.int32(wanted[i])
 
 
-@numba.njit(nogil=True)
+@compiled
 def _integrate_float(membrane: Any, current: Any, bias: Any, beta: Any, theta: Any, fired: Any) -> None:
     zero = membrane.dtype.type(0)
     for i in range(len(bias)):
@@ -135,7 +150,7 @@ def _integrate_float(membrane: Any, current: Any, bias: Any, beta: Any, theta: A
         fired[i] = u > theta
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled_and_cached
 def float_layer(
     raster: Any,
     synapses: Any,
@@ -170,7 +185,7 @@ def float_layer(
             at = recording * steps + t
             arrive(current, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
             if len(own.run) and t:
-                arrive(current, own, before, 0, _list(fired[recording, t - 1], before))
+                arrive(current, own, before, 0, list_fired(fired[recording, t - 1], before))
             _integrate_float(membrane, current, bias, beta, theta, fired[recording, t])
             if len(membranes):
                 membranes[recording, t] = membrane
@@ -181,7 +196,7 @@ def float_layer(
                 flush(current, least)
 
 
-@numba.njit(nogil=True)
+@compiled
 def _integrate_integer(
     membrane: Any, current: Any, sums: Any, bias: Any, threshold: Any, keep_u: Any, keep_v: Any, limit: Any, fired: Any
 ) -> None:
@@ -206,7 +221,7 @@ def _integrate_integer(
         fired[i] = v > threshold[i]
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled_and_cached
 def integer_layer(
     raster: Any,
     synapses: Any,
@@ -237,7 +252,7 @@ def integer_layer(
             at = recording * steps + t
             arrive(sums, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
             if len(own.run) and t:
-                arrive(sums, own, before, 0, _list(fired[recording, t - 1], before))
+                arrive(sums, own, before, 0, list_fired(fired[recording, t - 1], before))
             _integrate_integer(membrane, current, sums, bias, threshold, keep_u, keep_v, limit, fired[recording, t])
             if len(membranes):
                 membranes[recording, t] = membrane

@@ -314,7 +314,7 @@ def test_every_recording_is_run_once(spikeloom, passes, words, part):
 def test_parts_of_verify(spikeloom):
     checks = [
         "float32 reference",
-        "float64 beside it",
+        "ladder: float64",
         "chip",
         "specification",
         *(f"ladder: {rung}" for rung in ("beta", "weights", "bias_threshold", "proven")),

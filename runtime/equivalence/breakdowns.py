@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.interpret import vote
-from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.compiler.types import IntArray
 
 OFTEN = 10
 """Spikes from which on a neuron that falls silent, or that wakes up, is worth a line."""
@@ -38,20 +38,19 @@ class Breakdown:
 
 def breakdowns(
     names: Sequence[str],
-    reference: Sequence[BoolArray],
-    chip: Sequence[BoolArray],
+    reference: Sequence[IntArray],
+    chip: Sequence[IntArray],
     neurons: Sequence[IntArray],
     votes: tuple[IntArray, IntArray],
     files: Sequence[str],
 ) -> tuple[Breakdown, ...]:
     """Look for all of them.
 
-    `reference` and `chip` are the spikes of each layer, (samples, steps, compared) bool, of those neurons that
-    `neurons` numbers; `votes` are those of float model and chip, (samples, classes), of recordings that `files` names.
+    `reference` and `chip` are the spikes of each layer, (compared,), of those neurons that `neurons` numbers; `votes` are those of float model and chip, (samples, classes), of recordings that `files` names.
     """
     found: list[Breakdown] = []
     for name, ours, theirs, ids in zip(names, reference, chip, neurons, strict=True):
-        found += _fallen(name, ours.sum(axis=(0, 1)), theirs.sum(axis=(0, 1)), ids)
+        found += _fallen(name, ours, theirs, ids)
     return (*found, *undecided(*votes, files))
 
 

@@ -13,21 +13,29 @@ References
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
 
-from spikeloom.compiler.interpret import BATCH, channels_last
-from spikeloom.compiler.ir import INPUT, Network, Population
-from spikeloom.compiler.layer_kernel import DENORMAL
+from spikeloom.compiler.interpret import BATCH, channels_last, raster, threads
+from spikeloom.compiler.ir import INPUT, Network, Population, Sparse
+from spikeloom.compiler.layer_kernel import (
+    DENORMAL,
+    Synapses,
+    arrive,
+    by_source,
+    compiled,
+    compiled_and_cached,
+    flush,
+    list_fired,
+    no_synapses,
+)
 from spikeloom.compiler.passes.expand import Factored, effective_weight, expand, stack_of
 from spikeloom.compiler.systems import TACTILESGNET, in_order
-from spikeloom.compiler.types import BoolArray, FloatArray
-
-Floats = npt.NDArray[np.float32]
+from spikeloom.compiler.types import BoolArray
 
 UNIT = 2.0**-24
 """Unit roundoff of float32."""
@@ -38,26 +46,26 @@ SPARE = 8
 FLOOR = 10 * DENORMAL
 """Added to every radius: underflow, and membranes that a run flushes to zero."""
 
-SLACK = np.float32(1.01)
-"""Magnitudes are summed in float32, and stay an upper bound by this factor."""
+SLACK = 1.01
+"""Magnitudes are float32 and summed in float64; they stay an upper bound by this factor."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Layer:
-    """Weights (n_pre, n_post) of a layer: a row for each neuron of the sources, then for each of its own.
+    """Weights and magnitudes of a layer, of its `sources` and of itself.
 
     `magnitude` sums the magnitudes of all products that make up a weight. A current has `roundings`, and one more for
     each input spike if it is one plain sum over them (`per_spike`): a product with a zero is exact and adds exactly.
-    `loops` is the number of projections to itself.
     """
 
     population: Population
-    weight: FloatArray
-    magnitude: Floats
+    sources: tuple[int, ...]
+    weight: Synapses
+    magnitude: Synapses
+    own: Synapses
+    own_magnitude: Synapses
     roundings: int
     per_spike: bool
-    sources: tuple[int, ...]
-    loops: int
 
 
 def _layers(model: Factored | Network) -> list[_Layer]:
@@ -69,150 +77,176 @@ def _layers(model: Factored | Network) -> list[_Layer]:
     hops = checkpoint.hops.astype(np.float64)
     # Hop after hop on its own, as the released operator does: its terms may cancel only after they were rounded.
     spelled = in_order(checkpoint.system, effective_weight(stack_of(checkpoint, np.abs(adjacency)), np.abs(hops)))
-    magnitude = first.magnitude.copy()
+    weight = sum((p.weight for p in network.projections if p.post == 0), start=0).toarray()
+    magnitude = np.abs(weight)
     neurons, channels = len(spelled), spelled[0].size  # the relays of clocks come after the neurons
-    magnitude[:channels, :neurons] = spelled.reshape(neurons, channels).T
+    magnitude[:neurons, :channels] = spelled.reshape(neurons, channels)
+    kept = sparse.csr_array(magnitude)
+    row = np.repeat(np.arange(len(weight)), np.diff(kept.indptr))
+    aligned = sparse.csr_array((weight[row, kept.indices], kept.indices, kept.indptr), shape=kept.shape)
     # Of a graph the longest sum into a taxel, hop after hop; of a stack that into a place, filter after filter.
     gathered = int(np.count_nonzero(adjacency, axis=-1).max(initial=0)) + 1
     chain = len(hops) * gathered + hops.shape[2] * len(hops) + 1 + len(hops)
     if checkpoint.system == TACTILESGNET:
         chain = (len(hops) - 1) * gathered + hops.shape[2] + 1 + len(hops)
+    sums = {"weight": by_source([aligned], np.float64), "magnitude": by_source([kept], np.float32)}
     return [
-        replace(first, magnitude=magnitude, roundings=SPARE + chain, per_spike=False),
+        replace(first, **sums, roundings=SPARE + chain, per_spike=False),
         *(replace(layer, roundings=SPARE) for layer in others),
     ]
 
 
 def _plain(network: Network, post: int) -> _Layer:
     """A layer whose current is the plain sum over its synapses, as the float stage of the compiler has it."""
-    # those from itself come last
-    into = sorted((p for p in network.projections if p.post == post), key=lambda p: p.pre == post)
-    sources = tuple(projection.pre for projection in into if projection.pre != post)
-    weight = np.ascontiguousarray(np.concatenate([projection.weight.toarray().T for projection in into]))
+    into = [p for p in network.projections if p.post == post]
+    others, own = ([p for p in into if (p.pre == post) == itself] for itself in (False, True))
     return _Layer(
         population=network.populations[post],
-        weight=weight,
-        magnitude=np.abs(weight).astype(np.float32),
+        sources=tuple(p.pre for p in others),
+        weight=by_source([p.weight for p in others], np.float64),
+        magnitude=by_source([abs(p.weight) for p in others], np.float32),
+        own=_summed([p.weight for p in own], np.float64),
+        own_magnitude=_summed([abs(p.weight) for p in own], np.float32),
         roundings=SPARE + len(into),
         per_spike=True,
-        sources=sources,
-        loops=len(into) - len(sources),
     )
 
 
-def _sums(layer: _Layer, certain: BoolArray, doubt: BoolArray) -> tuple[FloatArray, Floats]:
-    """Centre and radius of what spikes bring, (samples, steps, n_post), with the bias if no current outlasts a step."""
-    population = layer.population
-    sure, unsure = (spikes.reshape(-1, spikes.shape[-1]) for spikes in (certain, doubt))
-    possible = (sure | unsure).astype(np.float32)
-    centre = (sure + 0.5 * unsure) @ layer.weight
-    radius: Floats = possible @ layer.magnitude
-    if not population.alpha:
-        centre += population.bias
-        radius += np.abs(population.bias).astype(np.float32)
-    added = np.full(len(sure), float(layer.roundings))
-    if layer.per_spike:
-        added += possible.sum(axis=1, dtype=np.float64)
-    radius *= (SLACK * added * UNIT / (1 - added * UNIT))[:, None].astype(np.float32)
-    rows = np.flatnonzero(unsure.any(axis=1))  # few
-    radius[rows] += 0.5 * SLACK * (unsure[rows].astype(np.float32) @ layer.magnitude)
-    shape = *certain.shape[:2], -1
-    return centre.reshape(shape), radius.reshape(shape)
+def _summed(weights: list[Sparse], dtype: npt.DTypeLike) -> Synapses:
+    return by_source([sum(weights[1:], start=weights[0])], dtype) if weights else no_synapses(dtype)
 
 
-def _keep(alpha: float, step: int, before: tuple[FloatArray, Floats], centre: FloatArray, radius: Floats) -> None:
-    """Add to a step's currents, in place, what is left of those of the step before, given by centre and radius."""
-    # Decay as of membranes: alpha itself rounded, the product, and the sum that follows.
-    lost = alpha * (1 + 8 * UNIT) * before[1] + 8 * UNIT * alpha * np.abs(before[0]) + FLOOR
-    radius[:] = np.nextafter((radius + lost).astype(np.float32), np.float32(np.inf))
-    centre += alpha * before[0]
-    if step % 16 == 15:
-        centre[np.abs(centre) < DENORMAL] = 0
-
-
-class _Membranes:
-    """Membranes of a layer, (samples, neurons), as centre and radius, step after step."""
-
-    def __init__(self, beta: float, theta: float, shape: tuple[int, ...]) -> None:
-        self._beta = beta
-        self._least, self._most = sorted((theta, float(np.float32(theta))))
-        self._centre, self._radius = np.zeros(shape), np.zeros(shape)
-
-    def step(self, step: int, centre: FloatArray, radius: Floats) -> tuple[BoolArray, BoolArray]:
-        """Let currents in; certain and uncertain spikes."""
+@compiled
+def _step(centre: Any, radius: Any, c: Any, r: Any, beta: Any, least: Any, most: Any, fired: Any, unsure: Any) -> None:
+    """Let the currents `c` with radius `r` into the membranes; who surely fires, and who may."""
+    for i in range(len(centre)):
         # Decay: beta itself rounded, the product, and the sum that follows.
-        lost = np.abs(self._centre) * (8 * UNIT * self._beta)
-        r = self._radius * (self._beta * (1 + 8 * UNIT)) + lost + radius + FLOOR
-        c = self._centre * self._beta + centre
-        low, high = c - r, c + r
-        fired, silent = low > self._most, high <= self._least
-        unknown = fired == silent
-        c *= silent
-        r *= silent
+        lost = abs(centre[i]) * (8 * UNIT * beta)
+        wide = radius[i] * (beta * (1 + 8 * UNIT)) + lost + r[i] + FLOOR
+        middle = centre[i] * beta + c[i]
+        low, high = middle - wide, middle + wide
+        fires, silent = low > most, high <= least
+        unknown = fires == silent
         # It was reset, or it is still below its threshold.
-        down = np.minimum(low[unknown], 0)
-        up = np.maximum(np.minimum(high[unknown], self._most), 0)
-        c[unknown] = (down + up) / 2
-        r[unknown] = (up - down) / 2 * (1 + UNIT)
-        if step % 16 == 15:
-            c[np.abs(c) < DENORMAL] = 0
-        self._centre, self._radius = c, r
-        return fired, unknown
+        down, up = min(low, 0.0), max(min(high, most), 0.0)
+        middle = (down + up) / 2 if unknown else (middle if silent else 0.0)
+        wide = (up - down) / 2 * (1 + UNIT) if unknown else (wide if silent else 0.0)
+        centre[i], radius[i] = middle, wide
+        fired[i], unsure[i] = fires, unknown
 
 
-def _spikes(layer: _Layer, certain: BoolArray, doubt: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """Certain and uncertain spikes of a layer from those of its sources, all (samples, steps, neurons)."""
-    population = layer.population
-    shape = *certain.shape[:2], population.size
-    fired, unsure = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
-    membranes = _Membranes(population.beta, population.theta, shape[::2])
-    before = np.zeros(shape[::2]), np.zeros(shape[::2], np.float32)
-    sums = None if layer.loops else _sums(layer, certain, doubt)
-    for step in range(shape[1]):
-        if sums is not None:
-            centre, radius = sums[0][:, step], sums[1][:, step]
-        else:  # what was uncertain in a step is so in the next; of step 0 nothing is known yet
-            now, last = slice(step, step + 1), slice(max(step - 1, 0), max(step, 1))
-            both = (
-                np.concatenate([sent[:, now], *[own[:, last]] * layer.loops], axis=2)
-                for sent, own in ((certain, fired), (doubt, unsure))
-            )
-            centres, radii = _sums(layer, *both)
-            centre, radius = centres[:, 0], radii[:, 0]
-        if population.alpha:
-            if step:
-                _keep(population.alpha, step, before, centre, radius)
-            before = centre, radius
-            # The bias goes past currents that last: it is rounded, added, and added to the membrane.
-            more = (np.abs(centre) + np.abs(population.bias)).astype(np.float32)
-            centre, radius = centre + population.bias, radius + SLACK * np.float32(4 * UNIT) * more
-        fired[:, step], unsure[:, step] = membranes.step(step, centre, radius)
-    return fired, unsure
+@compiled
+def _currents(c: Any, r: Any, doubtful: Any, bias: Any, error: Any) -> None:
+    """Radius of plain sums: of a share of their magnitude, and of spikes that may be missing."""
+    for i in range(len(c)):
+        c[i] += bias[i]
+        r[i] = (r[i] + abs(bias[i])) * error + 0.5 * SLACK * doubtful[i]
 
 
-def certain_spikes(model: Factored | Network, events: npt.NDArray[np.uint8]) -> list[tuple[BoolArray, BoolArray]]:
-    """Spikes of the float model that no order of summation can change, in float32 or finer.
+@compiled
+def _lasting(c: Any, r: Any, before_c: Any, before_r: Any, alpha: Any, bias: Any) -> None:
+    """Add what is left of the currents of the step before, and the bias, which goes past them."""
+    for i in range(len(c)):
+        # Decay as of membranes: alpha itself rounded, the product, and the sum that follows.
+        r[i] += alpha * (1 + 8 * UNIT) * before_r[i] + 8 * UNIT * alpha * abs(before_c[i]) + FLOOR
+        c[i] += alpha * before_c[i]
+        before_c[i], before_r[i] = c[i], r[i]
+        # It is rounded, added, and added to the membrane.
+        r[i] += SLACK * 4 * UNIT * (abs(c[i]) + abs(bias[i]))
+        c[i] += bias[i]
 
-    Of each layer two arrays (samples, steps, neurons) bool: entries that surely spike, and entries that may or may not.
-    All others surely do not. `events` is (samples, taxels, polarities, steps) uint8; a network sums over its
-    synapses.
-    """
-    layers = _layers(model)
-    inputs = channels_last(
-        events, model.input.clocks if isinstance(model, Network) else model.checkpoint.dynamics.clocks
-    )
 
-    def batch(part: BoolArray) -> list[tuple[BoolArray, BoolArray]]:
+@compiled_and_cached
+def _run(
+    sure: Any,
+    doubt: Any,
+    weight: Any,
+    magnitude: Any,
+    own: Any,
+    own_magnitude: Any,
+    bias: Any,
+    constants: Any,
+    roundings: Any,
+    per_spike: Any,
+    fired: Any,
+    unsure: Any,
+) -> None:
+    """Run recordings through a layer; `fired` and `unsure` (recordings, steps, neurons) uint8 are filled."""
+    alpha, beta, least, most = constants
+    recordings, steps, size = fired.shape
+    listed, nothing = np.empty(size, np.int32), np.zeros(size)
+    for recording in range(recordings):
+        centre, radius, before_c, before_r = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
+        for t in range(steps):
+            c, half, r, doubtful = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
+            at = recording * steps + t
+            first, last = sure.bounds[at], sure.bounds[at + 1]
+            arrive(c, weight, sure.source, first, last)
+            arrive(r, magnitude, sure.source, first, last)
+            spikes = last - first
+            first, last = doubt.bounds[at], doubt.bounds[at + 1]
+            arrive(half, weight, doubt.source, first, last)
+            arrive(doubtful, magnitude, doubt.source, first, last)
+            spikes += last - first
+            if len(own.run) and t:  # what was uncertain in a step is so in the next
+                found = list_fired(fired[recording, t - 1], listed)
+                arrive(c, own, listed, 0, found)
+                arrive(r, own_magnitude, listed, 0, found)
+                spikes += found
+                found = list_fired(unsure[recording, t - 1], listed)
+                arrive(half, own, listed, 0, found)
+                arrive(doubtful, own_magnitude, listed, 0, found)
+                spikes += found
+            c += 0.5 * half
+            r += doubtful
+            added = (roundings + (spikes if per_spike else 0)) * UNIT
+            _currents(c, r, doubtful, nothing if alpha else bias, SLACK * added / (1 - added))
+            if alpha:
+                _lasting(c, r, before_c, before_r, alpha, bias)
+            _step(centre, radius, c, r, beta, least, most, fired[recording, t], unsure[recording, t])
+            if t % 16 == 15:
+                flush(centre, DENORMAL)
+                flush(before_c, DENORMAL)
+
+
+class Certainty:
+    """Which spikes of a float model no order of summation can change, in float32 or finer; prepared once."""
+
+    def __init__(self, model: Factored | Network) -> None:
+        """A network sums over its synapses, a checkpoint as its operator does."""
+        self._layers = _layers(model)
+        self._clocks = model.input.clocks if isinstance(model, Network) else model.checkpoint.dynamics.clocks
+
+    def spikes(self, events: npt.NDArray[np.uint8]) -> list[tuple[BoolArray, BoolArray]]:
+        """Of each layer two arrays (samples, steps, neurons) bool: what surely spikes, and what may or may not.
+
+        All others surely do not. `events` is (samples, taxels, polarities, steps) uint8.
+        """
+        inputs = channels_last(events, self._clocks)
+        parts = threads().map(self._batch, (inputs[start : start + BATCH] for start in range(0, len(inputs), BATCH)))
+        return [
+            (np.concatenate([certain for certain, _ in layer]), np.concatenate([doubt for _, doubt in layer]))
+            for layer in zip(*parts, strict=True)
+        ]
+
+    def _batch(self, part: BoolArray) -> list[tuple[BoolArray, BoolArray]]:
         sent = {INPUT: (part, np.zeros_like(part))}
-        for post, layer in enumerate(layers):
-            sources = zip(*(sent[source] for source in layer.sources), strict=True)
-            sent[post] = _spikes(layer, *(np.concatenate(each, axis=-1) for each in sources))
-        return [sent[post] for post in range(len(layers))]
-
-    parts = [inputs[start : start + BATCH] for start in range(0, len(inputs), BATCH)]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        results = list(pool.map(batch, parts))
-    return [
-        (np.concatenate([certain for certain, _ in of_layer]), np.concatenate([doubt for _, doubt in of_layer]))
-        for of_layer in zip(*results, strict=True)
-    ]
+        for post, layer in enumerate(self._layers):
+            population = layer.population
+            fired, unsure = np.zeros((2, *part.shape[:2], population.size), np.bool_)
+            _run(
+                raster([sent[pre][0] for pre in layer.sources]),
+                raster([sent[pre][1] for pre in layer.sources]),
+                layer.weight,
+                layer.magnitude,
+                layer.own,
+                layer.own_magnitude,
+                np.asarray(population.bias, np.float64),
+                (population.alpha, population.beta, *sorted((population.theta, float(np.float32(population.theta))))),
+                layer.roundings,
+                layer.per_spike,
+                fired.view(np.uint8),
+                unsure.view(np.uint8),
+            )
+            sent[post] = fired, unsure
+        return [sent[post] for post in range(len(self._layers))]

@@ -17,7 +17,7 @@ from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.types import BoolArray, IntArray
-from spikeloom.runtime.equivalence.certain_spikes import certain_spikes
+from spikeloom.runtime.equivalence.certain_spikes import Certainty
 from spikeloom.runtime.machines.votes import readout_counts
 
 
@@ -69,40 +69,55 @@ def wins(decisions: IntArray, least: IntArray, most: IntArray) -> BoolArray:
     return sure
 
 
-def certify(
-    model: Factored | Network,
-    integer: IntegerNetwork,
-    events: npt.NDArray[np.uint8],
-    chip: Sequence[BoolArray],
-    decisions: IntArray,
-    *,
-    kept: Sequence[slice | IntArray] | None = None,
-    lengths: IntArray | None = None,
-) -> Certificate:
-    """Certify spikes and decisions of the chip on recordings, and its registers on any input.
+class Certifier:
+    """Certifies spikes and decisions of the chip, some recordings after others, and its registers on any input."""
 
-    `chip` holds the spikes of each layer, (samples, steps, kept neurons) bool, aligned with the data and cut to
-    `lengths`, of those neurons that `kept` names: all by default, and always all of the last layer. Its classes
-    `decisions` are (samples,). The others are those of :func:`certain_spikes`.
-    """
-    neurons = [slice(None)] * len(chip) if kept is None else kept
-    float_model = [
-        (cut(certain[..., part], lengths), cut(doubt[..., part], lengths))
-        for part, (certain, doubt) in zip(neurons, certain_spikes(model, events), strict=True)
-    ]
-    steps = events.shape[3] * len(events) if lengths is None else int(lengths.sum())
-    layers = {}
-    for population, (certain, doubt), spikes in zip(integer.populations, float_model, chip, strict=True):
-        entries, unknown = steps * spikes.shape[2], int(np.count_nonzero(doubt))
-        different = int(np.count_nonzero((certain != spikes) & ~doubt))
-        layers[population.name] = LayerCertificate(
-            entries=entries, equal=entries - unknown - different, different=different
+    def __init__(
+        self, model: Factored | Network, integer: IntegerNetwork, kept: Sequence[slice | IntArray] | None = None
+    ) -> None:
+        """`kept` names the neurons of each layer that are compared, by default and in the last layer all."""
+        self._integer = integer
+        self._certainty = Certainty(model)
+        self._kept = [slice(None)] * len(integer.populations) if kept is None else kept
+        self._entries, self._unknown, self._different = np.zeros((3, len(integer.populations)), np.int64)
+        self._samples = self._decisions = 0
+
+    def add(
+        self,
+        events: npt.NDArray[np.uint8],
+        chip: Sequence[BoolArray],
+        decisions: IntArray,
+        lengths: IntArray | None = None,
+    ) -> None:
+        """Certify recordings (samples, taxels, polarities, steps).
+
+        `chip` holds the spikes of each layer, (samples, steps, kept neurons) bool, aligned with the data and cut to
+        `lengths`; its classes `decisions` are (samples,).
+        """
+        float_model = [
+            (cut(certain[..., part], lengths), cut(doubt[..., part], lengths))
+            for part, (certain, doubt) in zip(self._kept, self._certainty.spikes(events), strict=True)
+        ]
+        steps = events.shape[3] * len(events) if lengths is None else int(lengths.sum())
+        for index, ((certain, doubt), spikes) in enumerate(zip(float_model, chip, strict=True)):
+            self._entries[index] += steps * spikes.shape[2]
+            self._unknown[index] += np.count_nonzero(doubt)
+            self._different[index] += np.count_nonzero((certain != spikes) & ~doubt)
+        readout, classes = self._integer.readout, self._integer.classes
+        least, more = (readout_counts(readout, classes, each) for each in float_model[readout.population])
+        self._samples += len(events)
+        self._decisions += int(np.count_nonzero(wins(decisions, least, least + more)))
+
+    def certificate(self) -> Certificate:
+        """What is proven of all of them."""
+        figures = zip(self._entries.tolist(), self._unknown.tolist(), self._different.tolist(), strict=True)
+        layers = {
+            population.name: LayerCertificate(entries=entries, equal=entries - unknown - different, different=different)
+            for population, (entries, unknown, different) in zip(self._integer.populations, figures, strict=True)
+        }
+        return Certificate(
+            layers=layers,
+            samples=self._samples,
+            decisions=self._decisions,
+            unproven=tuple(proof.layer for proof in prove_ranges(self._integer) if not proof.holds),
         )
-    votes = [readout_counts(integer.readout, integer.classes, each) for each in float_model[integer.readout.population]]
-    least, most = votes[0], votes[0] + votes[1]
-    return Certificate(
-        layers=layers,
-        samples=len(events),
-        decisions=int(np.count_nonzero(wins(decisions, least, most))),
-        unproven=tuple(proof.layer for proof in prove_ranges(integer) if not proof.holds),
-    )

@@ -12,7 +12,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,14 @@ from spikeloom.compiler import Netlist
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
-from spikeloom.compiler.interpret import channels_last, cut, run_float, run_integer
+from spikeloom.compiler.interpret import (
+    Simulation,
+    channels_last,
+    cut,
+    float_simulation,
+    integer_simulation,
+    run_float,
+)
 from spikeloom.compiler.ir import IntegerNetwork, Network, Projection, Readout, Sparse
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.passes.range_proof import prove_ranges
@@ -57,14 +64,14 @@ def _timing(clocks: Clocks, bins: int) -> dict[str, int]:
     return found | ({"bins of a step": bins} if bins > 1 else {})
 
 
-def spikes_of(model: Factored | Network, events: npt.NDArray[np.uint8], dtype: str) -> list[BoolArray]:
-    """Float spikes of each layer: of a checkpoint in its own operator order, of a network as sums over synapses."""
+def reference_of(model: Factored | Network) -> Callable[[npt.NDArray[np.uint8]], list[BoolArray]]:
+    """What gives the spikes of each layer in float32: of a checkpoint in its own operator order, else synapse sums."""
+    if isinstance(model, Network):
+        clocks, ready = model.input.clocks, float_simulation(model, np.float32)
+        return lambda events: list(ready.run(channels_last(events, clocks)).spikes)
     from spikeloom.models.networks.reference import float_spikes  # torch, so only here
 
-    if isinstance(model, Network):
-        inputs = channels_last(events, model.input.clocks)
-        return list(run_float(model, inputs, dtype=np.dtype(dtype)).spikes)
-    return list(float_spikes(model.checkpoint, model.propagation, events, dtype=dtype).values())
+    return lambda events: list(float_spikes(model.checkpoint, model.propagation, events).values())
 
 
 PART = 16
@@ -73,10 +80,10 @@ PART = 16
 
 def votes_so_far(readout: Readout, classes: int, model: Factored | Network, data: Recordings) -> IntArray:
     """Votes of the float32 model after each step, (samples, steps, classes); a recording's stay from its end on."""
-    lengths, votes = data.step_counts, []
+    lengths, votes, reference = data.step_counts, [], reference_of(model)
     for first in range(0, len(data), PART):
         part = slice(first, first + PART)
-        spikes = spikes_of(model, data.events[part], "float32")[readout.population]
+        spikes = reference(data.events[part])[readout.population]
         votes.append(votes_by_step(readout, classes, cut(spikes, lengths[part])))
     return np.concatenate(votes)
 
@@ -156,16 +163,10 @@ def _rows_scaled(weight: Sparse, factor: FloatArray) -> Sparse:
     return scaled
 
 
-def rungs(
-    network: Network, integer: IntegerNetwork, inputs: BoolArray, begin: Callable[[str], None]
-) -> Iterator[tuple[str, tuple[BoolArray, ...] | None]]:
-    """Spikes of the rungs between float64 and the chip; None for one that is proven to be the chip itself."""
-    for stage, rung in zip(LADDER[1:4], realised(network, integer), strict=True):
-        begin(f"ladder: {stage}")
-        yield stage, run_float(rung, inputs).spikes
-    if all(proof.holds for proof in prove_ranges(integer)):
-        begin("ladder: proven")  # no register leaves its range on any input: without limits the chip is the same
-        yield "rounding", None
-    else:
-        begin("ladder: rounding")
-        yield "rounding", run_integer(integer, inputs, saturates=False).spikes
+def rungs(network: Network, integer: IntegerNetwork) -> dict[str, Simulation | None]:
+    """The rungs below the chip, ready to run; None for one that is proven to be the chip itself."""
+    proven = all(proof.holds for proof in prove_ranges(integer))
+    stages = map(float_simulation, (network, *realised(network, integer)))
+    # where no register leaves its range on any input, the chip is the same without limits
+    unlimited = None if proven else integer_simulation(integer, saturates=False)
+    return dict(zip(LADDER[:-1], (*stages, unlimited), strict=True))

@@ -19,13 +19,14 @@ from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
-from spikeloom.runtime.equivalence.certificates import certify
+from spikeloom.runtime.equivalence.certificates import Certifier
 from spikeloom.runtime.equivalence.reference import (
+    LADDER,
     float_network,
     membranes_of,
+    reference_of,
     require_match,
     rungs,
-    spikes_of,
     taxel_and_feature,
 )
 from spikeloom.runtime.equivalence.rounding import check_rounding
@@ -33,6 +34,9 @@ from spikeloom.runtime.equivalence.verdict import Divergence, LayerSpikes, Rung,
 from spikeloom.runtime.machines.base import ENGINES
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_of
 from spikeloom.runtime.machines.votes import readout_counts
+
+PART = 16
+"""Recordings that are compared at a time: what is held does not grow with their number."""
 
 
 def verify(
@@ -47,7 +51,7 @@ def verify(
     spec_samples: int = 3,
     engine_name: str = ENGINES[0],
     required: Mapping[str, float] | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str, int], None] | None = None,
 ) -> Verdict:
     """Compare float model, chip and specification.
 
@@ -64,7 +68,7 @@ def verify(
     required : mapping of level to share, optional
         What has to be reached, see :mod:`equivalence.verdict`; the weights always have to be the checkpoint's.
     progress : callable, optional
-        Called with the name of each part as it starts.
+        Called with the name of each part as it starts, and the number of recordings that are done.
 
     Raises
     ------
@@ -74,7 +78,7 @@ def verify(
     """
     if not 1 <= spec_samples:
         raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")
-    begin = progress or (lambda _part: None)
+    begin = progress or (lambda _part, _done: None)
     model = source if original is None else original
     require_match(netlist, source)
     require_match(netlist, model)
@@ -85,79 +89,100 @@ def verify(
     tuned = isinstance(source, Factored) and source.checkpoint.forms is not None
     origin = network if original is None else float_network(source)
     weights = check_rounding(machine, origin, fine_tuned=tuned)
-    kept = machine.compared()
-
-    def compared(layers: Sequence[BoolArray]) -> list[BoolArray]:
-        return [cut(spikes, lengths)[..., keep] for spikes, keep in zip(layers, kept, strict=True)]
-
-    begin("float32 reference")
-    reference = compared(spikes_of(model, events, "float32"))
-    begin("float64 beside it")
-    wide = compared(spikes_of(model, events, "float64"))
-
-    begin("chip")
-    ran = machine.run(events, lengths=lengths, spikes=True)
-    assert ran.spikes is not None, "spikes were wanted"
-    chip = [ran.spikes[name][..., keep] for name, keep in zip(names, kept, strict=True)]
-
-    quantised_different = None
-    if isinstance(source, Factored) and tuned:
-        begin("fine-tuned model")
-        from spikeloom.models.networks.quantised import quantised_spikes  # torch, so only here
-
-        torch_spikes = [*quantised_spikes(source.checkpoint, source.propagation, events).values()]
-        pairs = zip(compared(torch_spikes), chip, strict=True)
-        quantised_different = sum(int(np.count_nonzero(a != b)) for a, b in pairs)
-
-    begin("specification")
-    checked = min(spec_samples, len(events))
+    kept, checked = machine.compared(), min(spec_samples, len(events))
+    begin("specification", 0)
     equal = machine.check(events[:checked], lengths=lengths) == 0
-    engine_different = None if beside is None else beside(events, lengths)
+    beside = None if engine_name == ENGINES[0] else machine.beside(events, lengths=lengths, samples=checked)
+    reference_spikes, ladder = reference_of(model), rungs(network, integer)
+    fine_tuned_spikes = _fine_tuned(source) if tuned else None
+    certifier = Certifier(model, integer, kept)
+    different = {stage: np.zeros(len(names), np.int64) for stage in LADDER}
+    sizes = [integer.populations[i].size if isinstance(each, slice) else len(each) for i, each in enumerate(kept)]
+    totals = [(np.zeros(size, np.int64), np.zeros(size, np.int64)) for size in sizes]  # spikes of both sides
+    float_votes, chip_votes = np.zeros((2, len(events), network.classes), np.int64)
+    quantised_different, divergence = 0 if tuned else None, None
+    for first in range(0, len(events), PART):
+        rows = slice(first, first + PART)
+        part, ends = events[rows], None if lengths is None else lengths[rows]
+        channels = channels_last(part, netlist.clocks)
 
-    def rung(stage: str, spikes: list[BoolArray]) -> Rung:
-        differ = {name: int(np.count_nonzero(a != b)) for name, a, b in zip(names, reference, spikes, strict=True)}
-        return Rung(stage=stage, different=differ)
+        def compared(layers: Sequence[BoolArray], ends: IntArray | None = ends) -> list[BoolArray]:
+            return [cut(spikes, ends)[..., keep] for spikes, keep in zip(layers, kept, strict=True)]
 
-    ladder = [rung("float64", wide)]
-    for stage, spikes in rungs(network, integer, channels_last(events, netlist.clocks), begin):
-        ladder.append(rung(stage, chip if spikes is None else compared(spikes)))
-    ladder.append(rung("saturation", chip))
+        begin("float32 reference", first)
+        reference = compared(reference_spikes(part))
+        begin("chip", first)
+        ran = machine.run(part, lengths=ends, spikes=True)
+        assert ran.spikes is not None, "spikes were wanted"
+        chip = [ran.spikes[name][..., keep] for name, keep in zip(names, kept, strict=True)]
+        if fine_tuned_spikes is not None and quantised_different is not None:
+            begin("fine-tuned model", first)
+            quantised_different += int(_differences(compared(fine_tuned_spikes(part)), chip).sum())
 
-    begin("first divergence")
-    divergence = _first_divergence(machine, model, reference, chip, wide, events, files)
-    float_counts = readout_counts(network.readout, network.classes, reference[network.readout.population])
+        wide = chip
+        for stage, ready in ladder.items():
+            begin(f"ladder: {'proven' if ready is None else stage}", first)
+            spikes = chip if ready is None else compared(ready.run(channels).spikes)
+            different[stage] += _differences(reference, spikes)
+            wide = spikes if stage == "float64" else wide
+        different["saturation"] += _differences(reference, chip)
+        for index, (ours, theirs) in enumerate(totals):
+            ours += reference[index].sum(axis=(0, 1))
+            theirs += chip[index].sum(axis=(0, 1))
+        if divergence is None:
+            begin("first divergence", first)
+            divergence = _first_divergence(machine, model, reference, chip, wide, part, files[rows])
+        float_votes[rows] = readout_counts(network.readout, network.classes, reference[network.readout.population])
+        chip_votes[rows] = ran.votes
+        begin("certificate", first)
+        certifier.add(part, chip, ran.decisions, ends)
+
     neurons = [np.arange(each.size)[keep] for each, keep in zip(integer.populations, kept, strict=True)]
-    begin("certificate")
-    certificate = certify(model, integer, events, chip, ran.decisions, kept=kept, lengths=lengths)
+    ours, theirs = zip(*totals, strict=True)
     return Verdict(
         files=files,
         labels=labels,
-        float_predictions=vote(float_counts),
-        chip_predictions=ran.decisions,
-        float_counts=float_counts,
-        chip_counts=ran.votes,
+        float_predictions=vote(float_votes),
+        chip_predictions=vote(chip_votes),
+        float_counts=float_votes,
+        chip_counts=chip_votes,
         spikes={
             name: LayerSpikes(
-                float=int(np.count_nonzero(reference[i])),
-                chip=int(np.count_nonzero(chip[i])),
-                different=ladder[-1].different[name],
-                ill_posed=ladder[0].different[name],
+                float=int(ours[i].sum()),
+                chip=int(theirs[i].sum()),
+                different=int(different["saturation"][i]),
+                ill_posed=int(different["float64"][i]),
             )
             for i, name in enumerate(names)
         },
         spec_samples=checked,
-        spec_equals_engine=equal and not engine_different,
+        spec_equals_engine=equal and (beside is None or beside.equal),
         weights=weights,
         first_divergence=divergence,
-        ladder=tuple(ladder),
+        ladder=tuple(
+            Rung(stage=stage, different=dict(zip(names, different[stage].tolist(), strict=True))) for stage in LADDER
+        ),
         quantised_different=quantised_different,
-        breakdowns=breakdowns(names, reference, chip, neurons, (float_counts, ran.votes), files),
+        breakdowns=breakdowns(names, ours, theirs, neurons, (float_votes, chip_votes), files),
         not_compared={name: int(out.sum()) for name, out in zip(names, machine.unread, strict=True) if out.any()},
-        certificate=certificate,
+        certificate=certifier.certificate(),
         engine=engine_name,
-        engine_different=engine_different,
+        engine_different=None if beside is None else beside.different,
         required={} if required is None else required,
     )
+
+
+def _fine_tuned(source: Factored | Network) -> Callable[[npt.NDArray[np.uint8]], list[BoolArray]]:
+    """What gives the spikes of each layer of a fine-tuned checkpoint's torch model."""
+    from spikeloom.models.networks.quantised import quantised_spikes  # torch, so only here
+
+    assert isinstance(source, Factored), "networks are not fine-tuned"
+    return lambda events: list(quantised_spikes(source.checkpoint, source.propagation, events).values())
+
+
+def _differences(ours: Sequence[BoolArray], theirs: Sequence[BoolArray]) -> IntArray:
+    """Entries of each layer that differ."""
+    return np.array([np.count_nonzero(a != b) for a, b in zip(ours, theirs, strict=True)], np.int64)
 
 
 def _first_divergence(

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import Machine
-from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.console import Progress, progress
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 
 CHIP = "chip integers"
@@ -42,11 +42,11 @@ KINDS = {
     "no float": Kind("float", "none", "the float model says nothing about the chip's decisions or costs"),
     # of verify
     "float32 reference": Kind("float32, released operator order", "all", "what the chip's spikes are held against"),
-    "float64 beside it": Kind("float64, released operator order", "all", "shows spikes that rounding of sums decides"),
+    "ladder: float64": Kind("float64 sums", "all", "shows spikes that rounding of sums decides"),
     "chip": Kind(CHIP, "all", "every spike kept, since every one is compared"),
     "fine-tuned model": Kind("chip integers in torch", "all", "E1: the fine-tuned model has to be the chip"),
     "specification": Kind(
-        "Python integers, and the engine again with membranes", "checked", "E0; --spec-samples says how many"
+        "64-bit integers, and the engine again with membranes", "checked", "E0; --spec-samples says how many"
     ),
     "ladder: beta": Kind("float64 sums", "all", "spikes that differ by the decay registers alone"),
     "ladder: weights": Kind("float64 sums", "all", "and by rounded weights"),
@@ -98,20 +98,26 @@ class Account:
     def __init__(self, machine: Machine, data: Recordings, *, checked: int = 0) -> None:
         self._machine, self._checked = machine, min(checked, len(data))
         self._steps = data.step_counts
-        self._parts: list[tuple[str, float]] = []
+        self._seconds: dict[str, float] = {}
+        self._now, self._since = "", time.perf_counter()
+        self._progress = Progress(len(data))
 
-    def begin(self, part: str) -> None:
-        """A part begins, and the one before it has ended."""
-        self._parts.append((part, time.perf_counter()))
+    def begin(self, part: str, done: int = 0) -> None:
+        """A part begins, perhaps once more, and the one before it has ended; so many recordings are done."""
+        now = time.perf_counter()
+        if self._now:
+            self._seconds[self._now] += now - self._since
+        self._seconds.setdefault(part, 0.0)
+        self._now, self._since = part, now
         if KINDS[part].over != "none":
-            progress(part)
+            self._progress(done, part)
 
     def explained(self, wanted: bool) -> tuple[Part, ...] | None:
         """All parts in their order, written to stderr too, if they are wanted; the last one ends now."""
         if not wanted:
             return None
-        ends = [begun for _, begun in self._parts[1:]] + [time.perf_counter()]
-        parts = tuple(self._part(name, end - begun) for (name, begun), end in zip(self._parts, ends, strict=True))
+        self.begin(self._now)
+        parts = tuple(self._part(name, seconds) for name, seconds in self._seconds.items())
         progress("")
         sys.stderr.writelines(f"spikeloom: {part}\n" for part in parts)
         return parts

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 
 
 def progress(label: str) -> None:
@@ -11,6 +12,20 @@ def progress(label: str) -> None:
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[K{label} …" if label else "\r\x1b[K")
         sys.stderr.flush()
+
+
+class Progress:
+    """Says on a terminal how many of `total` parts of some work are done, and what time the others will take."""
+
+    def __init__(self, total: int) -> None:
+        self._total, self._begun = total, time.perf_counter()
+
+    def __call__(self, done: int, label: str = "running") -> None:
+        """So many are done; the `label` is of the next."""
+        spent = time.perf_counter() - self._begun
+        left = round(spent * (self._total - done) / done) if done else 0
+        ahead = f", {left // 60}:{left % 60:02} left" if left else ""
+        progress(f"{label}: {done} of {self._total}{ahead}" if self._total > 1 else label)
 
 
 def show(text: str) -> None:

@@ -36,8 +36,8 @@ from numba import types
 from numba.extending import intrinsic
 
 from spikeloom.compiler.fixedpoint import DECAY_BITS
+from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached
 from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.machines.loihi1.kernel import compiled, compiled_and_cached
 
 AnyArray = npt.NDArray[Any]
 Function = Callable[..., Any]

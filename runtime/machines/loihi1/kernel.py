@@ -10,13 +10,13 @@ to one of them, so that the low bits say whether anything arrived at all, which 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
+from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import IntArray
 
@@ -105,19 +105,6 @@ def state_of(netlist: Netlist) -> State:
         updates=updates,
         saturations=saturations,
     )
-
-
-def compiled(function: Function) -> Function:
-    """Compile a part of the kernel; it is cached with the whole."""
-    return cast(Function, njit(nogil=True)(function))
-
-
-def compiled_and_cached(function: Function) -> Function:
-    """Compile and keep the machine code on disk, if there is any place for it."""
-    try:
-        return cast(Function, njit(nogil=True, cache=True)(function))
-    except RuntimeError:  # neither the folder of this file nor the user's cache folder can be written
-        return cast(Function, njit(nogil=True)(function))
 
 
 @compiled

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached
 from spikeloom.compiler.types import FloatArray, IntArray
-from spikeloom.runtime.machines.loihi1.kernel import compiled, compiled_and_cached
 
 AnyArray = npt.NDArray[Any]
 

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO
 from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.machines.loihi1.kernel import compiled, compiled_and_cached
 
 Int32 = npt.NDArray[np.int32]
 
