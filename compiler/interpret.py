@@ -167,8 +167,10 @@ def run_float(
     def layer(post: int, sums: Floating, own: Floating | None) -> tuple[BoolArray, Floating | None]:
         return float_recurrence(network.populations[post], sums, own=own, membranes=membranes)
 
-    own = _own_weights(network, lambda p: p.weight, dtype)
-    return _run(network, events, lambda p, spikes: product(p.weight, spikes, dtype), layer, own)
+    def sums(weight: Sparse, spikes: BoolArray) -> Floating:
+        return product(weight, spikes, dtype)
+
+    return _run(network, events, lambda p: p.weight, sums, layer, dtype)
 
 
 def run_integer(
@@ -179,30 +181,24 @@ def run_integer(
     def layer(post: int, sums: Floating, own: Floating | None) -> tuple[BoolArray, IntArray | None]:
         return integer_recurrence(network.populations[post], sums, own=own, membranes=membranes, saturates=saturates)
 
-    own = _own_weights(network, IntegerProjection.effective, np.float64)
-    return _run(network, events, lambda p, spikes: integer_sums(p.effective(), spikes), layer, own)
-
-
-def _own_weights(
-    network: Network | IntegerNetwork, weight_of: Callable[[Any], Sparse], dtype: npt.DTypeLike
-) -> list[Floating | None]:
-    """Weights of each population to itself, (from, to), all planes together; None if it is not recurrent."""
-    found: list[Floating | None] = [None] * len(network.populations)
-    for p in network.projections:
-        if p.pre == p.post:
-            weight, before = np.ascontiguousarray(weight_of(p).toarray().astype(dtype).T), found[p.post]
-            found[p.post] = weight if before is None else before + weight
-    return found
+    return _run(network, events, IntegerProjection.effective, integer_sums, layer, np.float64)
 
 
 def _run(
     network: Network | IntegerNetwork,
     events: BoolArray,
-    sums_of: Callable[[Any, BoolArray], Floating],
+    weight_of: Callable[[Any], Sparse],
+    sums_of: Callable[[Sparse, BoolArray], Floating],
     layer: Callable[[int, Floating, Floating | None], tuple[BoolArray, npt.NDArray[Any] | None]],
-    own: list[Floating | None],
+    dtype: npt.DTypeLike,
 ) -> Activity:
     """Run batch by batch on all cores, population by population."""
+    # weights of each population to itself, (from, to), all planes together; None if it is not recurrent
+    own: list[Floating | None] = [None] * len(network.populations)
+    for p in network.projections:
+        if p.pre == p.post:
+            weight, before = np.ascontiguousarray(weight_of(p).toarray().astype(dtype).T), own[p.post]
+            own[p.post] = weight if before is None else before + weight
 
     def batch(part: BoolArray) -> list[tuple[BoolArray, npt.NDArray[Any] | None]]:
         done: list[tuple[BoolArray, npt.NDArray[Any] | None]] = []
@@ -211,7 +207,7 @@ def _run(
             for projection in network.projections:
                 if projection.post == post != projection.pre:
                     source = part if projection.pre == INPUT else done[projection.pre][0]
-                    more = sums_of(projection, source)
+                    more = sums_of(weight_of(projection), source)
                     sums = more if sums is None else sums + more
             assert sums is not None, "verify: every population is reached"
             done.append(layer(post, sums, own[post]))
