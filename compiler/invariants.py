@@ -88,15 +88,14 @@ def _values_are_finite(network: Network) -> Faults:
 
 def _registers_hold(network: IntegerNetwork) -> Faults:
     for population in network.populations:
-        name = population.name
-        if not (0 <= population.decay_u <= 4095 and 0 <= population.decay_v <= 4095):
-            yield f"population {name!r} has a decay outside 0 … 4095"
-        if np.any(population.threshold < 0) or np.any(population.threshold > THRESHOLD_MANTISSA_MAX):
-            yield f"population {name!r} has a threshold outside 0 … {THRESHOLD_MANTISSA_MAX}"
-        if np.any(np.abs(population.bias_mantissa) > BIAS_MANTISSA_MAX):
-            yield f"population {name!r} has a bias mantissa beyond {BIAS_MANTISSA_MAX}"
-        if np.any(population.bias_exponent < 0) or np.any(population.bias_exponent > BIAS_EXPONENT_MAX):
-            yield f"population {name!r} has a bias exponent outside 0 … {BIAS_EXPONENT_MAX}"
+        for what, values, low, high in (
+            ("decay", np.array([population.decay_u, population.decay_v]), 0, 4095),
+            ("threshold", population.threshold, 0, THRESHOLD_MANTISSA_MAX),
+            ("bias mantissa", population.bias_mantissa, -BIAS_MANTISSA_MAX, BIAS_MANTISSA_MAX),
+            ("bias exponent", population.bias_exponent, 0, BIAS_EXPONENT_MAX),
+        ):
+            if np.any((values < low) | (values > high)):
+                yield f"population {population.name!r} has a {what} outside {low} … {high}"
 
 
 def _mantissas_hold(network: IntegerNetwork) -> Faults:

@@ -124,12 +124,6 @@ def in_order(system: str, array: Any) -> Any:
     return turned.reshape(-1, *array.shape[2:])
 
 
-def kernel_of(filters: int) -> int:
-    """Side of a square window with so many cells; 0 if there is none."""
-    side = math.isqrt(filters)
-    return side if side * side == filters else 0
-
-
 def shape_faults(system: str, filters: int, places: int, taxels: int, grid: Grid | None) -> list[str]:
     """What is wrong about a first layer that was made for so many places.
 
@@ -144,8 +138,8 @@ def shape_faults(system: str, filters: int, places: int, taxels: int, grid: Grid
         case "mlp" if filters != taxels or places != 1:
             return [f"an MLP has a filter for each of its {taxels} taxels and one place, here {filters} and {places}"]
         case "grid-cnn":
-            kernel = kernel_of(filters)
-            if not kernel or grid is None:
+            kernel = math.isqrt(filters)
+            if kernel**2 != filters or grid is None:
                 return [f"a grid-based CNN has a grid and a square window, conv1.hops has {filters} cells"]
             if math.prod(grid.places(kernel)) != places or len(grid.cells) != taxels:
                 fits = f"{math.prod(grid.places(kernel))} places and {len(grid.cells)} taxels"

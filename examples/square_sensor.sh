@@ -14,7 +14,7 @@ python3 -c 'print("x,y", *(f"{3 * i},{3 * j}" for j in range(5) for i in range(5
 
 # 2. Recordings. Yours would be event files (time_s,taxel,polarity) or the released layout; these are made up.
 say spikeloom data convert synthetic --taxels coords.csv -o grasps
-say spikeloom data describe grasps --taxels coords.csv --picture grasps.png
+say spikeloom data describe grasps --taxels coords.csv
 
 # 3. Train on a graph of the four nearest neighbours, on all cores if you give several --seeds.
 say spikeloom train --data grasps --taxels coords.csv --graph knn:4 --epochs 1 --features 16 -o square.pt --picture training.png

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from random_networks import dense_weights
 
 
 def probed(stage, channels):
@@ -11,24 +12,22 @@ def probed(stage, channels):
     return (stage(np.eye(channels)) - bias).T, bias
 
 
-def weight_differences(first, second):
-    """(layer, row, column, weight, other weight) of each synapse that two integer networks of the same layers differ
-    in; planes are added up. Thresholds, biases and decays must be the same."""
-    for one, other in zip(first.populations, second.populations, strict=True):
-        assert (one.decay_u, one.decay_v) == (other.decay_u, other.decay_v)
-        np.testing.assert_array_equal(one.threshold, other.threshold)
-        np.testing.assert_array_equal(one.bias, other.bias)
-    found = []
-    ends = {(p.pre, p.post) for network in (first, second) for p in network.projections}
-    for pre, post in sorted(ends):
-        one, other = (
-            sum(p.effective() for p in network.projections if (p.pre, p.post) == (pre, post))
-            for network in (first, second)
-        )
-        row, column = (one != other).nonzero()
-        name = first.populations[post].name
-        found += [(name, int(i), int(j), int(one[i, j]), int(other[i, j])) for i, j in zip(row, column, strict=True)]
-    return found
+def assert_same_network(found, expected):
+    """Equal in everything but names, scales, stored zeros and the division into projections."""
+    assert found.input == expected.input
+    assert found.classes == expected.classes
+    assert found.readout.population == expected.readout.population
+    np.testing.assert_array_equal(found.readout.label, expected.readout.label)
+    for ours, theirs in zip(found.populations, expected.populations, strict=True):
+        for name in ("beta", "theta", "decay_u", "decay_v"):
+            assert getattr(ours, name) == getattr(theirs, name), name
+        for name in ("threshold", "bias_mantissa", "bias_exponent"):
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), err_msg=name)
+    for post in range(len(expected.populations)):
+        ours, theirs = dense_weights(found, post), dense_weights(expected, post)
+        for pre in set(ours) | set(theirs):
+            nothing = np.zeros(1, np.int64)
+            np.testing.assert_array_equal(*np.broadcast_arrays(ours.get(pre, nothing), theirs.get(pre, nothing)))
 
 
 def load_weights(network, weights):

@@ -194,7 +194,7 @@ def test_each_recording_is_decided_as_it_is_alone(name):
     made = specimen(name)
     steps = made.events.shape[-1]
     lengths = np.array([steps, 1, steps - 2, steps])
-    together = made.machine.run(made.events, lengths=lengths, threads=2)
+    together = made.machine.run(made.events, lengths=lengths)
     for index, length in enumerate(lengths):
         alone = made.machine.run(made.events[index : index + 1, ..., :length])
         assert_array_equal(together.votes[index], alone.votes[0])

@@ -330,7 +330,7 @@ def test_a_float_network_that_breaks_a_rule(change, words):
         ("decay_u", (0, 4095), (-1, 4096), "decay outside 0 … 4095"),
         ("decay_v", (0, 4095), (-1, 4096), "decay outside 0 … 4095"),
         ("threshold", (0, 131071), (-1, 131072), "threshold outside 0 … 131071"),
-        ("bias_mantissa", (-4095, 4095), (-4096, 4096), "bias mantissa beyond 4095"),
+        ("bias_mantissa", (-4095, 4095), (-4096, 4096), "bias mantissa outside -4095 … 4095"),
         ("bias_exponent", (0, 7), (-1, 8), "bias exponent outside 0 … 7"),
     ],
 )

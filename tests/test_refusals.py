@@ -6,7 +6,6 @@ One table: what is typed, and the words that the line must hold: the option or f
 import dataclasses
 import errno
 import io
-import json
 import os
 import pickle
 import shlex
@@ -38,14 +37,8 @@ def one_recording(folder, array, name="sample_0_label_0.npy", split="test"):
     np.save(folder / split / name, array)
 
 
-def checkpoint(path, change):
-    state = state_dict(made_weights())
-    change(state)
-    torch.save(state, path)
-
-
-def zipped(path, name, content, method=zipfile.ZIP_DEFLATED):
-    with zipfile.ZipFile(path, "w", method) as archive:
+def zipped(path, name, content):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(name, content)
 
 
@@ -73,15 +66,8 @@ def place(tmp_path_factory):
     own_file(at / "other.pt", last=made_weights(sizes=(9, 7, CLASSES)))
     own_file(at / "same.pt", last=made_weights(7))
     (at / "empty.pt").touch()
-    (at / "words.pt").write_text("hello")
     (at / "words.txt").write_text("hello")
     (at / "cut.pt").write_bytes((at / "net.pt").read_bytes()[:2000])
-    (at / "cut.t7").write_bytes((at / "net.t7").read_bytes()[:2000])
-    content = (at / "net.pt").read_bytes()
-    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(at / "altered.pt", "w") as new:
-        for name in old.namelist():
-            new.writestr(name, old.read(name).replace(b'"beta": 0.2', b'"beta": 0.3'))
-    zipped(at / "newer.pt", "manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 99}), 0)
     zipped(at / "bomb.pt", "manifest.json", bytes(1 << 20))
     zipped(at / "notes.zip", "a/b/notes.txt", "hello")
     for name in ("events", "grasp_label_1"):
@@ -90,8 +76,6 @@ def place(tmp_path_factory):
         evil = released({"fc1.weight": Evil()})
         torch.save(evil, at / f"evil{int(new)}.t7", _use_new_zipfile_serialization=new)
     (at / "plain.pkl").write_bytes(pickle.dumps({"net_list": [Evil()]}))
-    checkpoint(at / "keys.pt", lambda s: (s.pop("fc2.bias"), s.update({"fc3.weight": torch.zeros(CLASSES, 99)})))
-    checkpoint(at / "nan.pt", lambda s: s["fc1.weight"][0, :3].fill_(float("nan")))
     for name, (array, _) in ARRAYS.items():
         one_recording(at / name, array)
     one_recording(at / "label", GOOD, f"sample_0_label_{CLASSES}.npy")
@@ -136,20 +120,14 @@ TABLE = [
     # checkpoints
     *((f"{command} missing.pt", "missing.pt: no such file") for command in ("inspect", "compile -o out.loom")),
     ("inspect empty.pt", "empty.pt: is not a checkpoint"),
-    ("inspect words.pt", "words.pt: is not a checkpoint"),
     ("inspect data", "data: is a folder|spikeloom data describe"),
     ("inspect notes.zip", "notes.zip: holds a/b/notes.txt"),
     ("inspect events.npz", "events.npz: holds polarity.npy, taxel.npy, time_s.npy|spikeloom data describe"),
     ("inspect cut.pt", "cut.pt: is truncated or damaged"),
-    ("inspect cut.t7", "cut.t7: is truncated or damaged"),
-    (COMPILE.format("altered.pt"), "altered.pt: its content does not match its hash"),
-    ("inspect newer.pt", "newer.pt: has format version 99|update spikeloom"),
     ("inspect bomb.pt", "bomb.pt|claim to hold 1048576"),
     (COMPILE.format("evil0.t7 --graph manual"), "evil0.t7: is a pickle that calls posix.mkdir"),
     (COMPILE.format("evil1.t7 --graph manual"), "evil1.t7: is a pickle that calls posix.mkdir"),
     ("inspect plain.pkl", "plain.pkl: is pickled with protocol 4|torch.save"),
-    (COMPILE.format("keys.pt --graph manual"), "fc2.bias is missing|fc3.weight is (4, 99), wanted (4, 8)"),
-    (COMPILE.format("nan.pt --graph manual"), "fc1.weight has 3 of 270 values NaN"),
     ("inspect net.t7 --run 3", "--run 3|runs 0 to 2"),
     ("inspect net.t7 --weights best", "--weights best|last epoch only"),
     ("inspect net.pt --weights best", "--weights best: the file holds last"),

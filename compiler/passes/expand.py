@@ -83,14 +83,12 @@ def synapses(stack: FloatArray, filters: FloatArray, system: str = TACTILESGNET)
 
 
 def expand_first_layer(checkpoint: Checkpoint, propagation: FloatArray) -> tuple[Sparse, FloatArray]:
-    """Weights (neurons, taxels * channels) and biases (neurons,) of a first layer, in the order of its neurons."""
+    """Weights (neurons, channels) and biases (neurons,) of a first layer, in the order of its neurons.
+
+    A relay for each clock comes last, see :mod:`compiler.dynamics`.
+    """
     weight = synapses(stack_of(checkpoint, propagation), checkpoint.hops.astype(np.float64), checkpoint.system)
-    bias = np.tile(checkpoint.conv_bias.astype(np.float64), (checkpoint.places, 1))
-    return weight, in_order(checkpoint.system, bias)
-
-
-def _with_relays(checkpoint: Checkpoint, weight: Sparse, bias: FloatArray) -> tuple[Sparse, FloatArray]:
-    """Weights and biases of the first layer with a relay for each clock, see :mod:`compiler.dynamics`."""
+    bias = in_order(checkpoint.system, np.tile(checkpoint.conv_bias.astype(np.float64), (checkpoint.places, 1)))
     clocks = checkpoint.dynamics.clocks.channels
     if not clocks:
         return weight, bias
@@ -120,7 +118,7 @@ def expand(checkpoint: Checkpoint, propagation: FloatArray) -> Network:
     """
     _require_fit(checkpoint, propagation.shape)
     dynamics = checkpoint.dynamics
-    stages = [("conv1", *_with_relays(checkpoint, *expand_first_layer(checkpoint, propagation)))]
+    stages = [("conv1", *expand_first_layer(checkpoint, propagation))]
     for layer, dense in enumerate(checkpoint.dense, 1):
         stages.append((dense.name, expand_dense(checkpoint, layer), dense.bias.astype(np.float64)))
     polarities, bins = checkpoint.hops.shape[2], checkpoint.bins

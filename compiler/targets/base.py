@@ -143,12 +143,6 @@ class Target:
         passes: Passes = self.module.PASSES
         return passes
 
-    @property
-    def options(self) -> type[Any]:
-        """Class of the options that :meth:`compile` takes."""
-        options: type[Any] = self.module.Options
-        return options
-
     def compile(self, source: Any, options: Any = None, *, after: Callable[[str, Any], object] | None = None) -> Any:
         """Lower what is trained to a compilation of the chip, with the result as ``netlist``.
 

@@ -46,7 +46,8 @@ def breakdowns(
 ) -> tuple[Breakdown, ...]:
     """Look for all of them.
 
-    `reference` and `chip` are the spikes of each layer, (compared,), of those neurons that `neurons` numbers; `votes` are those of float model and chip, (samples, classes), of recordings that `files` names.
+    `reference` and `chip` are the spikes of each layer, (compared,), of those neurons that `neurons` numbers; `votes`
+    are those of float model and chip, (samples, classes), of recordings that `files` names.
     """
     found: list[Breakdown] = []
     for name, ours, theirs, ids in zip(names, reference, chip, neurons, strict=True):

@@ -98,7 +98,7 @@ def verify(
     certifier = Certifier(model, integer, kept)
     different = {stage: np.zeros(len(names), np.int64) for stage in LADDER}
     sizes = [integer.populations[i].size if isinstance(each, slice) else len(each) for i, each in enumerate(kept)]
-    totals = [(np.zeros(size, np.int64), np.zeros(size, np.int64)) for size in sizes]  # spikes of both sides
+    ours, theirs = ([np.zeros(size, np.int64) for size in sizes] for _ in range(2))  # spikes of each neuron
     float_votes, chip_votes = np.zeros((2, len(events), network.classes), np.int64)
     quantised_different, divergence = 0 if tuned else None, None
     for first in range(0, len(events), PART):
@@ -126,9 +126,9 @@ def verify(
             different[stage] += _differences(reference, spikes)
             wide = spikes if stage == "float64" else wide
         different["saturation"] += _differences(reference, chip)
-        for index, (ours, theirs) in enumerate(totals):
-            ours += reference[index].sum(axis=(0, 1))
-            theirs += chip[index].sum(axis=(0, 1))
+        for index in range(len(names)):
+            ours[index] += reference[index].sum(axis=(0, 1))
+            theirs[index] += chip[index].sum(axis=(0, 1))
         if divergence is None:
             begin("first divergence", first)
             divergence = _first_divergence(machine, model, reference, chip, wide, part, files[rows])
@@ -138,7 +138,6 @@ def verify(
         certifier.add(part, chip, ran.decisions, ends)
 
     neurons = [np.arange(each.size)[keep] for each, keep in zip(integer.populations, kept, strict=True)]
-    ours, theirs = zip(*totals, strict=True)
     return Verdict(
         files=files,
         labels=labels,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
@@ -70,7 +70,6 @@ class Price:
     time_s: Mapping[str, FloatArray]
     step_s: Mapping[str, float]  # Seconds of the longest data step
     outcome: Outcome  # All that the chip's own price model knows, with its layout
-    time_ns: Mapping[str, FloatArray] = field(default_factory=dict)  # Not rounded to seconds, where counted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -61,9 +61,8 @@ def lift(netlist: Netlist) -> IntegerNetwork:
     axon = netlist.axon_of_synapse()
     source, form = netlist.axon_source[axon], netlist.axon_format[axon]
     target = netlist.synapse_compartment()
-    inner = source >= netlist.n_inputs
-    pre = np.where(inner, netlist.layer[np.where(inner, source - netlist.n_inputs, 0)], INPUT)
-    column = np.where(inner, netlist.neuron[np.where(inner, source - netlist.n_inputs, 0)], source)
+    pre = np.concatenate([np.full(netlist.n_inputs, INPUT), netlist.layer])[source]
+    column = np.concatenate([np.arange(netlist.n_inputs), netlist.neuron])[source]
     post, row = netlist.layer[target], netlist.neuron[target]
     exponent, bits = netlist.format_exponent[form], netlist.format_weight_bits[form]
     kinds = np.stack([post, pre, exponent, bits])

@@ -25,20 +25,6 @@ from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice, cho
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness, make_exact
 from spikeloom.compiler.types import FloatArray, IntArray
 
-__all__ = [
-    "INTEGERS",
-    "LATER",
-    "LAYOUT",
-    "PASSES",
-    "STORAGE",
-    "Compilation",
-    "Options",
-    "lay_out_again",
-    "start",
-    "to_integers",
-    "without",
-]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Compilation:

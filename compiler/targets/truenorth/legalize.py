@@ -177,11 +177,11 @@ def _needs_of(network: Network, layer: int, chip: Target) -> Iterator[tuple[str,
 
 def _distinct_weights(network: Network, layer: int) -> IntArray:
     """Number of different weights, zero left out, of each neuron of a layer; (neurons,) int64."""
-    found = np.zeros(network.populations[layer].size, np.int64)
-    for projection in network.projections:
-        if projection.post == layer:
-            rows = np.split(projection.weight.data, projection.weight.indptr[1:-1])
-            found = np.maximum(found, [len(np.unique(row[row != 0])) for row in rows])
+    size = network.populations[layer].size
+    found = np.zeros(size, np.int64)
+    for weight in (projection.weight.tocoo() for projection in network.projections if projection.post == layer):
+        pairs = np.unique(np.stack([weight.coords[0], weight.data])[:, weight.data != 0], axis=1)
+        found = np.maximum(found, np.bincount(pairs[0].astype(np.int64), minlength=size))
     return found
 
 

@@ -162,13 +162,12 @@ def _kind_faults(manifest: Mapping[str, Any]) -> list[str]:
         "training": dict,
         **dict.fromkeys(("taxels", "polarities", "classes", "copies"), (1, 2**20)),
     }
-    if found := entry_faults(manifest, kinds):
-        return found
-    fine = {
-        "weights": set(manifest["weights"]) <= set(WEIGHTS),
-        "graph": all(len(edge) == 2 for edge in manifest["graph"]["edges"]),
-    }
-    return [f"the manifest has no usable {name}" for name, good in fine.items() if not good]
+    found = entry_faults(manifest, kinds)
+    if not found and not set(manifest["weights"]) <= set(WEIGHTS):
+        found.append("the manifest has no usable weights")
+    if not found and any(len(edge) != 2 for edge in manifest["graph"]["edges"]):
+        found.append("the manifest has no usable graph")
+    return found
 
 
 def _shape_faults(stages: Mapping[str, Mapping[str, Array]]) -> list[str]:

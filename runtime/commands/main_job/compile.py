@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if own is not None:
         return own.compile_network(arguments)  # type: ignore[no-any-return]
     refuse(arguments, ("in_time",), f"{arguments.target} has no such option")
-    options = chip.options(
+    options = chip.module.Options(
         packings=parse_packings(arguments),
         spike_exact=arguments.spike_exact,
         keep_all=arguments.keep_all,
@@ -152,7 +152,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
 def _compile_integers(arguments: argparse.Namespace) -> Outcome:
     """Compile a file that brings its integers: nothing is rounded, they are laid out as they stand."""
     path = arguments.checkpoint
-    if load_target(arguments.target).options is not Options:
+    if load_target(arguments.target).module.Options is not Options:
         raise OptionError(f"--target {arguments.target}: {path} holds integers of another chip; omit it")
     floats = ("in_time", "dt", "convention", *ROUNDING, "dump_after", "calibrate", "optimize")
     refuse(arguments, floats, f"is for float networks, {path} holds integers")

@@ -160,12 +160,10 @@ class Loihi(IntegerMachine):
             progress=progress,
         )
         report = cost_report(self.netlist, chip, found, bin_s=bin_s * self.netlist.bins)
-        time_ns = {name: times.duration_ns.sum(axis=1) for name, times in found.simple.items()}
         return self._run(trace, trace.counts.spikes), Price(
             synaptic_operations=found.costs.synaptic_operations.sum(axis=1),
             energy_j={name: each.sum(axis=1) for name, each in found.costs.energy.items()},
-            time_s={name: each * 1e-9 for name, each in time_ns.items()},
-            time_ns=time_ns,
+            time_s={name: times.seconds for name, times in found.simple.items()},
             step_s={name: float(times.duration_ns.max() * 1e-9) for name, times in found.simple.items()},
             outcome=Outcome(report, sections),
         )

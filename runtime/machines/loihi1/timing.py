@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.targets.base import PICOSECONDS, Target, TimeTable
-from spikeloom.compiler.targets.loihi1.layout.place import require_one_chip
+from spikeloom.compiler.targets.loihi1.layout.place import chip_count, require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1.engine import EventArray
@@ -146,6 +146,13 @@ def prepare(netlist: Netlist, target: Target, table: TimeTable) -> Tables:
         capacity=int(table.link_buffer.value),
         barrier=table.barrier(len(np.unique(tile))),
     )
+
+
+def tables_of(netlist: Netlist, target: Target) -> dict[str, Tables]:
+    """For each of the chip's time tables; none for several chips, whose links have no public latency."""
+    if chip_count(netlist.core_tile, target) > 1:
+        return {}
+    return {table.name: prepare(netlist, target, table) for table in target.time}
 
 
 def charges(tables: Tables) -> Charges:

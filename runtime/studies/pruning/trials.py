@@ -41,7 +41,7 @@ def priced(netlist: Netlist, of: Recordings) -> tuple[IntArray, Costs]:
     return run.decisions, Costs(
         operations=float(price.synaptic_operations.mean()),
         energy_j={name: float(each.mean()) for name, each in price.energy_j.items()},
-        time_s={name: float(each.mean() * 1e-9) for name, each in price.time_ns.items()},
+        time_s={name: float(each.mean()) for name, each in price.time_s.items()},
         cores=netlist.n_cores,
         neurons=netlist.n_compartments,
         synapses=netlist.n_synapses,

@@ -72,16 +72,6 @@ def hops(tile: Tiles, other: Tiles, width: int) -> tuple[Tiles, Tiles]:
     return abs(tile % width - other % width), abs(tile // width - other // width)
 
 
-def _prices(x: IntArray, y: IntArray) -> FloatArray:
-    """Price of a packet between each two sites; shape (sites, sites)."""
-    prices: FloatArray = np.abs(x[:, None] - x) + (1 + TIE) * np.abs(y[:, None] - y)
-    return prices
-
-
-def _cost(between: FloatArray, price: FloatArray, site: IntArray) -> float:
-    return float((between * price[np.ix_(site, site)]).sum() / 2)
-
-
 def _grow(between: FloatArray, price: FloatArray, tile_cores: int, first: int) -> IntArray:
     """Place one core in the middle, then always the one that talks most to the placed ones, where it is cheapest."""
     site = np.full(len(between), -1)
@@ -120,27 +110,24 @@ def _improve(between: FloatArray, price: FloatArray, tile_cores: int, site: IntA
             site[pair] = site[pair[::-1]]
 
 
-def place(traffic: FloatArray, target: Target) -> Placement:
+def place(traffic: FloatArray, target: Target, width: int | None = None, height: int | None = None) -> Placement:
     """Choose tiles of few spikes times hops; among equal ones those with more of the cheaper east-west hops.
 
     A layout is grown around each of the busiest cores and improved change by change, and the best of these is taken:
     the optimum, by branch and bound, on every network tried that has up to ten cores. `traffic` is packets per step,
-    (cores, cores).
+    (cores, cores). The mesh is the chip's, or one of another `width` and `height`.
     """
-    return _place(traffic, target.limit("mesh.width"), target.limit("mesh.height"), target.limit("mesh.tile_cores"))
-
-
-def _place(traffic: FloatArray, width: int, height: int, tile_cores: int) -> Placement:
-    cores = len(traffic)
+    width, height = width or target.limit("mesh.width"), height or target.limit("mesh.height")
+    cores, tile_cores = len(traffic), target.limit("mesh.tile_cores")
     if cores == 1:
         return Placement(tiles=(0,), spike_hops=0.0)
     between = traffic + traffic.T
     np.fill_diagonal(between, 0)
     y, x = np.divmod(np.arange(width * height), width)
-    price = _prices(x, y)
+    price = np.abs(x[:, None] - x) + (1 + TIE) * np.abs(y[:, None] - y)  # of a packet between each two sites
     heaviest = np.argsort(-between.sum(axis=1), kind="stable")[:STARTS]
     grown = [_improve(between, price, tile_cores, _grow(between, price, tile_cores, int(core))) for core in heaviest]
-    site = min(grown, key=lambda layout: _cost(between, price, layout))
+    site = min(grown, key=lambda layout: float((between * price[np.ix_(layout, layout)]).sum()))
     tiles = tuple(site.tolist())
     spent = sum(between[a, b] * sum(hops(tiles[a], tiles[b], width)) for a in range(cores) for b in range(a))
     return Placement(tiles=tiles, spike_hops=float(spent))
@@ -157,7 +144,7 @@ def place_within(traffic: FloatArray, target: Target, tiles: int) -> Placement:
     for columns in range(1, min(width, tiles) + 1):
         rows = min(height, tiles // columns)
         if columns * rows * tile_cores >= len(traffic):
-            inside = _place(traffic, columns, rows, tile_cores)
+            inside = place(traffic, target, columns, rows)
             moved = tuple(tile // columns * width + tile % columns for tile in inside.tiles)
             found.append(replace(inside, tiles=moved))
     return min(found, key=lambda placement: placement.spike_hops, default=free)
@@ -220,10 +207,7 @@ def place_on_chips(traffic: FloatArray, target: Target) -> Placement:
 
     Spike-hops are those within chips.
     """
-    room = target.limit("chip.cores")
-    if len(traffic) <= room:
-        return place(traffic, target)
-    chip = share(traffic, room)
+    chip = share(traffic, target.limit("chip.cores"))
     tiles = np.zeros(len(chip), np.int64)
     placed = []
     for number in range(int(chip.max()) + 1):

@@ -10,7 +10,6 @@ import numpy as np
 
 from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, largest_current
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.layout.place import chip_count
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.base import EventArray
@@ -55,10 +54,9 @@ def run(prepared: engine.Engine, target: Target, events: EventArray, lengths: In
     `lag` are the chip steps by which the votes are behind the data.
     """
     netlist = prepared.netlist
-    timed = target.time if chip_count(netlist.core_tile, target) == 1 else ()
-    latencies = [timing.prepare(netlist, target, table) for table in timed]
+    latencies = timing.tables_of(netlist, target)
     meter = cost.prepare(netlist, target, "whole")
-    parts = [vote_charges(netlist), _event_charges(netlist, meter), *map(timing.charges, latencies)]
+    parts = [vote_charges(netlist), _event_charges(netlist, meter), *map(timing.charges, latencies.values())]
     trace = engine.simulate(prepared, events, lengths=lengths, charges=side_by_side(parts))
     assert trace.charged is not None, "sums were wanted"
     ends = np.cumsum([part.sources.shape[1] for part in parts])[:-1]
@@ -76,8 +74,8 @@ def run(prepared: engine.Engine, target: Target, events: EventArray, lengths: In
         operations=np.cumsum(operations, axis=1),
         energy={name: np.cumsum(each, axis=1) for name, each in energy.items()},
         time={
-            table.name: np.cumsum(timing.simple_times(each, own, chip_steps).duration_ns, axis=1) * 1e-9
-            for table, each, own in zip(timed, latencies, times, strict=True)
+            name: np.cumsum(timing.simple_times(each, own, chip_steps).duration_ns, axis=1) * 1e-9
+            for (name, each), own in zip(latencies.items(), times, strict=True)
         },
     )
 

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.layout.place import chip_count, require_one_chip
+from spikeloom.compiler.targets.loihi1.layout.place import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1 import engine, timing
@@ -69,8 +69,7 @@ def estimate(
     netlist, deep = prepared.netlist, detail == "cycle"
     if deep:
         require_one_chip(netlist.core_tile, target, "--detail cycle")
-    timed = target.time if chip_count(netlist.core_tile, target) == 1 else ()
-    latencies = {table.name: timing.prepare(netlist, target, table) for table in timed}
+    latencies = timing.tables_of(netlist, target)
     charges = side_by_side([timing.charges(each) for each in latencies.values()]) if latencies else None
     steps = np.full(len(events), events.shape[2]) if lengths is None else np.asarray(lengths, np.int64)
     chip_steps = steps + netlist.max_depth
