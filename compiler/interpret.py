@@ -103,8 +103,7 @@ def float_layer(
     """
     from spikeloom.compiler import layer_kernel
 
-    kind = np.dtype(dtype).type
-    constants = (kind(value) for value in (population.alpha, population.beta, population.theta))
+    constants = np.array([population.alpha, population.beta, population.theta], dtype)
     pres, synapses = _synapses([(p, p.weight) for p in projections], dtype, loops=loops)
     fixed = *synapses, population.bias.astype(dtype), *constants
     return Layer(pres=pres, size=population.size, kernel=layer_kernel.float_layer, fixed=fixed)

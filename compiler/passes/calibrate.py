@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.interpret import BATCH, Layer, raster, run_float, step_late, threads
@@ -49,11 +50,14 @@ class Calibration:
         Of each neuron the entries in which its spikes differ, and how many more there are; (2, neurons).
         """
 
-        def part(start: int) -> IntArray:
+        def part(start: int) -> npt.NDArray[np.int32]:
             rows = slice(start, start + BATCH)
             return layer.moved(raster([self.source(pre, post, rows) for pre in layer.pres]), self.spikes[post][rows])
 
-        return np.sum(list(threads().map(part, range(0, len(self.events), BATCH))), axis=0, dtype=np.int64)
+        total = np.zeros((2, layer.size), np.int64)
+        for counts in threads().map(part, range(0, len(self.events), BATCH)):
+            total += counts
+        return total
 
     def after(self, layer: Layer, post: int) -> Calibration:
         """The same where the populations to come receive what population `post` sends as it was rounded."""

@@ -89,9 +89,9 @@ def _layers(model: Factored | Network) -> list[_Layer]:
     chain = len(hops) * gathered + hops.shape[2] * len(hops) + 1 + len(hops)
     if checkpoint.system == TACTILESGNET:
         chain = (len(hops) - 1) * gathered + hops.shape[2] + 1 + len(hops)
-    sums = {"weight": by_source([aligned], np.float64), "magnitude": by_source([kept], np.float32)}
+    sums, bounds = by_source([aligned], np.float64), by_source([kept], np.float32)
     return [
-        replace(first, **sums, roundings=SPARE + chain, per_spike=False),
+        replace(first, weight=sums, magnitude=bounds, roundings=SPARE + chain, per_spike=False),
         *(replace(layer, roundings=SPARE) for layer in others),
     ]
 

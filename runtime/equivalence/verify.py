@@ -6,7 +6,7 @@ in which the two differ are ill-posed, decided by the rounding of a sum and not 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +34,9 @@ from spikeloom.runtime.equivalence.verdict import Divergence, LayerSpikes, Rung,
 from spikeloom.runtime.machines.base import ENGINES
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_of
 from spikeloom.runtime.machines.votes import readout_counts
+
+Layers = Sequence[BoolArray]
+"""Spikes of each layer, (samples, steps, compared neurons)."""
 
 PART = 16
 """Recordings that are compared at a time: what is held does not grow with their number."""
@@ -92,13 +95,12 @@ def verify(
     kept, checked = machine.compared(), min(spec_samples, len(events))
     begin("specification", 0)
     equal = machine.check(events[:checked], lengths=lengths) == 0
-    beside = None if engine_name == ENGINES[0] else machine.beside(events, lengths=lengths, samples=checked)
+    engine_different = None if beside is None else beside(events, lengths)
     reference_spikes, ladder = reference_of(model), rungs(network, integer)
     fine_tuned_spikes = _fine_tuned(source) if tuned else None
     certifier = Certifier(model, integer, kept)
-    different = {stage: np.zeros(len(names), np.int64) for stage in LADDER}
-    sizes = [integer.populations[i].size if isinstance(each, slice) else len(each) for i, each in enumerate(kept)]
-    ours, theirs = ([np.zeros(size, np.int64) for size in sizes] for _ in range(2))  # spikes of each neuron
+    neurons = [np.arange(each.size)[keep] for each, keep in zip(integer.populations, kept, strict=True)]
+    tally = _Tally([len(each) for each in neurons])
     float_votes, chip_votes = np.zeros((2, len(events), network.classes), np.int64)
     quantised_different, divergence = 0 if tuned else None, None
     for first in range(0, len(events), PART):
@@ -119,25 +121,19 @@ def verify(
             begin("fine-tuned model", first)
             quantised_different += int(_differences(compared(fine_tuned_spikes(part)), chip).sum())
 
-        wide = chip
+        lower = {}
         for stage, ready in ladder.items():
             begin(f"ladder: {'proven' if ready is None else stage}", first)
-            spikes = chip if ready is None else compared(ready.run(channels).spikes)
-            different[stage] += _differences(reference, spikes)
-            wide = spikes if stage == "float64" else wide
-        different["saturation"] += _differences(reference, chip)
-        for index in range(len(names)):
-            ours[index] += reference[index].sum(axis=(0, 1))
-            theirs[index] += chip[index].sum(axis=(0, 1))
+            lower[stage] = chip if ready is None else compared(ready.run(channels).spikes)
+        tally.add(reference, chip, lower)
         if divergence is None:
             begin("first divergence", first)
-            divergence = _first_divergence(machine, model, reference, chip, wide, part, files[rows])
+            divergence = _first_divergence(machine, model, reference, chip, lower[LADDER[0]], part, files[rows])
         float_votes[rows] = readout_counts(network.readout, network.classes, reference[network.readout.population])
         chip_votes[rows] = ran.votes
         begin("certificate", first)
         certifier.add(part, chip, ran.decisions, ends)
 
-    neurons = [np.arange(each.size)[keep] for each, keep in zip(integer.populations, kept, strict=True)]
     return Verdict(
         files=files,
         labels=labels,
@@ -145,30 +141,48 @@ def verify(
         chip_predictions=vote(chip_votes),
         float_counts=float_votes,
         chip_counts=chip_votes,
-        spikes={
-            name: LayerSpikes(
-                float=int(ours[i].sum()),
-                chip=int(theirs[i].sum()),
-                different=int(different["saturation"][i]),
-                ill_posed=int(different["float64"][i]),
-            )
-            for i, name in enumerate(names)
-        },
+        spikes=dict(zip(names, tally.spikes(), strict=True)),
         spec_samples=checked,
-        spec_equals_engine=equal and (beside is None or beside.equal),
+        spec_equals_engine=equal and not engine_different,
         weights=weights,
         first_divergence=divergence,
         ladder=tuple(
-            Rung(stage=stage, different=dict(zip(names, different[stage].tolist(), strict=True))) for stage in LADDER
+            Rung(stage=stage, different=dict(zip(names, counts.tolist(), strict=True)))
+            for stage, counts in tally.different.items()
         ),
         quantised_different=quantised_different,
-        breakdowns=breakdowns(names, ours, theirs, neurons, (float_votes, chip_votes), files),
+        breakdowns=breakdowns(names, tally.float, tally.chip, neurons, (float_votes, chip_votes), files),
         not_compared={name: int(out.sum()) for name, out in zip(names, machine.unread, strict=True) if out.any()},
         certificate=certifier.certificate(),
         engine=engine_name,
-        engine_different=None if beside is None else beside.different,
+        engine_different=engine_different,
         required={} if required is None else required,
     )
+
+
+class _Tally:
+    """Spikes of each neuron of the layers, of float model and chip, and entries of each layer that differ, by rung."""
+
+    def __init__(self, sizes: Sequence[int]) -> None:
+        self.float, self.chip = ([np.zeros(size, np.int64) for size in sizes] for _ in range(2))
+        self.different = {stage: np.zeros(len(sizes), np.int64) for stage in LADDER}
+
+    def add(self, reference: Layers, chip: Layers, lower: Mapping[str, Layers]) -> None:
+        """Count some recordings: the reference, the chip and the rungs below it."""
+        for stage, spikes in {**lower, LADDER[-1]: chip}.items():
+            self.different[stage] += _differences(reference, spikes)
+        for total, layers in ((self.float, reference), (self.chip, chip)):
+            for layer, spikes in enumerate(layers):
+                total[layer] += spikes.sum(axis=(0, 1))
+
+    def spikes(self) -> Iterator[LayerSpikes]:
+        """The same, layer by layer."""
+        for ours, theirs, different, ill_posed in zip(
+            self.float, self.chip, self.different[LADDER[-1]], self.different[LADDER[0]], strict=True
+        ):
+            yield LayerSpikes(
+                float=int(ours.sum()), chip=int(theirs.sum()), different=int(different), ill_posed=int(ill_posed)
+            )
 
 
 def _fine_tuned(source: Factored | Network) -> Callable[[npt.NDArray[np.uint8]], list[BoolArray]]:
@@ -179,7 +193,7 @@ def _fine_tuned(source: Factored | Network) -> Callable[[npt.NDArray[np.uint8]],
     return lambda events: list(quantised_spikes(source.checkpoint, source.propagation, events).values())
 
 
-def _differences(ours: Sequence[BoolArray], theirs: Sequence[BoolArray]) -> IntArray:
+def _differences(ours: Layers, theirs: Layers) -> IntArray:
     """Entries of each layer that differ."""
     return np.array([np.count_nonzero(a != b) for a, b in zip(ours, theirs, strict=True)], np.int64)
 

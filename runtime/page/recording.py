@@ -12,7 +12,7 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.equivalence.reference import membranes_of, spikes_of, taxel_and_feature
+from spikeloom.runtime.equivalence.reference import membranes_of, reference_of, taxel_and_feature
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.integer import IntegerMachine
 from spikeloom.runtime.machines.votes import readout_counts
@@ -119,7 +119,7 @@ def recording(machine: IntegerMachine, loaded: LoadedNetwork, data: Recordings, 
     run = machine.run(events, spikes=True, membranes=True)
     assert run.spikes is not None, "spikes were wanted"
     assert run.membranes is not None, "membranes were wanted"
-    sent = spikes_of(loaded.model, events, "float32")
+    sent = reference_of(loaded.model)(events)
     ours = [spikes[0] & ~unread for spikes, unread in zip(sent, machine.unread, strict=True)]
     chip = [spikes[0] & ~unread for spikes, unread in zip(run.spikes.values(), machine.unread, strict=True)]
     readout = loaded.network.readout

@@ -46,9 +46,8 @@ def decayed(value: IntArray, lost: IntArray | int) -> IntArray:
     >>> decayed(np.array([6, -6, -5]), 3277).tolist()
     [1, -1, 0]
     """
-    magnitude = np.abs(value) * (DECAY_ONE - lost) // DECAY_ONE
-    kept: IntArray = np.sign(value) * magnitude
-    return kept
+    magnitude: IntArray = np.abs(value) * (DECAY_ONE - lost) // DECAY_ONE
+    return np.where(value < 0, -magnitude, magnitude)
 
 
 def read_synapses(netlist: Netlist) -> list[tuple[IntArray, IntArray]]:
@@ -61,7 +60,7 @@ def read_synapses(netlist: Netlist) -> list[tuple[IntArray, IntArray]]:
         stored = slice(netlist.axon_synapses[axon], netlist.axon_synapses[axon + 1])
         mantissa = netlist.synapse_weight[stored].astype(np.int64)
         # at exponent -1 mantissas are even, so halving is exact
-        weight = mantissa // 2 if exponent == -1 else mantissa * 2**exponent
+        weight: IntArray = mantissa // 2 if exponent == -1 else mantissa << exponent
         of_source[source].append((first_on_core + netlist.synapse_target[stored].astype(np.int64), weight))
     return [_joined(axons) for axons in of_source]
 
@@ -93,8 +92,8 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trac
     current, membrane = np.zeros((2, neurons), np.int64)
     for t in range(chip_steps):
         # active sources: channels with an event now, compartments that spiked one step ago
-        channels = np.flatnonzero(events[:, t]) if t < length else []
-        fired = n_inputs + np.flatnonzero(spikes[t - 1]) if t else []
+        channels = np.flatnonzero(events[:, t]).tolist() if t < length else []
+        fired = (n_inputs + np.flatnonzero(spikes[t - 1])).tolist() if t else []
 
         # gather input: positive and negative weights apart
         target, weight = _joined([synapses[source] for source in (*channels, *fired)])
