@@ -10,10 +10,11 @@ from made_files import CLASSES, FEATURES, TAXELS, events, ring, small_checkpoint
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.interpret import channels_last, run_float, vote
+from spikeloom.compiler.layer_kernel import arrive
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.models.networks.reference import float_spikes
-from spikeloom.runtime.equivalence.certain_spikes import SPARE, _layers, _Membranes, certain_spikes
-from spikeloom.runtime.equivalence.certificates import certify, wins
+from spikeloom.runtime.equivalence.certain_spikes import SPARE, Certainty, _layers, _step
+from spikeloom.runtime.equivalence.certificates import Certifier, wins
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
@@ -31,6 +32,13 @@ def on_chip(netlist, recordings):
     trace = engine.simulate(engine.prepare(netlist), flat, spikes=True)
     chip = [aligned(netlist, trace.spikes, layer) for layer in range(len(netlist.layers))]
     return chip, predictions(netlist, trace.counts.spikes)
+
+
+def certified(model, integer, recordings, chip, decisions):
+    """All recordings at once."""
+    certifier = Certifier(model, integer)
+    certifier.add(recordings, chip, decisions)
+    return certifier.certificate()
 
 
 def shuffled(checkpoint, adjacency, recordings, seed):
@@ -72,7 +80,7 @@ def runs(checkpoint, adjacency, recordings, seed=0):
 def test_certain_spikes_are_those_of_every_run(folder, seed, gain, beta):
     checkpoint, adjacency = small_checkpoint(folder, last=weights(seed, gain=gain), beta=beta)
     recordings = events(seed, samples=3)
-    certainty = certain_spikes(Factored(checkpoint, adjacency), recordings)
+    certainty = Certainty(Factored(checkpoint, adjacency)).spikes(recordings)
     for run in runs(checkpoint, adjacency, recordings, seed):
         for (certain, doubt), spikes in zip(certainty, run, strict=True):
             assert not (certain & doubt).any()
@@ -89,7 +97,7 @@ def test_certain_spikes_among_many_ties(folder, seed, step, decimal):
     last = {name: (np.round(array / 0.25) * unit).astype(np.float32) for name, array in weights(seed).items()}
     checkpoint, adjacency = small_checkpoint(folder, last=last, theta=4 * unit, beta=0.5)
     recordings = events(seed, samples=3)
-    certainty = certain_spikes(Factored(checkpoint, adjacency), recordings)
+    certainty = Certainty(Factored(checkpoint, adjacency)).spikes(recordings)
     for run in runs(checkpoint, adjacency, recordings, seed):
         for (certain, doubt), spikes in zip(certainty, run, strict=True):
             np.testing.assert_array_equal(certain[~doubt], spikes[~doubt])
@@ -108,7 +116,7 @@ def test_uncertain_spikes_reach_the_next_layer(folder):
     arrays["fc2.bias"][:] = [0.25, 0.75, 0.75]
     arrays["fc2.weight"][:, 0] = [0.125, 0.125, -0.5]
     checkpoint, adjacency = small_checkpoint(folder, last=arrays, beta=0.0)
-    (_, conv), (fc1, doubt1), (fc2, doubt2), (_, doubt3) = certain_spikes(Factored(checkpoint, adjacency), events(0))
+    (_, conv), (fc1, doubt1), (fc2, doubt2), (_, doubt3) = Certainty(Factored(checkpoint, adjacency)).spikes(events(0))
     assert not conv.any()
     assert doubt1[..., 0].all()
     assert fc1[..., 1].all()
@@ -127,7 +135,7 @@ def test_an_uncertain_spike_leaves_both_membranes(folder):
     recordings = np.zeros((1, TAXELS, 2, 4), np.uint8)
     recordings[0, 0, 0, 0] = recordings[0, 0, 1, 1] = 1
     certain, doubt = (
-        array[0, :, :FEATURES] for array in certain_spikes(Factored(checkpoint, adjacency), recordings)[0]
+        array[0, :, :FEATURES] for array in Certainty(Factored(checkpoint, adjacency)).spikes(recordings)[0]
     )
     assert doubt[0].tolist() == [True, False, False, False, True]
     # 0 + 0.375, or 0.25 + 0.375: below and above the threshold
@@ -147,20 +155,28 @@ def test_cancelling_hops_count_with_their_magnitudes(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=arrays, graph=graph, beta=0.0)
     assert not expand(checkpoint, adjacency).projections[0].weight.toarray().any()
     recordings = np.ones((1, TAXELS, 2, 1), np.uint8)
-    _, doubt = certain_spikes(Factored(checkpoint, adjacency), recordings)[0]
+    _, doubt = Certainty(Factored(checkpoint, adjacency)).spikes(recordings)[0]
     assert doubt.all()
-    _, quiet = certain_spikes(Factored(checkpoint, adjacency), np.zeros_like(recordings))[0]
+    _, quiet = Certainty(Factored(checkpoint, adjacency)).spikes(np.zeros_like(recordings))[0]
     assert not quiet.any()
 
 
 def test_a_membrane_that_was_not_reset_is_below_its_threshold():
     """A current of 0 to 10 may fire; if it did not, less than half of the threshold is left for the next step."""
-    membranes = _Membranes(0.5, 0.5, (1, 1))
-    found = [
-        membranes.step(step, np.full((1, 1), centre), np.full((1, 1), radius, np.float32))
-        for step, (centre, radius) in enumerate([(5.0, 5.0), (0.2, 0.0)])
-    ]
-    assert [(bool(certain), bool(doubt)) for certain, doubt in found] == [(False, True), (False, False)]
+    membrane, fired, unsure = np.zeros((2, 1)), np.zeros(1, np.uint8), np.zeros(1, np.uint8)
+    found = []
+    for centre, radius in ((5.0, 5.0), (0.2, 0.0)):
+        _step(*membrane, np.array([centre]), np.array([radius]), 0.5, 0.5, 0.5, fired, unsure)
+        found.append((bool(fired[0]), bool(unsure[0])))
+    assert found == [(False, True), (False, False)]
+
+
+def dense(synapses, neurons):
+    """Weights as a matrix (sources, neurons)."""
+    found = np.zeros((len(synapses.run) - 1, neurons))
+    for source in range(len(found)):
+        arrive(found[source], synapses, np.array([source], np.int32), 0, 1)
+    return found
 
 
 def test_roundings_and_magnitudes_of_the_released_operator_are_those_of_its_loops(tmp_path):
@@ -174,16 +190,16 @@ def test_roundings_and_magnitudes_of_the_released_operator_are_those_of_its_loop
     powers = np.stack([np.linalg.matrix_power(np.abs(adjacency), hop) for hop in range(4)])
     for hop, taxel, source in np.ndindex(4, TAXELS, TAXELS):
         wanted[source, :, taxel] += powers[hop, taxel, source] * np.abs(checkpoint.hops[hop]).T
-    np.testing.assert_allclose(first.magnitude, wanted.reshape(2 * TAXELS, -1), rtol=1e-6)
-    for layer, dense in zip(others, checkpoint.dense, strict=True):
-        np.testing.assert_array_equal(layer.magnitude, np.abs(dense.weight).T)
+    np.testing.assert_allclose(dense(first.magnitude, TAXELS * FEATURES), wanted.reshape(2 * TAXELS, -1), rtol=1e-6)
+    for layer, given in zip(others, checkpoint.dense, strict=True):
+        np.testing.assert_allclose(dense(layer.magnitude, len(given.weight)), np.abs(given.weight).T, rtol=1e-6)
 
 
 # -- against the chip --------------------------------------------------------------------------------------------------
 def by_hand(checkpoint, adjacency, recordings, chip, kept=None, lengths=None):
     """Equal and different entries per layer, entry by entry."""
     found = []
-    for layer, (certain, doubt) in enumerate(certain_spikes(Factored(checkpoint, adjacency), recordings)):
+    for layer, (certain, doubt) in enumerate(Certainty(Factored(checkpoint, adjacency)).spikes(recordings)):
         equal = different = 0
         neurons = range(certain.shape[2]) if kept is None else kept[layer]
         for sample in range(len(recordings)):
@@ -201,7 +217,7 @@ def test_entries_are_counted_once_each(folder):
     netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(Packing(bits=4),))).netlist
     recordings = events(4, samples=5, steps=12)
     chip, decisions = on_chip(netlist, recordings)
-    found = certify(Factored(checkpoint, adjacency), lift(netlist), recordings, chip, decisions)
+    found = certified(Factored(checkpoint, adjacency), lift(netlist), recordings, chip, decisions)
     assert list(found.layers) == ["conv1", "fc1", "fc2", "fc3"]
     expected = by_hand(checkpoint, adjacency, recordings, chip)
     assert [(layer.equal, layer.different) for layer in found.layers.values()] == expected
@@ -224,9 +240,10 @@ def test_parts_of_layers_and_of_recordings(folder):
     chip, decisions = on_chip(netlist, recordings)
     inside = (np.arange(12) < lengths[:, None])[:, :, None]
     parts = [spikes[..., part] & inside for spikes, part in zip(chip, kept, strict=True)]
-    found = certify(
-        Factored(checkpoint, adjacency), lift(netlist), recordings, parts, decisions, kept=kept, lengths=lengths
-    )
+    certifier = Certifier(Factored(checkpoint, adjacency), lift(netlist), kept)
+    for rows in (slice(0, 1), slice(1, 3)):
+        certifier.add(recordings[rows], [spikes[rows] for spikes in parts], decisions[rows], lengths[rows])
+    found = certifier.certificate()
     assert [layer.entries for layer in found.layers.values()] == [26 * len(part) for part in kept]
     expected = by_hand(checkpoint, adjacency, recordings, parts, kept, lengths)
     assert [(layer.equal, layer.different) for layer in found.layers.values()] == expected
@@ -268,7 +285,7 @@ def test_registers_without_a_proof_are_named(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path, beta=4095 / 4096)
     netlist = compile_network(expand(checkpoint, adjacency), Options(keep_all=True)).netlist
     recordings = events(2, steps=8)
-    found = certify(Factored(checkpoint, adjacency), lift(netlist), recordings, *on_chip(netlist, recordings))
+    found = certified(Factored(checkpoint, adjacency), lift(netlist), recordings, *on_chip(netlist, recordings))
     assert found.unproven == ("conv1", "fc1", "fc2", "fc3")
 
 

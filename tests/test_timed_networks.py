@@ -37,7 +37,7 @@ from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.models.networks.reference import float_spikes
-from spikeloom.runtime.equivalence.certain_spikes import certain_spikes
+from spikeloom.runtime.equivalence.certain_spikes import Certainty
 from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.integer import integer_machine_of
@@ -179,7 +179,7 @@ def test_what_is_certain_is_so_in_both_precisions(folder, seed, alpha, beta):
     dynamics = Dynamics(betas=(0.2, beta, beta, beta), alphas=(0.0, alpha, alpha, alpha), clocks=TIMING.clocks)
     checkpoint, seen, network = float_network(folder, dynamics=dynamics, seed=seed)
     events = events_of(seed, samples=2, steps=30)
-    certainty = certain_spikes(Factored(checkpoint, seen), events)
+    certainty = Certainty(Factored(checkpoint, seen)).spikes(events)
     runs = [list(float_spikes(checkpoint, seen, events, dtype=kind).values()) for kind in ("float32", "float64")]
     runs.append(list(run_float(network, channels_last(events, TIMING.clocks), dtype=np.float32).spikes))
     for layer, (sure, doubt) in enumerate(certainty):
@@ -195,7 +195,7 @@ def test_a_radius_covers_the_gathered_rounding():
     network = replace(network, populations=(replace(network.populations[0], alpha=0.95),))
     network = replace(network, input=Input(taxels=1, polarities=1))
     events = np.ones((1, 1, 1, 2000), np.uint8)  # the current climbs to 0.5, the threshold, and stays below
-    ((sure, doubt),) = certain_spikes(network, events)
+    ((sure, doubt),) = Certainty(network).spikes(events)
     assert not sure[0, :100].any()
     assert not doubt[0, :100].any()
     assert doubt[0, -1].all()
