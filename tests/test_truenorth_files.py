@@ -310,14 +310,3 @@ def test_ranc_spikes_the_same(simulator, tmp_path, netlist, seed):
     done = subprocess.run([simulator, source, result, source, ticks], capture_output=True, text=True, check=True)
     assert "ERROR" not in done.stdout
     np.testing.assert_array_equal(outputs_of(result.read_text("utf-8"), len(voters)), expected.spikes[:, voters])
-
-
-def test_a_part_of_every_recording(path, monkeypatch):
-    monkeypatch.chdir(path.parent)
-    made = np.random.default_rng(2).integers(0, 2, (8, 3, 2, 24)).astype(np.uint8)
-    recordings_folder(path.parent / "data", train=made, test=made, classes=2)
-    for command in ("run", "estimate"):
-        words = (command, "net.loom", "--data", "data", "--window")
-        found = as_json(*words, "50%")
-        assert command == "run" or found["per_inference"]["ticks"] == 12 * network().bin_ticks + network().drain
-        assert "--window 0%: not a part of a recording" in refusal(*words, "0%")
