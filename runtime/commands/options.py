@@ -107,7 +107,7 @@ def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], defaul
     }
     depths = "; ".join(f"{choice}: {what[choice]}" for choice in choices)
     options.add_argument("--detail", choices=choices, default=default, help=f"{depths} (default: {default})")
-    options.add_argument("--table", metavar="NAME|FILE.toml", help="price and time by this table only, or by your own")
+    options.add_argument("--table", metavar="NAME|FILE.toml", help="energy or time by this table alone, or by your own")
     add_explain_cost(parser)
 
 
