@@ -10,7 +10,6 @@ from spikeloom.compiler.formats.netx import writer as netx
 from spikeloom.compiler.formats.nir import CONVENTIONS
 from spikeloom.compiler.formats.nir import writer as nir
 from spikeloom.compiler.formats.onnx import writer as onnx
-from spikeloom.compiler.formats.onnx.builder import port_words
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
@@ -97,8 +96,8 @@ def _sanafe(request: Request) -> Export:
 
 def _onnx(request: Request) -> Export:
     netlist, form = read_netlist(request.source), request.form or "scan"
-    content = onnx.export(netlist, form)
-    inputs, outputs = port_words(content)
+    content, *ports = onnx.export(netlist, form)
+    inputs, outputs = ([str(port) for port in side] for side in ports)
     facts = OnnxFacts(
         neurons=netlist.n_compartments, synapses=netlist.n_synapses, form=form, inputs=inputs, outputs=outputs
     )

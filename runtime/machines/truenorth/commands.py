@@ -55,7 +55,7 @@ def takes(path: str) -> bool:
 
 def read(path: str, arguments: argparse.Namespace) -> Trained:
     """Read a trained network as the options say; OptionError or ModelError if it is not as they say."""
-    others = [name for name in NETWORK if name != "weights" and getattr(arguments, name, None) != SYSTEM]
+    others = [name for name in NETWORK if name != "weights"]
     refuse(arguments, others, f"{path} is a network for {TITLE} and says that itself")
     return read_trained(shipped(path), weights=arguments.weights)
 
