@@ -12,7 +12,7 @@ from timed_networks import events_of, written
 from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.towers import join
+from spikeloom.compiler.formats.tensors import join
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.models.networks.reference import float_spikes

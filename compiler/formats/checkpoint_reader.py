@@ -23,7 +23,7 @@ The manifest may have, beside these,
     ``betas`` and ``alphas`` (one a layer, or none) and ``clocks`` (``channels`` and ``steps``), see
     :mod:`compiler.dynamics`; ``fc1`` has one more input for each clock, at the end.
 ``towers``
-    How many networks of the same sizes lie side by side, see :mod:`formats.towers`. Arrays hold one tower after the
+    How many networks of the same sizes lie side by side, see :mod:`formats.tensors`. Arrays hold one tower after the
     other: ``conv1.hops`` along its features, the others along their first axis, so that ``fc1.weight`` has the inputs
     of one tower. Neuron ``tower * classes + class`` of the last layer votes for that class.
 ``bins``

@@ -36,7 +36,7 @@ from spikeloom.compiler.fixedpoint import (
     reach,
     step_units,
 )
-from spikeloom.compiler.formats.towers import arrays_of
+from spikeloom.compiler.formats.tensors import arrays_of
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.ir import Form, Network
 from spikeloom.compiler.passes.calibrate import Calibration, calibrate, evenly_spaced

@@ -254,7 +254,6 @@ class Request:
     recording: which of them.
     form: which form of the format.
     dt: seconds of a step.
-    strict: whether to write nothing that had to be rounded.
     """
 
     source: str
@@ -263,7 +262,6 @@ class Request:
     recording: int | None = None
     form: str | None = None
     dt: float | None = None
-    strict: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.formats.netx import writer as netx
 from spikeloom.compiler.formats.nir import CONVENTIONS
@@ -124,8 +123,6 @@ def _netx(request: Request) -> Export:
     blocks = netx.blocks_for(network)
     layers = [NetxLayer(rounding=block.rounding) for block in blocks]
     rounded = [line for block in blocks if (line := str(block.rounding))]
-    if request.strict and rounded:
-        raise OptionError(f"--strict: netx cannot hold {request.source} as it is ({'; '.join(rounded)})")
     lines = rounded or ["biases, thresholds and weights are the netlist's"]
     count = None
     if request.recordings is not None:
@@ -165,6 +162,6 @@ FORMATS = (
         name="netx",
         title="a netlist as a .net file of lava-dl, biases rounded to whole weight steps",
         write=_netx,
-        options=("data", "split", "bin", "limit", "strict"),
+        options=("data", "split", "bin", "limit"),
     ),
 )
