@@ -20,7 +20,7 @@ from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.truenorth.codebook import PartialSums, in_levels, run_levels
 from spikeloom.compiler.targets.truenorth.in_time import first_spikes
-from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork
+from spikeloom.compiler.targets.truenorth.native import NativeNetwork
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Compilation, Options
