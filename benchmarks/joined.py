@@ -22,7 +22,7 @@ from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.towers import join
+from spikeloom.compiler.formats.tensors import join
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.recordings.events import joined_bins, load_data

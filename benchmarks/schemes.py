@@ -64,7 +64,7 @@ def measure(
     trace = engine.simulate(netlist, test.events.reshape(len(test), -1, test.steps), spikes=True)
     assert trace.spikes is not None
     meter = cost.prepare(netlist, load_target(netlist.target))
-    costs = cost.estimate(meter, trace.counts, test.steps + netlist.max_depth)
+    costs = cost.price(meter, trace.counts, test.steps + netlist.max_depth)
     kept = integer_machine_of(netlist).compared()
     different = {
         layer.name: int(np.count_nonzero((aligned(netlist, trace.spikes, i) != reference[layer.name])[..., kept[i]]))

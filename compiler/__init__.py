@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from spikeloom.compiler.ir import IntegerNetwork, Network
     from spikeloom.compiler.passes.expand import Factored
-    from spikeloom.compiler.targets.loihi1.alike import store_alike
     from spikeloom.compiler.targets.loihi1.lift import lift
     from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist, write_netlist
     from spikeloom.compiler.targets.loihi1.options import GOALS, MAX_PLANES, Options, Packing, check_packings
@@ -28,7 +27,6 @@ __version__ = "0.1.0"
 DEFAULT_TARGET = "loihi1"
 
 _NAMES = {
-    "alike": "store_alike",
     "lift": "lift",
     "netlist": "Netlist read_netlist write_netlist",
     "options": "GOALS MAX_PLANES Options Packing check_packings",

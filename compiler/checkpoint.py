@@ -59,7 +59,7 @@ class Checkpoint:
     system: str = TACTILESGNET  # One of ``SYSTEMS``
     grid: Grid | None = None  # Of a grid-based CNN
     dynamics: Dynamics = PLAIN  # Decays of single layers, and clocks
-    towers: int = 1  # Networks that lie side by side and vote together, see :mod:`formats.towers`
+    towers: int = 1  # Networks that lie side by side and vote together, see :mod:`formats.tensors`
     bins: int = 1  # Bins of the recordings that a step joins
 
     @property

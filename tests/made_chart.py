@@ -78,7 +78,6 @@ def made_network(
     file = NetworkFile(
         path=f"{name}.pt",
         name=name,
-        target="loihi1",
         graph=graph,
         sha256="ab" * 32,
         system="tactilesgnet",

@@ -77,7 +77,7 @@ def test_all_figures_of_a_stopped_chip(report, place, monkeypatch):
                 inputs=state.inputs[None], spikes=state.spikes[None], updates=updates, saturations=0 * updates
             )
             assert rule["samples"]["decisions"][i] == predictions(netlist, counts.spikes)[0]
-            found = cost.estimate(meter, counts, ends)
+            found = cost.price(meter, counts, ends)
             left = whole.costs.synaptic_operations[i].sum() - found.synaptic_operations.sum()
             assert rule["samples"]["saved_operations"][i] == left
             for name, each in found.energy.items():

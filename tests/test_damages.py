@@ -1,7 +1,5 @@
 """Damage done to netlist and float network alike: what changes, what does not, and that both change by as much."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from made_files import ring
@@ -10,15 +8,12 @@ from random_networks import chain, compiled, integer_chain, random_checkpoint
 from timed_networks import written
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
-from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import decay_registers
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.alike import unplaced
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.machines.loihi1 import engine, spec
-from spikeloom.runtime.machines.loihi1.block_kernel import Blocks
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.studies.stress import damages
 from spikeloom.runtime.studies.stress.pair import Pair
@@ -204,77 +199,3 @@ def test_windows_that_open_late_are_those_of_the_specification():
     events = inputs(pair, samples=1)
     fast, slow = engine.simulate(pair.netlist, events, spikes=True), spec.simulate(pair.netlist, events[0])
     assert_array_equal(fast.spikes[0], slow.spikes)
-
-
-# -- other networks ----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("packing", [None, (Packing(planes=2),)])
-def test_an_unplaced_netlist_spikes_as_the_placed_one(packing):
-    pair = made(packing=packing)
-    flat = unplaced(lift(pair.netlist), pair.netlist)
-    events = inputs(pair)
-    placed, other = (engine.simulate(netlist, events) for netlist in (pair.netlist, flat))
-    for post in range(len(flat.layers)):
-        ids, others = pair.netlist.compartments_of(post), flat.compartments_of(post)
-        ours = placed.counts.spikes[:, ids]
-        assert_array_equal(ours, other.counts.spikes[:, others][:, pair.netlist.neuron[ids]])
-        assert ours.any()
-    assert_array_equal(engine.simulate(flat, events[:1], spikes=True).spikes[0], spec.simulate(flat, events[0]).spikes)
-
-
-def test_the_same_network_is_stored_alike_and_none_can_overflow():
-    pair = made()
-    alike = damages.stored_alike(pair, pair.network)
-    integer = lift(alike.netlist)
-    for ours, theirs, population, projection in zip(
-        in_model_units(alike.netlist), weights(pair.network), integer.populations, integer.projections, strict=True
-    ):
-        half_a_step = 2.0**projection.exponent / population.scale.min()
-        assert np.abs(ours - theirs).max() <= half_a_step * (1 + 1e-9)
-    larger = tuple(replace(p, weight=p.weight * 40) for p in pair.network.projections)
-    shrunk = damages.stored_alike(pair, replace(pair.network, projections=larger))
-    for netlist in (alike.netlist, shrunk.netlist):
-        assert isinstance(lay_out_blocks(netlist), Blocks)
-
-
-def test_outliers_leave_the_float_network_but_for_one_weight_a_layer_and_coarsen_the_chip():
-    pair = made()
-    after = damages.outlier_weight(pair, 8, drawn(5))
-    for old, new in zip(weights(pair.network), weights(after.network), strict=True):
-        place = np.argwhere(old != new)
-        assert len(place) == 1
-        assert_allclose(np.abs(new).max(), 8 * np.abs(old).max())
-    for post in range(4):
-        before = np.median(pair.netlist.threshold[pair.netlist.compartments_of(post)])
-        assert after.netlist.threshold[after.netlist.compartments_of(post)].max() <= before / 8 + 1
-
-
-def test_rewired_edges():
-    edges = ring(8).edges
-    some, more = (damages.rewire(edges, 8, share, drawn(6)) for share in (0.25, 0.5))
-    for found, count in ((some, 2), (more, 4)):
-        pairs = set(map(tuple, found.tolist()))
-        assert len(pairs) == len(found) == len(edges)
-        assert {(b, a) for a, b in pairs} == pairs
-        assert len(set(map(tuple, edges.tolist())) - pairs) == 2 * count
-        assert all(a != b for a, b in pairs)
-    one_way = np.array([[0, 1], [1, 2], [2, 3]])
-    found = damages.rewire(one_way, 4, 1.0, drawn(6))
-    assert len(found) == 3
-    assert not set(map(tuple, one_way.tolist())) & set(map(tuple, found.tolist()))
-
-
-def test_doubled_edges_change_the_propagation_and_no_reach():
-    edges = ring(8).edges
-    twice = damages.double(edges, 0.5, drawn(7))
-    assert len(twice) == 1.5 * len(edges)
-    before, after = normalised_adjacency(edges, 8), normalised_adjacency(twice, 8)
-    assert_array_equal(before != 0, after != 0)
-    assert not np.allclose(before, after)
-    assert_allclose(normalised_adjacency(damages.double(edges, 1.0, drawn(7)), 8), before)
-
-
-def test_a_bias_that_no_register_holds():
-    pair = made()
-    populations = tuple(replace(p, bias=p.bias + 1e9) for p in pair.network.populations)
-    with pytest.raises(OptionError, match=r"^conv1: .*; omit this perturbation$"):
-        damages.stored_alike(pair, replace(pair.network, populations=populations))

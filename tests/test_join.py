@@ -17,7 +17,7 @@ from spikeloom.compiler.checkpoint import SHARED, towers_of
 from spikeloom.compiler.dynamics import PLAIN, Clocks, Dynamics, with_clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.towers import arrays_of, join, members
+from spikeloom.compiler.formats.tensors import arrays_of, join, members
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand

@@ -259,11 +259,11 @@ def test_a_share_that_nothing_reaches_is_a_failed_check(spikeloom, place):
 def test_the_printed_command_repeats_every_option():
     parser = cli.build_parser("bits")
     words = (
-        "bits 'my net.pt' --graph knn2 --system gcn --run 1 --weights best --beta 0.3 --theta 0.4 --calibrate data "
+        "bits 'my net.pt' --graph knn2 --run 1 --weights best --beta 0.3 --theta 0.4 --calibrate data "
         "--bin 0.01 --scale-groups 4 --agreement 0.9"
     )
     assert bits._command(parser.parse_args(shlex.split(words)), (2, 4)) == (
-        "spikeloom compile 'my net.pt' --graph knn2 --system gcn --run 1 --weights best --beta 0.3 --theta 0.4 "
+        "spikeloom compile 'my net.pt' --graph knn2 --run 1 --weights best --beta 0.3 --theta 0.4 "
         "--calibrate data --bin 0.01 --weight-bits 2,4 --scale-groups 4 -o NET.loom"
     )
     own = "bits x.pt --taxels t.csv --edges e.csv --directed --calibrate d --accuracy 0.9 -o a.loom"

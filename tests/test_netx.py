@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from commands import as_json, refusal, run
+from commands import as_json, run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from made_netx import conv, dense, even, events, flatten, given_input, neuron, write
@@ -299,17 +299,13 @@ def test_the_command_counts_what_it_moves(tmp_path):
     back = read_netx(out, polarities=1).network
     assert back.input.size == network.input.size
     assert [population.decay_u for population in back.populations] == [p.decay_u for p in network.populations]
-    before = out.read_bytes()
-    said = refusal("export", net, "--to", "netx", "-o", out, "--strict")
-    assert said.startswith(f"--strict: netx cannot hold {net} as it is (conv1: ")
-    assert out.read_bytes() == before
 
 
-def test_strict_writes_what_is_exact(tmp_path):
+def test_what_is_exact_comes_back(tmp_path):
     rng = np.random.default_rng(6)
     path = write(tmp_path / "a.net", dense(even(rng, 12, 6), bias=even(rng, 12, most=8)), dense(even(rng, 5, 12)))
     assert run("compile", path, "--keep-all", "-o", tmp_path / "a.loom")[0] == 0
-    code, text, _ = run("export", tmp_path / "a.loom", "--to", "netx", "--strict", "-o", tmp_path / "b.net")
+    code, text, _ = run("export", tmp_path / "a.loom", "--to", "netx", "-o", tmp_path / "b.net")
     assert code == 0
     assert text.splitlines()[1] == "biases, thresholds and weights are the netlist's"
     assert run("compile", tmp_path / "b.net", "--keep-all", "-o", tmp_path / "b.loom")[0] == 0

@@ -88,6 +88,7 @@ STAGES = [
     ("sorted, however input 'nobody'", "stage = Add(current, nobody)"),
 ]
 NODES = [
+    ("node stage (Einsum): cannot be evaluated", node("Einsum", "current b b", "stage", equation="ij,j,k->ij")),
     (f"node stage (Cast): rounds its input to whole numbers, so it {AFFINE}", node("Cast", "current", "stage", to=7)),
     ("node stage (LSTM): keeps a state that is no leaky", node("LSTM", "current w w", "stage", hidden_size=3)),
     (

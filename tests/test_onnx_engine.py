@@ -38,7 +38,7 @@ def by_name(session, given):
 
 def by_steps(netlist, events):
     """Spikes, membranes after the reset and votes of recordings in the form ``step``."""
-    session = onnx_engine.open_session(onnx_writer.export(netlist, "step"))
+    session = onnx_engine.open_session(onnx_writer.export(netlist, "step")[0])
     samples, _, length = events.shape
     given = {
         port.name: np.zeros(
@@ -234,7 +234,7 @@ def test_the_reference_of_the_format_computes_the_same():
     netlist = three_neurons()
     given = np.random.default_rng(2).integers(0, 2, (2, 2, 12), np.uint8)
     expected = engine.simulate(netlist, given, spikes=True).spikes
-    content = onnx.load_from_string(onnx_writer.export(netlist, "scan"))
+    content = onnx.load_from_string(onnx_writer.export(netlist, "scan")[0])
     onnx.checker.check_model(content, full_check=True)
     model = ReferenceEvaluator(content)
     found = dict(zip(model.output_names, model.run(None, {"events": given.transpose(2, 0, 1)}), strict=True))

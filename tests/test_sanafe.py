@@ -280,7 +280,6 @@ def test_a_current_that_lasts_is_a_float_there_and_that_is_said(tmp_path):
         ("netx --limit 2", "--limit 2: says which recording of --data"),
         ("nir --form step", "--form step: is for onnx"),
         ("sanafe --dt 1", "--dt 1.0: is for nir"),
-        ("sanafe --strict", "--strict: is for netx"),
     ],
 )
 def test_options_that_a_format_would_ignore(tmp_path, words, said):

@@ -12,10 +12,9 @@ from timed_networks import events_of, written
 from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.towers import join
+from spikeloom.compiler.formats.tensors import join
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import Factored, expand
-from spikeloom.models.graphs import NEUTOUCH, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine, spec
@@ -24,21 +23,21 @@ from spikeloom.runtime.machines.votes import class_counts, readout_counts
 from spikeloom.runtime.report.encode import decode, encode
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.stress.bench import NAMES, Bench, by_length, distances, longer, warm_state, whole
-from spikeloom.runtime.studies.stress.pair import Pair, Sensor, evaluate
+from spikeloom.runtime.studies.stress.pair import Pair, evaluate
 from spikeloom.runtime.studies.stress.results import Run, Spread
 from spikeloom.runtime.studies.stress.study import clean, generator, measure
 from spikeloom.runtime.studies.stress.verdicts import curve, parse_requirement, reasons, spread, unmet
 
 STRESS, REPORT = (f"{command} net.loom --checkpoint net.pt --data data".split() for command in ("stress", "report"))
-FEW = "taxels_dead,events_lost,warm_state,longer,weight_bit_flips,other_graph,fewer_bits"
+FEW = "taxels_dead,events_lost,warm_state,longer,weight_bit_flips,fewer_bits"
 
 
-def bench_of(network, netlist, recordings, *, checkpoint=None, edges=None, places=None):
+def bench_of(network, netlist, recordings):
     count, taxels, _, steps = recordings.shape
     pair = Pair(netlist=netlist, network=network)
     return Bench(
         pair=pair,
-        sensor=Sensor(distance=distances(taxels, places, edges), places=places, edges=edges, checkpoint=checkpoint),
+        distance=distances(taxels, None, None),
         events=recordings,
         labels=np.arange(count) % netlist.classes,
         files=tuple(f"r{i}" for i in range(count)),
@@ -47,24 +46,27 @@ def bench_of(network, netlist, recordings, *, checkpoint=None, edges=None, place
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory):
-    """A small TactileSGNet, labelled as its float model decides."""
-    checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
-    network = expand(checkpoint, adjacency)
-    known = {"checkpoint": checkpoint, "edges": checkpoint.edges, "places": np.arange(float(TAXELS))[:, None]}
-    made = bench_of(network, compile_network(network).netlist, events(2, samples=8), **known)
+def small(tmp_path_factory):
+    """A small TactileSGNet and its propagation."""
+    return small_checkpoint(tmp_path_factory.mktemp("small"))
+
+
+@pytest.fixture(scope="module")
+def bench(small):
+    """That network, with recordings that are labelled as its float model decides."""
+    network = expand(*small)
+    made = bench_of(network, compile_network(network).netlist, events(2, samples=8))
     found, _ = clean(made)
     return replace(made, labels=found.decisions("float"))
 
 
 # -- both sides --------------------------------------------------------------------------------------------------------
-def test_clean_recordings_are_what_reference_and_engine_say(bench):
+def test_clean_recordings_are_what_reference_and_engine_say(bench, small):
     found, counted = clean(bench)
     flat = with_clocks(bench.events, bench.pair.netlist.clocks)
     trace = engine.simulate(bench.pair.netlist, flat)
     assert_array_equal(found.votes["chip"], class_counts(bench.pair.netlist, trace.counts.spikes))
-    adjacency = normalised_adjacency(bench.sensor.checkpoint.edges, TAXELS)
-    layers = float_spikes(bench.sensor.checkpoint, adjacency, bench.events)
+    layers = float_spikes(*small, bench.events)
     counts = readout_counts(bench.pair.network.readout, CLASSES, layers["fc3"])
     assert_array_equal(found.votes["float"], counts)
     for layer, (name, spikes) in enumerate(layers.items()):
@@ -72,7 +74,7 @@ def test_clean_recordings_are_what_reference_and_engine_say(bench):
         ids = bench.pair.netlist.compartments_of(layer)
         assert counted.layers[name][1] == trace.counts.spikes[:, ids].sum()
         assert counted.layers[name][3] == len(ids) * 8 * STEPS
-    known = bench.pair.netlist, Factored(bench.sensor.checkpoint, adjacency), bench.events, bench.labels, bench.files
+    known = bench.pair.netlist, Factored(*small), bench.events, bench.labels, bench.files
     for name, spikes in verify(*known).spikes.items():
         assert counted.layers[name][:3] == (spikes.float, spikes.chip, spikes.different)
     equal = np.count_nonzero(vote(found.votes["chip"]) == vote(counts))
@@ -111,7 +113,7 @@ def test_clocks_are_no_taxels(tmp_path):
     made = bench_of(network, netlist, events_of(3))
     ticks = netlist.clocks.events(15)
     sensor = netlist.taxels * netlist.polarities
-    silent = NAMES["taxels_dead"](made.events, 39, made.sensor, generator("taxels_dead", 0))
+    silent = NAMES["taxels_dead"](made.events, 39, generator("taxels_dead", 0))
     reached = whole(silent, netlist, made.lengths).events
     assert not reached[:, :sensor].any()
     assert_array_equal(reached[0, sensor:], ticks)
@@ -169,25 +171,23 @@ def test_every_perturbation_runs_at_its_mildest_and_harshest_the_same_for_a_seed
 
 
 def test_levels_are_in_order_and_make_sense():
-    assert len(NAMES) == 30
+    assert len(NAMES) == 26
     for known in NAMES.values():
         for full in (False, True):
-            levels = known.levels_of(39, full=full)
-            numbers = [level for level in levels if not isinstance(level, str)]
-            assert numbers in (sorted(numbers), sorted(numbers, reverse=True))
-            assert all(known.least <= level <= known.most for level in numbers)
+            levels = list(known.levels_of(39, full=full))
+            assert levels in (sorted(levels), sorted(levels, reverse=True))
+            assert all(known.least <= level <= known.most for level in levels)
             assert len(set(levels)) == len(levels)
         assert known.to in ("events", "pair", "bench")
     assert NAMES["taxels_dead"].levels_of(6, full=False, also=[2]) == (1, 2, 3, 5)
     assert NAMES["taxels_dead"].levels_of(6, full=True) == (1, 2, 3, 4, 5)
     assert NAMES["weight_bit_flips"].levels_of(6, full=True) == (1e-4, 0.00055, 1e-3, 0.0055, 0.01, 0.03, 0.05)
     assert NAMES["taxels_dead"].level_of("3") == 3
-    assert NAMES["other_graph"].level_of("knn:4") == "knn:4"
 
 
 @pytest.mark.parametrize("system", ["tactilesgnet", "mlp"])
 def test_all_systems_timed_and_joined(tmp_path, system):
-    """Every network runs the whole battery but what needs a graph; so do those with clocks, and joined ones."""
+    """Every network runs the whole battery; so do those with clocks, and joined ones."""
     members = []
     for seed in (1, 2):
         _, seen = written(tmp_path / f"{seed}.pt", system, seed=seed)
@@ -196,18 +196,14 @@ def test_all_systems_timed_and_joined(tmp_path, system):
     recordings = events_of(3, samples=2)
     for checkpoint in (members[0], joined):
         network = expand(checkpoint, seen)
-        known = {"checkpoint": checkpoint, "edges": None if system == "mlp" else checkpoint.edges, "places": NEUTOUCH}
-        made = bench_of(network, compile_network(network).netlist, recordings, **known)
+        made = bench_of(network, compile_network(network).netlist, recordings)
         reference, _ = clean(made)
         spikes = list(float_spikes(checkpoint, seen, recordings).values())[-1]
         assert_array_equal(reference.votes["float"], readout_counts(network.readout, network.classes, spikes))
-        skipped = {name: NAMES[name].why_not(made.pair, made.sensor) for name in NAMES}
-        graphs = {"other_graph", "edges_rewired", "edges_doubled"}
-        assert {name for name, why in skipped.items() if why} == (graphs if system == "mlp" else set())
-        for name, why in skipped.items():
-            if why is None:
-                run = measure(made, name, NAMES[name].levels_of(39, full=False)[0], 0, reference)
-                assert run.stopped in range(3)
+        for name, each in NAMES.items():
+            assert each.why_not(made.pair) is None
+            run = measure(made, name, each.levels_of(39, full=False)[0], 0, reference)
+            assert run.stopped in range(3)
 
 
 # -- rules -------------------------------------------------------------------------------------------------------------
@@ -324,9 +320,9 @@ def test_any_number_of_threads_says_the_same(spikeloom, place):
     assert spikeloom(*words, "--jobs", "1", "-o", "two.json")[1] == out
     assert (place / "one.json").read_bytes() == (place / "two.json").read_bytes()
     report = json.loads((place / "one.json").read_bytes())
-    wanted = {*FEW.split(",")} - {"other_graph"}  # the positions of its taxels are not known
+    wanted = {*FEW.split(",")}
     assert list(report["perturbations"]) == [name for name in NAMES if name in wanted]
-    assert list(report["not_applicable"]) == ["other_graph"]
+    assert report["not_applicable"] == {}
     levels = report["perturbations"]["taxels_dead"]["levels"]
     assert [point["level"] for point in levels] == [1, 3, 5]
     assert levels[0]["seeds"] == [0, 1]
@@ -355,7 +351,6 @@ def test_requirements_decide_about_the_exit_code(as_json):
         ("--require events_lost:many>=0.5", "'many' is no level of it; give a number from 0 to 1 (probability)"),
         ("--require taxels_dead:7>=0.5", "the sensor has 6 taxels"),
         ("--only events_lost --require taxels_dead:3>=0.5", "--only leaves taxels_dead out"),
-        ("--require other_graph:knn:1>=0.5", "does not apply, positions of the taxels are not known"),
         ("--seeds 0", "allowed are 1 or more"),
     ],
 )
@@ -366,10 +361,8 @@ def test_what_is_refused(refusal, words, telling):
 def test_what_does_not_apply(bench):
     netlist = compile_network(bench.pair.network, Options(packings=(Packing(planes=2),))).netlist
     pair = Pair(netlist=netlist, network=bench.pair.network)
-    assert NAMES["fewer_bits"].why_not(pair, bench.sensor) == "weights are stored in several planes"
-    assert NAMES["fewer_bits"].why_not(bench.pair, bench.sensor) is None
-    onnx = Sensor(distance=bench.sensor.distance, places=None, edges=None, checkpoint=None)
-    assert "ONNX or NIR file has no taxel graph" in NAMES["edges_rewired"].why_not(pair, onnx)
+    assert NAMES["fewer_bits"].why_not(pair) == "weights are stored in several planes"
+    assert NAMES["fewer_bits"].why_not(bench.pair) is None
 
 
 def test_the_page_of_a_network_shows_it_if_it_is_a_result_about_its_netlist(as_json, refusal, place):

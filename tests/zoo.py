@@ -24,7 +24,7 @@ from timed_networks import GRAPH, TIMING, written
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import PLAIN, with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.towers import arrays_of, join
+from spikeloom.compiler.formats.tensors import arrays_of, join
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.truenorth.native_file import write_trained
 from spikeloom.models.networks.checkpoint import save_checkpoint

@@ -23,7 +23,7 @@ The manifest may have, beside these,
     ``betas`` and ``alphas`` (one a layer, or none) and ``clocks`` (``channels`` and ``steps``), see
     :mod:`compiler.dynamics`; ``fc1`` has one more input for each clock, at the end.
 ``towers``
-    How many networks of the same sizes lie side by side, see :mod:`formats.towers`. Arrays hold one tower after the
+    How many networks of the same sizes lie side by side, see :mod:`formats.tensors`. Arrays hold one tower after the
     other: ``conv1.hops`` along its features, the others along their first axis, so that ``fc1.weight`` has the inputs
     of one tower. Neuron ``tower * classes + class`` of the last layer votes for that class.
 ``bins``
@@ -86,14 +86,13 @@ def read_checkpoint(
     weights: str | None = None,
     beta: float | None = None,
     theta: float | None = None,
-    system: str | None = None,
 ) -> Checkpoint:
     """Read a checkpoint of any known layout; `run` is one of those of a released file.
 
     weights: which epoch, ``last``, ``best`` (on the test split) or ``clean`` (on a part of the training split), where
     the file holds several; the first of these that it holds by default.
     beta, theta: decay and threshold, where the file does not say; those of the released code by default.
-    system: which it must be; files in the released layout hold a TactileSGNet.
+    Files in the released layout hold a TactileSGNet.
 
     Raises ModelError if the file is no checkpoint, holds code, is damaged or altered, lacks the set or run, or its
     tensors do not make the system, with every fault of them; OptionError if an option contradicts the file, or has a
@@ -101,15 +100,13 @@ def read_checkpoint(
     """
     if weights is not None and weights not in WEIGHTS:
         raise OptionError(f"--weights {weights}: unknown; choose from {', '.join(WEIGHTS)}")
-    if system is not None and system not in SYSTEMS:
-        raise OptionError(f"--system {system}: unknown; choose from {', '.join(SYSTEMS)}")
     if faults := constant_faults(beta, theta):
         raise OptionError(faults[0])
     try:
         found = _read(read_whole(Path(path), "checkpoint", GIVE), run, weights)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
-    _require_fit(str(path), found, system, beta, theta)
+    _require_fit(str(path), found, beta, theta)
     given = [name for name, value in (("beta", beta), ("theta", theta)) if value is not None]
     return replace(
         found,
@@ -119,10 +116,8 @@ def read_checkpoint(
     )
 
 
-def _require_fit(where: str, found: Checkpoint, system: str | None, beta: float | None, theta: float | None) -> None:
+def _require_fit(where: str, found: Checkpoint, beta: float | None, theta: float | None) -> None:
     """Refuse what contradicts the file."""
-    if system not in (None, found.system):
-        raise OptionError(f"--system {system}: {where} holds a {found.system}; omit --system")
     for name, value, held in (("beta", beta, found.beta), ("theta", theta, found.theta)):
         if found.forms is not None and value not in (None, held):
             raise OptionError(f"--{name} {value:g}: {where} was fine-tuned with {held:g}; omit --{name}")

@@ -1,14 +1,26 @@
-"""What the tensors of a checkpoint must be: names, shapes, finite values. Every fault is found, not the first."""
+"""Tensors of a checkpoint: what they must be, and how those of several networks lie side by side as towers.
+
+A joined network has the filters of all its towers in its first layer, and fully connected layers that are blocks: a
+neuron receives its own tower, and the relays of clocks, of which there is one set for all. Each tower therefore spikes
+as it does alone. Its last layer has a neuron for every class and tower, ``tower * classes + class``; the class whose
+neurons spike most wins.
+
+Neurons of the first layer count as in any network of the system, with the features of all towers at each place.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.checkpoint import SHARED, Checkpoint, towers_of
+from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
+from spikeloom.compiler.ir import Form
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -99,3 +111,106 @@ def _tower_axis(name: str) -> int:
 
 def _shown(shape: tuple[int | str, ...]) -> str:
     return f"({', '.join(str(length) for length in shape)}{',' if len(shape) == 1 else ''})"
+
+
+def members(checkpoint: Checkpoint) -> tuple[Checkpoint, ...]:
+    """The networks that a checkpoint was joined from, or the one that it is."""
+    if checkpoint.towers == 1:
+        return (checkpoint,)
+    owners = towers_of(checkpoint)
+    found = []
+    for tower, arrays in enumerate(apart(arrays_of(checkpoint), checkpoint.towers)):
+        forms = None
+        if checkpoint.forms is not None:
+            forms = tuple(
+                replace(form, threshold=form.threshold[(owner == tower) | (owner == SHARED)])
+                for form, owner in zip(checkpoint.forms, owners, strict=True)
+            )
+        found.append(replace(_holding(checkpoint, arrays), forms=forms, towers=1))
+    return tuple(found)
+
+
+def _holding(checkpoint: Checkpoint, arrays: Arrays) -> Checkpoint:
+    """The checkpoint with other arrays."""
+    dense = tuple(
+        replace(stage, weight=arrays[f"{stage.name}.weight"], bias=arrays[f"{stage.name}.bias"])
+        for stage in checkpoint.dense
+    )
+    return replace(checkpoint, hops=arrays["conv1.hops"], conv_bias=arrays["conv1.bias"], dense=dense)
+
+
+def side_by_side(
+    checkpoint: Checkpoint, every: Sequence[Mapping[str, npt.NDArray[Any]]]
+) -> dict[str, npt.NDArray[Any]]:
+    """Values of all neurons from those of each tower; by layer, (..., neurons)."""
+    found = {}
+    for (name, neurons), owner in zip(checkpoint.neurons.items(), towers_of(checkpoint), strict=True):
+        first = every[0][name]
+        found[name] = np.empty((*first.shape[:-1], neurons), first.dtype)
+        for tower, values in enumerate(every):
+            found[name][..., (owner == tower) | (owner == SHARED)] = values[name]
+    return found
+
+
+def arrays_of(checkpoint: Checkpoint) -> Arrays:
+    """Arrays as a file holds them."""
+    arrays: Arrays = {"conv1.hops": checkpoint.hops, "conv1.bias": checkpoint.conv_bias}
+    for stage in checkpoint.dense:
+        arrays |= {f"{stage.name}.weight": stage.weight, f"{stage.name}.bias": stage.bias}
+    return arrays
+
+
+def join(checkpoints: Sequence[Checkpoint], names: Sequence[str]) -> Checkpoint:
+    """One network of all towers; where it is from, its training record and hash, are those of the first.
+
+    They are of one system, sensor, graph, sizes, neurons and clocks, and of one storage where they were fine-tuned;
+    joined ones give all their towers. `names` are for messages.
+
+    Raises ModelError if they disagree in any of these; all of them are listed.
+    """
+    facts = [_facts(checkpoint) for checkpoint in checkpoints]
+    others = {
+        what: [name for name, found in zip(names, facts, strict=True) if found[what] != first]
+        for what, first in facts[0].items()
+    }
+    if differing := [f"{what} ({', '.join(which)})" for what, which in others.items() if which]:
+        raise ModelError(
+            f"join: networks differ from {names[0]} in {', '.join(differing)}; give networks of one system, sensor and "
+            "timing"
+        )
+    every = [member for checkpoint in checkpoints for member in members(checkpoint)]
+    arrays = together([arrays_of(member) for member in every])
+    joined = replace(_holding(every[0], arrays), forms=None, towers=len(every))
+    return replace(joined, forms=_joined_forms(joined, every))
+
+
+def _joined_forms(joined: Checkpoint, every: Sequence[Checkpoint]) -> tuple[Form, ...] | None:
+    forms = [member.forms for member in every if member.forms is not None]
+    if not forms:
+        return None
+    thresholds = side_by_side(
+        joined, [dict(zip(joined.neurons, (form.threshold for form in one), strict=True)) for one in forms]
+    )
+    return tuple(replace(form, threshold=thresholds[name]) for name, form in zip(joined.neurons, forms[0], strict=True))
+
+
+def _facts(checkpoint: Checkpoint) -> dict[str, object]:
+    """What the networks of a joined one have in common."""
+    grid, dynamics = checkpoint.grid, checkpoint.dynamics
+    edges = np.zeros((0, 2), np.int64) if checkpoint.edges is None else checkpoint.edges
+    sizes = [len(stage.bias) // checkpoint.towers for stage in checkpoint.dense]
+    layers = range(1 + len(sizes))
+    return {
+        "system": checkpoint.system,
+        "sensor": (checkpoint.taxels, checkpoint.hops.shape[2]),
+        "grid": grid and (grid.rows, grid.columns, grid.stride, grid.padding, grid.cells.tolist()),
+        "graph": sorted(edges.tolist()),
+        "classes": checkpoint.classes,
+        "layers": (len(checkpoint.hops), checkpoint.hops.shape[1] // checkpoint.towers, *sizes),
+        "membrane decays": [dynamics.beta(layer, checkpoint.beta) for layer in layers],
+        "current decays": [dynamics.alpha(layer) for layer in layers],
+        "threshold": checkpoint.theta,
+        "clocks": dynamics.clocks,
+        "bins of a step": checkpoint.bins,
+        "storage": [(form.bits, form.exponents) for form in checkpoint.forms or ()],
+    }

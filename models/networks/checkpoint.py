@@ -15,7 +15,7 @@ from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.formats.checkpoint_reader import FORMAT, VERSION, content_digest
-from spikeloom.compiler.formats.towers import arrays_of
+from spikeloom.compiler.formats.tensors import arrays_of
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.systems import TACTILESGNET, Grid
 from spikeloom.models.graphs import Graph
@@ -43,7 +43,7 @@ def save_checkpoint(
     `weights` has the tensors of at least one of ``last``, ``best`` and ``clean``: ``conv1.hops`` (filters, features,
     channels), ``conv1.bias``, ``fc1.weight``, ``fc1.bias`` … float32. `training` are JSON values: how it was made and
     what it reached. `forms` say how the chip stores each layer, conv1 first, where the network was fine-tuned for it.
-    `towers` lie side by side in the tensors, see :mod:`formats.towers`; a step joins so many `bins` of the recordings.
+    `towers` lie side by side in the tensors, see :mod:`formats.tensors`; a step joins so many `bins` of the recordings.
     """
     tensors_of_one = next(iter(weights.values()))
     stages = sum(name.startswith("fc") and name.endswith(".weight") for name in tensors_of_one)

@@ -31,7 +31,7 @@ from spikeloom.compiler.fixedpoint import (
     round_steps,
     step_units,
 )
-from spikeloom.compiler.formats.towers import members, side_by_side
+from spikeloom.compiler.formats.tensors import members, side_by_side
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import effective_weight, stack_of
 from spikeloom.compiler.systems import in_order

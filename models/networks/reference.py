@@ -17,7 +17,7 @@ import torch
 
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import RELAY_WEIGHT
-from spikeloom.compiler.formats.towers import members, side_by_side
+from spikeloom.compiler.formats.tensors import members, side_by_side
 from spikeloom.compiler.systems import GCN, TACTILESGNET, feature_major, in_order
 from spikeloom.models.networks.layers import filter_places, lasting_current, lif, tag_convolution
 from spikeloom.models.networks.networks import relayed

@@ -36,7 +36,7 @@ from spikeloom.compiler.fixedpoint import (
     reach,
     step_units,
 )
-from spikeloom.compiler.formats.towers import arrays_of
+from spikeloom.compiler.formats.tensors import arrays_of
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.ir import Form, Network
 from spikeloom.compiler.passes.calibrate import Calibration, calibrate, evenly_spaced
@@ -55,7 +55,7 @@ BATCH = 4
 LEARNING_RATE = 1e-3
 """At the start; it falls to zero along half a cosine."""
 
-QUIET = 1e-4
+SILENT_RATE = 1e-4
 """Spike rate that an input without spikes is given, so that its weights still count."""
 
 COARSEST = 12
@@ -207,7 +207,7 @@ def initial_forms(
     for post, (population, width) in enumerate(zip(network.populations, bits, strict=True)):
         incoming = [p for p in network.projections if p.post == post]
         weight = np.concatenate([p.weight.toarray() for p in incoming], axis=1)
-        rate = np.concatenate([calibration.source(p.pre, p.post).mean(axis=(0, 1)) for p in incoming]) + QUIET
+        rate = np.concatenate([calibration.source(p.pre, p.post).mean(axis=(0, 1)) for p in incoming]) + SILENT_RATE
         step = _grouped(_nearest_steps(weight, rate, reach(width, (0,))), groups)  # model units in one step
         for exponent in sorted(exponents):
             threshold = np.rint(population.theta * step_units(width, (exponent,)) / step).astype(np.int64)

@@ -6,7 +6,6 @@ import argparse
 
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.formats.nir import CONVENTIONS
-from spikeloom.compiler.systems import SYSTEMS
 from spikeloom.models.graphs import CHOICES
 from spikeloom.models.recordings.events import BIN_S
 
@@ -70,12 +69,6 @@ def add_graph_options(parser: argparse.ArgumentParser, purpose: str) -> None:
     options.add_argument("--directed", action="store_true", help="take --edges as they are, one way")
 
 
-def add_system(parser: argparse.ArgumentParser, default: str, *more: str) -> None:
-    """Add the option that names a system: one of the usual ones, or of `more`."""
-    options = group(parser, "network")
-    options.add_argument("--system", choices=(*SYSTEMS, *more), help=f"{', '.join((*SYSTEMS, *more))} ({default})")
-
-
 def add_data(parser: argparse.ArgumentParser) -> None:
     """Add the options that name recordings, all splits of them."""
     group(parser, "recordings").add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
@@ -107,7 +100,7 @@ def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], defaul
     }
     depths = "; ".join(f"{choice}: {what[choice]}" for choice in choices)
     options.add_argument("--detail", choices=choices, default=default, help=f"{depths} (default: {default})")
-    options.add_argument("--table", metavar="NAME|FILE.toml", help="price and time by this table only, or by your own")
+    options.add_argument("--table", metavar="NAME|FILE.toml", help="energy or time by this table alone, or by your own")
     add_explain_cost(parser)
 
 
@@ -131,7 +124,6 @@ def add_model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
     options = group(parser, "network")
     if graph:
         add_graph_options(parser, "that it was trained on")
-    add_system(parser, "default: what the checkpoint is")
     options.add_argument("--run", type=int, default=0, metavar="N", help="which run of a released file (default: 0)")
     options.add_argument(
         "--weights",

@@ -210,5 +210,4 @@ def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
         weights=arguments.weights,
         beta=arguments.beta,
         theta=arguments.theta,
-        system=arguments.system,
     )

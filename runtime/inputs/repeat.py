@@ -12,7 +12,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.events import BIN_S
 
-NETWORK = ("graph", "taxels", "edges", "directed", "system", "run", "weights", "beta", "theta")
+NETWORK = ("graph", "taxels", "edges", "directed", "run", "weights", "beta", "theta")
 """Options that say how a checkpoint is read."""
 
 ROUNDING = ("weight_bits", "planes", "scale_groups", "spike_exact", "prune_unused")

@@ -254,7 +254,6 @@ class Request:
     recording: which of them.
     form: which form of the format.
     dt: seconds of a step.
-    strict: whether to write nothing that had to be rounded.
     """
 
     source: str
@@ -263,7 +262,6 @@ class Request:
     recording: int | None = None
     form: str | None = None
     dt: float | None = None
-    strict: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -324,7 +322,7 @@ def chip_module(name: str, part: str) -> Any:
     """What only some chips do in their own way: a module in the folder of a chip, or None if it has none of the name.
 
     - ``commands``: ``compile_network(arguments)`` and ``verify(arguments)`` for all networks; for checkpoints that were
-      trained for the chip, which ``takes(path)`` knows, ``inspect(arguments)`` and what a chart needs of them.
+      trained for the chip, which ``takes(path)`` knows, ``inspect(arguments)``.
     - ``compiled``: ``outcome(compilation, sha256, facts)``, what the target's ``compile`` chose, proved and removed;
       `sha256` is of the netlist's file, `facts` are what was read from a file of another format.
     - ``exports``: ``FORMATS`` of other programs that can be written.

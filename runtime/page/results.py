@@ -81,7 +81,7 @@ class Origin:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Provenance:
-    """Files and their hashes, titles of the chip's tables, versions, and what to type for all of it again."""
+    """Files and their hashes, titles of the chip's tables, versions, and what to type to get it again."""
 
     netlist: Origin
     checkpoint: Origin
@@ -181,12 +181,12 @@ def provenance(
         | {f"time, {table.name}": table.title for table in target.time},
         versions={"spikeloom": __version__, "python": platform.python_version()}
         | {name: metadata.version(name) for name in PACKAGES},
-        commands=_commands(arguments, netlist, recording),
+        commands=_commands(arguments, recording),
     )
 
 
-def _commands(arguments: argparse.Namespace, netlist: Netlist, recording: str) -> dict[str, str]:
-    """What to type, and what each is for."""
+def _commands(arguments: argparse.Namespace, recording: str) -> dict[str, str]:
+    """What to type, and what each is for; how the netlist was compiled is among its facts."""
 
     def name(given: Any) -> str:
         path = "" if given is None else str(getattr(given, "source", given))  # recordings that Python handed over
@@ -208,21 +208,4 @@ def _commands(arguments: argparse.Namespace, netlist: Netlist, recording: str) -
         "why this recording differs": ["explain", *both, "--sample", recording],
         "this page": ["report", *both, *spec, "--recording", recording, "-o", "report.html"],
     }
-    if "weight_bits" in netlist.provenance:
-        compiled = repeat.words(_compile_options(netlist.provenance, data))
-        lines = {"the netlist": ["compile", checkpoint, *model, *compiled, "-o", net]} | lines
     return {what: repeat.command(*words) for what, words in lines.items()}
-
-
-def _compile_options(made: Mapping[str, Any], data: str) -> JsonObject:
-    """Options of the compilation as far as the netlist remembers them."""
-    options: dict[str, Any] = {}
-    for name, usual in (("weight_bits", 8), ("planes", 1), ("scale_groups", 1)):
-        value = made.get(name, usual)
-        if value != usual and not made.get("fine_tuned"):
-            options[name] = ",".join(map(str, value)) if isinstance(value, list) else value
-    options |= {name: made.get(name) or None for name in ("spike_exact", "keep_all", "prune_unused")}
-    if made.get("cores_for"):
-        options["cores_for"] = ",".join(f"{layer}={count}" for layer, count in made["cores_for"].items())
-    options |= {name: made.get(name) for name in ("chips", "optimize")}
-    return options | {"calibrate": data if made.get("calibrated") else None}

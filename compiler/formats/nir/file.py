@@ -172,17 +172,12 @@ def loops(graph: Graph) -> Late:
         ring = [name for name in graph.nodes if name in members]
         neurons = [name for name in ring if graph.nodes[name].type in SPIKING]
         pairs = [(source, target) for source, target in graph.edges if {source, target} <= members]
-        if len(neurons) > 1:
-            raise ModelError(
-                f"nodes feed each other in a circle ({_circle(pairs)}) with {len(neurons)} spiking ones in it; a spike "
-                "takes the chip a step from one to the next, so it would come back late: only a layer may feed itself, "
-                "train without the rest"
-            )
         rest = [pair for pair in pairs if pair[1] not in neurons]
-        if not nx.is_directed_acyclic_graph(nx.DiGraph(rest)):
+        if len(neurons) > 1 or not nx.is_directed_acyclic_graph(nx.DiGraph(rest)):
             raise ModelError(
-                f"nodes feed each other in a circle ({_circle(rest)}) without neurons, so nothing in it takes a step; "
-                "put a spiking node into it or train without"
+                f"nodes feed each other in a circle ({_circle(rest if len(neurons) == 1 else pairs)}) with "
+                f"{len(neurons)} spiking ones in the loop; a spike takes the chip a step from one to the next: only a "
+                "layer may feed itself, through stages in a row; train without the rest"
             )
         for source, target in graph.edges:
             if target in ring and target not in neurons and source not in members:

@@ -42,6 +42,9 @@ class Port:
     kind: npt.DTypeLike
     shape: tuple[int | str, ...]
 
+    def __str__(self) -> str:
+        return f"{self.name} {np.dtype(self.kind).name} ({', '.join(map(str, self.shape))})"
+
 
 def one_each(values: npt.NDArray[Any], kind: npt.DTypeLike) -> Constant:
     """One number for each neuron, or a single number where all are the same."""
@@ -213,19 +216,3 @@ def model_bytes(model: Model, *, name: str, about: str, facts: Mapping[str, Any]
     onnx.checker.check_model(message, full_check=True)
     content: bytes = message.SerializeToString(deterministic=True)
     return content
-
-
-def port_words(content: bytes) -> tuple[list[str], list[str]]:
-    """Inputs and outputs of a model for people, such as ``events uint8 (time, batch, 78)``."""
-    onnx = _onnx()
-    graph = onnx.load_from_string(content).graph
-
-    def words(ports: Any) -> list[str]:
-        found = []
-        for port in ports:
-            kind = onnx.helper.tensor_dtype_to_np_dtype(port.type.tensor_type.elem_type)
-            sizes = [str(size.dim_param or size.dim_value) for size in port.type.tensor_type.shape.dim]
-            found.append(f"{port.name} {kind.name} ({', '.join(sizes)})")
-        return found
-
-    return words(graph.input), words(graph.output)

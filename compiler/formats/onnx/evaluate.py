@@ -199,7 +199,7 @@ def _gemm_matrix(node: Node, table: Table, operands: Sequence[Any], which: int) 
 
 def _einsum_matrix(node: Node, table: Table, operands: Sequence[Any], which: int) -> Sparse:
     spelled = str(node.attributes["equation"]).replace(" ", "").lower()
-    if "->" not in spelled or "." in spelled or len(operands) > 2:
+    if "->" not in spelled or "." in spelled or spelled.count(",") > 1:
         raise ValueError("an equation that is not known")
     inputs, out = spelled.split("->")
     labels = [*inputs.split(","), ""]

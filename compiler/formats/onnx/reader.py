@@ -110,9 +110,8 @@ def _threshold(neurons: Neurons, *, double: bool) -> float:
     """Threshold of a strict comparison: of ``u >= theta`` the next number below, in the arithmetic of the file."""
     if neurons.strict:
         return neurons.theta
-    if double:
-        return float(np.nextafter(neurons.theta, -np.inf))
-    return float(np.nextafter(np.float32(neurons.theta), np.float32(-np.inf)))
+    kind = np.float64 if double else np.float32
+    return float(np.nextafter(kind(neurons.theta), kind(-np.inf)))
 
 
 def _names(graph: Graph, table: Table, found: Unrolled) -> tuple[str, ...]:

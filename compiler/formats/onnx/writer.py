@@ -197,16 +197,16 @@ def _gathered(sources: dict[int, Weights]) -> int:
     return int(sum(sums)) << MEMBRANE_SHIFT
 
 
-def export(netlist: Netlist, form: str) -> bytes:
-    """Content of the ONNX file of a netlist in a form, see the module; equal netlists give equal bytes.
+def export(netlist: Netlist, form: str) -> tuple[bytes, list[Port], list[Port]]:
+    """Content of the ONNX file of a netlist in a form, see the module, its inputs and its outputs.
 
-    Raises ModelError if its weights as dense matrices are more than a file holds.
+    Equal netlists give equal bytes. Raises ModelError if its weights as dense matrices are more than a file holds.
     """
     layers = plan(netlist)
     model = _chip_step(netlist, layers)
     if form == "scan":
         model = whole_recordings(model, {each.name: (each.size, each.depth) for each in layers}, netlist.classes)
-    return model_bytes(
+    content = model_bytes(
         model,
         name=f"spikeloom-{form}",
         about=__doc__ or "",
@@ -227,6 +227,7 @@ def export(netlist: Netlist, form: str) -> bytes:
             ],
         },
     )
+    return content, *model[1:]
 
 
 def _input_words(netlist: Netlist) -> str:

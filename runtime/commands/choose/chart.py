@@ -59,12 +59,11 @@ def run(arguments: argparse.Namespace) -> Outcome:
     from spikeloom.runtime.studies.chart.study import chart
     from spikeloom.runtime.studies.chart.work import read_splits
 
-    stores = load_target(DEFAULT)
-    grid = Grid() if arguments.grid is None else parse_grid(arguments.grid, stores)
+    target = load_target(DEFAULT)
+    grid = Grid() if arguments.grid is None else parse_grid(arguments.grid, target)
     budgets = parse_budgets(arguments.budget)
     folder = _folder(arguments.output)
     networks = read_networks(arguments)
-    target = load_target(networks[0].target)
     tables = [table.name for table in target.energy]
     energy = tables[0] if arguments.table is None else arguments.table
     if energy not in tables:
@@ -80,7 +79,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         steps=splits["test"].steps,
     )
     require_suited(networks, splits, data.sha256)
-    require_grid(networks, grid, stores)
+    require_grid(networks, grid, target)
     folder.mkdir(exist_ok=True)
     charted = chart(
         networks,

@@ -23,9 +23,6 @@ from spikeloom.runtime.report.sections import Outcome, Section, Text
 FORMATS = {each.name: each for each in export_formats()}
 """By the value of ``--to``."""
 
-OPTIONS = ("form", "data", "split", "bin", "recording", "limit", "dt", "strict")
-"""Of single formats."""
-
 OF_RECORDINGS = ("split", "bin", "recording", "limit")
 
 
@@ -51,7 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--limit", type=int, metavar="N", help="netx: first N of them only")
     add_bin_option(parser)
     parser.add_argument("--dt", type=float, metavar="SECONDS", help=f"nir: length of a step (default: {BIN_S:g} a bin)")
-    parser.add_argument("--strict", action="store_true", help="netx: write nothing that had to be rounded")
     parser.add_argument("-o", "--output", required=True, metavar="FILE")
 
 
@@ -80,13 +76,12 @@ def _request(arguments: argparse.Namespace) -> Request:
         recording=arguments.recording,
         form=arguments.form,
         dt=arguments.dt,
-        strict=arguments.strict,
     )
 
 
 def _require_fit(arguments: argparse.Namespace) -> None:
     """Refuse options that the format would ignore."""
-    for name in OPTIONS:
+    for name in {option: None for each in FORMATS.values() for option in each.options}:
         if name not in FORMATS[arguments.to].options:
             formats = " and ".join(to for to, each in FORMATS.items() if name in each.options)
             refuse(arguments, (name,), f"is for {formats}, --to says {arguments.to}")

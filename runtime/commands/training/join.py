@@ -14,7 +14,7 @@ from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.towers import join as join_networks
+from spikeloom.compiler.formats.tensors import join as join_networks
 from spikeloom.models.networks.checkpoint import save_again
 from spikeloom.runtime.commands.main_job.inspect import LayerSize, tower_line
 from spikeloom.runtime.inputs.files import require_place, shipped

@@ -10,7 +10,7 @@ from typing import Any
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.files import write_atomically
-from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
+from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS, TACTILESGNET, TITLES, Grid
 from spikeloom.compiler.targets.native import BASES, USUAL_COPIES
 from spikeloom.compiler.targets.native import SYSTEM as NATIVE
 from spikeloom.models.graphs import CHOICES, Graph
@@ -28,7 +28,7 @@ from spikeloom.models.training.recipes import (
     check_recipe,
     decays_asked,
 )
-from spikeloom.runtime.commands.options import add_data, add_graph_options, add_system
+from spikeloom.runtime.commands.options import add_data, add_graph_options, group
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_graph, sensor_places
@@ -55,7 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--join", type=int, default=1, metavar="N", help="a step joins N bins, an event where one has any (default: 1)"
     )
     needing = ", ".join((*GRAPH_SYSTEMS, NATIVE))
-    add_system(parser, f"default: {TACTILESGNET}; {needing} need a graph", NATIVE)
+    group(parser, "network").add_argument(
+        "--system",
+        choices=(*SYSTEMS, NATIVE),
+        help=f"{', '.join((*SYSTEMS, NATIVE))} (default: {TACTILESGNET}; {needing} need a graph)",
+    )
     parser.add_argument(
         "--padding",
         choices=PADDINGS,

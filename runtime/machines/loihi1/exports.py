@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.formats.netx import writer as netx
 from spikeloom.compiler.formats.nir import CONVENTIONS
 from spikeloom.compiler.formats.nir import writer as nir
 from spikeloom.compiler.formats.onnx import writer as onnx
-from spikeloom.compiler.formats.onnx.builder import port_words
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
@@ -97,8 +95,8 @@ def _sanafe(request: Request) -> Export:
 
 def _onnx(request: Request) -> Export:
     netlist, form = read_netlist(request.source), request.form or "scan"
-    content = onnx.export(netlist, form)
-    inputs, outputs = port_words(content)
+    content, *ports = onnx.export(netlist, form)
+    inputs, outputs = ([str(port) for port in side] for side in ports)
     facts = OnnxFacts(
         neurons=netlist.n_compartments, synapses=netlist.n_synapses, form=form, inputs=inputs, outputs=outputs
     )
@@ -125,8 +123,6 @@ def _netx(request: Request) -> Export:
     blocks = netx.blocks_for(network)
     layers = [NetxLayer(rounding=block.rounding) for block in blocks]
     rounded = [line for block in blocks if (line := str(block.rounding))]
-    if request.strict and rounded:
-        raise OptionError(f"--strict: netx cannot hold {request.source} as it is ({'; '.join(rounded)})")
     lines = rounded or ["biases, thresholds and weights are the netlist's"]
     count = None
     if request.recordings is not None:
@@ -166,6 +162,6 @@ FORMATS = (
         name="netx",
         title="a netlist as a .net file of lava-dl, biases rounded to whole weight steps",
         write=_netx,
-        options=("data", "split", "bin", "limit", "strict"),
+        options=("data", "split", "bin", "limit"),
     ),
 )

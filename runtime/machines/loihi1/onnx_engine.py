@@ -45,7 +45,9 @@ def open_session(model: bytes) -> Any:
 
 def prepare(netlist: Netlist) -> OnnxEngine:
     """Export a netlist and load the file's content; ModelError if a file cannot hold the network."""
-    return OnnxEngine(netlist=netlist, layers=plan(netlist), session=open_session(onnx_writer.export(netlist, "scan")))
+    return OnnxEngine(
+        netlist=netlist, layers=plan(netlist), session=open_session(onnx_writer.export(netlist, "scan")[0])
+    )
 
 
 def simulate(

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from operator import add
 from pathlib import Path
 from typing import Any
@@ -21,18 +20,17 @@ from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.truenorth.codebook import PartialSums, in_levels, run_levels
 from spikeloom.compiler.targets.truenorth.in_time import first_spikes
-from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork, highest_level
+from spikeloom.compiler.targets.truenorth.native import NativeNetwork
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Compilation, Options
 from spikeloom.compiler.text import text
-from spikeloom.compiler.types import BoolArray, IntArray, JsonObject
-from spikeloom.models.recordings.evtouch import Recordings, steps_of
+from spikeloom.compiler.types import BoolArray, JsonObject
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
-from spikeloom.runtime.machines.truenorth.cost import TICK
 from spikeloom.runtime.machines.truenorth.describe import describe, describe_trained
 from spikeloom.runtime.machines.truenorth.machine import load, machine_of
 from spikeloom.runtime.machines.votes import class_counts
@@ -57,7 +55,7 @@ def takes(path: str) -> bool:
 
 def read(path: str, arguments: argparse.Namespace) -> Trained:
     """Read a trained network as the options say; OptionError or ModelError if it is not as they say."""
-    others = [name for name in NETWORK if name != "weights" and getattr(arguments, name, None) != SYSTEM]
+    others = [name for name in NETWORK if name != "weights"]
     refuse(arguments, others, f"{path} is a network for {TITLE} and says that itself")
     return read_trained(shipped(path), weights=arguments.weights)
 
@@ -288,55 +286,3 @@ def _verify_in_time(arguments: argparse.Namespace, netlist: CrossbarNetlist, chi
     samples = arguments.spec_samples
     verdict = compare(netlist, spikes, first_spikes(levels), data, spec_samples=samples, spec_steps=SPEC_STEPS)
     return replace(verdict, sums=sums)
-
-
-# -- what a chart asks of networks that were trained for the chip ------------------------------------------------------
-
-
-def times(chip: Target) -> dict[str, str]:
-    """What is known of the chip's time, by name."""
-    return {TICK: f"{chip.title}: every tick takes {chip.limit('tick.length')} µs, whatever happens in it"}
-
-
-@lru_cache(maxsize=2)
-def trained(path: str, weights: str | None) -> Trained:
-    """The network of a file."""
-    return read_trained(shipped(path), weights=weights)
-
-
-def facts(path: str, weights: str | None) -> JsonObject:
-    """What a chart says of a network: it knows everything but its weights itself."""
-    found = trained(path, weights)
-    network = found.network
-    return {
-        "target": "truenorth",
-        "graph": found.graph,
-        "sha256": found.sha256,
-        "weights": found.weights,
-        "system": SYSTEM,
-        "taxels": network.taxels,
-        "classes": network.classes,
-        "layers": tuple(stage.name for stage in network.stages),
-        "training": found.training,
-        "levels": 2 * highest_level(network.copies) + 1,
-    }
-
-
-def votes(path: str, weights: str | None, data: Recordings, windows: Sequence[int]) -> dict[int, IntArray]:
-    """Votes of the model, in torch, when parts of each recording have passed, by window in per cent."""
-    from spikeloom.models.truenorth.network import votes_by_step  # torch, so only here
-
-    network, counts = trained(path, weights).network, {window: list[IntArray]() for window in windows}
-    for index in range(len(data)):
-        steps = data.steps_of(index)
-        added = votes_by_step(network, data.events[index : index + 1, ..., :steps]).cumsum(axis=0)
-        for window in windows:
-            counts[window].append(added[int(steps_of(np.array([steps]), window)[0]) - 1])
-    return {window: np.stack(each) for window, each in counts.items()}
-
-
-def build(path: str, weights: str | None, file: Path) -> tuple[CrossbarNetlist, int, str]:
-    """Place a network and write it; the netlist, its neurons, the hash of its file; or CapacityError."""
-    found, chip = trained(path, weights), load_target("truenorth")
-    netlist: CrossbarNetlist = chip.compile(found.network, Options(provenance=provenance(found))).netlist
-    return netlist, netlist.n_neurons, write_crossbars(netlist, file)

@@ -29,7 +29,7 @@ from spikeloom.runtime.studies.chart.grid import Grid
 class Storage:
     """How a network is stored on the chip: width of all layers or of each, planes, scale groups, pruning.
 
-    It is a network's own if it was fine-tuned for it or trained in it; weights that have no width have `levels`.
+    It is a network's own if it was fine-tuned for it.
     """
 
     bits: tuple[int, ...]
@@ -37,7 +37,6 @@ class Storage:
     groups: int
     prune: bool
     own: bool = False
-    levels: int | None = None
 
     def options(self) -> JsonObject:
         """Options of ``compile`` that ask for it, where it is not the usual one."""
@@ -51,9 +50,7 @@ class Storage:
         }
 
     def label(self) -> str:
-        """Short name: ``4b``, ``8-4-4-8b 2p 3g pruned``, ``7 levels``."""
-        if self.levels is not None:
-            return f"{self.levels} levels"
+        """Short name: ``4b``, ``8-4-4-8b 2p 3g pruned``."""
         parts = [f"{'-'.join(map(str, self.bits))}b"]
         parts += [] if self.planes == 1 else [f"{self.planes}p"]
         parts += [] if self.groups == 1 else [f"{self.groups}g"]
@@ -68,7 +65,7 @@ class NetworkFile:
 
     path: str
     name: str  # Short, and no other network of the chart has it
-    target: str  # Chip that it is compiled for
+    target: str = DEFAULT  # Chip that it is compiled for
     graph: str  # That it was trained on; ``none`` of systems without
     # sha256, weights, system: Of the file, and what of it is taken
     sha256: str
@@ -84,8 +81,6 @@ class NetworkFile:
     training: Mapping[str, Any] = field(metadata=HIDDEN, compare=False)
     # Storage that it was fine-tuned for
     forms: tuple[Form, ...] | None = field(default=None, metadata=HIDDEN, compare=False)
-    # Levels of its weights, of a network that was trained in whole numbers for its chip
-    levels: int | None = field(default=None, metadata=HIDDEN)
 
     @property
     def fine_tuned(self) -> bool:
@@ -117,10 +112,8 @@ class NetworkFile:
         return argparse.Namespace(**others, **dict(self.options))
 
     def storages(self, grid: Grid) -> Iterator[Storage]:
-        """Every storage that a grid asks for; of a network that was trained in one its own and no other."""
-        if self.levels is not None:
-            yield Storage(bits=(), planes=1, groups=1, prune=False, own=True, levels=self.levels)
-        elif self.forms is not None:
+        """Every storage that a grid asks for; of a network that was fine-tuned for one its own and no other."""
+        if self.forms is not None:
             bits = tuple(form.bits for form in self.forms)
             yield Storage(
                 bits=bits[:1] if len(set(bits)) == 1 else bits,
@@ -132,10 +125,6 @@ class NetworkFile:
         else:
             for bits, planes, groups, prune in product(grid.bits, grid.planes, grid.groups, grid.prune):
                 yield Storage(bits=bits, planes=planes, groups=groups, prune=bool(prune))
-
-    def layouts(self, grid: Grid) -> tuple[str, ...]:
-        """Layouts that a grid asks for; of a network with its own storage the usual one."""
-        return grid.cores if self.levels is None else Grid().cores
 
 
 def read_networks(arguments: argparse.Namespace) -> tuple[NetworkFile, ...]:
@@ -156,13 +145,8 @@ def _read(path: str, arguments: argparse.Namespace) -> NetworkFile:
     if path.endswith(SUFFIX):
         raise ModelError(f"{path}: is an ONNX file, a chart takes checkpoints; give the checkpoint that it was made of")
     file = shipped(path)
-    chart = trained_for(file) if Path(file).is_file() else None
     name = Path(path.removeprefix(PRETRAINED)).stem
-    if chart is not None:
-        known = chart.facts(path, arguments.weights)
-        options = (("weights", arguments.weights), ("target", known["target"]))
-        return NetworkFile(path=path, name=name, options=options, **known)
-    if Path(file).is_file() and is_netlist(file):
+    if Path(file).is_file() and is_netlist(file) and trained_for(file) is None:
         raise ModelError(f"{path}: is a netlist, a chart compiles its own; give the checkpoint that it was made from")
     checkpoint = load_checkpoint(path, arguments)
     typed = repeat.given(arguments, repeat.NETWORK)
@@ -175,7 +159,6 @@ def _read(path: str, arguments: argparse.Namespace) -> NetworkFile:
     return NetworkFile(
         path=path,
         name=name,
-        target=DEFAULT,
         graph=graph,
         sha256=checkpoint.sha256,
         weights=checkpoint.weights,
@@ -195,11 +178,6 @@ def require_suited(networks: Sequence[NetworkFile], splits: Mapping[str, Recordi
     """Refuse networks that do not belong together, or were trained on other recordings than these of this hash."""
     first = networks[0]
     for network in networks:
-        if network.target != first.target:
-            raise ModelError(
-                f"{network.path}: is for {network.target}, {first.path} for {first.target}; prices of two chips hold "
-                "different things: make a chart of each"
-            )
         sizes = [(each.taxels, each.classes) for each in (first, network)]
         if sizes[0] != sizes[1]:
             raise ModelError(
@@ -216,8 +194,6 @@ def require_suited(networks: Sequence[NetworkFile], splits: Mapping[str, Recordi
 def require_grid(networks: Sequence[NetworkFile], grid: Grid, target: Target) -> None:
     """Refuse widths and layouts by layer that do not suit a network's layers."""
     for network in networks:
-        if network.levels is not None:
-            continue
         path, layers = network.path, network.layers
         for bits in grid.bits if network.forms is None else ():
             if len(bits) not in (1, len(layers)):

@@ -9,7 +9,6 @@ from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.types import JsonObject
-from spikeloom.runtime.machines.base import chip_module
 from spikeloom.runtime.report.encode import decode
 from spikeloom.runtime.studies.chart import choices, work
 from spikeloom.runtime.studies.chart.choices import Budget
@@ -40,7 +39,7 @@ def chart(
     """
     windows = tuple(sorted(grid.window))
     works = [
-        work.measurement(network, storage, network.layouts(grid), windows, data, target, folder)
+        work.measurement(network, storage, grid.cores, windows, data, target, folder)
         for network in networks
         for storage in network.storages(grid)
     ]
@@ -72,8 +71,7 @@ def chart(
         raise OptionError(
             f"--grid: {target.name} refuses all {len(refused)} configurations; the first: {refused[0].why[0]}"
         )
-    own = chip_module(target.name, "commands")
-    times = {table.name: table.title for table in target.time} if own is None else own.times(target)
+    times = {table.name: table.title for table in target.time}
     by = ChosenBy(energy=energy, time=next(iter(times), None))
     models = {each.network.name: result.model for each, result in measured}
     charted = [ChartedNetwork(file=network, model=models[network.name]) for network in networks]

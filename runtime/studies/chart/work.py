@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import Options, __version__, lay_out_again, to_integers, write_netlist
+from spikeloom.compiler import Netlist, Options, __version__, lay_out_again, to_integers, write_netlist
 from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
@@ -27,7 +27,7 @@ from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
-from spikeloom.runtime.machines.base import DEFAULT, Machine, Price, chip_module, machine_of
+from spikeloom.runtime.machines.base import DEFAULT, Machine, Price, machine_of
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
 from spikeloom.runtime.studies.chart.results import FORMAT, SPLITS, Data, Figures, Share, share
@@ -115,7 +115,7 @@ def commands(work: Measurement, layout: str, window: int) -> tuple[str, str]:
     network, storage, data = work.network, work.storage, work.data
     parts = [network.name, *storage.label().split(), *([] if layout == "cores" else [layout])]
     file = "-".join(parts).replace(":", "").replace("+", "-") + ".loom"
-    calibrated = {} if storage.levels is not None else {"calibrate": data.path, "bin": data.bin_s}
+    calibrated = {"calibrate": data.path, "bin": data.bin_s}
     stored = repeat.words(dict(network.options) | storage.options() | calibrated | layout_options(layout))
     part = None if window == WHOLE else f"{window}%"
     read = repeat.words({"data": data.path, "bin": data.bin_s, "detail": "counts", "window": part})
@@ -149,31 +149,23 @@ def _loaded(network: NetworkFile) -> LoadedNetwork:
 @lru_cache(maxsize=8)
 def _decided(network: NetworkFile, data: Data, windows: tuple[int, ...]) -> dict[int, dict[str, IntArray]]:
     """Decisions of the float32 model by window and split; one run each, since what comes later changes nothing."""
-    chart, decided = chip_module(network.target, "commands"), {window: dict[str, IntArray]() for window in windows}
+    loaded, decided = _loaded(network), {window: dict[str, IntArray]() for window in windows}
     for split, part in _in_steps(data, network).items():
-        if chart is not None:
-            at = chart.votes(network.path, dict(network.options)["weights"], part, windows)
-        else:
-            loaded = _loaded(network)
-            votes = votes_so_far(loaded.network.readout, network.classes, loaded.model, part)
-            at = {window: votes[np.arange(len(part)), steps_of(part.step_counts, window) - 1] for window in windows}
-        for window, counts in at.items():
-            decided[window][split] = vote(counts)
+        votes = votes_so_far(loaded.network.readout, network.classes, loaded.model, part)
+        for window in windows:
+            decided[window][split] = vote(votes[np.arange(len(part)), steps_of(part.step_counts, window) - 1])
     return decided
 
 
 # -- the work ----------------------------------------------------------------------------------------------------------
-
-Written = tuple[Any, int, str]
-"""A netlist, how many neurons it holds, and the hash of its file."""
 
 
 def measure(work: Measurement) -> JsonObject:
     """Do one piece of a chart's work; the JSON of a :class:`Measured`."""
     splits, decided = _in_steps(work.data, work.network), _decided(work.network, work.data, work.windows)
     try:
-        write = _rounded(work)
-        built = {layout: _built(work, write, layout) for layout in work.files}
+        place = _rounded(work)
+        built = {layout: _built(work, place, layout) for layout in work.files}
     except (CapacityError, ModelError) as error:
         built = dict.fromkeys(work.files, _refused(error))
     model = {
@@ -192,14 +184,15 @@ def _refused(error: CapacityError | ModelError) -> Built:
     return Built(refused=tuple(str(error).splitlines()))
 
 
-def _built(work: Measurement, write: Callable[[str, Path], Written], layout: str) -> Built:
+def _built(work: Measurement, place: Callable[[str], Netlist], layout: str) -> Built:
     """Write the netlist of a layout and measure it."""
-    file = work.files[layout]
-    file.parent.mkdir(parents=True, exist_ok=True)
     try:
-        netlist, neurons, sha256 = write(layout, file)
+        netlist = place(layout)
     except CapacityError as error:
         return _refused(error)
+    file = work.files[layout]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    sha256 = write_netlist(netlist, file)
     machine, splits = machine_of(netlist), _in_steps(work.data, work.network)
     figures = {
         window: {
@@ -208,38 +201,40 @@ def _built(work: Measurement, write: Callable[[str, Path], Written], layout: str
         }
         for window, each in _decided(work.network, work.data, work.windows).items()
     }
-    return Built(sha256=sha256, cores=netlist.n_cores, neurons=neurons, synapses=netlist.n_synapses, figures=figures)
+    return Built(
+        sha256=sha256,
+        cores=netlist.n_cores,
+        neurons=netlist.n_compartments,
+        synapses=netlist.n_synapses,
+        figures=figures,
+    )
 
 
-def _rounded(work: Measurement) -> Callable[[str, Path], Written]:
-    """Round a network; what writes it in a layout, or raises CapacityError."""
-    network, chart = work.network, chip_module(work.network.target, "commands")
-    if chart is not None:
-        return lambda _layout, file: chart.build(network.path, dict(network.options)["weights"], file)
-    loaded, options = _loaded(network), {layout: _compile_options(work, layout) for layout in work.files}
+def _rounded(work: Measurement) -> Callable[[str], Netlist]:
+    """Round a network; what places it in a layout, or raises CapacityError."""
+    loaded, options = _loaded(work.network), {layout: _compile_options(work, layout) for layout in work.files}
     some = next(iter(options.values()))
     stored = to_integers(
         loaded.model,
         Options(
-            forms=network.forms,
+            forms=work.network.forms,
             packings=parse_packings(some),
             prune_unused=some.prune_unused,
-            training_events=_in_steps(work.data, network)["train"].events,
+            training_events=_in_steps(work.data, work.network)["train"].events,
         ),
         load_target(some.target),
     )
 
-    def write(layout: str, file: Path) -> Written:
+    def place(layout: str) -> Netlist:
         each = options[layout]
         placing = Options(
             cores_for=parse_cores(each.cores_for),
             optimize=each.optimize,
             provenance=provenance(each, loaded, calibrated=True),
         )
-        netlist = lay_out_again(stored, placing).netlist
-        return netlist, netlist.n_compartments, write_netlist(netlist, file)
+        return lay_out_again(stored, placing).netlist
 
-    return write
+    return place
 
 
 def _compile_options(work: Measurement, layout: str) -> argparse.Namespace:

@@ -12,16 +12,15 @@ import numpy as np
 from spikeloom.compiler import Netlist, read_netlist
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import join_bins
-from spikeloom.models.sensors import read_layout, sensor_graph
+from spikeloom.models.sensors import read_layout
 from spikeloom.runtime.equivalence.reference import require_match
-from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_graph, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.studies.stress import damages, disturbances
-from spikeloom.runtime.studies.stress.pair import Events, Inputs, Pair, Perturbation, Sensor, perturbation
+from spikeloom.runtime.studies.stress.pair import Events, Inputs, Pair, Perturbation, perturbation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -29,7 +28,8 @@ class Bench:
     """What is stressed, and on what."""
 
     pair: Pair  # As compiled
-    sensor: Sensor
+    # Between taxels, (taxels, taxels) float64; in millimetres, or in steps on the graph where positions are not known
+    distance: FloatArray
     # (recordings, taxels, polarities, T) uint8; in the bins of the recordings, which are disturbed before a network
     # joins them
     events: Events
@@ -107,15 +107,12 @@ def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, loaded.model)
     data = load_recordings(arguments, netlist, labels_for="stress", joined=False)
-    places, edges = _places(arguments, netlist.taxels), _edges(arguments, loaded.checkpoint)
     digest = hashlib.sha256()
     for array in data.identity().values():
         digest.update(np.ascontiguousarray(array).tobytes())
     bench = Bench(
         pair=Pair(netlist=netlist, network=loaded.network),
-        sensor=Sensor(
-            distance=distances(netlist.taxels, places, edges), places=places, edges=edges, checkpoint=loaded.checkpoint
-        ),
+        distance=_distances(arguments, loaded.checkpoint, netlist.taxels),
         events=data.events,
         labels=data.labels,
         files=data.files,
@@ -124,23 +121,16 @@ def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
     return bench, loaded, digest.hexdigest()
 
 
-def _places(arguments: argparse.Namespace, taxels: int) -> FloatArray | None:
-    """Positions of the taxels, where they are known."""
+def _distances(arguments: argparse.Namespace, checkpoint: Checkpoint | None, taxels: int) -> FloatArray:
+    """Distances between taxels, as far as anything is known of their places."""
     if arguments.taxels is not None:
-        return read_layout(arguments.taxels)[1]
-    return NEUTOUCH if taxels == len(NEUTOUCH) and not arguments.edges else None
-
-
-def _edges(arguments: argparse.Namespace, checkpoint: Checkpoint | None) -> IntArray | None:
-    """Edges of the taxel graph, where there is one."""
-    if checkpoint is None or checkpoint.system not in GRAPH_SYSTEMS:
-        return None
-    if checkpoint.edges is not None:
-        return checkpoint.edges
-    graph, _ = sensor_graph(
-        graph=arguments.graph, taxels=arguments.taxels, edges=arguments.edges, directed=arguments.directed
-    )
-    return graph.edges
+        return distances(taxels, read_layout(arguments.taxels)[1], None)
+    if taxels == len(NEUTOUCH) and not arguments.edges:
+        return distances(taxels, NEUTOUCH, None)
+    graph = None if checkpoint is None else checkpoint.edges
+    if graph is None and checkpoint is not None and (given := load_graph(arguments, checkpoint.system)) is not None:
+        graph = given.edges
+    return distances(taxels, None, graph)
 
 
 def distances(taxels: int, places: FloatArray | None, edges: IntArray | None) -> FloatArray:

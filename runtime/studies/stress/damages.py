@@ -2,9 +2,7 @@
 
 A damage takes a :class:`Pair` and hands back another. What is stored in integers is changed there; the float weight
 moves by as much in its own units, which is the same relative change up to rounding. Compartments alone are damaged: a
-neuron that the chip does not hold stays as it is in the float network. Another float network is stored on the scales
-that the netlist has, since compiling anew would choose others: a netlist to simulate, not one to load, as its cores may
-need more than there is.
+neuron that the chip does not hold stays as it is in the float network.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from spikeloom.compiler import Netlist, store_alike
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.fixedpoint import (
     DECAY_BITS,
     THRESHOLD_MANTISSA_MAX,
@@ -27,12 +25,8 @@ from spikeloom.compiler.fixedpoint import (
     weight_step,
 )
 from spikeloom.compiler.ir import INPUT, Network, Population, Projection
-from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.systems import GRAPH_SYSTEMS, TITLES
 from spikeloom.compiler.types import FloatArray, IntArray
-from spikeloom.models.graphs import build_graph
-from spikeloom.models.systems import propagation_of
-from spikeloom.runtime.studies.stress.pair import Pair, Sensor, perturbation
+from spikeloom.runtime.studies.stress.pair import Pair, perturbation
 
 Mask = npt.NDArray[np.bool_]
 
@@ -233,91 +227,10 @@ def _rows_scaled(network: Network, factors: list[FloatArray]) -> Network:
     return replace(network, projections=tuple(scaled(projection) for projection in network.projections))
 
 
-# -- taxel graphs ------------------------------------------------------------------------------------------------------
-
-
-def stored_alike(pair: Pair, network: Network, *, coarser: int = 1) -> Pair:
-    """Another float network of the same sizes beside a netlist that stores it as :func:`store_alike` says."""
-    return Pair(netlist=store_alike(pair.netlist, network, coarser=coarser), network=network)
-
-
-def no_graph(_pair: Pair, sensor: Sensor) -> str | None:
-    """Why there are no edges."""
-    if sensor.checkpoint is None:
-        return "a network from an ONNX or NIR file has no taxel graph that is known"
-    system = sensor.checkpoint.system
-    return None if system in GRAPH_SYSTEMS else f"{TITLES[system]} has no taxel graph"
-
-
-def no_places(pair: Pair, sensor: Sensor) -> str | None:
-    """Why there is no other graph."""
-    unknown = "positions of the taxels are not known, no graph can be built on them"
-    return no_graph(pair, sensor) or (unknown if sensor.places is None else None)
-
-
-def _on_graph(pair: Pair, sensor: Sensor, edges: IntArray) -> Pair:
-    checkpoint = sensor.checkpoint
-    assert checkpoint is not None, "no obstacle"
-    seen = propagation_of(checkpoint.system, edges, checkpoint.taxels, checkpoint.grid, len(checkpoint.hops))
-    return stored_alike(pair, expand(checkpoint, seen))
-
-
-@perturbation("graph", ("knn:1", "knn:4", "mst:0"), unless=no_places)
-def other_graph(pair: Pair, name: str, sensor: Sensor) -> Pair:
-    """Another taxel graph than the one of the training."""
-    assert sensor.places is not None, "no obstacle"
-    return _on_graph(pair, sensor, build_graph(name, sensor.places).edges)
-
-
-@perturbation("share of edges", (0.05, 0.1, 0.25, 0.5), unless=no_graph)
-def edges_rewired(pair: Pair, share: float, sensor: Sensor, rng: np.random.Generator) -> Pair:
-    """Edges of the taxel graph lead elsewhere."""
-    assert sensor.edges is not None, "no obstacle"
-    return _on_graph(pair, sensor, rewire(sensor.edges, sensor.taxels, share, rng))
-
-
-@perturbation("share of edges", (0.1, 0.25, 0.5, 1), unless=no_graph)
-def edges_doubled(pair: Pair, share: float, sensor: Sensor, rng: np.random.Generator) -> Pair:
-    """Edges of the taxel graph are listed twice."""
-    assert sensor.edges is not None, "no obstacle"
-    return _on_graph(pair, sensor, double(sensor.edges, share, rng))
-
-
-def _links(edges: IntArray) -> tuple[IntArray, bool]:
-    """Edges to choose from: pairs where each edge has its way back, else single ones; repeats once, no loops."""
-    single = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0)
-    both = len(np.unique(np.concatenate([single, single[:, ::-1]]), axis=0)) == len(single)
-    return (single[single[:, 0] < single[:, 1]], True) if both else (single, False)
-
-
-def _there_and_back(links: IntArray, both: bool) -> IntArray:
-    return np.concatenate([links, links[:, ::-1]]) if both else links
-
-
-def rewire(edges: IntArray, taxels: int, share: float, rng: np.random.Generator) -> IntArray:
-    """Replace a share of the edges by others that the graph does not have; (edges, 2) int64."""
-    links, both = _links(edges)
-    known = set(map(tuple, links.tolist()))
-    free = [
-        (a, b) for a in range(taxels) for b in range(a + 1 if both else 0, taxels) if a != b and (a, b) not in known
-    ]
-    count = min(round(share * len(links)), len(free))
-    kept = links[np.sort(rng.permutation(len(links))[count:])]
-    others = np.array(free, np.int64).reshape(-1, 2)[rng.permutation(len(free))[:count]]
-    return _there_and_back(np.concatenate([kept, others]), both)
-
-
-def double(edges: IntArray, share: float, rng: np.random.Generator) -> IntArray:
-    """List a share of the edges twice, as the released kNN graphs do; (edges, 2) int64."""
-    links, both = _links(edges)
-    again = links[rng.permutation(len(links))[: round(share * len(links))]]
-    return np.concatenate([edges, _there_and_back(again, both)])
-
-
 # -- storage and decay -------------------------------------------------------------------------------------------------
 
 
-def several_planes(pair: Pair, _sensor: Sensor) -> str | None:
+def several_planes(pair: Pair) -> str | None:
     """Why a stored weight has no bits of its own."""
     netlist = pair.netlist
     exponent = netlist.format_exponent[netlist.axon_format[netlist.axon_of_synapse()]]
@@ -333,22 +246,6 @@ def fewer_bits(pair: Pair, width: int) -> Pair:
     most = (np.int64(1) << (np.minimum(bits, width) - 1)) - 1
     kept = np.clip(round_half_even(code / factor), -most, most) * factor
     return with_weights(pair, kept * weight_steps(bits))
-
-
-@perturbation("times the largest", (2, 4, 8, 16), least=1, most=64)
-def outlier_weight(pair: Pair, factor: int, rng: np.random.Generator) -> Pair:
-    """One weight a layer grows beyond the largest and takes the scale with it.
-
-    The float network has that one weight more; on the chip all others are stored on a grid that is as much coarser.
-    """
-    projections = list[Projection]()
-    for projection in pair.network.projections:
-        weight = projection.weight.copy()
-        if weight.nnz:
-            place = int(rng.integers(weight.nnz))
-            weight.data[place] = np.copysign(factor * np.abs(weight.data).max(), weight.data[place])
-        projections.append(replace(projection, weight=weight))
-    return stored_alike(pair, replace(pair.network, projections=tuple(projections)), coarser=factor)
 
 
 @perturbation("times the decay", (0.75, 0.5, 0.25, 0))

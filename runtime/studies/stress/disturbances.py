@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from spikeloom.compiler.types import FloatArray, IntArray
-from spikeloom.runtime.studies.stress.pair import TAXELS, Events, Pair, Sensor, perturbation
+from spikeloom.runtime.studies.stress.pair import TAXELS, Events, Pair, perturbation
 
 COUNTS = (1, 3, 5, 10, 20)
 STEPS = (2, 5, 10, 25, 50)
@@ -24,9 +24,9 @@ DENSITY = "share of entries with an event"
 # -- taxels ------------------------------------------------------------------------------------------------------------
 
 
-def chosen(taxels: int, count: int, rng: np.random.Generator) -> IntArray:
+def chosen(events: Events, count: int, rng: np.random.Generator) -> IntArray:
     """Some taxels at random; (count,) int64."""
-    picked: IntArray = rng.permutation(taxels)[:count]
+    picked: IntArray = rng.permutation(events.shape[1])[:count]
     return picked
 
 
@@ -41,27 +41,27 @@ def neighbours(distance: FloatArray, count: int, rng: np.random.Generator) -> In
 
 
 @perturbation(TAXELS, COUNTS, most=np.inf)
-def taxels_dead(events: Events, count: int, sensor: Sensor, rng: np.random.Generator) -> Events:
+def taxels_dead(events: Events, count: int, rng: np.random.Generator) -> Events:
     """Random taxels send nothing."""
-    return held(events, chosen(sensor.taxels, count, rng), 0)
+    return held(events, chosen(events, count, rng), 0)
 
 
 @perturbation(TAXELS, COUNTS, most=np.inf)
-def taxels_dead_adjacent(events: Events, count: int, sensor: Sensor, rng: np.random.Generator) -> Events:
+def taxels_dead_adjacent(events: Events, count: int, distance: FloatArray, rng: np.random.Generator) -> Events:
     """A taxel and its nearest ones send nothing."""
-    return held(events, neighbours(sensor.distance, count, rng), 0)
+    return held(events, neighbours(distance, count, rng), 0)
 
 
 @perturbation(TAXELS, COUNTS, most=np.inf)
-def taxels_stuck(events: Events, count: int, sensor: Sensor, rng: np.random.Generator) -> Events:
+def taxels_stuck(events: Events, count: int, rng: np.random.Generator) -> Events:
     """Random taxels send both polarities in every step."""
-    return held(events, chosen(sensor.taxels, count, rng), 1)
+    return held(events, chosen(events, count, rng), 1)
 
 
 @perturbation(TAXELS, COUNTS, most=np.inf)
-def taxels_stuck_adjacent(events: Events, count: int, sensor: Sensor, rng: np.random.Generator) -> Events:
+def taxels_stuck_adjacent(events: Events, count: int, distance: FloatArray, rng: np.random.Generator) -> Events:
     """A taxel and its nearest ones send both polarities in every step."""
-    return held(events, neighbours(sensor.distance, count, rng), 1)
+    return held(events, neighbours(distance, count, rng), 1)
 
 
 def held(events: Events, taxels: IntArray, value: int) -> Events:
@@ -143,16 +143,16 @@ def play(events: Events, speed: float) -> Events:
     return changed
 
 
-def not_two_polarities(pair: Pair, _sensor: Sensor) -> str | None:
+def not_two_polarities(pair: Pair) -> str | None:
     """Why there is nothing to exchange."""
     count = pair.netlist.polarities
     return None if count == 2 else f"the sensor has {count} polarities"
 
 
 @perturbation("share of taxels", (0.1, 0.25, 0.5, 1), unless=not_two_polarities)
-def polarity_swapped(events: Events, share: float, sensor: Sensor, rng: np.random.Generator) -> Events:
+def polarity_swapped(events: Events, share: float, rng: np.random.Generator) -> Events:
     """Random taxels exchange rise and fall."""
-    return swap_polarity(events, chosen(sensor.taxels, round(share * sensor.taxels), rng))
+    return swap_polarity(events, chosen(events, round(share * events.shape[1]), rng))
 
 
 def swap_polarity(events: Events, taxels: IntArray) -> Events:

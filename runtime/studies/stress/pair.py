@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
@@ -16,12 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler import Netlist
-from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import NumericRangeError, OptionError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.models.graphs import build_graph
 from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_of
 
@@ -151,37 +149,21 @@ def _counts(inputs: Inputs, steps: int, lag: int) -> BoolArray:
 
 Events = npt.NDArray[np.uint8]
 
-Level = int | float | str
+Level = int | float
 
 TAXELS = "taxels"
 """Unit of levels of which a sensor has only so many."""
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Sensor:
-    """What perturbations must know beside the network."""
-
-    # (taxels, taxels) float64; in millimetres, or in steps on the graph where positions are not known
-    distance: FloatArray
-    places: FloatArray | None  # (taxels, dimensions) float64, or None; positions in millimetres
-    edges: IntArray | None  # (edges, 2) int64, or None; graph that the network was trained on
-    checkpoint: Checkpoint | None  # What the network was made from; None for an ONNX or NIR file
-
-    @property
-    def taxels(self) -> int:
-        """Number of taxels."""
-        return len(self.distance)
+Obstacle = Callable[[Pair], str | None]
 
 
-Obstacle = Callable[[Pair, Sensor], str | None]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Perturbation:
     """One kind of trouble, its levels from mild to harsh, and which others make sense.
 
     Its function takes what it is done to, first: `events`, a `pair`, or a `bench` of which recordings follow each other
-    in another way; then the level; then `sensor` and `rng`, a source of chance, if it needs them.
+    in another way; then the level; then, if it needs them, `distance` between taxels, (taxels, taxels), and `rng`, a
+    source of chance.
     """
 
     act: Callable[..., Any]
@@ -220,19 +202,17 @@ class Perturbation:
         """The function itself."""
         return self.act(*arguments)
 
-    def done(self, to: Any, level: Any, sensor: Sensor, rng: np.random.Generator) -> Any:
+    def done(self, to: Any, level: Any, distance: FloatArray, rng: np.random.Generator) -> Any:
         """What becomes of events, a pair or a bench."""
-        known = {"sensor": sensor, "rng": rng}
+        known = {"distance": distance, "rng": rng}
         return self.act(to, level, *(known[name] for name in self._takes[2:]))
 
-    def why_not(self, pair: Pair, sensor: Sensor) -> str | None:
+    def why_not(self, pair: Pair) -> str | None:
         """Why it makes no sense for a network, or None where it does."""
-        return None if self.obstacle is None else self.obstacle(pair, sensor)
+        return None if self.obstacle is None else self.obstacle(pair)
 
     def level_of(self, words: str) -> Level:
         """Read a level; refused if it is none that makes sense."""
-        if isinstance(self.levels[0], str):
-            return build_graph(words).name
         try:
             level = float(words)
         except ValueError:
@@ -247,15 +227,12 @@ class Perturbation:
     def levels_of(self, taxels: int, *, full: bool, also: Sequence[Level] = ()) -> tuple[Level, ...]:
         """Levels to measure on a sensor of so many taxels, further ones among them; with `full` those between, too."""
         levels = list(self.levels)
-        if full and not isinstance(levels[0], str):
-            between = [float(f"{(float(a) + float(b)) / 2:.2g}") for a, b in pairwise(levels)]
+        if full:
+            between = [float(f"{(a + b) / 2:.2g}") for a, b in pairwise(levels)]
             levels += [int(level) for level in between] if isinstance(levels[0], int) else between
         if self.unit == TAXELS:
-            levels = [level for level in levels if float(level) <= taxels]
-        every = list(dict.fromkeys([*levels, *also]))
-        if isinstance(levels[0], str):
-            return tuple(every)
-        return tuple(sorted(every, key=float, reverse=float(self.levels[0]) > float(self.levels[-1])))
+            levels = [level for level in levels if level <= taxels]
+        return tuple(sorted({*levels, *also}, reverse=self.levels[0] > self.levels[-1]))
 
 
 def perturbation(
@@ -265,8 +242,4 @@ def perturbation(
 
     Levels are counted in `unit` and lie between `least` and `most`; `unless` says why it makes no sense for a network.
     """
-
-    def made(act: Callable[..., Any]) -> Perturbation:
-        return Perturbation(act=act, unit=unit, levels=levels, least=least, most=most, obstacle=unless)
-
-    return made
+    return partial(Perturbation, unit=unit, levels=levels, least=least, most=most, obstacle=unless)

@@ -120,10 +120,10 @@ def shown(level: Level) -> str:
 
     Examples
     --------
-    >>> shown(3), shown(0.25), shown(1e-4), shown("knn:4")
-    ('3', '0.25', '0.0001', 'knn:4')
+    >>> shown(3), shown(0.25), shown(1e-4)
+    ('3', '0.25', '0.0001')
     """
-    return level if isinstance(level, str) else f"{level:g}"
+    return f"{level:g}"
 
 
 def read_stress(path: str, netlist: str, sha256: str) -> Stress:

@@ -26,12 +26,12 @@ from spikeloom.runtime.studies.stress.verdicts import Requirement, curve, unmet
 def study(arguments: argparse.Namespace, names: Sequence[str], requirements: Sequence[Requirement]) -> Stress:
     """Measure perturbations on the files that a command's options name, and judge them."""
     bench, loaded, data = bench_of(arguments)
-    recordings, classes, taxels = len(bench.labels), bench.pair.netlist.classes, bench.sensor.taxels
-    reasons = {name: NAMES[name].why_not(bench.pair, bench.sensor) for name in names}
+    recordings, classes, taxels = len(bench.labels), bench.pair.netlist.classes, bench.events.shape[1]
+    reasons = {name: NAMES[name].why_not(bench.pair) for name in names}
     for wanted in requirements:
         if reasons[wanted.name] is not None:
             raise OptionError(f"--require {wanted}: does not apply, {reasons[wanted.name]}; omit it")
-        if NAMES[wanted.name].unit == TAXELS and float(wanted.level) > taxels:
+        if NAMES[wanted.name].unit == TAXELS and wanted.level > taxels:
             raise OptionError(f"--require {wanted}: the sensor has {taxels} taxels; give a smaller level")
     progress("clean recordings")
     reference, undisturbed = clean(bench)
@@ -114,12 +114,12 @@ def measure(bench: Bench, name: str, level: Level, seed: int, reference: Outcome
     """One perturbation at one level under one seed; `reference` is of the clean recordings."""
     trouble, rng, pair = NAMES[name], generator(name, seed), bench.pair
     if trouble.to == "bench":
-        inputs: Inputs = trouble.done(bench, level, bench.sensor, rng)
+        inputs: Inputs = trouble.done(bench, level, bench.distance, rng)
     elif trouble.to == "pair":
-        pair = trouble.done(pair, level, bench.sensor, rng)
+        pair = trouble.done(pair, level, bench.distance, rng)
         inputs = whole(bench.events, pair.netlist, bench.lengths)
     else:
-        events = by_length(bench.events, bench.lengths, lambda part: trouble.done(part, level, bench.sensor, rng))
+        events = by_length(bench.events, bench.lengths, lambda part: trouble.done(part, level, bench.distance, rng))
         inputs = whole(events, pair.netlist, bench.lengths)
     return _run(bench, evaluate(pair, inputs), seed, inputs, reference)
 
