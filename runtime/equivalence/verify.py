@@ -172,8 +172,8 @@ class _Tally:
         for stage, spikes in {**lower, LADDER[-1]: chip}.items():
             self.different[stage] += _differences(reference, spikes)
         for total, layers in ((self.float, reference), (self.chip, chip)):
-            for layer, spikes in enumerate(layers):
-                total[layer] += spikes.sum(axis=(0, 1))
+            for index, each in enumerate(layers):
+                total[index] += each.sum(axis=(0, 1))
 
     def spikes(self) -> Iterator[LayerSpikes]:
         """The same, layer by layer."""

@@ -46,8 +46,8 @@ def decayed(value: IntArray, lost: IntArray | int) -> IntArray:
     >>> decayed(np.array([6, -6, -5]), 3277).tolist()
     [1, -1, 0]
     """
-    magnitude: IntArray = np.abs(value) * (DECAY_ONE - lost) // DECAY_ONE
-    return np.where(value < 0, -magnitude, magnitude)
+    kept: IntArray = np.sign(value) * (np.abs(value) * (DECAY_ONE - lost) // DECAY_ONE)
+    return kept
 
 
 def read_synapses(netlist: Netlist) -> list[tuple[IntArray, IntArray]]:

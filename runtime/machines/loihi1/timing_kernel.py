@@ -147,7 +147,8 @@ def _send_all(  # noqa: PLR0915 - one loop over local state, which numba passes 
     for core in range(cores):
         if queue[core] < queue[core + 1]:
             due[core] = generation[queue[core]]
-    under_way, work_under_way = 0, 0
+    under_way = 0
+    work_under_way: Any = 0
     blocked, peak = 0.0, 0
     while True:
         core = _earliest(due)
