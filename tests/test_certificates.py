@@ -191,8 +191,10 @@ def test_roundings_and_magnitudes_of_the_released_operator_are_those_of_its_loop
     for hop, taxel, source in np.ndindex(4, TAXELS, TAXELS):
         wanted[source, :, taxel] += powers[hop, taxel, source] * np.abs(checkpoint.hops[hop]).T
     np.testing.assert_allclose(dense(first.magnitude, TAXELS * FEATURES), wanted.reshape(2 * TAXELS, -1), rtol=1e-6)
-    for layer, given in zip(others, checkpoint.dense, strict=True):
-        np.testing.assert_allclose(dense(layer.magnitude, len(given.weight)), np.abs(given.weight).T, rtol=1e-6)
+    for layer, layer_given in zip(others, checkpoint.dense, strict=True):
+        np.testing.assert_allclose(
+            dense(layer.magnitude, len(layer_given.weight)), np.abs(layer_given.weight).T, rtol=1e-6
+        )
 
 
 # -- against the chip --------------------------------------------------------------------------------------------------

@@ -46,7 +46,7 @@ def decayed(value: IntArray, lost: IntArray | int) -> IntArray:
     >>> decayed(np.array([6, -6, -5]), 3277).tolist()
     [1, -1, 0]
     """
-    kept: IntArray = np.sign(value) * (np.abs(value) * (DECAY_ONE - lost) // DECAY_ONE)
+    kept: IntArray = np.sign(value) * (np.abs(value) * (DECAY_ONE - lost) >> DECAY_BITS)
     return kept
 
 
