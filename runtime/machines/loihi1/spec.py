@@ -46,8 +46,9 @@ def decayed(value: IntArray, lost: IntArray | int) -> IntArray:
     >>> decayed(np.array([6, -6, -5]), 3277).tolist()
     [1, -1, 0]
     """
-    kept: IntArray = np.sign(value) * (np.abs(value) * (DECAY_ONE - lost) >> DECAY_BITS)
-    return kept
+    kept = np.abs(value) * (DECAY_ONE - lost) // DECAY_ONE
+    signed: IntArray = (np.sign(value) * kept).astype(np.int64)
+    return signed
 
 
 def read_synapses(netlist: Netlist) -> list[tuple[IntArray, IntArray]]:
