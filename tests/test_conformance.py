@@ -24,15 +24,13 @@ from spikeloom.compiler.targets.truenorth.netlist import crossbar_bytes
 from spikeloom.compiler.text import text
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.cli import build_parser
-from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.machines.base import machine_for
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
-from spikeloom.runtime.machines.loihi1.trace import aligned, unpack
+from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
 from spikeloom.runtime.machines.truenorth import spec as crossbar_spec
-from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.encode import encode
 
 CHECKPOINTS = tuple(name for name in FLOAT if name not in ("recurrent", "onnx"))
@@ -266,28 +264,13 @@ def test_costs_of_crossbars_are_those_counted_tick_by_tick(name):
 def test_the_expanded_network_is_the_float_model(name):
     made = specimen(name)
     loaded = float_side(made)
-    wanted = float_spikes(loaded.checkpoint, loaded.adjacency, made.events, dtype="float64")
-    found = run_float(loaded.network, channels_last(made.events, loaded.network.input.clocks)).spikes
-    for ours, (layer, theirs) in zip(found, wanted.items(), strict=True):
-        assert_array_equal(ours, theirs, err_msg=layer)
-        assert theirs.any(), layer
-
-
-@over(FLOAT)
-def test_the_float_engine_is_the_float_model(name):
-    made = specimen(name)
-    loaded, netlist = float_side(made), made.machine.netlist
-    inputs = channels_last(made.events, netlist.clocks)
-    if loaded.checkpoint is None:
-        wanted = run_float(loaded.network, inputs, dtype=np.float32).spikes
-    else:
-        wanted = tuple(float_spikes(loaded.checkpoint, loaded.adjacency, made.events).values())
-    found = float_engine.run(float_engine.prepare(loaded.network, netlist), channels(made))
-    flags = unpack(found.packed, netlist.n_compartments)
-    for layer, theirs in enumerate(wanted):
-        held = netlist.neuron[netlist.compartments_of(layer)]
-        assert_array_equal(aligned(netlist, flags, layer)[..., held], theirs[..., held])
-    assert_array_equal(found.votes, readout_counts(loaded.network.readout, loaded.network.classes, wanted[-1]))
+    for dtype in ("float64", "float32"):
+        wanted = float_spikes(loaded.checkpoint, loaded.adjacency, made.events, dtype=dtype)
+        inputs = channels_last(made.events, loaded.network.input.clocks)
+        found = run_float(loaded.network, inputs, dtype=dtype).spikes
+        for ours, (layer, theirs) in zip(found, wanted.items(), strict=True):
+            assert_array_equal(ours, theirs, err_msg=layer)
+            assert theirs.any(), layer
 
 
 # --- commands ------------------------------------------------------------------------------------------------------

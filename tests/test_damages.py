@@ -12,11 +12,10 @@ from spikeloom.compiler.fixedpoint import decay_registers
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.graphs import normalised_adjacency
-from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.studies.stress import damages
-from spikeloom.runtime.studies.stress.pair import Pair
+from spikeloom.runtime.studies.stress.pair import Pair, float_layers
 
 
 def made(seed=0, packing=None, taxels=6):
@@ -111,7 +110,7 @@ def test_fewer_bits_round_to_a_coarser_grid_and_hold_the_rest():
 def both_spikes(pair, events):
     """Whether each neuron of each side fires in each step: of the chip, and of the float network by layer."""
     trace = engine.simulate(pair.netlist, events, spikes=True)
-    return trace.spikes, float_engine.run(float_engine.prepare(pair.network, pair.netlist), events)
+    return trace.spikes, list(float_layers(pair, events, np.full(len(events), events.shape[2])))
 
 
 @pytest.mark.parametrize("firing", [False, True])
@@ -123,12 +122,12 @@ def test_stuck_neurons_fire_in_every_step_or_never_on_both_sides(firing):
     assert np.all(after.netlist.readout_class[stuck] < 0)
     events = inputs(pair)
     spikes, model = both_spikes(after, events)
-    flags = np.unpackbits(model.packed.view(np.uint8), axis=-1, bitorder="little")[..., : after.netlist.n_compartments]
     for compartment in stuck.tolist():
-        depth = after.netlist.layers[after.netlist.layer[compartment]].depth
+        layer = after.netlist.layer[compartment]
+        depth = after.netlist.layers[layer].depth
         window = slice(depth, depth + events.shape[2])
         assert np.all(spikes[:, window, compartment] == firing)
-        assert np.all(flags[:, window, compartment] == firing)
+        assert np.all(model[layer][..., after.netlist.neuron[compartment]] == firing)
 
 
 def _silenced(before, after):
@@ -176,7 +175,7 @@ def test_a_tie_does_not_fire_and_does_with_the_threshold_one_unit_lower():
     for one, fires in ((pair, False), (lower, True)):
         spikes, model = both_spikes(one, events)
         assert spikes.any() == fires
-        assert model.packed.any() == fires
+        assert model[0].any() == fires
 
 
 def test_shorter_decay_on_both_sides(tmp_path):

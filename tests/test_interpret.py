@@ -22,15 +22,16 @@ from random_networks import (
 )
 from scipy import sparse
 
+import spikeloom.runtime.studies.stress.pair
 from spikeloom.compiler import Options, compile_network
-from spikeloom.compiler.errors import SpikeloomError, VerifyError
+from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent
 from spikeloom.compiler.text import text
-from spikeloom.runtime.equivalence import float_engine
-from spikeloom.runtime.machines.loihi1.trace import aligned, unpack
+from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.votes import readout_counts
+from spikeloom.runtime.studies.stress.pair import Inputs, Pair, evaluate, float_layers
 
 
 def weights_hit(incoming, spikes, post, neuron, t):
@@ -156,10 +157,7 @@ def test_the_lowest_class_wins_a_tie():
     assert vote(np.array([[0, 2, 2], [0, 0, 0], [1, 0, 3]])).tolist() == [1, 0, 2]
 
 
-# --- the fast float engine --------------------------------------------------------------------------------------------
-REPEATABLE = settings(max_examples=30, deadline=None, derandomize=True)
-
-
+# --- beside the chip --------------------------------------------------------------------------------------------------
 def lively(weights=3, seed=0, sizes=(8, 6, 5, 4)):
     rng = np.random.default_rng(seed)
     matrices = [rng.normal(0, 1.0, (after, before)) for before, after in pairwise(sizes)]
@@ -170,80 +168,63 @@ def random_inputs(channels, seed=0, samples=4, steps=30, rate=0.3):
     return (np.random.default_rng(seed).random((samples, channels, steps)) < rate).astype(np.uint8)
 
 
-def spikes_of(prepared, netlist, inputs, **options):
-    """Spikes of each layer as they come back packed, aligned with the data."""
-    found = float_engine.run(prepared, inputs, **options)
-    flags = unpack(found.packed, netlist.n_compartments)
-    return found, [aligned(netlist, flags, layer) for layer in range(len(netlist.layers))]
+def as_they_are(events):
+    """Inputs of whole recordings."""
+    samples, _, steps = events.shape
+    return Inputs(channels=lambda rows: events[rows], lengths=np.full(samples, steps), begin=np.zeros(samples, int))
 
 
-@REPEATABLE
-@given(float_networks().flatmap(lambda n: recordings_for(n.input.size).map(lambda events: (n, events))))
-def test_any_wiring(drawn):
-    network, events = drawn
-    try:
-        netlist = compile_network(network, Options(keep_all=True)).netlist
-    except SpikeloomError:
-        return
-    inputs = np.ascontiguousarray(np.asarray(events, np.uint8).reshape(len(events), network.input.size, -1))
-    found = float_engine.run(float_engine.prepare(network, netlist), inputs)
-    wide = run_float(network, inputs.transpose(0, 2, 1).astype(bool), membranes=True)
-    near = any(
-        (np.abs(u - population.theta) < 1e-4).any()
-        for u, population in zip(wide.membranes, network.populations, strict=True)
-    )
-    if not near:  # where no membrane is so near to its threshold that float32 may decide otherwise
-        assert_array_equal(found.spikes, np.stack([s.sum(axis=(1, 2)) for s in wide.spikes], axis=1))
+def float_spikes(network, events):
+    return run_float(network, events.transpose(0, 2, 1).astype(bool), dtype=np.float32).spikes
 
 
-def test_neurons_that_the_chip_leaves_out_are_counted_elsewhere():
+def test_neurons_that_the_chip_leaves_out_are_compared_if_others_receive_them():
     network = lively(seed=2)
-    netlist = compile_network(network).netlist
-    first = netlist.compartments_of(0)
-    smaller = replace(netlist, layer=netlist.layer.copy(), neuron=netlist.neuron)
-    gone = int(netlist.neuron[first[0]])
-    moved = smaller.layer.copy()
-    moved[first[0]] = len(netlist.layers)  # of no layer any more
-    smaller = replace(smaller, layer=moved)
-    inputs = random_inputs(network.input.size, 2)
-    wanted = run_float(network, inputs.transpose(0, 2, 1).astype(bool)).spikes[0]
-    found = float_engine.run(float_engine.prepare(network, smaller), inputs)
-    assert wanted[..., gone].any()
-    assert_array_equal(found.elsewhere[:, 0], wanted[..., gone].sum(axis=1))
-    quiet = replace(smaller, layers=(replace(netlist.layers[0], unread=(gone,)), *netlist.layers[1:]))
-    found = float_engine.run(float_engine.prepare(network, quiet), inputs)
-    assert not found.elsewhere.any()
-    assert_array_equal(found.spikes[:, 0], np.delete(wanted, gone, axis=2).sum(axis=(1, 2)))
+    never = with_population(network, 0, bias=np.where(np.arange(6) == 4, -100, network.populations[0].bias))
+    netlist = compile_network(never).netlist
+    assert 4 not in netlist.neuron[netlist.compartments_of(0)]
+    events = random_inputs(network.input.size, 2)
+    ours = float_spikes(network, events)[0]
+    theirs = next(iter(integer_machine_of(netlist).run(events[:, :, None], spikes=True).spikes.values()))
+    assert ours[..., 4].any()
+    unread = replace(netlist, layers=(replace(netlist.layers[0], unread=(4,)), *netlist.layers[1:]))
+    for each, compared in ((netlist, np.arange(6) >= 0), (unread, np.arange(6) != 4)):
+        found = evaluate(Pair(netlist=each, network=network), as_they_are(events)).spikes[0].tolist()
+        assert found == [int(side[..., compared].sum()) for side in (ours, theirs, ours != theirs)]
 
 
-def test_shorter_recordings_and_late_beginnings():
+def test_shorter_recordings_and_late_beginnings(monkeypatch):
+    monkeypatch.setattr(spikeloom.runtime.studies.stress.pair, "HELD", 1000)  # so that there are several parts
     network = lively(seed=4)
-    netlist = compile_network(network, Options(keep_all=True)).netlist
-    prepared = float_engine.prepare(network, netlist)
-    inputs, lengths, begin = random_inputs(network.input.size, 4), np.array([30, 11, 1, 20]), np.array([0, 5, 0, 19])
-    found, spikes = spikes_of(prepared, netlist, inputs, lengths=lengths, begin=begin)
+    pair = Pair(netlist=compile_network(network, Options(keep_all=True)).netlist, network=network)
+    events, lengths, begin = random_inputs(network.input.size, 4), np.array([30, 11, 1, 20]), np.array([0, 5, 0, 19])
+    found = evaluate(pair, Inputs(channels=lambda rows: events[rows], lengths=lengths, begin=begin))
+    wanted = np.zeros((3, 3), int)
     for i, (length, first) in enumerate(zip(lengths.tolist(), begin.tolist(), strict=True)):
-        alone = run_float(network, inputs[i : i + 1, :, :length].transpose(0, 2, 1).astype(bool)).spikes
-        for ours, theirs in zip(spikes, alone, strict=True):
-            assert_array_equal(ours[i, :length], theirs[0])
-            assert not ours[i, length:].any()
-        assert found.spikes[i].tolist() == [int(s[0, first:].sum()) for s in alone]
-        assert_array_equal(found.votes[i], readout_counts(network.readout, network.classes, alone[-1][:, first:])[0])
+        alone = events[i : i + 1, :, :length]
+        chip = pair.chip.run(alone[:, :, None], spikes=True).spikes.values()
+        for layer, (ours, theirs) in enumerate(zip(float_spikes(network, alone), chip, strict=True)):
+            counts = ours[:, first:], theirs[:, first:], ours[:, first:] != theirs[:, first:]
+            wanted[layer] += [each.sum() for each in counts]
+        for side, spikes in (("float", counts[0]), ("chip", counts[1])):
+            votes = readout_counts(network.readout, network.classes, spikes)[0]
+            assert_array_equal(found.votes[side][i], votes)
+    assert_array_equal(found.spikes, wanted)
 
 
 def test_a_window_that_opens_late_misses_the_first_steps():
     network = lively(weights=2, seed=6)
     netlist = compile_network(network, Options(keep_all=True)).netlist
     late = replace(netlist, layers=(netlist.layers[0], replace(netlist.layers[1], depth=netlist.layers[1].depth + 3)))
-    inputs = random_inputs(network.input.size, 6)
-    first = run_float(network, inputs.transpose(0, 2, 1).astype(bool)).spikes[0]
+    events = random_inputs(network.input.size, 6)
+    first, second = float_spikes(network, events)
     alone = chain(network.projections[1].weight.toarray(), biases=[network.populations[1].bias])
-    heard_late = np.zeros_like(first)
-    heard_late[:, :-3] = first[:, 3:]
-    wanted = run_float(alone, heard_late).spikes[0]
-    _, spikes = spikes_of(float_engine.prepare(network, late), late, inputs)
-    assert_array_equal(spikes[1], wanted)
-    assert not np.array_equal(wanted, run_float(network, inputs.transpose(0, 2, 1).astype(bool)).spikes[1])
+    missed = np.zeros_like(first)
+    missed[:, :-3] = first[:, 3:]
+    wanted = run_float(alone, missed).spikes[0]
+    _, found = float_layers(Pair(netlist=late, network=network), events, np.full(4, 30))
+    assert_array_equal(found, wanted)
+    assert not np.array_equal(wanted, second)
 
 
 def small() -> Network:

@@ -246,7 +246,7 @@ def test_what_is_done_to_recordings_is_done_before_they_are_joined():
     events[..., 4] = 1
     netlist = SimpleNamespace(bins=3, clocks=NO_CLOCKS)
     late = bench.whole(disturbances.start_late(events, 2), netlist, np.array([7]))
-    assert late.events.tolist() == [[[0, 0, 1]] * 2]
+    assert late.channels(slice(None)).tolist() == [[[0, 0, 1]] * 2]
     assert late.lengths.tolist() == [3]
 
 

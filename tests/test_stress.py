@@ -84,21 +84,22 @@ def test_clean_recordings_are_what_reference_and_engine_say(bench, small):
 
 def test_recordings_after_others_without_a_reset_are_one_long_run_of_the_specification(bench):
     inputs = warm_state(bench, 2, generator("warm_state", 0))
-    found = evaluate(bench.pair, inputs)
+    found, events = evaluate(bench.pair, inputs), inputs.channels(slice(None))
     for i in range(3):
-        slow = spec.simulate(bench.pair.netlist, inputs.events[i, :, : inputs.lengths[i]])
+        slow = spec.simulate(bench.pair.netlist, events[i, :, : inputs.lengths[i]])
         layer = bench.pair.netlist.layers[-1]
         window = slow.spikes[inputs.begin[i] + layer.depth : inputs.lengths[i] + layer.depth]
         assert_array_equal(found.votes["chip"][i], class_counts(bench.pair.netlist, window.sum(axis=0)[None])[0])
-        assert_array_equal(inputs.events[i, :, 2 * STEPS :], with_clocks(bench.events, bench.pair.netlist.clocks)[i])
+        assert_array_equal(events[i, :, 2 * STEPS :], with_clocks(bench.events, bench.pair.netlist.clocks)[i])
 
 
 def test_ten_times_as_long_is_ten_recordings_of_which_the_last_counts(bench):
     inputs = longer(bench, 10)
-    assert inputs.events.shape[2] == 10 * STEPS
+    events = inputs.channels(slice(None))
+    assert events.shape[2] == 10 * STEPS
     assert set(inputs.begin.tolist()) == {9 * STEPS}
     found = evaluate(bench.pair, inputs)
-    trace = engine.simulate(bench.pair.netlist, inputs.events, packed=True)
+    trace = engine.simulate(bench.pair.netlist, events, packed=True)
     flags = unpack(trace.packed, bench.pair.netlist.n_compartments)
     depth = bench.pair.netlist.layers[-1].depth
     counts = flags[:, 9 * STEPS + depth : 10 * STEPS + depth].sum(axis=1)
@@ -114,12 +115,12 @@ def test_clocks_are_no_taxels(tmp_path):
     ticks = netlist.clocks.events(15)
     sensor = netlist.taxels * netlist.polarities
     silent = NAMES["taxels_dead"](made.events, 39, generator("taxels_dead", 0))
-    reached = whole(silent, netlist, made.lengths).events
+    reached = whole(silent, netlist, made.lengths).channels(slice(None))
     assert not reached[:, :sensor].any()
     assert_array_equal(reached[0, sensor:], ticks)
-    warm = warm_state(made, 1, generator("warm_state", 0)).events
+    warm = warm_state(made, 1, generator("warm_state", 0)).channels(slice(None))
     assert_array_equal(warm[0, sensor:], np.tile(ticks, 2))
-    long = longer(made, 10).events
+    long = longer(made, 10).channels(slice(None))
     assert_array_equal(long[0, sensor:, :15], ticks)
     assert not long[0, sensor:, 15:].any()
 

@@ -48,8 +48,11 @@ class Bench:
 
 def whole(events: Events, netlist: Netlist, lengths: IntArray) -> Inputs:
     """Recordings from their first bin on."""
-    joined = with_clocks(join_bins(events, netlist.bins), netlist.clocks)
-    return Inputs(events=joined, lengths=-(-lengths // netlist.bins), begin=np.zeros_like(lengths))
+
+    def channels(rows: slice) -> Events:
+        return with_clocks(join_bins(events[rows], netlist.bins), netlist.clocks)
+
+    return Inputs(channels=channels, lengths=-(-lengths // netlist.bins), begin=np.zeros_like(lengths))
 
 
 def by_length(events: Events, lengths: IntArray, change: Callable[[Events], Events]) -> Events:
@@ -71,11 +74,16 @@ def warm_state(bench: Bench, before: int, rng: np.random.Generator) -> Inputs:
     flat = with_clocks(steps, bench.pair.netlist.clocks)
     order = np.stack([rng.permutation(len(flat)) for _ in range(before)] + [np.arange(len(flat))], axis=1)
     length = lengths[order].sum(axis=1)
-    events = np.zeros((len(flat), flat.shape[1], int(length.max())), np.uint8)
-    for i, parts in enumerate(order.tolist()):
-        one = np.concatenate([flat[part, :, : lengths[part]] for part in parts], axis=1)
-        events[i, :, : one.shape[1]] = one
-    return Inputs(events=events, lengths=length, begin=length - lengths)
+
+    def channels(rows: slice) -> Events:
+        chosen = order[rows]
+        events = np.zeros((len(chosen), flat.shape[1], int(length[rows].max())), np.uint8)
+        for row, parts in zip(events, chosen.tolist(), strict=True):
+            one = np.concatenate([flat[part, :, : lengths[part]] for part in parts], axis=1)
+            row[:, : one.shape[1]] = one
+        return events
+
+    return Inputs(channels=channels, lengths=length, begin=length - lengths)
 
 
 @perturbation("times the length", (2, 10), least=1, most=100)
@@ -85,11 +93,15 @@ def longer(bench: Bench, rounds: int) -> Inputs:
     Clocks run on and end, as they would.
     """
     steps, lengths = bench.steps()
-    events = np.zeros((*steps.shape[:3], steps.shape[3] * rounds), np.uint8)
-    for i, length in enumerate(lengths.tolist()):
-        events[i, ..., : length * rounds] = np.tile(steps[i, ..., :length], rounds)
-    begin = lengths * (rounds - 1)
-    return Inputs(events=with_clocks(events, bench.pair.netlist.clocks), lengths=lengths * rounds, begin=begin)
+
+    def channels(rows: slice) -> Events:
+        own = lengths[rows]
+        events = np.zeros((len(own), *steps.shape[1:3], int(own.max()) * rounds), np.uint8)
+        for row, one, length in zip(events, steps[rows], own.tolist(), strict=True):
+            row[..., : length * rounds] = np.tile(one[..., :length], rounds)
+        return with_clocks(events, bench.pair.netlist.clocks)
+
+    return Inputs(channels=channels, lengths=lengths * rounds, begin=lengths * (rounds - 1))
 
 
 _ALL = (*vars(disturbances).values(), warm_state, longer, *vars(damages).values())

@@ -6,10 +6,12 @@ What is counted is what spikes after `begin`, so that recordings may follow othe
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -17,18 +19,25 @@ import numpy.typing as npt
 
 from spikeloom.compiler import Netlist
 from spikeloom.compiler.errors import NumericRangeError, OptionError
-from spikeloom.compiler.interpret import vote
-from spikeloom.compiler.ir import Network
+from spikeloom.compiler.interpret import Simulation, cut, float_simulation, vote
+from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_of
+from spikeloom.runtime.machines.votes import readout_counts
 
+Events = npt.NDArray[np.uint8]
 Words = npt.NDArray[np.uint64]
 
 SIDES = ("float", "chip")
 
 STOPPED = -1
 """Decision where a register of the chip overflows and the simulator stops."""
+
+HELD = 1 << 23
+"""Entries (recording, step, neuron) that run together."""
+
+_ALONE = Lock()
+"""For recordings that are longer than that, of which one may take some hundred megabytes: one at a time."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,24 +53,19 @@ class Pair:
         return integer_machine_of(self.netlist)
 
     @cached_property
-    def model(self) -> float_engine.FloatEngine:
-        """The float network, likewise."""
-        return float_engine.prepare(self.network, self.netlist)
-
-    def masks(self) -> Words:
-        """Bits of each layer's compartments in packed spikes; (layers, words) uint64."""
-        netlist = self.netlist
-        masks = np.zeros((len(netlist.layers), -(-netlist.n_compartments // 64)), np.uint64)
-        ids = np.arange(netlist.n_compartments)
-        np.bitwise_or.at(masks, (netlist.layer, ids // 64), np.left_shift(np.uint64(1), (ids % 64).astype(np.uint64)))
-        return masks
+    def model(self) -> Simulation:
+        """The float network, likewise; in float32."""
+        return float_simulation(self.network, np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Inputs:
-    """Channels (recordings, channels, T) uint8; steps of each recording, and the first that counts, (recordings,)."""
+    """What recordings become: steps of each and the first that counts, (recordings,); and their channels.
 
-    events: npt.NDArray[np.uint8]
+    `channels` makes those of some recordings, (recordings, channels, T) uint8, when these run.
+    """
+
+    channels: Callable[[slice], Events]
     lengths: IntArray
     begin: IntArray
 
@@ -71,7 +75,7 @@ class Outcome:
     """What both sides did."""
 
     votes: dict[str, IntArray]  # By side
-    spikes: IntArray  # (recordings, layers, 3) int64; of the float network, of the chip, and those in which they differ
+    spikes: IntArray  # (layers, 3) int64; of the float network, of the chip, and those in which they differ
     stopped: BoolArray  # (recordings,) bool; where a register of the chip would overflow
     saturated: IntArray  # (recordings,) int64; membranes that were clipped
 
@@ -82,72 +86,85 @@ class Outcome:
 
 
 def evaluate(pair: Pair, inputs: Inputs) -> Outcome:
-    """Run both sides from rest."""
-    netlist = pair.netlist
-    model = float_engine.run(pair.model, inputs.events, lengths=inputs.lengths, begin=inputs.begin)
-    packed, stopped, saturated = _chip(pair.chip, inputs)
-    depth = np.array([layer.depth for layer in netlist.layers])
-    spikes = np.zeros((len(inputs.events), len(netlist.layers), 3), np.int64)
-    spikes[:, :, 0] = model.spikes
-    spikes[:, :, 1:] = _tally(packed, model.packed, pair.masks(), depth, inputs)
-    spikes[:, :, 2] += model.elsewhere
-    votes = _votes(netlist, packed, depth, inputs)
-    return Outcome(votes={"float": model.votes, "chip": votes}, spikes=spikes, stopped=stopped, saturated=saturated)
+    """Run both sides from rest, so many recordings at a time that memory does not grow with their number."""
+    held = int(inputs.lengths.max()) * pair.netlist.n_compartments
+    size, parts = max(1, HELD // held), []
+    for first in range(0, len(inputs.lengths), size):
+        with _ALONE if held > HELD else nullcontext():
+            parts += _part(pair, inputs, slice(first, min(first + size, len(inputs.lengths))))
+    return Outcome(
+        votes={side: np.concatenate([part.votes[side] for part in parts]) for side in SIDES},
+        spikes=np.sum([part.spikes for part in parts], axis=0),
+        stopped=np.concatenate([part.stopped for part in parts]),
+        saturated=np.concatenate([part.saturated for part in parts]),
+    )
 
 
-def _chip(machine: IntegerMachine, inputs: Inputs) -> tuple[Words, BoolArray, IntArray]:
-    """Packed spikes, which recordings stopped the simulator, and clipped membranes."""
-    stopped = np.zeros(len(inputs.events), np.bool_)
+def _part(pair: Pair, inputs: Inputs, rows: slice) -> list[Outcome]:
+    """Some recordings together, or one by one if the simulator stops."""
+    from spikeloom.runtime.studies.stress.meeting import NOWHERE, UNREAD, meeting
+
+    netlist, events = pair.netlist, inputs.channels(rows)
+    lengths, begin, stopped = inputs.lengths[rows], inputs.begin[rows], False
     try:
-        packed, saturated = machine.packed(inputs.events, inputs.lengths)
-    except NumericRangeError:  # by one recording at least: run them one by one
-        netlist = machine.netlist
-        steps = inputs.events.shape[2] + netlist.max_depth
-        packed = np.zeros((len(inputs.events), steps, -(-netlist.n_compartments // 64)), np.uint64)
-        saturated = np.zeros(len(inputs.events), np.int64)
-        for index in range(len(inputs.events)):
-            one = slice(index, index + 1)
-            try:
-                packed[one], saturated[one] = machine.packed(inputs.events[one], inputs.lengths[one])
-            except NumericRangeError:
-                stopped[index] = True
-    return packed, stopped, saturated
+        packed, saturated = pair.chip.packed(events, lengths)
+    except NumericRangeError:
+        if len(events) > 1:
+            return [each for i in range(rows.start, rows.stop) for each in _part(pair, inputs, slice(i, i + 1))]
+        packed = np.zeros((1, events.shape[2] + netlist.max_depth, -(-netlist.n_compartments // 64)), np.uint64)
+        saturated, stopped = np.zeros(1, np.int64), True
+    spikes = np.zeros((len(netlist.layers), 3), np.int64)
+    votes = {side: np.zeros((len(events), netlist.classes), np.int64) for side in SIDES}
+    for index, (fired, layer) in enumerate(zip(float_layers(pair, events, lengths), netlist.layers, strict=True)):
+        ids = netlist.compartments_of(index)
+        seat = np.full(layer.neurons, NOWHERE)
+        seat[list(layer.unread)] = UNREAD
+        seat[netlist.neuron[ids]] = ids
+        ours, both = meeting(fired.view(np.uint8), packed, layer.depth, seat, begin)
+        step = np.arange(packed.shape[1])
+        counts = (step >= begin[:, None] + layer.depth) & (step < lengths[:, None] + layer.depth)
+        theirs = _ones(packed, ids, counts)
+        spikes[index] = ours, theirs, ours + theirs - 2 * both
+        for voter in ids[netlist.readout_class[ids] >= 0].tolist():
+            fires = (packed[..., voter // 64] >> np.uint64(voter % 64)) & np.uint64(1)
+            votes["chip"][:, netlist.readout_class[voter]] += np.where(counts, fires, 0).sum(axis=1).astype(np.int64)
+        if index == pair.network.readout.population:
+            late = fired & (np.arange(fired.shape[1]) >= begin[:, None])[:, :, None]
+            votes["float"] = readout_counts(pair.network.readout, netlist.classes, late)
+    return [Outcome(votes=votes, spikes=spikes, stopped=np.full(len(events), stopped), saturated=saturated)]
 
 
-def _tally(packed: Words, model: Words, masks: Words, depth: IntArray, inputs: Inputs) -> IntArray:
-    """Spikes of the chip and those in which the float network differs, where steps count; (recordings, layers, 2)."""
-    spikes = np.zeros((len(packed), len(masks), 2), np.int64)
-    for layer, mask in enumerate(masks):
-        words = np.flatnonzero(mask)
-        chip = packed[..., words] & mask[words]
-        differ = chip ^ (model[..., words] & mask[words])
-        counts = _counts(inputs, packed.shape[1], depth[layer])
-        for column, bits in enumerate((chip, differ)):
-            ones = np.bitwise_count(bits).sum(axis=2, dtype=np.int64)
-            spikes[:, layer, column] = np.where(counts, ones, 0).sum(axis=1)
-    return spikes
+def float_layers(pair: Pair, events: Events, lengths: IntArray) -> Iterator[BoolArray]:
+    """Spikes of the float network, layer by layer, (recordings, T, neurons)."""
+    ends = None if (lengths == events.shape[2]).all() else lengths
+    depth = {INPUT: -1} | {index: layer.depth for index, layer in enumerate(pair.netlist.layers)}
+    sent = {INPUT: cut(events.transpose(0, 2, 1) != 0, ends)}
+    for index, layer in enumerate(pair.model.layers):
+        # a window that opens later than it has to misses the first steps
+        sources = [_from(sent[pre], depth[index] - depth[pre] - 1) for pre in layer.pres]
+        sent[index] = cut(layer.run(sources)[0], ends)
+        yield sent[index]
 
 
-def _votes(netlist: Netlist, packed: Words, depth: IntArray, inputs: Inputs) -> IntArray:
-    """Votes of the chip where steps count; (recordings, classes)."""
-    votes = np.zeros((len(packed), netlist.classes), np.int64)
-    for voter in np.flatnonzero(netlist.readout_class >= 0).tolist():
-        fires = (packed[..., voter // 64] >> np.uint64(voter % 64)) & np.uint64(1)
-        counts = _counts(inputs, packed.shape[1], depth[netlist.layer[voter]])
-        votes[:, netlist.readout_class[voter]] += np.where(counts, fires, 0).sum(axis=1).astype(np.int64)
-    return votes
+def _from(spikes: BoolArray, step: int) -> BoolArray:
+    """Spikes (recordings, T, neurons) without the first steps, silence at the end."""
+    if not step:
+        return spikes
+    moved = np.zeros_like(spikes)
+    moved[:, :-step] = spikes[:, step:]
+    return moved
 
 
-def _counts(inputs: Inputs, steps: int, lag: int) -> BoolArray:
-    """Which chip steps of each recording count for a layer that lags so much; (recordings, steps)."""
-    step = np.arange(steps)
-    counts: BoolArray = (step >= inputs.begin[:, None] + lag) & (step < inputs.lengths[:, None] + lag)
-    return counts
+def _ones(packed: Words, ids: IntArray, counts: BoolArray) -> int:
+    """Spikes of some compartments in the steps that count, (recordings, chip steps)."""
+    mask = np.zeros(packed.shape[2], np.uint64)
+    np.bitwise_or.at(mask, ids // 64, np.left_shift(np.uint64(1), (ids % 64).astype(np.uint64)))
+    words = np.flatnonzero(mask)
+    ones = np.bitwise_count(packed[..., words] & mask[words]).sum(axis=2, dtype=np.int64)
+    return int(ones[counts].sum())
 
 
 # -- perturbations -----------------------------------------------------------------------------------------------------
-
-Events = npt.NDArray[np.uint8]
 
 Level = int | float
 

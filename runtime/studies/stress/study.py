@@ -128,7 +128,7 @@ def _run(bench: Bench, outcome: Outcome, seed: int | None, inputs: Inputs, refer
     """Counts over the recordings."""
     netlist = bench.pair.netlist
     decided = {side: outcome.decisions(side) for side in SIDES}
-    spikes = outcome.spikes.sum(axis=0).tolist()
+    spikes = outcome.spikes.tolist()
     steps = int((inputs.lengths - inputs.begin).sum())
     held = np.bincount(netlist.layer, minlength=len(netlist.layers)).tolist()
     kinds = {side: np.unique_counts(values) for side, values in decided.items()}
