@@ -28,7 +28,7 @@ from spikeloom.models.graphs import Graph, build_graph, normalised_adjacency
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.systems import HOPS, PADDINGS, filters_of, propagation_of, sensor_grid
+from spikeloom.models.systems import HOPS, filters_of, propagation_of, sensor_grid
 from spikeloom.models.training.evaluate import rate_loss
 from spikeloom.models.training.train import Epoch, train
 
@@ -58,7 +58,7 @@ def main() -> None:
 
 def _epochs(system: str, epochs: int, training: Recordings, test: Recordings, graph: Graph) -> dict[str, Any]:
     taxels = graph.n_taxels
-    grid = sensor_grid(graph.coordinates, PADDINGS[0]) if system == "grid-cnn" else None
+    grid = sensor_grid(graph.coordinates, "none") if system == "grid-cnn" else None
     marks = [(time.process_time(), time.perf_counter())]
 
     def mark(_epoch: Epoch) -> None:

@@ -92,24 +92,6 @@ def grid_from_json(values: Mapping[str, Any]) -> Grid:
     return Grid(rows=sizes[0], columns=sizes[1], stride=sizes[2], padding=sizes[3], cells=frozen(cells))
 
 
-def window_forms(cells: IntArray, kernel: int) -> dict[str, Grid]:
-    """The two forms of the grid-based CNN: a window that moves by 2 without padding, and one that keeps the size.
-
-    The grid is the smallest that holds the cells of all taxels.
-    """
-    rows, columns = (int(most) + 1 for most in cells.max(axis=0))
-    forms = {"none": (2, 0), "same": (1, kernel // 2)}
-    return {
-        name: Grid(rows=rows, columns=columns, stride=stride, padding=padding, cells=cells)
-        for name, (stride, padding) in forms.items()
-    }
-
-
-def taxel_propagation(taxels: int) -> FloatArray:
-    """Stack (taxels, 1, taxels) that picks one taxel after the other."""
-    return np.eye(taxels)[:, None, :]
-
-
 def feature_major(system: str) -> bool:
     """Whether neurons of the first layer count ``feature * places + place``, as a flattened picture does.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, Grid, taxel_propagation, window_forms
+from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, Grid
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.graphs import NEUTOUCH, Graph, normalised_adjacency
 
@@ -15,8 +15,8 @@ KERNEL = 3
 HOPS = 3
 """K of the graph convolution of a TactileSGNet."""
 
-PADDINGS = ("none", "same")
-"""Forms of its first layer: a window that moves by 2 without padding, or by 1 with the size kept."""
+PADDINGS = {"none": (2, 0), "same": (1, KERNEL // 2)}
+"""Forms of its first layer: cells that the window moves by, and empty ones around the grid ("same" keeps the size)."""
 
 NO_GRAPH = "none"
 """Name of the graph of a system that has none."""
@@ -53,10 +53,12 @@ def grid_cells(coordinates: FloatArray = NEUTOUCH) -> IntArray:
 
 
 def sensor_grid(coordinates: FloatArray, padding: str) -> Grid:
-    """Grid over a sensor; refuses unknown paddings, and a sensor over which no grid or window fits."""
+    """The smallest grid over a sensor; refuses unknown paddings, and a sensor over which no grid or window fits."""
     if padding not in PADDINGS:
         raise OptionError(f"--padding {padding}: unknown; choose from {', '.join(PADDINGS)}")
-    grid = window_forms(grid_cells(coordinates), KERNEL)[padding]
+    cells, (stride, empty) = grid_cells(coordinates), PADDINGS[padding]
+    rows, columns = (int(most) + 1 for most in cells.max(axis=0))
+    grid = Grid(rows=rows, columns=columns, stride=stride, padding=empty, cells=cells)
     if 0 in grid.places(KERNEL):
         raise DataError(
             f"grid-cnn: the grid has {grid.rows} * {grid.columns} cells, a window of {KERNEL} * {KERNEL} does not fit "
@@ -88,7 +90,7 @@ def propagation_of(system: str, edges: IntArray, taxels: int, grid: Grid | None,
         case "gcn":
             return with_self_loops(edges, taxels)[None]
         case "mlp":
-            return taxel_propagation(taxels)
+            return np.eye(taxels)[:, None, :]
     assert system == GRID_CNN, "systems are checked where they are named"
     assert grid is not None, "a grid-based CNN has a grid"
     return grid.propagation(round(filters**0.5))

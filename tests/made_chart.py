@@ -4,31 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-from spikeloom.runtime.studies.chart import choices
+from spikeloom.runtime.studies.chart import choices, results
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile
-from spikeloom.runtime.studies.chart.results import (
-    Chart,
-    ChartedNetwork,
-    ChosenBy,
-    Data,
-    Figures,
-    Point,
-    Refused,
-    share,
-)
 
 SAMPLES = {"train": 400, "test": 100}
-BY = ChosenBy(energy="one", time="clock")
+BY = results.ChosenBy(energy="one", time="clock")
 
 
-def made_figures(right: int, samples: int, energy: float, time: float, *, step: float = 20e-6) -> Figures:
+def made_figures(right: int, samples: int, energy: float, time: float, *, step: float = 20e-6) -> results.Figures:
     """Figures of a split: recordings right, µJ and ms."""
-    accuracy = share(right, samples)
-    return Figures(
+    accuracy = results.share(right, samples)
+    return results.Figures(
         **{name: getattr(accuracy, name) for name in ("correct", "accuracy", "low", "high")},
         samples=samples,
-        model=share(min(samples, right + samples // 50), samples),
+        model=results.share(min(samples, right + samples // 50), samples),
         equal=samples - 3,
         energy_j={"one": energy * 1e-6, "two": 1.5e-6 * energy},
         time_s={"clock": time * 1e-3},
@@ -38,7 +28,7 @@ def made_figures(right: int, samples: int, energy: float, time: float, *, step: 
     )
 
 
-def made_point(number: int, **about: Any) -> Point:
+def made_point(number: int, **about: Any) -> results.Point:
     """A point of the usual kind, but for what is said."""
     usual: dict[str, Any] = {
         "network": "grasps",
@@ -61,7 +51,7 @@ def made_point(number: int, **about: Any) -> Point:
         "test": made_figures(100, 100, 1.0, 1.0),
         "commands": ("spikeloom compile", "spikeloom run"),
     }
-    return Point(number=number, **(usual | about))
+    return results.Point(number=number, **(usual | about))
 
 
 def made_network(
@@ -72,7 +62,7 @@ def made_network(
     expected: float = 0.0,
     graph: str = "manual",
     bins: int = 1,
-) -> ChartedNetwork:
+) -> results.ChartedNetwork:
     """A network of the usual kind, but for what is said; its float model has so many training recordings right."""
     known = {} if validation is None else {"validation": {"correct": 100 * validation, "samples": 100}}
     file = NetworkFile(
@@ -90,15 +80,15 @@ def made_network(
         training={"command": "spikeloom train"} | known,
     )
     model = {
-        50: {split: share(n // 2, n) for split, n in SAMPLES.items()},
-        100: {"train": share(trained, 400), "test": share(90, 100)},
+        50: {split: results.share(n // 2, n) for split, n in SAMPLES.items()},
+        100: {"train": results.share(trained, 400), "test": results.share(90, 100)},
     }
-    return ChartedNetwork(file=file, model=model, expected=expected)
+    return results.ChartedNetwork(file=file, model=model, expected=expected)
 
 
-def made_chart(*budgets: str) -> Chart:
+def made_chart(*budgets: str) -> results.Chart:
     """Two networks, three widths, two windows; one configuration does not fit."""
-    points: list[Point] = []
+    points: list[results.Point] = []
     for net, graph in (("grasps", "manual"), ("grasps-knn1", "knn:1")):
         for bits in (2, 4, 8):
             for window in (50, 100):
@@ -125,18 +115,18 @@ def made_chart(*budgets: str) -> Chart:
     points = choices.with_fronts(points, BY)
     named = ("network", "target", "graph", "bits", "planes", "groups", "prune", "fine_tuned", "cores")
     refused = {name: getattr(points[0], name) for name in named}
-    return Chart(
+    return results.Chart(
         spikeloom="0.1.0",
         target="loihi1",
         command="spikeloom chart grasps.pt grasps-knn1.pt --data 'a <b>' -o out",
-        data=Data(path="a <b>", bin_s=0.02, sha256="cd" * 32, steps=250, **SAMPLES),
+        data=results.Data(path="a <b>", bin_s=0.02, sha256="cd" * 32, steps=250, **SAMPLES),
         tables={"energy": {"one": "prices <one>", "two": "prices two"}, "time": {"clock": "times"}},
         chosen_by=BY,
         grid=Grid(bits=((2,), (4,), (8,)), window=(50, 100)),
         networks=tuple(networks),
         expected=expected,
         points=tuple(points),
-        refused=(Refused(**refused, storage="8b 3p", why=("core 0 (fc1): 5 used, 4 allowed; fewer planes",)),),
+        refused=(results.Refused(**refused, storage="8b 3p", why=("core 0 (fc1): 5 used, 4 allowed; fewer planes",)),),
         recommended=choices.recommended(points, networks, BY, bin_s=0.02),
         saving=choices.saving(points, BY),
         budget=choices.pick(points, choices.parse_budgets(budgets), BY),

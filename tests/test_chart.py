@@ -26,20 +26,8 @@ from spikeloom.compiler.targets.truenorth.native_file import write_trained
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import data_digest
+from spikeloom.runtime.studies.chart import choices
 from spikeloom.runtime.studies.chart import work as chart_work
-from spikeloom.runtime.studies.chart.choices import (
-    TRAINING,
-    VALIDATION,
-    Budget,
-    front,
-    parse_budgets,
-    pick,
-    recommended,
-    saving,
-    usual_point,
-    with_expectations,
-    with_fronts,
-)
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
 from spikeloom.runtime.studies.chart.results import ChosenBy
 
@@ -232,7 +220,7 @@ def points():
         point(4, 395, 89, 40, 2.5, bits=2),
         point(5, 400, 60, 300, 1.0, cores="latency"),
     ]
-    return with_fronts(with_expectations(made, [made_network()])[0], BY)
+    return choices.with_fronts(choices.with_expectations(made, [made_network()])[0], BY)
 
 
 # -- fronts and expectations -------------------------------------------------------------------------------------------
@@ -243,7 +231,7 @@ def test_the_front_is_what_no_other_point_beats(pairs):
         not any(other[0] >= gain and other[1] <= cost and other != (gain, cost) for other in pairs)
         for gain, cost in pairs
     ]
-    assert front(gains, costs) == wanted
+    assert choices.front(gains, costs) == wanted
 
 
 def test_fronts_are_of_test_accuracy_and_each_cost(points):
@@ -253,17 +241,17 @@ def test_fronts_are_of_test_accuracy_and_each_cost(points):
 
 
 def test_expected_is_validation_times_what_is_kept_on_training_recordings():
-    (reached,), (network,), words = with_expectations([point(1, 380, 50, 1, 1)], [made_network(trained=396)])
-    assert (reached.expected, network.expected, words) == (pytest.approx(0.9 * 0.95 / 0.99), 0.9, VALIDATION)
+    (reached,), (network,), words = choices.with_expectations([point(1, 380, 50, 1, 1)], [made_network(trained=396)])
+    assert (reached.expected, network.expected, words) == (pytest.approx(0.9 * 0.95 / 0.99), 0.9, choices.VALIDATION)
     # where one checkpoint knows no validation, training figures stand for all
     networks = [made_network(trained=396), made_network("other", validation=None)]
-    (reached,), _, words = with_expectations([point(1, 380, 50, 1, 1)], networks)
-    assert (reached.expected, words) == (pytest.approx(0.95), TRAINING)
+    (reached,), _, words = choices.with_expectations([point(1, 380, 50, 1, 1)], networks)
+    assert (reached.expected, words) == (pytest.approx(0.95), choices.TRAINING)
 
 
 # -- choices -----------------------------------------------------------------------------------------------------------
 def chosen(points, expected=0.9, bins=1):
-    return recommended(points, [made_network(expected=expected, bins=bins)], BY, bin_s=0.02)
+    return choices.recommended(points, [made_network(expected=expected, bins=bins)], BY, bin_s=0.02)
 
 
 def test_recommended_points(points):
@@ -281,11 +269,11 @@ def test_a_point_that_does_not_keep_pace_with_the_sensor_is_not_the_fastest(poin
 def test_choices_do_not_look_at_the_test_split(points):
     blind = [replace(each, test=made_figures(1, 100, 1, 1)) for each in points]
     assert chosen(blind) == chosen(points)
-    assert pick(blind, parse_budgets(["energy=100uJ"]), BY).point == 3
+    assert choices.pick(blind, choices.parse_budgets(["energy=100uJ"]), BY).point == 3
 
 
 def test_saving_against_eight_bits(points):
-    found = saving(points, BY)
+    found = choices.saving(points, BY)
     assert (found.usual, found.chosen.point, found.seen.point) == (1, 3, 4)
     assert found.chosen.energy == {"one": pytest.approx(200 / 60), "two": pytest.approx(200 / 60)}
     assert found.chosen.accuracy == pytest.approx(-0.18)
@@ -294,13 +282,13 @@ def test_saving_against_eight_bits(points):
 
 
 def test_the_usual_mapping_is_the_manual_graph_at_eight_bits_on_whole_recordings(points):
-    assert usual_point(points[1:]) is None
-    assert saving(points[1:], BY) is None
+    assert choices.usual_point(points[1:]) is None
+    assert choices.saving(points[1:], BY) is None
     other = point(6, 400, 80, 100, 1, bits=8, graph="knn:1")
-    assert usual_point([other, *points]).number == 1
-    assert usual_point([other, *points[1:]]).number == 6
+    assert choices.usual_point([other, *points]).number == 1
+    assert choices.usual_point([other, *points[1:]]).number == 6
     for about in ({"fine_tuned": True}, {"prune": True}, {"window": 50}, {"planes": 2}, {"cores": "latency"}):
-        assert usual_point([point(7, 400, 80, 100, 1, bits=8, **about)]) is None
+        assert choices.usual_point([point(7, 400, 80, 100, 1, bits=8, **about)]) is None
 
 
 # -- budgets -----------------------------------------------------------------------------------------------------------
@@ -315,8 +303,8 @@ def test_the_usual_mapping_is_the_manual_graph_at_eight_bits_on_whole_recordings
     ],
 )
 def test_a_budget_in_units(words, limit):
-    (budget,) = parse_budgets([words])
-    assert budget == Budget(what=words.partition("=")[0], limit=pytest.approx(limit), words=words)
+    (budget,) = choices.parse_budgets([words])
+    assert budget == choices.Budget(what=words.partition("=")[0], limit=pytest.approx(limit), words=words)
 
 
 @pytest.mark.parametrize(
@@ -330,9 +318,9 @@ def test_a_budget_in_units(words, limit):
 )
 def test_a_budget_that_is_none(words):
     with pytest.raises(OptionError, match=f"--budget {words}: .*(write|allowed|give)"):
-        parse_budgets([words])
+        choices.parse_budgets([words])
     with pytest.raises(OptionError, match="--budget latency=2ms: latency is limited twice; give it once"):
-        parse_budgets(["latency=1ms", "latency=2ms"])
+        choices.parse_budgets(["latency=1ms", "latency=2ms"])
 
 
 @pytest.mark.parametrize(
@@ -347,13 +335,13 @@ def test_a_budget_that_is_none(words):
     ],
 )
 def test_the_point_that_fits_all_budgets(points, budgets, number, fitting):
-    found = pick(points, parse_budgets(budgets), BY)
+    found = choices.pick(points, choices.parse_budgets(budgets), BY)
     assert (found.fits, found.point, found.fitting, found.misses) == (True, number, fitting, {})
 
 
 def test_what_is_given_up_beside_the_best(points):
-    assert pick(points, (), BY) is None
-    found = pick(points, parse_budgets(["energy=150uJ"]), BY)
+    assert choices.pick(points, (), BY) is None
+    found = choices.pick(points, choices.parse_budgets(["energy=150uJ"]), BY)
     assert found.best == 1
     assert found.given_up.expected == pytest.approx(-0.0045)
     assert found.given_up.accuracy == pytest.approx(0.02)
@@ -362,14 +350,14 @@ def test_what_is_given_up_beside_the_best(points):
 
 
 def test_the_nearest_point_of_a_budget_that_nothing_fits(points):
-    found = pick(points, parse_budgets(["energy=20uJ"]), BY)
+    found = choices.pick(points, choices.parse_budgets(["energy=20uJ"]), BY)
     assert (found.fits, found.fitting, found.point) == (False, 0, 4)
     (miss,) = found.misses.values()
     assert (miss["limit"], miss["found"]) == (pytest.approx(20 * UJ), pytest.approx(40 * UJ))
-    both = pick(points, parse_budgets(["energy=50uJ", "latency=2ms"]), BY)
+    both = choices.pick(points, choices.parse_budgets(["energy=50uJ", "latency=2ms"]), BY)
     assert (both.point, list(both.misses)) == (3, ["energy"])
     with pytest.raises(OptionError, match=r"--budget latency: .*no time table"):
-        pick(points, parse_budgets(["latency=1ms"]), ChosenBy(energy="one", time=None))
+        choices.pick(points, choices.parse_budgets(["latency=1ms"]), ChosenBy(energy="one", time=None))
 
 
 TARGET = load_target("loihi1")

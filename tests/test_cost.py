@@ -24,29 +24,23 @@ from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.studies.yardsticks import HOROWITZ, measure
 
-PICOJOULES = {
-    "davies2018": {
-        "synaptic_operation_dense": 23.6,
-        "synaptic_operation_sparse": 23.6,
-        "neuron_idle": 52.0,
-        "neuron_active": 81.0,
-        "spike": 0.0,  # part of the active update
-        "packet": 1.7,
-        "hop_east_west": 3.0,
-        "hop_north_south": 4.0,
-    },
-    "sanafe": {
-        "synaptic_operation_dense": 35.5,
-        "synaptic_operation_sparse": 33.6,
-        "neuron_idle": 51.2,
-        "neuron_active": 72.8,
-        "spike": 69.3,
-        "packet": 111.0,
-        "hop_east_west": 3.0,
-        "hop_north_south": 4.2,
-    },
-}
-"""The published prices, typed a second time."""
+DAVIES = {"synaptic_operation": 23.6, "neuron_idle": 52, "neuron_active": 81, "packet": 1.7}
+DAVIES |= {"hop_east_west": 3, "hop_north_south": 4}
+SANAFE = {"synaptic_operation_dense": 35.5, "synaptic_operation_sparse": 33.6, "neuron_idle": 51.2}
+SANAFE |= {"neuron_active": 72.8, "spike": 69.3, "packet": 111, "hop_east_west": 3, "hop_north_south": 4.2}
+PICOJOULES = {"davies2018": DAVIES, "sanafe": SANAFE}
+
+
+@pytest.mark.parametrize(("table", "prices"), PICOJOULES.items())
+def test_energies_are_the_published_ones(table, prices):
+    found = {entry.name: entry for entry in LOIHI.energy}
+    assert set(found) == set(PICOJOULES)
+    assert {event: price.value for event, price in found[table].prices.items()} == prices
+    assert {price.unit for price in found[table].prices.values()} == {"pJ"}
+    for event, picojoule in prices.items():
+        assert found[table].joule(event) == pytest.approx(picojoule * 1e-12, rel=1e-15)
+    with pytest.raises(KeyError):  # unknown, not free
+        found["davies2018"].joule("spike")
 
 
 def brute_force(netlist, recording, trace=None):
@@ -75,6 +69,8 @@ def brute_force(netlist, recording, trace=None):
                     found["packet"][netlist.layer[sender]] += 1
                     found["hop_east_west"][netlist.layer[sender]] += abs(here[1] - there[1])
                     found["hop_north_south"][netlist.layer[sender]] += abs(here[0] - there[0])
+    of_both_forms = found["synaptic_operation_dense"], found["synaptic_operation_sparse"]
+    found["synaptic_operation"] = np.sum(of_both_forms, axis=0).tolist()
     for layer in layers:
         found["neuron_active"][layer] = int(trace.counts.updates[layer])
         held = int(np.count_nonzero(netlist.layer == layer))

@@ -14,15 +14,7 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.base import (
-    CROSSBARS,
-    LATENCIES,
-    known_targets,
-    load_target,
-    read_target,
-    shipped,
-    with_tables,
-)
+from spikeloom.compiler.targets import base
 from spikeloom.compiler.targets.loihi1.legalize import REMEDIES
 from spikeloom.compiler.targets.loihi1.netlist import write_netlist
 from spikeloom.runtime import machines
@@ -143,10 +135,10 @@ def test_a_third_chip_is_a_folder_of_the_compiler_and_one_of_the_machines(tmp_pa
         for name, text in texts.items():
             (folder / name).write_text(text)
         monkeypatch.setattr(package, "__path__", [*package.__path__, str(folder.parent)])
-    shipped.cache_clear()
+    base.shipped.cache_clear()
     try:
         done = compile_network(expand(random_checkpoint(), ring(5)), target="toy")
-        assert [step.name for step in load_target("toy").passes][4] == "unplug"
+        assert [step.name for step in base.load_target("toy").passes][4] == "unplug"
         assert np.diff(done.netlist.core_compartments).max() <= 8
         assert not (done.netlist.axon_source == 0).any()
         write_netlist(done.netlist, tmp_path / "net.loom")
@@ -161,7 +153,7 @@ def test_a_third_chip_is_a_folder_of_the_compiler_and_one_of_the_machines(tmp_pa
         with pytest.raises(OptionError, match="toy has no such price model; allowed: counts"):
             machine.price(events, bin_s=0.02, detail="cycle")
     finally:
-        shipped.cache_clear()
+        base.shipped.cache_clear()
         for name in [name for name in sys.modules if ".toy" in name]:
             del sys.modules[name]
 
@@ -184,13 +176,6 @@ CHOICES = {
     "synapse.index_bits": (0, 6, 7, 8, 9, 10, 11, 12),
     "synapse.exponent": (-1, 0, 1, 2, 3, 4, 5, 6, 7),
 }
-DAVIES = table("""
-    synaptic_operation 23.6  neuron_idle 52  neuron_active 81  packet 1.7  hop_east_west 3  hop_north_south 4
-""")
-SANAFE = table("""
-    synaptic_operation_dense 35.5  synaptic_operation_sparse 33.6  neuron_idle 51.2  neuron_active 72.8  spike 69.3
-    packet 111  hop_east_west 3  hop_north_south 4.2
-""")
 TIME = table("""
     neuron_access 6  neuron_update 3.7  spike 30  axon_out 5.1  axon_in 16  synaptic_operation_dense 3.8
     synaptic_operation_sparse 4.7  hop_east_west 4.1  hop_north_south 6.5
@@ -199,7 +184,7 @@ BARRIERS = {1: 600, 2: 1000, 4: 1400, 29: 1800}
 
 
 def test_limits_are_the_published_ones():
-    target = load_target("loihi1")
+    target = base.load_target("loihi1")
     assert (target.name, target.title) == ("loihi1", "Intel Loihi 1")
     assert {rule: entry.value for rule, entry in target.limits.items()} == LIMITS
     assert [target.limit(rule) for rule in LIMITS] == list(LIMITS.values())
@@ -209,22 +194,10 @@ def test_limits_are_the_published_ones():
     assert set(REMEDIES) == {rule for rule in LIMITS if rule.startswith(("core.", "chip."))}
 
 
-@pytest.mark.parametrize(("table", "prices"), [("davies2018", DAVIES), ("sanafe", SANAFE)])
-def test_energies_are_the_published_ones(table, prices):
-    found = {entry.name: entry for entry in load_target("loihi1").energy}
-    assert set(found) == {"davies2018", "sanafe"}
-    assert {event: price.value for event, price in found[table].prices.items()} == prices
-    assert {price.unit for price in found[table].prices.values()} == {"pJ"}
-    for event, picojoule in prices.items():
-        assert found[table].joule(event) == pytest.approx(picojoule * 1e-12, rel=1e-15)
-    with pytest.raises(KeyError):  # unknown, not free
-        found["davies2018"].joule("spike")
-
-
 def test_latencies_are_the_published_ones():
-    (table,) = load_target("loihi1").time
+    (table,) = base.load_target("loihi1").time
     assert table.name == "sanafe"
-    assert set(TIME) == set(LATENCIES)
+    assert set(TIME) == set(base.LATENCIES)
     assert {event: entry.value for event, entry in table.latencies.items()} == TIME
     assert {least: entry.value for least, entry in table.barriers.items()} == BARRIERS
     assert {entry.unit for entry in (*table.latencies.values(), *table.barriers.values())} == {"ns"}
@@ -235,8 +208,8 @@ def test_latencies_are_the_published_ones():
 
 
 def test_known_targets_are_the_folders():
-    assert known_targets() == ("loihi1", "truenorth")
-    assert known_targets(CROSSBARS) == ("truenorth",)
+    assert base.known_targets() == ("loihi1", "truenorth")
+    assert base.known_targets(base.CROSSBARS) == ("truenorth",)
 
 
 # -- files that are wrong ----------------------------------------------------------------------------------------------
@@ -268,11 +241,11 @@ WRONG = [
 def test_a_wrong_entry_is_named(tmp_path, old, new, words):
     assert TEXT.count(old) == 1
     (tmp_path / "x.toml").write_text(TEXT.replace(old, new), "utf-8")
-    refused(OptionError, f"{tmp_path / 'x.toml'}: |{words}", read_target, tmp_path / "x.toml")
+    refused(OptionError, f"{tmp_path / 'x.toml'}: |{words}", base.read_target, tmp_path / "x.toml")
 
 
 def test_a_file_that_is_not_there(tmp_path):
-    refused(OptionError, "cannot be read", read_target, tmp_path / "no.toml")
+    refused(OptionError, "cannot be read", base.read_target, tmp_path / "no.toml")
 
 
 # -- tables of one's own -----------------------------------------------------------------------------------------------
@@ -285,27 +258,27 @@ neuron_active = { value = 80.0, unit = "pJ", source = "board 7" }
 
 
 def test_tables_by_name_or_from_a_file(tmp_path):
-    chip = load_target("loihi1")
-    assert [table.name for table in with_tables(chip, "davies2018").energy] == ["davies2018"]
-    assert with_tables(chip, "davies2018").time == chip.time
+    chip = base.load_target("loihi1")
+    assert [table.name for table in base.with_tables(chip, "davies2018").energy] == ["davies2018"]
+    assert base.with_tables(chip, "davies2018").time == chip.time
     (tmp_path / "mine.toml").write_text(MINE)
-    found = with_tables(chip, str(tmp_path / "mine.toml"))
+    found = base.with_tables(chip, str(tmp_path / "mine.toml"))
     assert [(table.name, table.joule("neuron_active")) for table in found.energy] == [("mine", 80e-12)]
     assert (found.time, found.limits, found.static) == (chip.time, chip.limits, chip.static)
 
 
 def test_tables_that_are_not_there_or_wrong(tmp_path):
-    chip, path = load_target("loihi1"), tmp_path / "mine.toml"
-    refused(OptionError, "--table davis: unknown|davies2018, sanafe|.toml", with_tables, chip, "davis")
-    refused(OptionError, f"{path}: cannot be read", with_tables, chip, str(path))
+    chip, path = base.load_target("loihi1"), tmp_path / "mine.toml"
+    refused(OptionError, "--table davis: unknown|davies2018, sanafe|.toml", base.with_tables, chip, "davis")
+    refused(OptionError, f"{path}: cannot be read", base.with_tables, chip, str(path))
     path.write_text("limits = 3")
-    refused(OptionError, "holds limits|[energy.NAME]|[time.NAME]", with_tables, chip, str(path))
+    refused(OptionError, "holds limits|[energy.NAME]|[time.NAME]", base.with_tables, chip, str(path))
     path.write_text("")
-    refused(OptionError, "holds nothing|[energy.NAME]", with_tables, chip, str(path))
+    refused(OptionError, "holds nothing|[energy.NAME]", base.with_tables, chip, str(path))
     path.write_text(MINE.replace("80.0", "-80.0"))
-    refused(OptionError, "energy.mine.neuron_active: value is -80.0", with_tables, chip, str(path))
+    refused(OptionError, "energy.mine.neuron_active: value is -80.0", base.with_tables, chip, str(path))
     path.write_text(MINE.replace("[energy.mine]", "[energy.mine]\nhopp = 1"))
-    refused(OptionError, "energy.mine.hopp: unknown", with_tables, chip, str(path))
+    refused(OptionError, "energy.mine.hopp: unknown", base.with_tables, chip, str(path))
 
 
 # -- crossbars ---------------------------------------------------------------------------------------------------------
@@ -319,7 +292,7 @@ UNVERIFIED = {"neuron.leak_bits", "neuron.threshold_bits", "neuron.reset_bits"}
 
 
 def test_truenorth_limits_with_source_and_confidence():
-    target = load_target("truenorth")
+    target = base.load_target("truenorth")
     assert {rule: target.limit(rule) for rule in target.limits} == TRUENORTH
     assert all(entry.source and entry.confidence for entry in target.limits.values())
     assert {rule for rule, entry in target.limits.items() if entry.confidence == "unverified"} == UNVERIFIED
@@ -328,7 +301,7 @@ def test_truenorth_limits_with_source_and_confidence():
 
 
 def test_truenorth_energy_has_two_readings_and_only_one_has_a_floor():
-    target = load_target("truenorth")
+    target = base.load_target("truenorth")
     read = {table.name: (table.joule("synaptic_event"), table.floor_w) for table in target.energy}
     assert read == {
         "all_in": (pytest.approx(26e-12), None),

@@ -12,17 +12,9 @@ from random_netlists import Axon, Neuron, build
 from random_networks import LOIHI, chain, compiled, integer_chain, integer_population, small_target, stored
 from timed_networks import TIMING, events_of, written
 
-from spikeloom.compiler import Options, Packing, compile_network, lift
+from spikeloom.compiler import Options, Packing, compile_network, fixedpoint, lift
 from spikeloom.compiler.dynamics import Dynamics, with_clocks
 from spikeloom.compiler.errors import CapacityError, NumericRangeError
-from spikeloom.compiler.fixedpoint import (
-    ACCUMULATOR_MAX,
-    CURRENT_MAX,
-    MEMBRANE_MAX,
-    ONE_STEP_SUM_MAX,
-    decay_registers,
-    read_only,
-)
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import Input, IntegerProjection, Projection
@@ -75,7 +67,7 @@ def compilation(timed):
     [(0.0, 4095, 0.0), (0.5, 2047, 0.5), (0.95, 204, 3891 / 4096), (0.9999, 0, 4095 / 4096), (0.0001, 4095, 0.0)],
 )
 def test_the_current_register_is_the_nearest(alpha, register, realised):
-    assert decay_registers(0.2, alpha) == (register, 3277)
+    assert fixedpoint.decay_registers(0.2, alpha) == (register, 3277)
     assert replace(integer_population("fc1", 1), decay_u=register).realised_alpha == realised
     assert abs(realised - alpha) <= 1.5e-4  # half a step, at the end of the register a little more
 
@@ -84,8 +76,8 @@ def test_a_current_counts_by_the_register_that_it_fills_first():
     """Loses 205/4096 a step: 6,559 units a step add up to 6,559 * 64 * 4096 / 205 = 8,387,4xx of 8,388,607."""
     assert current_load(4095) == current_load(1023) == 1.0  # four times as wide a register
     assert current_load(204) == pytest.approx((4096 / 205) * 32767 * 64 / 8388607, rel=1e-12)
-    most = int(ONE_STEP_SUM_MAX / current_load(204))
-    assert most * 64 * 4096 // 205 <= CURRENT_MAX < (most + 1) * 64 * 4096 // 205
+    most = int(fixedpoint.ONE_STEP_SUM_MAX / current_load(204))
+    assert most * 64 * 4096 // 205 <= fixedpoint.CURRENT_MAX < (most + 1) * 64 * 4096 // 205
 
 
 def one_synapse(weight, exponent, **neuron):
@@ -103,7 +95,7 @@ def test_the_largest_current_stays_and_one_unit_more_overflows():
     for _ in range(400):
         current = current * 3891 // 4096 + 6528 * 64
     assert trace.membranes[-1, 0] == current  # no membrane outlasts its step here
-    assert 0.99 * CURRENT_MAX < current <= CURRENT_MAX
+    assert 0.99 * fixedpoint.CURRENT_MAX < current <= fixedpoint.CURRENT_MAX
     over = one_synapse(104, 6, decay_u=204, threshold=2**17 - 1)  # 6,656
     messages = []
     for simulate in (spec.simulate, lambda n, e: engine.simulate(n, e[None])):
@@ -142,14 +134,15 @@ def test_a_neuron_that_only_fires_from_its_gathered_current_is_kept():
 def test_ranges_are_proven_for_any_input(compilation):
     assert all(proof.holds for proof in compilation.proofs)
     lasting = compilation.proofs[1]
-    assert 0.8 * MEMBRANE_MAX < max(lasting.current, lasting.membrane) <= MEMBRANE_MAX, "the scale is as fine as can be"
-    assert lasting.accumulator < 0.3 * ACCUMULATOR_MAX
+    widest = max(lasting.current, lasting.membrane)
+    assert 0.8 * fixedpoint.MEMBRANE_MAX < widest <= fixedpoint.MEMBRANE_MAX, "the scale is as fine as can be"
+    assert lasting.accumulator < 0.3 * fixedpoint.ACCUMULATOR_MAX
     assert_allclose(
         [p.accumulator for p in prove_ranges(lift(compilation.netlist))], [p.accumulator for p in compilation.proofs]
     )
     positive, negative = one_step_bounds(compilation.netlist)
     ids = compilation.netlist.compartments_of(1)
-    assert np.all(np.maximum(positive, negative)[ids] * 64 * 4096 // 205 <= CURRENT_MAX)
+    assert np.all(np.maximum(positive, negative)[ids] * 64 * 4096 // 205 <= fixedpoint.CURRENT_MAX)
 
 
 @pytest.mark.parametrize(
@@ -222,7 +215,7 @@ def test_a_wrong_current_register_is_named(timed, compilation):
     _, _, network = timed
     decay = compilation.netlist.decay_u.copy()
     decay[compilation.netlist.compartments_of(1)] = 100
-    wrong = replace(compilation.netlist, decay_u=read_only(decay))
+    wrong = replace(compilation.netlist, decay_u=fixedpoint.read_only(decay))
     assert check_rounding(integer_machine_of(compilation.netlist), network).holds
     assert check_rounding(integer_machine_of(wrong), network).layers["fc1"].faults == (
         "fc1 has decay registers 100 and 2867 instead of 204 and 2867",

@@ -22,19 +22,12 @@ from spikeloom.models.networks.surrogate import FAST_SIGMOID, Surrogate
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.models.systems import propagation_of
+from spikeloom.models.truenorth import network as truenorth
 from spikeloom.models.truenorth.kind import CROSSBARS
-from spikeloom.models.truenorth.network import (
-    NativeArchitecture,
-    native_network,
-    run_layers,
-    run_network,
-    sized,
-    votes_by_step,
-)
 from spikeloom.models.truenorth.neurons import block_sums, integrate
 
 SMOOTH = Surrogate(shape=FAST_SIGMOID, width=0.5, reset=False)
-SIZES = NativeArchitecture(taxels=6, classes=3, features=4, groups=2, hidden=(6, 4), clocks=clocks_over(2, 9))
+SIZES = truenorth.NativeArchitecture(taxels=6, classes=3, features=4, groups=2, hidden=(6, 4), clocks=clocks_over(2, 9))
 EDGES = np.array([[0, 1], [1, 0], [1, 2], [2, 1], [3, 4], [4, 3]])
 
 
@@ -91,9 +84,9 @@ def test_what_is_trained_is_what_is_exported():
     with torch.no_grad():
         net.biases[1] += 0.3
         net.hops *= 2
-    found = native_network(SIZES, net.export_weights())
+    found = truenorth.native_network(SIZES, net.export_weights())
     assert faults(found) == []
-    votes = run_network(found, events)["fc3"].sum(axis=1).reshape(3, -1, 3).mean(axis=1) / 9
+    votes = truenorth.run_network(found, events)["fc3"].sum(axis=1).reshape(3, -1, 3).mean(axis=1) / 9
     rates = net(torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32)))
     np.testing.assert_allclose(rates.detach().numpy(), votes, rtol=1e-6)
     for layer in net.rounded():
@@ -118,7 +111,7 @@ def test_equal_votes_stay_equal():
     rng, equal = np.random.default_rng(3), 0
     for lengths in (None, torch.tensor([40] * 200)):
         events = torch.tensor(rng.random((40, 200, 6, 2)) < 0.3, dtype=torch.float32)
-        *_, spikes = run_layers(net.rounded(), net.inputs, sizes.clocks, events, net.surrogate)
+        *_, spikes = truenorth.run_layers(net.rounded(), net.inputs, sizes.clocks, events, net.surrogate)
         counts = spikes.detach().numpy().sum(0).reshape(200, 12, 3).sum(1)
         rates = net(events, lengths).detach().numpy()
         for one, other in ((0, 1), (0, 2), (1, 2)):
@@ -129,14 +122,14 @@ def test_equal_votes_stay_equal():
 
 
 def test_groups_fill_the_axons_of_a_core():
-    found = sized(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(5, 325))
+    found = truenorth.sized(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(5, 325))
     assert (found.groups, found.hidden) == (8, (80, 80))
-    found = sized(taxels=39, classes=20, hops=3, features=15, copies=2, clocks=clocks_over(8, 325))
+    found = truenorth.sized(taxels=39, classes=20, hops=3, features=15, copies=2, clocks=clocks_over(8, 325))
     assert (found.groups, found.hidden) == (5, (120, 120))
     with pytest.raises(OptionError, match=r"--copies 4: 78 input channels with 4 axons each, .* has 256"):
-        sized(taxels=39, classes=20, hops=3, features=16, copies=4, clocks=clocks_over(5, 325))
+        truenorth.sized(taxels=39, classes=20, hops=3, features=16, copies=4, clocks=clocks_over(5, 325))
     with pytest.raises(OptionError, match=r"--features 16: .* 39 taxels and 60 clocks to cores of 85 inputs"):
-        sized(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(60, 325))
+        truenorth.sized(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(60, 325))
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
@@ -216,7 +209,7 @@ def test_from_recordings_to_the_chip(tmp_path, monkeypatch):
     found = as_json("verify", "x.loom", "--data", "data", "--checkpoint", "x.pt", "--spec-samples", "1")
     assert found["exact"]
     network = read_trained("x.pt").network
-    votes = [votes_by_step(network, events[None]).sum(axis=0) for events in grasps[1].events]
+    votes = [truenorth.votes_by_step(network, events[None]).sum(axis=0) for events in grasps[1].events]
     right = np.count_nonzero(np.argmax(votes, axis=1) == grasps[1].labels)
     assert found["correct"] == run["last"]["correct"] == right
     # what was finished is not trained again

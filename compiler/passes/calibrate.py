@@ -68,9 +68,7 @@ class Calibration:
 
 def evenly_spaced(events: BoolArray, count: int = FEW) -> BoolArray:
     """At most `count` recordings, evenly spaced over the first axis."""
-    if len(events) <= count:
-        return events
-    return events[np.linspace(0, len(events) - 1, count).round().astype(np.int64)]
+    return events[np.linspace(0, len(events) - 1, min(count, len(events))).round().astype(np.int64)]
 
 
 def fewer(calibration: Calibration, count: int = FEW) -> Calibration:

@@ -20,6 +20,7 @@ class LIF(nn.Module):
 
     Examples
     --------
+    >>> import torch
     >>> neuron = LIF(beta=0.5, theta=1.0)
     >>> [float(neuron(torch.tensor([0.75]))) for _ in range(3)]
     [0.0, 1.0, 0.0]

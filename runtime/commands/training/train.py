@@ -246,7 +246,7 @@ def _sensor(arguments: argparse.Namespace) -> tuple[Graph, Grid | None]:
     graph = load_graph(arguments, system)
     if system not in GRAPH_SYSTEMS:
         places = sensor_places(arguments.taxels)
-        grid = sensor_grid(places, arguments.padding or PADDINGS[0]) if system == GRID_CNN else None
+        grid = sensor_grid(places, arguments.padding or "none") if system == GRID_CNN else None
         return taxels_alone(places), grid
     if graph is None:
         raise OptionError(f"train: no graph; name it with --graph: {CHOICES}, or give --edges")
