@@ -6,12 +6,14 @@ as the spikes that arrive in it, and a pass over the neurons.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
 
 import numba
 import numpy as np
 import numpy.typing as npt
+from numba.core import event as numba_event
 from scipy import sparse
 
 from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT
@@ -77,9 +79,31 @@ def raster_of(spikes: BoolArray) -> Raster:
     return Raster((at - np.repeat(begins[:-1], np.diff(bounds))).astype(np.int32), bounds)
 
 
+class _Notice(numba_event.Listener):
+    """Says once on a terminal that machine code is being compiled, which takes seconds."""
+
+    said = False
+
+    def on_start(self, _event: Any) -> None:
+        """The first of many functions."""
+        if not self.said and sys.stderr.isatty():
+            sys.stderr.write("\r\x1b[Kcompiling the simulator's machine code, once after an installation\n")
+        self.said = True
+
+    def on_end(self, _event: Any) -> None:
+        """Nothing more to say."""
+
+
+_events: Any = numba_event  # without types
+_events.register("numba:compile", _Notice())  # no cache has a function
+
+_PART: Any = {"nogil": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+"""Only kernels are called from Python."""
+
+
 def compiled(function: Function) -> Function:
     """Compile a part of a kernel; it is cached with the whole."""
-    return cast(Function, numba.njit(nogil=True)(function))
+    return cast(Function, numba.njit(**_PART)(function))
 
 
 def compiled_and_cached(function: Function) -> Function:
@@ -87,7 +111,7 @@ def compiled_and_cached(function: Function) -> Function:
     try:
         return cast(Function, numba.njit(nogil=True, cache=True)(function))
     except RuntimeError:  # neither the folder of this file nor the user's cache folder can be written
-        return compiled(function)
+        return cast(Function, numba.njit(nogil=True)(function))
 
 
 # Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the loops.
@@ -118,6 +142,13 @@ def list_fired(fired: Any, listed: Any) -> Any:
             listed[n] = neuron
             n += 1
     return n
+
+
+@compiled
+def copy(values: Any, out: Any) -> None:
+    """As ``out[:] = values``, which takes seconds to compile: it can refuse shapes with a message that it composes."""
+    for i in range(len(values)):
+        out[i] = values[i]
 
 
 @compiled
@@ -188,7 +219,7 @@ def float_layer(
                 arrive(current, own, before, 0, list_fired(fired[recording, t - 1], before))
             _integrate_float(membrane, current, bias, beta, theta, fired[recording, t])
             if len(membranes):
-                membranes[recording, t] = membrane
+                copy(membrane, membranes[recording, t])
             if len(wanted):
                 _compare(fired[recording, t], wanted[recording, t], moved[0], moved[1])
             if t % 16 == 15:
@@ -255,6 +286,6 @@ def integer_layer(
                 arrive(sums, own, before, 0, list_fired(fired[recording, t - 1], before))
             _integrate_integer(membrane, current, sums, bias, threshold, keep_u, keep_v, limit, fired[recording, t])
             if len(membranes):
-                membranes[recording, t] = membrane
+                copy(membrane, membranes[recording, t])
             if len(wanted):
                 _compare(fired[recording, t], wanted[recording, t], moved[0], moved[1])

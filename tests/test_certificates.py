@@ -10,7 +10,6 @@ from made_files import CLASSES, FEATURES, TAXELS, events, ring, small_checkpoint
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.interpret import channels_last, run_float, vote
-from spikeloom.compiler.layer_kernel import arrive
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.equivalence.certain_spikes import SPARE, Certainty, _layers, _step
@@ -166,7 +165,7 @@ def test_a_membrane_that_was_not_reset_is_below_its_threshold():
     membrane, fired, unsure = np.zeros((2, 1)), np.zeros(1, np.uint8), np.zeros(1, np.uint8)
     found = []
     for centre, radius in ((5.0, 5.0), (0.2, 0.0)):
-        _step(*membrane, np.array([centre]), np.array([radius]), 0.5, 0.5, 0.5, fired, unsure)
+        _step.py_func(*membrane, np.array([centre]), np.array([radius]), 0.5, 0.5, 0.5, fired, unsure)
         found.append((bool(fired[0]), bool(unsure[0])))
     assert found == [(False, True), (False, False)]
 
@@ -175,7 +174,9 @@ def dense(synapses, neurons):
     """Weights as a matrix (sources, neurons)."""
     found = np.zeros((len(synapses.run) - 1, neurons))
     for source in range(len(found)):
-        arrive(found[source], synapses, np.array([source], np.int32), 0, 1)
+        for run in range(synapses.run[source], synapses.run[source + 1]):
+            weights_of_run = synapses.weight[synapses.offset[run] : synapses.offset[run + 1]]
+            found[source, synapses.target[run] :][: len(weights_of_run)] += weights_of_run
     return found
 
 

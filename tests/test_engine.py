@@ -21,6 +21,7 @@ from random_netlists import (
     ungated,
 )
 
+from spikeloom.compiler import layer_kernel
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1 import engine, kernel, spec
@@ -169,8 +170,8 @@ def test_the_kernel_compiles_where_nothing_can_be_cached(monkeypatch):
             raise RuntimeError("cannot cache function: no locator available")
         return lambda function: (function, options)
 
-    monkeypatch.setattr(kernel, "njit", njit)
-    assert kernel.compiled_and_cached(len) == (len, {"nogil": True})
+    monkeypatch.setattr(layer_kernel.numba, "njit", njit)
+    assert layer_kernel.compiled_and_cached(len) == (len, {"nogil": True})
 
 
 # --- the kernel of layers ---------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.archive import stated
+from spikeloom.compiler.archive import TRAINED, stated
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
@@ -29,6 +29,7 @@ from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime import machines
+from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
 
@@ -233,10 +234,6 @@ class Machine(ABC):
         """Recordings of so many data steps whose price is worked out at a time where memory is short."""
 
     @abstractmethod
-    def describe(self, sha256: str) -> Outcome:
-        """Layers, cores, and how full each limit is; `sha256` is the file's."""
-
-    @abstractmethod
     def stream(self) -> Stream:
         """State of one grasp that runs bin after bin; OptionError if the simulator runs whole recordings only."""
 
@@ -310,17 +307,27 @@ def machine_of(netlist: Netlist) -> Machine:
     return machine
 
 
+def describe(path: str | os.PathLike[str]) -> Outcome:
+    """Layers and cores of a netlist file, and how full each limit is; SpikeloomError if it is none."""
+    outcome: Outcome = chip_module(_chip_of(path), "description").inspect(path)
+    return outcome
+
+
+def _chip_of(path: str | os.PathLike[str]) -> str:
+    name = stated(Path(path), "target")
+    return name if name is not None and name.isidentifier() and has_machine(name) else DEFAULT
+
+
 def machine_for(path: str | os.PathLike[str]) -> Machine:
     """Read a netlist file, whatever chip it is for; SpikeloomError if it is none."""
-    name = stated(Path(path), "target")
-    known = name is not None and name.isidentifier() and has_machine(name)
-    machine: Machine = _module(name if known and name else DEFAULT).load(path)
+    machine: Machine = _module(_chip_of(path)).load(path)
     return machine
 
 
 def chip_module(name: str, part: str) -> Any:
     """What only some chips do in their own way: a module in the folder of a chip, or None if it has none of the name.
 
+    - ``description``: ``inspect(path)``, what a netlist file holds; it loads no simulator.
     - ``commands``: ``compile_network(arguments)`` and ``verify(arguments)`` for all networks; for checkpoints that were
       trained for the chip, which ``takes(path)`` knows, ``inspect(arguments)``.
     - ``compiled``: ``outcome(compilation, sha256, facts)``, what the target's ``compile`` chose, proved and removed;
@@ -338,8 +345,8 @@ def _chip_modules(part: str) -> list[Any]:
 
 def trained_for(path: object) -> Any:
     """Commands of the chip that a checkpoint was trained for; None for any other network."""
-    if not isinstance(path, str):
-        return None
+    if not isinstance(path, str) or stated(Path(shipped(path)), "format") != TRAINED:
+        return None  # without a look into the modules of any chip, which load its simulator
     return next((chip for chip in _chip_modules("commands") if chip.takes(path)), None)
 
 

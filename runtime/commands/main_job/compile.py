@@ -29,7 +29,7 @@ from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.inputs.repeat import NETWORK, ROUNDING, refuse
-from spikeloom.runtime.machines.base import chip_module, machine_of, trained_for
+from spikeloom.runtime.machines.base import chip_module, describe, trained_for
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
@@ -173,7 +173,7 @@ def _compile_integers(arguments: argparse.Namespace) -> Outcome:
     options = Options(keep_all=arguments.keep_all, cores_for=cores_for, chips=arguments.chips, provenance=provenance)
     done = compile_network(read.network, options, target=arguments.target)
     sha256 = write_netlist(done.netlist, arguments.output)
-    described = machine_of(done.netlist).describe(sha256)
+    described = describe(arguments.output)
 
     def sections(made: LaidOut) -> Iterator[Section]:
         yield Section("", [*map(Text, made.facts)])

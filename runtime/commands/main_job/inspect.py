@@ -9,13 +9,12 @@ from typing import Any
 
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.dynamics import Dynamics
-from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET
 from spikeloom.runtime.commands.options import add_model
 from spikeloom.runtime.inputs.files import require_inspectable
 from spikeloom.runtime.inputs.network import load_checkpoint
 from spikeloom.runtime.inputs.repeat import NETWORK, refuse
-from spikeloom.runtime.machines.base import machine_for, trained_for
+from spikeloom.runtime.machines.base import describe, trained_for
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 
@@ -66,8 +65,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         return own.inspect(arguments)  # type: ignore[no-any-return]
     if is_netlist(arguments.path):
         refuse(arguments, NETWORK, f"is for checkpoints, {arguments.path} is a netlist")
-        machine = machine_for(arguments.path)
-        return machine.describe(sha256_of(arguments.path))
+        return describe(arguments.path)
     given = tuple(name for name in ("beta", "theta") if getattr(arguments, name) is not None)
     checkpoint = load_checkpoint(arguments.path, arguments)
     facts = CheckpointFacts(

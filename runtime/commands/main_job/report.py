@@ -13,6 +13,7 @@ from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
+from spikeloom.runtime.machines.base import describe
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
 from spikeloom.runtime.machines.simulated import Account
 from spikeloom.runtime.page.recording import recording
@@ -97,7 +98,7 @@ def _report(
     ran, price = machine.price(data.events, lengths=data.lengths, bin_s=arguments.bin)
     account.begin("the recording")
     origin = provenance(arguments, netlist, machine.target, loaded, data, data.files[chosen])
-    described = machine.describe(origin.netlist.sha256)
+    described = describe(arguments.netlist)
     return Report(
         verify=verdict,
         decisions=Decisions(

@@ -491,7 +491,7 @@ def _run_stage(
 def _run_stages(blocks: Blocks, n_words: int, steps: int, scratch: Scratch, lasting: Lasting | None) -> None:
     """Let all stages integrate, one after the other, and count spikes and events."""
     bounds = np.empty(steps + 1, np.int64)
-    active, start, width, count = scratch.words, 0, n_words, scratch.inputs
+    active, start, width, count = scratch.words, np.int64(0), n_words, scratch.inputs
     for s in range(blocks.stage.size - 1):
         listed = _list(active, start, width, steps, bounds, count)
         _run_stage(blocks, s, steps, active, start, width, listed, bounds, scratch, lasting)
@@ -591,7 +591,8 @@ def run_recordings(
             lasting = Lasting(keep_u, np.zeros(n_blocks * LANES, np.int32))
             _run_stages(blocks, n_words, steps, scratch, lasting)
 
-        inputs[r] = scratch.inputs[: events.shape[1]]
+        for channel in range(events.shape[1]):
+            inputs[r, channel] = scratch.inputs[channel]
         for position in range(n_blocks * LANES):
             if blocks.compartment[position] >= 0:
                 spikes[r, blocks.compartment[position]] = scratch.spikes[position]
@@ -602,9 +603,9 @@ def run_recordings(
                     worked -= _count_idle(blocks, block, s, steps, scratch.idle)
                 updates[r, blocks.layer[block]] += worked
         if fired.shape[0]:
-            _pack_compartments(blocks, steps, scratch.raster, fired[r], False)
+            _pack_compartments(blocks, steps, scratch.raster, fired[r], np.bool_(False))
         if updated.shape[0]:
-            _pack_compartments(blocks, steps, scratch.idle, updated[r], True)
+            _pack_compartments(blocks, steps, scratch.idle, updated[r], np.bool_(True))
         if membranes.shape[0]:
             _copy_membranes(blocks, steps, scratch.membranes, membranes[r])
 

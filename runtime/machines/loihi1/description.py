@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,14 +10,15 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.dynamics import Clocks
+from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.fixedpoint import kept_shares
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count
-from spikeloom.compiler.targets.loihi1.legalize import LimitUse
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.report.encode import OPTIONAL
-from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 
 OneOrMany = float | Sequence[float]
 """One value where all neurons of a layer share it, else the different ones, ascending."""
@@ -68,6 +70,12 @@ class NetlistFacts:
     limits: Sequence[LimitUse]
     provenance: Mapping[str, Any]
     sha256: str
+
+
+def inspect(path: str | os.PathLike[str]) -> Outcome:
+    """What a netlist file holds, with its layout; raises as :func:`netlist.read_netlist` does."""
+    netlist = read_netlist(path)
+    return Outcome(describe(netlist, measure(netlist, load_target(netlist.target)), sha256_of(path)), sections)
 
 
 def describe(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> NetlistFacts:

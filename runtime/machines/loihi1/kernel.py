@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
-from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached
+from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached, copy
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import IntArray
 
@@ -222,10 +222,10 @@ def chip_steps(
             compartment, register, value = _first_overflow(state, tables.depth, step, length)
             return step, compartment, register, value
         if spikes.shape[0]:
-            spikes[t] = state.flags
+            copy(state.flags, spikes[t])
         if membranes.shape[0]:
-            membranes[t] = state.membrane
+            copy(state.membrane, membranes[t])
         if updated.shape[0]:
-            updated[t] = state.worked
+            copy(state.worked, updated[t])
         _reset_and_count(state)
     return -1, 0, 0, 0

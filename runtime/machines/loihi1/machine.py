@@ -13,14 +13,14 @@ import numpy.typing as npt
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import with_tables
-from spikeloom.compiler.targets.loihi1.legalize import measure, require_legal
+from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.base import EventArray, Price, Run, T, one_by_one
 from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
-from spikeloom.runtime.machines.loihi1 import description, engine, spec
+from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.costs import cumulative
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
@@ -172,11 +172,6 @@ class Loihi(IntegerMachine):
         """As many recordings as keep the sums of the time model small."""
         held = (steps + self.netlist.max_depth) * 2 * self.netlist.n_cores * max(1, len(self.target.time))
         return max(1, SUMS // held)
-
-    def describe(self, sha256: str) -> Outcome:
-        """Layers, scales, cores, and the fill of every limit."""
-        facts = description.describe(self.netlist, measure(self.netlist, self.target), sha256)
-        return Outcome(facts, description.sections)
 
     def stream(self) -> Stream:
         """One grasp, bin after bin."""

@@ -31,7 +31,7 @@ from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
-from spikeloom.runtime.machines.truenorth.describe import describe, describe_trained
+from spikeloom.runtime.machines.truenorth.description import describe, describe_trained
 from spikeloom.runtime.machines.truenorth.machine import load, machine_of
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.console import progress
@@ -90,7 +90,7 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
         netlist = chip.compile(source, Options(in_time=arguments.in_time, provenance=origin), after=dump).netlist
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
-    return describe(netlist, chip, write_crossbars(netlist, arguments.output))
+    return describe(netlist, write_crossbars(netlist, arguments.output))
 
 
 def provenance(trained: Trained) -> JsonObject:

@@ -18,9 +18,7 @@ from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_c
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.base import EventArray, Machine, Price, Run, T, one_by_one
 from spikeloom.runtime.machines.truenorth import cost, engine, spec
-from spikeloom.runtime.machines.truenorth.describe import describe
 from spikeloom.runtime.machines.truenorth.spec import Trace, differences
-from spikeloom.runtime.report.sections import Outcome
 
 
 @dataclass(frozen=True)
@@ -89,10 +87,6 @@ class TrueNorth(Machine):
     def batch(self, steps: int) -> int:
         """Recordings whose counts are held at a time."""
         return 16
-
-    def describe(self, sha256: str) -> Outcome:
-        """Sizes, layers, and the fullest core by each limit."""
-        return describe(self.netlist, self.target, sha256)
 
     def stream(self) -> NoReturn:
         """Whole recordings only."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.dynamics import Clocks
-from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.files import sha256_of
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.native import BASES, SYSTEM, highest_level
 from spikeloom.compiler.targets.truenorth.native_file import Trained
-from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 
@@ -61,8 +64,16 @@ class Description:
     sha256: str
 
 
-def describe(netlist: CrossbarNetlist, chip: Target, sha256: str) -> Outcome:
+def inspect(path: str | os.PathLike[str]) -> Outcome:
+    """What a netlist file holds, which breaks no rule of the chip; FormatError or CapacityError if it does."""
+    netlist = read_crossbars(path)
+    require_legal(netlist, load_target(netlist.target))
+    return describe(netlist, sha256_of(path))
+
+
+def describe(netlist: CrossbarNetlist, sha256: str) -> Outcome:
     """What a netlist is; `sha256` is its file's."""
+    chip = load_target(netlist.target)
     core, degree = netlist.core_of_neuron(), np.diff(netlist.axon_synapses)
     fan_in = np.bincount(netlist.neuron_of_synapse(), minlength=netlist.n_neurons)
     fullest = {
