@@ -22,7 +22,7 @@ from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, TACTIL
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.graphs import NEUTOUCH, build_graph, normalised_adjacency
 from spikeloom.models.networks.checkpoint import save_checkpoint
-from spikeloom.models.networks.layers import filter_places, lif, spike_linear
+from spikeloom.models.networks.layers import filter_places, lif, spike_linear, times
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.networks.quantised import quantised_spikes
 from spikeloom.models.networks.reference import BATCH, float_membranes, float_spikes
@@ -92,6 +92,13 @@ def test_spike_linear_equals_a_dense_product_and_its_gradient(rate):
         results.append([out.detach(), *(leaf.grad for leaf in leaves)])
     for a, b in zip(*results, strict=True):
         assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("inputs", [12, 2496])
+def test_a_product_is_the_same_by_either_library(inputs):
+    generator = torch.Generator().manual_seed(5)
+    rows, weight = torch.randn(9, 128, generator=generator), torch.randn(inputs, 128, generator=generator)
+    assert_allclose(times(rows, weight), rows.double() @ weight.double().t(), rtol=0, atol=1e-4)
 
 
 # --- the network ---------------------------------------------------------------------------------------------------
