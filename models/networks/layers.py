@@ -198,7 +198,8 @@ class _SpikeLinear(torch.autograd.Function):
 
 def times(rows: Tensor, weight: Tensor) -> Tensor:
     """``rows @ weight.t()``, a large one by oneDNN, whose wider registers need half the time for the same sums."""
-    if weight.numel() < LARGE or rows.dtype != torch.float32 or not torch.backends.mkldnn.is_available():
+    usable = rows.dtype == torch.float32 and torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
+    if weight.numel() < LARGE or not usable:
         return rows @ weight.t()
     return torch.nn.functional.linear(rows.to_mkldnn(), weight.detach().to_mkldnn()).to_dense()
 
