@@ -4,8 +4,9 @@
 
 Each job is a row of processes of one core (``taskset``, ``OMP_NUM_THREADS=1``). Trees take turns, so that both meet the
 same machine; figures are medians of the turns: seconds of wall and CPU time and the peak memory of the largest process,
-with the ratio of CPU times within a turn, which other work on the machine disturbs less. Machine code is compiled before anything is timed, except where a job begins
-with an empty cache. A job that ends with an error or after ``--limit`` seconds has no figures, but says so.
+with the ratio of CPU times within a turn, which other work on the machine disturbs less. Machine code is compiled
+before anything is timed, except where a job begins with an empty cache. A job that ends with an error, or after
+``--limit`` seconds, is not repeated; its exit code says so.
 
 What the jobs read is made in ``--folder`` and kept there: netlists by each tree itself, and, with the old tree, whose
 files the new one reads, a grid-based CNN with padding, whose first layer has 15,808 neurons, after one epoch.

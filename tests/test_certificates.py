@@ -13,11 +13,11 @@ from spikeloom.compiler.interpret import channels_last, run_float, vote
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.equivalence.certain_spikes import SPARE, Certainty, _layers, _step
-from spikeloom.runtime.equivalence.certificates import Certifier, wins
+from spikeloom.runtime.equivalence.certificates import Certifier
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
-from spikeloom.runtime.machines.votes import predictions
+from spikeloom.runtime.machines.votes import predictions, wins
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.equivalence.certain_spikes import Certainty
-from spikeloom.runtime.machines.votes import readout_counts
+from spikeloom.runtime.machines.votes import readout_counts, wins
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,24 +49,6 @@ class Certificate:
     samples: int
     decisions: int
     unproven: tuple[str, ...]
-
-
-def wins(decisions: IntArray, least: IntArray, most: IntArray) -> BoolArray:
-    """Whether a class wins the vote whatever the counts between their bounds; ties go to the lowest class.
-
-    `decisions` is the class in question, (samples,); `least` and `most` bound the votes, (samples, classes).
-
-    Examples
-    --------
-    >>> least, most = np.array([[3, 3], [3, 3], [2, 1]]), np.array([[3, 3], [3, 4], [4, 2]])
-    >>> wins(np.array([0, 0, 0]), least, most).tolist()
-    [True, False, True]
-    """
-    rows, classes = np.arange(len(decisions)), np.arange(least.shape[1])
-    ahead = least[rows, decisions][:, None] - most
-    ahead[rows, decisions] = 0  # no class has to beat itself
-    sure: BoolArray = np.all(ahead >= (classes < decisions[:, None]), axis=1)
-    return sure
 
 
 class Certifier:

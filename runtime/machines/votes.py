@@ -35,3 +35,21 @@ def votes_by_step(readout: Readout, classes: int, spikes: BoolArray) -> IntArray
     votes = np.zeros((*spikes.shape[:2], classes), np.int64)
     np.add.at(np.moveaxis(votes, 2, 0), readout.label, np.moveaxis(spikes, 2, 0))
     return np.cumsum(votes, axis=1)
+
+
+def wins(decisions: IntArray, least: IntArray, most: IntArray) -> BoolArray:
+    """Whether a class wins the vote whatever the counts between their bounds; ties go to the lowest class.
+
+    `decisions` is the class in question, (samples,); `least` and `most` bound the votes, (samples, classes).
+
+    Examples
+    --------
+    >>> least, most = np.array([[3, 3], [3, 3], [2, 1]]), np.array([[3, 3], [3, 4], [4, 2]])
+    >>> wins(np.array([0, 0, 0]), least, most).tolist()
+    [True, False, True]
+    """
+    rows, classes = np.arange(len(decisions)), np.arange(least.shape[1])
+    ahead = least[rows, decisions][:, None] - most
+    ahead[rows, decisions] = 0  # no class has to beat itself
+    sure: BoolArray = np.all(ahead >= (classes < decisions[:, None]), axis=1)
+    return sure

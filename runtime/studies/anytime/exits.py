@@ -28,8 +28,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.equivalence.certificates import wins
 from spikeloom.runtime.machines.integer import IntegerMachine
+from spikeloom.runtime.machines.votes import wins
 from spikeloom.runtime.report.encode import key
 
 CONFIDENCE = 0.95
