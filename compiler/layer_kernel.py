@@ -152,7 +152,8 @@ def copy(values: Any, out: Any) -> None:
 
 
 @compiled
-def _keep(values: Any, factor: Any) -> None:
+def keep(values: Any, factor: Any) -> None:
+    """Let values decay."""
     for i in range(len(values)):
         values[i] *= factor
 
@@ -173,7 +174,8 @@ def _compare(fired: Any, wanted: Any, moved: Any, more: Any) -> None:
 
 
 @compiled
-def _integrate_float(membrane: Any, current: Any, bias: Any, beta: Any, theta: Any, fired: Any) -> None:
+def integrate_float(membrane: Any, current: Any, bias: Any, beta: Any, theta: Any, fired: Any) -> None:
+    """Let a step's currents into the membranes, of which those that fired before start from zero."""
     zero = membrane.dtype.type(0)
     for i in range(len(bias)):
         u = (zero if membrane[i] > theta else membrane[i] * beta) + (current[i] + bias[i])
@@ -210,14 +212,14 @@ def float_layer(
         current[:] = 0
         for t in range(steps):
             if alpha:
-                _keep(current, alpha)
+                keep(current, alpha)
             else:
                 current[:] = 0
             at = recording * steps + t
             arrive(current, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
             if len(own.run) and t:
                 arrive(current, own, before, 0, list_fired(fired[recording, t - 1], before))
-            _integrate_float(membrane, current, bias, beta, theta, fired[recording, t])
+            integrate_float(membrane, current, bias, beta, theta, fired[recording, t])
             if len(membranes):
                 copy(membrane, membranes[recording, t])
             if len(wanted):

@@ -76,7 +76,7 @@ def _compiled(network: Network, training: Recordings) -> Compilation:
 
 def float_decisions(checkpoint: Checkpoint, adjacency: FloatArray, test: Recordings) -> IntArray:
     """Class of each recording by the float32 model, in the released operator order."""
-    from spikeloom.models.networks.reference import float_spikes  # torch, so only here
+    from spikeloom.models.networks.reference import float_spikes
 
     counts = []
     for first in range(0, len(test), PART):

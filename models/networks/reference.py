@@ -8,77 +8,26 @@ network run one after the other, so that each has every spike that it has alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import RELAY_WEIGHT
 from spikeloom.compiler.formats.tensors import members, side_by_side
+from spikeloom.compiler.interpret import threads
+from spikeloom.compiler.layer_kernel import compiled_and_cached, integrate_float, keep
 from spikeloom.compiler.systems import GCN, TACTILESGNET, feature_major, in_order
-from spikeloom.models.networks.layers import filter_places, lasting_current, lif, tag_convolution
-from spikeloom.models.networks.networks import relayed
+
+Array = npt.NDArray[Any]
 
 BATCH = 8
-"""Recordings that run together: few enough for the caches."""
+"""Recordings that run together."""
 
-DTYPES = {"float32": torch.float32, "float64": torch.float64}
-
-
-def _layers(
-    checkpoint: Checkpoint, adjacency: npt.NDArray[np.float64], events: npt.NDArray[np.uint8], dtype: str
-) -> Iterator[tuple[str, torch.Tensor, torch.Tensor]]:
-    """Name, spikes and membranes of each layer, (steps, samples, neurons)."""
-    kind = DTYPES[dtype]
-
-    def tensor(array: npt.NDArray[np.generic]) -> torch.Tensor:
-        return torch.tensor(np.ascontiguousarray(array), dtype=kind)
-
-    def neurons(layer: int, drive: torch.Tensor, bias: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        alpha = dynamics.alpha(layer)
-        current = lasting_current(drive, alpha) + bias if alpha else drive
-        return lif(current, dynamics.beta(layer, checkpoint.beta), checkpoint.theta)
-
-    def inside(layer: int, bias: torch.Tensor) -> torch.Tensor:
-        """The bias as part of what the spikes bring, unless that outlasts its step."""
-        return torch.zeros_like(bias) if dynamics.alpha(layer) else bias
-
-    dynamics = checkpoint.dynamics
-    x = tensor(events.transpose(3, 0, 1, 2))
-    bias = tensor(checkpoint.conv_bias)
-    drive = _first(checkpoint.system, x, tensor(adjacency), tensor(checkpoint.hops), inside(0, bias))
-    spikes, membranes = neurons(0, drive, _of_neurons(checkpoint, bias))
-    if dynamics.clocks.channels:
-        ticks = relayed(dynamics.clocks, spikes)
-        spikes = torch.cat([spikes, ticks], dim=2)
-        membranes = torch.cat([membranes, ticks * (RELAY_WEIGHT * checkpoint.theta)], dim=2)
-    yield "conv1", spikes, membranes
-    for layer, dense in enumerate(checkpoint.dense, 1):
-        bias = tensor(dense.bias)
-        drive = torch.nn.functional.linear(spikes, tensor(dense.weight), inside(layer, bias))
-        spikes, membranes = neurons(layer, drive, bias)
-        yield dense.name, spikes, membranes
-
-
-def _of_neurons(checkpoint: Checkpoint, bias: torch.Tensor) -> torch.Tensor:
-    """Biases of the features as those of the first layer's neurons, in the order of the system."""
-    turned: torch.Tensor = in_order(checkpoint.system, bias.repeat(checkpoint.places, 1))
-    return turned
-
-
-def _first(system: str, x: torch.Tensor, propagation: torch.Tensor, hops: torch.Tensor, bias: torch.Tensor) -> Any:
-    """Currents of the first layer, (steps, samples, neurons), in the order of the system's neurons."""
-    if system == TACTILESGNET:
-        return tag_convolution(x, propagation, hops, bias)
-    if system == GCN:
-        return (propagation[0] @ (x @ hops[0].t()) + bias).flatten(2)
-    current = filter_places(x, propagation, hops, bias)
-    if feature_major(system):
-        return current.view(*current.shape[:2], -1, len(bias)).transpose(2, 3).flatten(2)
-    return current
+STEPS = 32
+"""Steps of these that run together: few enough for the caches."""
 
 
 def float_spikes(
@@ -92,14 +41,7 @@ def float_spikes(
 
     What the first layer sees, see :func:`expand.stack_of`, is rounded to `dtype`; networks are trained in float32.
     """
-    if checkpoint.towers > 1:
-        return side_by_side(checkpoint, [float_spikes(m, adjacency, events, dtype=dtype) for m in members(checkpoint)])
-    batches: dict[str, list[npt.NDArray[np.bool_]]] = {}
-    with torch.no_grad():
-        for start in range(0, len(events), BATCH):
-            for name, spikes, _ in _layers(checkpoint, adjacency, events[start : start + BATCH], dtype):
-                batches.setdefault(name, []).append(spikes.bool().transpose(0, 1).numpy())
-    return {name: np.concatenate(parts) for name, parts in batches.items()}
+    return _run(checkpoint, adjacency, events, np.dtype(dtype), membranes=False)
 
 
 def float_membranes(
@@ -110,11 +52,119 @@ def float_membranes(
     dtype: str = "float32",
 ) -> dict[str, npt.NDArray[np.floating]]:
     """Membranes of every layer before the comparison; as :func:`float_spikes`, (samples, steps, neurons) of `dtype`."""
+    return _run(checkpoint, adjacency, events, np.dtype(dtype), membranes=True)
+
+
+def _run(
+    checkpoint: Checkpoint, adjacency: Array, events: Array, dtype: np.dtype[Any], *, membranes: bool
+) -> dict[str, Array]:
     if checkpoint.towers > 1:
-        every = [float_membranes(m, adjacency, events, dtype=dtype) for m in members(checkpoint)]
+        every = [_run(each, adjacency, events, dtype, membranes=membranes) for each in members(checkpoint)]
         return side_by_side(checkpoint, every)
-    with torch.no_grad():
-        return {
-            name: membranes.transpose(0, 1).contiguous().numpy()
-            for name, _, membranes in _layers(checkpoint, adjacency, events, dtype)
-        }
+    shape, kind = (len(events), events.shape[3]), dtype if membranes else np.bool_
+    found = {name: np.empty((*shape, neurons), kind) for name, neurons in checkpoint.neurons.items()}
+
+    def batch(start: int) -> None:
+        rows = slice(start, start + BATCH)
+        layers = _layers(checkpoint, adjacency, dtype)
+        for first in range(0, shape[1], STEPS):
+            steps = slice(first, first + STEPS)
+            spikes = np.ascontiguousarray(events[rows, :, :, steps].transpose(3, 0, 1, 2), dtype)
+            for name, layer in zip(checkpoint.neurons, layers, strict=True):
+                spikes, compared = layer(spikes)
+                if layer is layers[0]:
+                    spikes, compared = _with_relays(checkpoint, spikes, compared, first)
+                found[name][rows, steps] = (compared if membranes else spikes).transpose(1, 0, 2)
+
+    list(threads().map(batch, range(0, len(events), BATCH)))
+    return found
+
+
+def _layers(
+    checkpoint: Checkpoint, adjacency: Array, dtype: np.dtype[Any]
+) -> list[Callable[[Array], tuple[Array, Array]]]:
+    """What turns spikes of some steps into spikes and membranes of each layer, from rest at first."""
+    dynamics, hops = checkpoint.dynamics, checkpoint.hops.astype(dtype)
+    propagation, bias = adjacency.astype(dtype), checkpoint.conv_bias.astype(dtype)
+    # the bias is part of what the spikes bring, unless that outlasts its step
+    inside = np.zeros_like(bias) if dynamics.alpha(0) else bias
+    drives = [lambda x: _first(checkpoint.system, x, propagation, hops, inside)]
+    biases = [in_order(checkpoint.system, np.tile(bias, (checkpoint.places, 1)))]
+    for layer, dense in enumerate(checkpoint.dense, 1):
+        weight, bias = dense.weight.T.astype(dtype), dense.bias.astype(dtype)
+        drives.append(_linear(weight, np.zeros_like(bias) if dynamics.alpha(layer) else bias))
+        biases.append(bias)
+    return [
+        _Neurons(drive, bias, dynamics.alpha(layer), dynamics.beta(layer, checkpoint.beta), checkpoint.theta)
+        for layer, (drive, bias) in enumerate(zip(drives, biases, strict=True))
+    ]
+
+
+def _linear(weight: Array, bias: Array) -> Callable[[Array], Array]:
+    return lambda spikes: spikes @ weight + bias
+
+
+class _Neurons:
+    """Neurons of a layer and their state; what arrives is what `drive` makes of spikes (steps, samples, neurons)."""
+
+    def __init__(self, drive: Callable[[Array], Array], bias: Array, alpha: float, beta: float, theta: float) -> None:
+        self._drive, self._bias = drive, bias if alpha else np.zeros_like(bias)
+        self._constants = [bias.dtype.type(value) for value in (alpha, beta, theta)]
+        self._state: Array = np.zeros(0, bias.dtype)
+
+    def __call__(self, spikes: Array) -> tuple[Array, Array]:
+        """Spikes, zeros and ones of the float type, and membranes of some steps."""
+        drive = np.ascontiguousarray(self._drive(spikes))
+        if not len(self._state):
+            self._state = np.zeros((2, drive[0].size), drive.dtype)
+        fired = np.empty(drive.shape, np.uint8)
+        rows = drive.reshape(len(drive), -1)
+        _integrate(rows, np.tile(self._bias, drive.shape[1]), *self._constants, *self._state, fired.reshape(rows.shape))
+        return fired.astype(drive.dtype), drive
+
+
+@compiled_and_cached
+def _integrate(
+    drive: Any, bias: Any, alpha: Any, beta: Any, theta: Any, current: Any, membrane: Any, fired: Any
+) -> None:
+    """Run neurons for some steps; `drive` becomes the membranes that were compared."""
+    for t in range(len(drive)):
+        keep(current, alpha)
+        current += drive[t]
+        integrate_float(membrane, current, bias, beta, theta, fired[t])
+        drive[t] = membrane
+
+
+def _with_relays(checkpoint: Checkpoint, spikes: Array, membranes: Array, first: int) -> tuple[Array, Array]:
+    """Add those of the relays, which spike as their clocks tick."""
+    clocks = checkpoint.dynamics.clocks
+    ticks = clocks.events(len(spikes), first=first).T.astype(spikes.dtype)
+    relays = np.broadcast_to(ticks[:, None], (*spikes.shape[:2], clocks.channels))
+    return (
+        np.concatenate([spikes, relays], axis=2),
+        np.concatenate([membranes, relays * (RELAY_WEIGHT * checkpoint.theta)], axis=2),
+    )
+
+
+def _first(system: str, x: Array, propagation: Array, hops: Array, bias: Array) -> Array:
+    """Currents of the first layer, (steps, samples, neurons), in the order of the system's neurons."""
+    steps, samples, taxels, channels = x.shape
+    if system == GCN:
+        return (propagation[0] @ (x @ hops[0].T) + bias).reshape(steps, samples, -1)
+    # taxels first: a hop is then one product of (taxels, taxels) with a wide matrix
+    reached = x.transpose(2, 0, 1, 3).reshape(taxels, -1)
+    if system == TACTILESGNET:
+        current: Array = np.zeros(0, x.dtype)
+        for k, hop in enumerate(hops):
+            reached = propagation @ reached if k else reached
+            rows = reached.reshape(taxels, -1, channels).transpose(1, 0, 2).reshape(-1, channels)
+            current = current + rows @ hop.T if k else rows @ hop.T
+        return (current + bias).reshape(steps, samples, -1)
+    filters, places, _ = propagation.shape
+    seen = propagation.transpose(1, 0, 2).reshape(-1, taxels) @ reached
+    rows = seen.reshape(places, filters, -1, channels).transpose(2, 0, 1, 3).reshape(-1, filters * channels)
+    current = rows @ hops.transpose(0, 2, 1).reshape(filters * channels, -1) + bias
+    current = current.reshape(steps, samples, places, len(bias))
+    if feature_major(system):
+        current = current.transpose(0, 1, 3, 2)
+    return current.reshape(steps, samples, -1)

@@ -69,7 +69,7 @@ def reference_of(model: Factored | Network) -> Callable[[npt.NDArray[np.uint8]],
     if isinstance(model, Network):
         clocks, ready = model.input.clocks, float_simulation(model, np.float32)
         return lambda events: list(ready.run(channels_last(events, clocks)).spikes)
-    from spikeloom.models.networks.reference import float_spikes  # torch, so only here
+    from spikeloom.models.networks.reference import float_spikes
 
     return lambda events: list(float_spikes(model.checkpoint, model.propagation, events).values())
 
@@ -90,7 +90,7 @@ def votes_so_far(readout: Readout, classes: int, model: Factored | Network, data
 
 def membranes_of(model: Factored | Network, events: npt.NDArray[np.uint8]) -> list[npt.NDArray[np.floating]]:
     """Membranes of each layer in float32, likewise."""
-    from spikeloom.models.networks.reference import float_membranes  # torch, so only here
+    from spikeloom.models.networks.reference import float_membranes
 
     if isinstance(model, Network):
         inputs = channels_last(events, model.input.clocks)

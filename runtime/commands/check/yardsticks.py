@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
-    from spikeloom.models.networks.reference import float_spikes  # torch, so only here
+    from spikeloom.models.networks.reference import float_spikes
 
     checkpoint = load_checkpoint(arguments.checkpoint, arguments)
     graph, adjacency = propagation(checkpoint, load_graph(arguments, checkpoint.system), arguments.checkpoint)
