@@ -45,10 +45,8 @@ def test_runs_and_prices_are_the_simulators(made):
     np.testing.assert_array_equal(done.decisions, done.votes.argmax(axis=1))
     assert tuple(done.spikes) == machine.layers
     for detail in machine.details:
-        again, price = machine.price(events, lengths=LENGTHS, bin_s=0.02, detail=detail, spikes=True)
+        again, price = machine.price(events, lengths=LENGTHS, bin_s=0.02, detail=detail)
         np.testing.assert_array_equal(again.votes, done.votes)
-        for name, spikes in done.spikes.items():
-            np.testing.assert_array_equal(again.spikes[name], spikes)
         each = [price.synaptic_operations, *price.energy_j.values(), *price.time_s.values()]
         assert {np.shape(values) for values in each} == {(4,)}
         assert set(price.energy_j) == {table.name for table in machine.target.energy}

@@ -38,9 +38,6 @@ from spikeloom.runtime.machines.votes import readout_counts
 Layers = Sequence[BoolArray]
 """Spikes of each layer, (samples, steps, compared neurons)."""
 
-PART = 16
-"""Recordings that are compared at a time: what is held does not grow with their number."""
-
 
 def verify(
     netlist: Netlist,
@@ -103,8 +100,8 @@ def verify(
     tally = _Tally([len(each) for each in neurons])
     float_votes, chip_votes = np.zeros((2, len(events), network.classes), np.int64)
     quantised_different, divergence = 0 if tuned else None, None
-    for first in range(0, len(events), PART):
-        rows = slice(first, first + PART)
+    for rows in machine.parts(len(events), events.shape[3]):
+        first = rows.start
         part, ends = events[rows], None if lengths is None else lengths[rows]
         channels = channels_last(part, netlist.clocks)
 
@@ -121,14 +118,14 @@ def verify(
             begin("fine-tuned model", first)
             quantised_different += int(_differences(compared(fine_tuned_spikes(part)), chip).sum())
 
-        lower = {}
+        tally.add(reference, chip)
         for stage, ready in ladder.items():
             begin(f"ladder: {'proven' if ready is None else stage}", first)
-            lower[stage] = chip if ready is None else compared(ready.run(channels).spikes)
-        tally.add(reference, chip, lower)
-        if divergence is None:
-            begin("first divergence", first)
-            divergence = _first_divergence(machine, model, reference, chip, lower[LADDER[0]], part, files[rows])
+            lower = chip if ready is None else compared(ready.run(channels).spikes)
+            tally.different[stage] += _differences(reference, lower)
+            if stage == LADDER[0] and divergence is None:
+                begin("first divergence", first)
+                divergence = _first_divergence(machine, model, reference, chip, lower, part, files[rows])
         float_votes[rows] = readout_counts(network.readout, network.classes, reference[network.readout.population])
         chip_votes[rows] = ran.votes
         begin("certificate", first)
@@ -167,10 +164,9 @@ class _Tally:
         self.float, self.chip = ([np.zeros(size, np.int64) for size in sizes] for _ in range(2))
         self.different = {stage: np.zeros(len(sizes), np.int64) for stage in LADDER}
 
-    def add(self, reference: Layers, chip: Layers, lower: Mapping[str, Layers]) -> None:
-        """Count some recordings: the reference, the chip and the rungs below it."""
-        for stage, spikes in {**lower, LADDER[-1]: chip}.items():
-            self.different[stage] += _differences(reference, spikes)
+    def add(self, reference: Layers, chip: Layers) -> None:
+        """Count some recordings."""
+        self.different[LADDER[-1]] += _differences(reference, chip)
         for total, layers in ((self.float, reference), (self.chip, chip)):
             for index, each in enumerate(layers):
                 total[index] += each.sum(axis=(0, 1))
@@ -225,7 +221,7 @@ def _first_divergence(
     layer = machine.integer.populations[index]
     ill_posed = bool(wide[index][sample, step, neuron] != reference[index][sample, step, neuron])
     neuron = int(np.arange(layer.size)[machine.compared()[index]][neuron])
-    recording = events[sample : sample + 1]
+    recording = events[sample : sample + 1, ..., : step + 1]
     membranes = machine.run(recording, membranes=True).membranes
     assert membranes is not None, "membranes were wanted"
     register = int(membranes[layer.name][0, step, neuron])

@@ -37,6 +37,12 @@ EventArray = npt.NDArray[np.uint8 | np.bool_]
 
 T = TypeVar("T", bound=np.generic)
 
+PART = 16
+"""Recordings whose spikes are held at a time, at most."""
+
+HELD = 1 << 25
+"""Entries (recording, step, neuron) of these, unless one recording has more."""
+
 DEFAULT = "loihi1"
 """Whose reader says what is wrong with a file that names no target."""
 
@@ -188,6 +194,11 @@ class Machine(ABC):
         DataError for another sensor, NumericRangeError where a register overflows.
         """
 
+    def parts(self, recordings: int, steps: int) -> Iterator[slice]:
+        """Recordings of so many data steps, some at a time: spikes that are held do not grow with their number."""
+        size = min(PART, max(1, HELD // (steps * len(self.netlist.readout_class))))
+        return (slice(first, min(first + size, recordings)) for first in range(0, recordings, size))
+
     @abstractmethod
     def price(
         self,
@@ -197,10 +208,9 @@ class Machine(ABC):
         lengths: IntArray | None = None,
         detail: str = "counts",
         table: str | None = None,
-        spikes: bool = False,
         progress: Callable[[int], object] | None = None,
     ) -> tuple[Run, Price]:
-        """Run recordings as :meth:`run` does, and price them.
+        """Run recordings as :meth:`run` does, keep no spikes, and price them.
 
         `bin_s` are the seconds of a bin at the pace of the sensor, `detail` is one of `details`, `table` the name of a
         table of prices or a TOML file with some; `progress` is called with the number of recordings done. Raises

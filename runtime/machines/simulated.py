@@ -36,7 +36,7 @@ UNBOUNDED = "integer sums, no limits of registers"
 KINDS = {
     # of run and estimate
     "spikes": Kind(CHIP, "all", "decisions need counts of spikes alone: none is kept, nothing is priced"),
-    "spikes kept": Kind(CHIP, "all", "--spikes wants every spike: they are kept, nothing is priced"),
+    "spikes kept": Kind(CHIP, "all", "--spikes wants every spike: all run once more for each layer that is written"),
     "counts": Kind(CHIP, "all", SUMS),
     "cycle": Kind(CHIP, "all", "every message of every step is scheduled: spikes and updates kept, in the same run"),
     "no float": Kind("float", "none", "the float model says nothing about the chip's decisions or costs"),

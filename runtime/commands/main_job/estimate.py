@@ -9,7 +9,6 @@ from spikeloom.runtime.commands.options import add_detail, add_netlist, add_reco
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.base import Machine, Price, Run, machine_for
 from spikeloom.runtime.machines.simulated import Account, Accounted
-from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
 
 
@@ -25,25 +24,21 @@ def run(arguments: argparse.Namespace) -> Outcome:
     machine = machine_for(arguments.netlist)
     data = netlist_recordings(arguments, machine.netlist)
     account = Account(machine, data)
-    account.begin(arguments.detail)
-    _, price = priced(arguments, machine, data)
+    _, price = priced(arguments, machine, data, account)
     account.begin("no float")
     shown = price.outcome
     result = Accounted(result=shown.result, explained_cost=account.explained(arguments.explain_cost))
     return Outcome(result, lambda result: shown.sections(result.result))
 
 
-def priced(
-    arguments: argparse.Namespace, machine: Machine, data: Recordings, *, spikes: bool = False
-) -> tuple[Run, Price]:
+def priced(arguments: argparse.Namespace, machine: Machine, data: Recordings, account: Account) -> tuple[Run, Price]:
     """Run the recordings and price them as the options say."""
-    progress("running")
+    account.begin(arguments.detail)
     return machine.price(
         data.events,
         bin_s=arguments.bin,
         lengths=data.lengths,
         detail=arguments.detail,
         table=arguments.table,
-        spikes=spikes,
-        progress=lambda done: progress(f"running: {done} of {len(data)}"),
+        progress=lambda done: account.begin(arguments.detail, done),
     )

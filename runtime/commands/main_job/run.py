@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -10,15 +11,15 @@ from typing import ClassVar
 import numpy as np
 
 from spikeloom.compiler.files import write_atomically
+from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.types import IntArray
-from spikeloom.models.recordings.evtouch import UNLABELLED
+from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
 from spikeloom.runtime.commands.main_job.estimate import priced
 from spikeloom.runtime.commands.options import add_detail, add_netlist, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import netlist_recordings
-from spikeloom.runtime.machines.base import Price, machine_for
+from spikeloom.runtime.machines.base import Machine, Price, Run, machine_for
 from spikeloom.runtime.machines.simulated import Account, Accounted
-from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
@@ -64,34 +65,53 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
-    keep = arguments.spikes is not None
-    if keep:
-        require_place(arguments.spikes, "--spikes", arguments)
+    require_place(arguments.spikes, "--spikes", arguments)
     machine = machine_for(arguments.netlist)
     data = netlist_recordings(arguments, machine.netlist)
     account = Account(machine, data)
     price: Price | None = None
     if arguments.detail == "spikes":
-        account.begin("spikes kept" if keep else "spikes")
-        progress("running")
-        done = machine.run(data.events, lengths=data.lengths, spikes=keep)
+        votes = np.concatenate([done.votes for done in _runs("spikes", machine, data, account)])
     else:
-        account.begin(arguments.detail)
-        done, price = priced(arguments, machine, data, spikes=keep)
+        done, price = priced(arguments, machine, data, account)
+        votes = done.votes
+    if arguments.spikes is not None:
+        _write_spikes(arguments.spikes, machine, data, account)
     account.begin("no float")
-    if done.spikes is not None:
-        with write_atomically(arguments.spikes) as file:
-            np.savez_compressed(file, **done.spikes)  # type: ignore[arg-type]
     found = Decisions(
         files=data.files,
         labels=data.labels,
-        predictions=done.decisions,
-        counts=done.votes,
+        predictions=vote(votes),
+        counts=votes,
         price=price,
         costs=None if price is None else price.outcome.result,
     )
     result = Accounted(result=found, explained_cost=account.explained(arguments.explain_cost))
     return Outcome(result, lambda result: sections(result.result))
+
+
+def _runs(part: str, machine: Machine, data: Recordings, account: Account, *, spikes: bool = False) -> Iterator[Run]:
+    """Some recordings after others."""
+    for rows in machine.parts(len(data), data.steps):
+        account.begin(part, rows.start)
+        lengths = None if data.lengths is None else data.lengths[rows]
+        yield machine.run(data.events[rows], lengths=lengths, spikes=spikes)
+
+
+def _write_spikes(path: str, machine: Machine, data: Recordings, account: Account) -> None:
+    """Write the spikes of every layer; all run again for each, so that no more is held than some recordings."""
+    with write_atomically(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in machine.layers:
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                shape: tuple[int, ...] = ()
+                for done in _runs("spikes kept", machine, data, account, spikes=True):
+                    assert done.spikes is not None, "spikes were wanted"
+                    spikes = np.ascontiguousarray(done.spikes[name])
+                    if not shape:
+                        shape = len(data), *spikes.shape[1:]
+                        form = {"descr": "|b1", "fortran_order": False, "shape": shape}
+                        np.lib.format.write_array_header_1_0(member, form)
+                    member.write(spikes.data)
 
 
 def sections(found: Decisions) -> Iterator[Section]:

@@ -144,7 +144,6 @@ class Loihi(IntegerMachine):
         lengths: IntArray | None = None,
         detail: str = "counts",
         table: str | None = None,
-        spikes: bool = False,
         progress: Callable[[int], object] | None = None,
     ) -> tuple[Run, Price]:
         """Decisions and costs, of the cores' tiles and times too."""
@@ -156,7 +155,6 @@ class Loihi(IntegerMachine):
             with_clocks(events, self.netlist.clocks),
             lengths=lengths,
             detail=detail,
-            spikes=spikes,
             progress=progress,
         )
         report = cost_report(self.netlist, chip, found, bin_s=bin_s * self.netlist.bins)

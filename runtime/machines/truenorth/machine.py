@@ -75,13 +75,12 @@ class TrueNorth(Machine):
         lengths: IntArray | None = None,
         detail: str = "counts",
         table: str | None = None,
-        spikes: bool = False,
         progress: Callable[[int], object] | None = None,
     ) -> tuple[Run, Price]:
         """Decisions and costs."""
         self.require_detail(detail)
         chip = self.target if table is None else with_tables(self.target, table)
-        trace = self.simulate(events, lengths, spikes=spikes)
+        trace = self.simulate(events, lengths, spikes=False)
         return self._run(trace, trace.counts.votes), cost.price(self.netlist, chip, trace.counts, bin_s)
 
     def batch(self, steps: int) -> int:

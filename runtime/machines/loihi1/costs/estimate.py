@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -21,10 +21,10 @@ from spikeloom.runtime.machines.loihi1.costs.cost import Costs
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
 from spikeloom.runtime.machines.loihi1.trace import Counts, Trace, side_by_side
 
-T = TypeVar("T", Counts, Trace, DetailedTimes)
+T = TypeVar("T", Counts, SimpleTimes, DetailedTimes)
 
-PART = 16
-"""Recordings whose spikes are kept at a time in detail ``cycle``."""
+HELD = 1 << 27
+"""Bytes of spikes and updates, or of sums of the time model, that are held at a time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,13 +49,12 @@ def estimate(
     *,
     lengths: IntArray | None = None,
     detail: str = "counts",
-    spikes: bool = False,
     progress: Callable[[int], object] | None = None,
 ) -> tuple[Trace, Estimate]:
-    """Run recordings, keep their spikes where wanted, and say what they cost.
+    """Run recordings, some at a time, and say what they cost.
 
     `events` are (samples, n_inputs, T), `lengths` (samples,) the data steps of each, `detail` is ``counts`` or
-    ``cycle``; for that `progress` is called with the number of recordings done.
+    ``cycle``; `progress` is called with the number of recordings done. The trace holds counts alone.
 
     Raises
     ------
@@ -73,37 +72,35 @@ def estimate(
     charges = side_by_side([timing.charges(each) for each in latencies.values()]) if latencies else None
     steps = np.full(len(events), events.shape[2]) if lengths is None else np.asarray(lengths, np.int64)
     chip_steps = steps + netlist.max_depth
+    simple: dict[str, list[SimpleTimes]] = {name: [] for name in latencies}
     detailed: dict[str, list[DetailedTimes]] = {name: [] for name in latencies if deep}
-    traces, updates, size = [], [], PART if deep else max(1, len(events))
+    counts, updates = [], []
+    held = 2 * netlist.n_compartments if deep else 8 * max(1, 0 if charges is None else charges.sources.shape[1])
+    size = max(1, HELD // (held * (events.shape[2] + netlist.max_depth)))
     for first in range(0, max(1, len(events)), size):
         part = slice(first, first + size)
-        trace = engine.simulate(
-            prepared, events[part], lengths=steps[part], spikes=deep or spikes, updated=deep, charges=charges
-        )
-        traces.append(replace(trace, spikes=trace.spikes if spikes else None, updated=None))
-        if not deep:
-            continue
-        assert trace.spikes is not None, "spikes were wanted"
-        assert trace.updated is not None, "updates were wanted"
-        updates.append(cost.updates_by_core(netlist, trace.updated))
-        given = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after a recording's end
-        for name, times in detailed.items():
-            times.append(timing.detailed(latencies[name], trace.spikes, trace.updated, given, steps=chip_steps[part]))
+        trace = engine.simulate(prepared, events[part], lengths=steps[part], spikes=deep, updated=deep, charges=charges)
+        counts.append(trace.counts)
+        sums = [] if trace.charged is None else np.split(trace.charged, len(latencies), axis=2)
+        for (name, tables), charged in zip(latencies.items(), sums, strict=True):
+            simple[name].append(timing.simple_times(tables, charged, chip_steps[part]))
+        if trace.spikes is not None and trace.updated is not None:
+            updates.append(cost.updates_by_core(netlist, trace.updated))
+            given = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after the end
+            for name, times in detailed.items():
+                run = latencies[name], trace.spikes, trace.updated, given
+                times.append(timing.detailed(*run, steps=chip_steps[part]))
         if progress is not None:
-            progress(min(first + PART, len(events)))
-    whole = traces[0] if len(traces) == 1 else _joined(Trace, traces)
-    sums = [] if whole.charged is None else np.split(whole.charged, len(latencies), axis=2)
+            progress(min(first + size, len(events)))
+    whole = _joined(Counts, counts)
     cores: Mapping[str, FloatArray] = {}
     if deep:
-        by_core = replace(whole.counts, updates=np.concatenate(updates))
+        by_core = replace(whole, updates=np.concatenate(updates))
         cores = cost.price(cost.prepare(netlist, target, "core"), by_core, chip_steps).energy
-    return whole, Estimate(
-        costs=cost.price(cost.prepare(netlist, target), whole.counts, chip_steps),
+    return Trace(counts=whole, spikes=None, membranes=None), Estimate(
+        costs=cost.price(cost.prepare(netlist, target), whole, chip_steps),
         steps=steps,
-        simple={
-            name: timing.simple_times(each, charged, chip_steps)
-            for (name, each), charged in zip(latencies.items(), sums, strict=True)
-        },
+        simple={name: _joined(SimpleTimes, times) for name, times in simple.items()},
         detailed={name: _joined(DetailedTimes, times) for name, times in detailed.items()},
         cores=cores,
     )
@@ -111,10 +108,4 @@ def estimate(
 
 def _joined(kind: type[T], parts: Sequence[T]) -> T:
     """One dataclass of arrays from those of some recordings each."""
-
-    def join(values: Sequence[Any]) -> Any:
-        if isinstance(values[0], Counts):
-            return _joined(Counts, values)
-        return None if values[0] is None else np.concatenate(values)
-
-    return kind(**{field.name: join([getattr(part, field.name) for part in parts]) for field in fields(kind)})
+    return kind(**{each.name: np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(kind)})
