@@ -75,7 +75,7 @@ def test_provenance_names_everything_that_decided(as_json, place):
         "keep_all": False,
         "prune_unused": False,
         "calibrated": True,
-        "compensated": ["fc1"],
+        "compensated": ["conv1", "fc1", "fc3"],
     }
 
 
@@ -258,7 +258,7 @@ def test_progress_goes_to_a_terminal_only(monkeypatch, capsys):
     monkeypatch.setattr(sys, "stderr", terminal)
     assert cli.main(["run", "net.loom", "--data", "data", "--json"]) == 0
     json.loads(capsys.readouterr().out)
-    assert "\r\x1b[Krunning …" in terminal.getvalue()
+    assert "\r\x1b[Kspikes: 0 of 6 …" in terminal.getvalue()
     assert terminal.getvalue().endswith("\r\x1b[K")  # and cleared
 
 
@@ -323,33 +323,34 @@ def passes(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("words", "part"),
+    ("words", "parts"),
     [
-        (RUNNING, "spikes"),
-        ((*RUNNING, "--spikes", "out.npz"), "spikes kept"),
-        ((*RUNNING, "--detail", "counts", "--spikes", "out.npz"), "counts"),
-        (("estimate", *RUNNING[1:], "--detail", "cycle"), "cycle"),
+        (RUNNING, ["spikes"]),
+        ((*RUNNING, "--spikes", "out.npz"), ["spikes", "spikes kept"]),
+        ((*RUNNING, "--detail", "counts", "--spikes", "out.npz"), ["counts", "spikes kept"]),
+        (("estimate", *RUNNING[1:], "--detail", "cycle"), ["cycle"]),
     ],
 )
-def test_every_recording_is_run_once(spikeloom, passes, words, part):
+def test_every_recording_is_run_once_and_for_each_layer_that_is_written(spikeloom, passes, words, parts):
     _, out, err = spikeloom(*words, "--explain-cost", "--json")
-    assert passes == [6]
-    entry, absent = json.loads(out)["explained_cost"]
-    assert (entry.pop("seconds") > 0, bool(entry.pop("why"))) == (True, True)
-    known = {"part": part, "ran": True, "arithmetic": "chip integers", "recordings": 6, "data_steps": 6 * STEPS}
-    assert entry == known | {"layers": LAYERS, "kernel": "layer by layer, 64 neurons at a time"}
+    assert passes == [6] * (1 if len(parts) == 1 else 5)
+    *entries, absent = json.loads(out)["explained_cost"]
+    for entry, part in zip(entries, parts, strict=True):
+        assert (entry.pop("seconds") > 0, bool(entry.pop("why"))) == (True, True)
+        known = {"part": part, "ran": True, "arithmetic": "chip integers", "recordings": 6, "data_steps": 6 * STEPS}
+        assert entry == known | {"layers": LAYERS, "kernel": "layer by layer, 64 neurons at a time"}
     assert (absent["ran"], absent["recordings"], absent["layers"]) == (False, 0, [])
-    assert len(err.splitlines()) == 2
+    assert len(err.splitlines()) == len(parts) + 1
 
 
 def test_parts_of_verify(spikeloom):
     checks = [
-        "float32 reference",
-        "ladder: float64",
-        "chip",
         "specification",
-        *(f"ladder: {rung}" for rung in ("beta", "weights", "bias_threshold", "proven")),
+        "float32 reference",
+        "chip",
+        "ladder: float64",
         "first divergence",
+        *(f"ladder: {rung}" for rung in ("beta", "weights", "bias_threshold", "proven")),
         "certificate",
     ]
     _, out, err = spikeloom(*VERIFYING, "--spec-samples", 2, "--explain-cost", "--json")

@@ -150,11 +150,11 @@ def _first(system: str, x: Array, propagation: Array, hops: Array, bias: Array) 
     """Currents of the first layer, (steps, samples, neurons), in the order of the system's neurons."""
     steps, samples, taxels, channels = x.shape
     if system == GCN:
-        return (propagation[0] @ (x @ hops[0].T) + bias).reshape(steps, samples, -1)
+        current: Array = propagation[0] @ (x @ hops[0].T) + bias
+        return current.reshape(steps, samples, -1)
     # taxels first: a hop is then one product of (taxels, taxels) with a wide matrix
     reached = x.transpose(2, 0, 1, 3).reshape(taxels, -1)
     if system == TACTILESGNET:
-        current: Array = np.zeros(0, x.dtype)
         for k, hop in enumerate(hops):
             reached = propagation @ reached if k else reached
             rows = reached.reshape(taxels, -1, channels).transpose(1, 0, 2).reshape(-1, channels)
@@ -163,8 +163,9 @@ def _first(system: str, x: Array, propagation: Array, hops: Array, bias: Array) 
     filters, places, _ = propagation.shape
     seen = propagation.transpose(1, 0, 2).reshape(-1, taxels) @ reached
     rows = seen.reshape(places, filters, -1, channels).transpose(2, 0, 1, 3).reshape(-1, filters * channels)
-    current = rows @ hops.transpose(0, 2, 1).reshape(filters * channels, -1) + bias
-    current = current.reshape(steps, samples, places, len(bias))
+    current = (rows @ hops.transpose(0, 2, 1).reshape(filters * channels, -1) + bias).reshape(
+        steps, samples, places, -1
+    )
     if feature_major(system):
         current = current.transpose(0, 1, 3, 2)
     return current.reshape(steps, samples, -1)

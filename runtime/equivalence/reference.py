@@ -30,13 +30,15 @@ from spikeloom.compiler.interpret import (
     integer_simulation,
     run_float,
 )
-from spikeloom.compiler.ir import IntegerNetwork, Network, Projection, Readout, Sparse
+from spikeloom.compiler.ir import IntegerNetwork, Network, Projection, Sparse
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.machines.base import parts_of
 from spikeloom.runtime.machines.votes import votes_by_step
+from spikeloom.runtime.report.console import Progress
 
 
 def require_match(netlist: Netlist, model: Factored | Network) -> None:
@@ -74,17 +76,17 @@ def reference_of(model: Factored | Network) -> Callable[[npt.NDArray[np.uint8]],
     return lambda events: list(float_spikes(model.checkpoint, model.propagation, events).values())
 
 
-PART = 16
-"""Recordings whose float spikes are held at a time."""
+def votes_so_far(network: Network, model: Factored | Network, data: Recordings) -> IntArray:
+    """Votes of the float32 model after each step, (samples, steps, classes); a recording's stay from its end on.
 
-
-def votes_so_far(readout: Readout, classes: int, model: Factored | Network, data: Recordings) -> IntArray:
-    """Votes of the float32 model after each step, (samples, steps, classes); a recording's stay from its end on."""
-    lengths, votes, reference = data.step_counts, [], reference_of(model)
-    for first in range(0, len(data), PART):
-        part = slice(first, first + PART)
+    `network` is the model's float stage.
+    """
+    lengths, votes, reference, progress = data.step_counts, [], reference_of(model), Progress(len(data))
+    readout, neurons = network.readout, sum(population.size for population in network.populations)
+    for part in parts_of(len(data), data.steps * neurons):
+        progress(part.start, "float model")
         spikes = reference(data.events[part])[readout.population]
-        votes.append(votes_by_step(readout, classes, cut(spikes, lengths[part])))
+        votes.append(votes_by_step(readout, network.classes, cut(spikes, lengths[part])))
     return np.concatenate(votes)
 
 

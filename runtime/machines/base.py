@@ -101,6 +101,12 @@ class Step:
         return int(first - second)
 
 
+def parts_of(recordings: int, entries: int) -> Iterator[slice]:
+    """Recordings of so many entries each, some at a time."""
+    size = min(PART, max(1, HELD // entries))
+    return (slice(first, min(first + size, recordings)) for first in range(0, recordings, size))
+
+
 def one_by_one(channels: EventArray, lengths: IntArray | None) -> Iterator[EventArray]:
     """Recordings (samples, channels, steps) in turn, each as long as it is."""
     for index, each in enumerate(channels):
@@ -196,8 +202,7 @@ class Machine(ABC):
 
     def parts(self, recordings: int, steps: int) -> Iterator[slice]:
         """Recordings of so many data steps, some at a time: spikes that are held do not grow with their number."""
-        size = min(PART, max(1, HELD // (steps * len(self.netlist.readout_class))))
-        return (slice(first, min(first + size, recordings)) for first in range(0, recordings, size))
+        return parts_of(recordings, steps * len(self.netlist.readout_class))
 
     @abstractmethod
     def price(

@@ -25,6 +25,7 @@ from typing import Any, TypeVar
 
 from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, UnfinishedError
 from spikeloom.compiler.types import JsonObject
+from spikeloom.runtime.report.console import Progress
 
 APayload = TypeVar("APayload")
 AResult = TypeVar("AResult")
@@ -71,13 +72,11 @@ def sweep(
     They are begun in this order; of those with equal keys the first is measured. `measure` makes JSON values of a job,
     a function of a module, since it crosses process borders. `store` is an SQLite file in a folder that exists; with
     `fresh` what it holds is forgotten. `jobs` are processes at a time (one a core), whose libraries use one thread
-    each; `label` is that of the progress bar.
+    each; `label` says what is done.
 
     What a measurement raises is raised with a note that names it; UnfinishedError, if a process died. The text of a
     KeyboardInterrupt says what is kept.
     """
-    from tqdm import tqdm  # here, since commands load this module before they know whether they measure
-
     keys = list(dict.fromkeys(point.key for point in points))
     with only_one(store), closing(_opened(store, fresh=fresh)) as kept:
         results = {key: json.loads(result) for key, result in kept.execute("SELECT key, result FROM results")}
@@ -87,10 +86,11 @@ def sweep(
         def standing() -> str:
             return f"{sum(key in results for key in keys)} of {len(keys)} points are kept in {store}"
 
-        there = tqdm(total=len(keys), initial=len(keys) - len(waiting), desc=label, unit="point", disable=None)
-        with there as bar, ended_by_signal():
+        progress = Progress(len(waiting))
+        with ended_by_signal():
             try:
-                for index, found in side_by_side(waiting, measure, jobs=jobs):
+                progress(0, label)
+                for done, (index, found) in enumerate(side_by_side(waiting, measure, jobs=jobs), 1):
                     if isinstance(found, ProcessDied):
                         raise UnfinishedError(f"{found}\n{standing()}")
                     if isinstance(found, Exception):
@@ -100,7 +100,7 @@ def sweep(
                     with kept:
                         kept.execute("INSERT INTO results VALUES (?, ?)", (waiting[index].key, text))
                     results[waiting[index].key] = json.loads(text)
-                    bar.update()
+                    progress(done, label)
             except KeyboardInterrupt as interrupt:
                 raise KeyboardInterrupt(f"{standing()}; go on with the same command") from interrupt
             except sqlite3.OperationalError as error:  # a full disk, say

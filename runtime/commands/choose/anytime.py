@@ -110,5 +110,4 @@ def _float_votes(arguments: argparse.Namespace, machine: IntegerMachine, data: R
 
     loaded = load_network(arguments.checkpoint, arguments, machine.netlist)
     require_match(machine.netlist, loaded.model)
-    progress("float model")
-    return votes_so_far(loaded.network.readout, machine.netlist.classes, loaded.model, data)
+    return votes_so_far(loaded.network, loaded.model, data)

@@ -84,11 +84,12 @@ class Loihi(IntegerMachine):
 
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Every spike, membrane, update and count, one recording after another."""
-        found = 0
-        for sample in one_by_one(with_clocks(events, self.netlist.clocks), lengths):
+
+        def found(sample: EventArray) -> int:
             fast = engine.simulate(self._engine, sample[None], spikes=True, membranes=True, updated=True)
-            found += differences(spec.simulate(self.netlist, sample), fast)
-        return found
+            return differences(spec.simulate(self.netlist, sample), fast)
+
+        return sum(map(found, one_by_one(with_clocks(events, self.netlist.clocks), lengths)))
 
     def beside(self, engine: str) -> Callable[[EventArray, IntArray | None], int] | None:
         """The integer graph in onnxruntime."""

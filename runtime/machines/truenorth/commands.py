@@ -34,7 +34,7 @@ from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
 from spikeloom.runtime.machines.truenorth.description import describe, describe_trained
 from spikeloom.runtime.machines.truenorth.machine import load, machine_of
 from spikeloom.runtime.machines.votes import class_counts
-from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.console import Progress, progress
 from spikeloom.runtime.report.encode import OPTIONAL, key
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
@@ -176,8 +176,9 @@ def compare(
     machine, layers = machine_of(netlist), list(netlist.layers)
     spikes, differences = dict.fromkeys(first, 0), dict.fromkeys(first, 0)
     votes, overflows, wrong = np.zeros((len(data), netlist.classes), np.int64), 0, 0
+    count = Progress(len(data))
     for index in range(len(data)):
-        progress(f"comparing: {index} of {len(data)}")
+        count(index, "comparing")
         events = data.events[index : index + 1, ..., : data.steps_of(index)]
         trace = machine.simulate(events, spikes=True)
         assert trace.spikes is not None, "spikes are kept"

@@ -151,7 +151,7 @@ def _decided(network: NetworkFile, data: Data, windows: tuple[int, ...]) -> dict
     """Decisions of the float32 model by window and split; one run each, since what comes later changes nothing."""
     loaded, decided = _loaded(network), {window: dict[str, IntArray]() for window in windows}
     for split, part in _in_steps(data, network).items():
-        votes = votes_so_far(loaded.network.readout, network.classes, loaded.model, part)
+        votes = votes_so_far(loaded.network, loaded.model, part)
         for window in windows:
             decided[window][split] = vote(votes[np.arange(len(part)), steps_of(part.step_counts, window) - 1])
     return decided

@@ -85,7 +85,6 @@ class _Whole:
         self.loose = replace(self.strict, allowed=allowed)
         self.trials = (self.strict, self.loose) if allowed else (self.strict,)
         self.overflowing: list[str] = []
-        progress("taxels, one at a time")
         self.changed = changed_alone(self.netlist, training, self.wanted)
         self.changed_test = changed_alone(self.netlist, test, self.wanted_test)
 

@@ -21,6 +21,7 @@ from spikeloom.compiler.passes.prune import without_channels
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.studies.pruning.results import Costs
 
 
@@ -158,7 +159,9 @@ def without_taxels(integer: IntegerNetwork, netlist: Netlist, taxels: IntArray) 
 def changed_alone(netlist: Netlist, of: Recordings, wanted: IntArray) -> IntArray:
     """Decisions that change without each taxel; shape (taxels,)."""
     machine, changed = machine_of(netlist), np.zeros(netlist.taxels, np.int64)
+    progress = Progress(netlist.taxels)
     for taxel in range(netlist.taxels):
+        progress(taxel, f"{of.split}, taxels one at a time")
         if of.events[:, taxel].any():
             without_it = of.events.copy()
             without_it[:, taxel] = 0

@@ -8,6 +8,8 @@ taxels; they are not among the events here.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from spikeloom.compiler.types import FloatArray, IntArray
@@ -77,13 +79,18 @@ def held(events: Events, taxels: IntArray, value: int) -> Events:
 @perturbation("probability", (0.1, 0.25, 0.5, 0.75, 0.9))
 def events_lost(events: Events, share: float, rng: np.random.Generator) -> Events:
     """Each event is lost with a probability."""
-    return events & (rng.random(events.shape, np.float32) >= share)
+    return _one_by_one(events, lambda one: one & (rng.random(one.shape, np.float32) >= share))
 
 
 @perturbation("probability", (0.005, 0.01, 0.02, 0.05, 0.1))
 def events_spurious(events: Events, share: float, rng: np.random.Generator) -> Events:
     """Each empty entry gets an event with a probability."""
-    return events | (rng.random(events.shape, np.float32) < share)
+    return _one_by_one(events, lambda one: one | (rng.random(one.shape, np.float32) < share))
+
+
+def _one_by_one(events: Events, change: Callable[[Events], Events]) -> Events:
+    """Change each recording on its own: numbers that are drawn for all entries of all would fill the memory."""
+    return np.stack([change(one) for one in events])
 
 
 @perturbation("steps, standard deviation", (1, 2, 5, 10, 25), most=MOST_STEPS)
@@ -178,10 +185,12 @@ def _filled(events: Events, density: float, rng: np.random.Generator, *, keep: b
     """Bring recordings to a density: from above if `keep`, else from below; others stay as they are."""
     flat = events.reshape(len(events), -1)
     wanted = int(np.floor(density * flat.shape[1]) if keep else np.ceil(density * flat.shape[1]))
-    # entries that hold an event come first, each kind in random order: the first `wanted` ones hold an event then
-    order = np.argsort(rng.random(flat.shape, np.float32) - flat, axis=1, kind="stable")
-    changed = np.zeros_like(flat)
-    for row, ranked, before in zip(changed, order, flat, strict=True):
-        there = int(np.count_nonzero(before))
-        row[ranked[: min(there, wanted) if keep else max(there, wanted)]] = 1
-    return changed.reshape(events.shape)
+
+    def filled(before: Events) -> Events:
+        # entries that hold an event come first, each kind in random order: the first `wanted` ones hold an event then
+        ranked = np.argsort(rng.random(before.shape, np.float32) - before, kind="stable")
+        there, changed = int(np.count_nonzero(before)), np.zeros_like(before)
+        changed[ranked[: min(there, wanted) if keep else max(there, wanted)]] = 1
+        return changed
+
+    return _one_by_one(flat, filled).reshape(events.shape)

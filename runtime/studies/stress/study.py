@@ -16,7 +16,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import sha256_of
 from spikeloom.runtime.equivalence.breakdowns import undecided
 from spikeloom.runtime.inputs.network import LoadedNetwork
-from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.console import Progress, progress
 from spikeloom.runtime.studies.stress.bench import NAMES, Bench, bench_of, by_length, whole
 from spikeloom.runtime.studies.stress.pair import SIDES, TAXELS, Inputs, Level, Outcome, evaluate
 from spikeloom.runtime.studies.stress.results import Provenance, Run, Stress
@@ -84,12 +84,12 @@ def _measured(
     points: Sequence[tuple[str, Level, int]], bench: Bench, reference: Outcome, jobs: int | None
 ) -> list[Run]:
     """The run of each point, several at a time in threads: kernels let go of the interpreter's lock."""
-    pool = ThreadPoolExecutor(jobs or os.cpu_count())
+    pool, progress = ThreadPoolExecutor(jobs or os.cpu_count()), Progress(len(points))
     try:
         waiting = [pool.submit(measure, bench, *point, reference) for point in points]
         for done, finished in enumerate(as_completed(waiting), 1):
             finished.result()
-            progress(f"stress: {done} of {len(points)} points")
+            progress(done, "stress")
     finally:
         pool.shutdown(cancel_futures=True)
     return [each.result() for each in waiting]
