@@ -71,14 +71,6 @@ def no_synapses(dtype: npt.DTypeLike) -> Synapses:
     return Synapses(none, none, none, np.zeros(0, dtype))
 
 
-def raster_of(spikes: BoolArray) -> Raster:
-    """List spikes (recordings, steps, sources)."""
-    recordings, steps, sources = spikes.shape
-    at, begins = np.flatnonzero(spikes), np.arange(recordings * steps + 1) * sources
-    bounds = np.searchsorted(at, begins)
-    return Raster((at - np.repeat(begins[:-1], np.diff(bounds))).astype(np.int32), bounds)
-
-
 class _Notice(numba_event.Listener):
     """Says once on a terminal that machine code is being compiled, which takes seconds."""
 
@@ -164,6 +156,26 @@ def flush(values: Any, least: Any) -> None:
     zero = values.dtype.type(0)
     for i in range(len(values)):
         values[i] = zero if abs(values[i]) < least else values[i]
+
+
+def raster_of(spikes: BoolArray) -> Raster:
+    """List spikes (recordings, steps, sources)."""
+    rows = np.ascontiguousarray(spikes).view(np.uint8).reshape(-1, spikes.shape[2])
+    source, bounds = np.empty(np.count_nonzero(rows) + 1, np.int32), np.zeros(len(rows) + 1, np.int64)
+    _list_rows(rows, source, bounds)
+    return Raster(source[:-1], bounds)
+
+
+@compiled_and_cached
+def _list_rows(rows: Any, source: Any, bounds: Any) -> None:
+    """List the spikes of each row; there is a place more than there are spikes, so that no spike is asked for."""
+    n = 0
+    for row in range(len(rows)):
+        fired = rows[row]
+        for place in range(len(fired)):
+            source[n] = place
+            n += fired[place]
+        bounds[row + 1] = n
 
 
 @compiled
