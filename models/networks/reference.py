@@ -18,7 +18,7 @@ from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import RELAY_WEIGHT
 from spikeloom.compiler.formats.tensors import members, side_by_side
 from spikeloom.compiler.interpret import threads
-from spikeloom.compiler.layer_kernel import compiled_and_cached, integrate_float, keep
+from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached, copy, integrate_float, keep
 from spikeloom.compiler.systems import GCN, TACTILESGNET, feature_major, in_order
 
 Array = npt.NDArray[Any]
@@ -123,6 +123,12 @@ class _Neurons:
         return fired.astype(drive.dtype), drive
 
 
+@compiled
+def _add(values: Any, more: Any) -> None:
+    for i in range(len(values)):
+        values[i] += more[i]
+
+
 @compiled_and_cached
 def _integrate(
     drive: Any, bias: Any, alpha: Any, beta: Any, theta: Any, current: Any, membrane: Any, fired: Any
@@ -130,9 +136,9 @@ def _integrate(
     """Run neurons for some steps; `drive` becomes the membranes that were compared."""
     for t in range(len(drive)):
         keep(current, alpha)
-        current += drive[t]
+        _add(current, drive[t])
         integrate_float(membrane, current, bias, beta, theta, fired[t])
-        drive[t] = membrane
+        copy(membrane, drive[t])
 
 
 def _with_relays(checkpoint: Checkpoint, spikes: Array, membranes: Array, first: int) -> tuple[Array, Array]:
