@@ -102,7 +102,8 @@ def _storage(facts: CompilationFacts) -> Iterator[Block]:
             ]
             for choice in facts.calibration
         ]
-        yield Text("storage chosen on training recordings (each layer on the float model's own input):")
+        receives = "the float model's own input" if facts.exactness else "what the rounded ones before it send"
+        yield Text(f"storage chosen on training recordings (each layer on {receives}):")
         yield Table(["layer", "tried", "weights clipped", "errors", "spikes moved", "of"], rows)
         yield from _exactness(facts.exactness)
     for choice in facts.calibration:
