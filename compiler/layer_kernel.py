@@ -89,8 +89,9 @@ class _Notice(numba_event.Listener):
 _events: Any = numba_event  # without types
 _events.register("numba:compile", _Notice())  # no cache has a function
 
-_PART: Any = {"nogil": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-"""Only kernels are called from Python."""
+_KERNEL: Any = {"nogil": True, "no_cfunc_wrapper": True}
+_PART: Any = {**_KERNEL, "no_cpython_wrapper": True}
+"""Nothing is called from C, and a part of a kernel not from Python either."""
 
 
 def compiled(function: Function) -> Function:
@@ -101,9 +102,9 @@ def compiled(function: Function) -> Function:
 def compiled_and_cached(function: Function) -> Function:
     """Compile and keep the machine code on disk, if there is any place for it."""
     try:
-        return cast(Function, numba.njit(nogil=True, cache=True)(function))
+        return cast(Function, numba.njit(**_KERNEL, cache=True)(function))
     except RuntimeError:  # neither the folder of this file nor the user's cache folder can be written
-        return cast(Function, numba.njit(nogil=True)(function))
+        return cast(Function, numba.njit(**_KERNEL)(function))
 
 
 # Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the loops.

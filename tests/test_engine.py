@@ -171,7 +171,7 @@ def test_the_kernel_compiles_where_nothing_can_be_cached(monkeypatch):
         return lambda function: (function, options)
 
     monkeypatch.setattr(layer_kernel.numba, "njit", njit)
-    assert layer_kernel.compiled_and_cached(len) == (len, {"nogil": True})
+    assert layer_kernel.compiled_and_cached(len) == (len, layer_kernel._KERNEL)
 
 
 # --- the kernel of layers ---------------------------------------------------------------------------------------------

@@ -136,11 +136,11 @@ def _step(centre: Any, radius: Any, c: Any, r: Any, beta: Any, least: Any, most:
 
 
 @compiled
-def _currents(c: Any, r: Any, doubtful: Any, bias: Any, error: Any) -> None:
+def _currents(c: Any, half: Any, r: Any, doubtful: Any, bias: Any, error: Any) -> None:
     """Radius of plain sums: of a share of their magnitude, and of spikes that may be missing."""
     for i in range(len(c)):
-        c[i] += bias[i]
-        r[i] = (r[i] + abs(bias[i])) * error + 0.5 * SLACK * doubtful[i]
+        c[i] = c[i] + 0.5 * half[i] + bias[i]
+        r[i] = (r[i] + doubtful[i] + abs(bias[i])) * error + 0.5 * SLACK * doubtful[i]
 
 
 @compiled
@@ -197,10 +197,8 @@ def _run(
                 arrive(half, own, listed, 0, found)
                 arrive(doubtful, own_magnitude, listed, 0, found)
                 spikes += found
-            c += 0.5 * half
-            r += doubtful
             added = (roundings + (spikes if per_spike else 0)) * UNIT
-            _currents(c, r, doubtful, nothing if alpha else bias, SLACK * added / (1 - added))
+            _currents(c, half, r, doubtful, nothing if alpha else bias, SLACK * added / (1 - added))
             if alpha:
                 _lasting(c, r, before_c, before_r, alpha, bias)
             _step(centre, radius, c, r, beta, least, most, fired[recording, t], unsure[recording, t])
