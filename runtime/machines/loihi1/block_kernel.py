@@ -467,35 +467,18 @@ _run_block, _run_lasting_block = (_block_runner(lasts=lasts) for lasts in (False
 
 
 @compiled
-def _run_stage(
-    blocks: Blocks,
-    s: int,
-    steps: int,
-    words: AnyArray,
-    start: int,
-    width: int,
-    listed: AnyArray,
-    bounds: IntArray,
-    scratch: Scratch,
-    lasting: Lasting | None,
-) -> None:
-    """Let a stage integrate, block by block: its rows and membranes stay in cache."""
-    for block in range(blocks.stage[s], blocks.stage[s + 1]):
-        if lasting is not None and lasting.keep_u[block] != 0:
-            _run_lasting_block(blocks, s, block, steps, words, start, width, listed, bounds, scratch, lasting)
-        else:
-            _run_block(blocks, s, block, steps, words, start, width, listed, bounds, scratch, None)
-
-
-@compiled
 def _run_stages(blocks: Blocks, n_words: int, steps: int, scratch: Scratch, lasting: Lasting | None) -> None:
     """Let all stages integrate, one after the other, and count spikes and events."""
     bounds = np.empty(steps + 1, np.int64)
     active, start, width, count = scratch.words, np.int64(0), n_words, scratch.inputs
     for s in range(blocks.stage.size - 1):
         listed = _list(active, start, width, steps, bounds, count)
-        _run_stage(blocks, s, steps, active, start, width, listed, bounds, scratch, lasting)
         begin, end = blocks.stage[s], blocks.stage[s + 1]
+        for block in range(begin, end):  # one after another: their rows and membranes stay in cache
+            if lasting is not None and lasting.keep_u[block] != 0:
+                _run_lasting_block(blocks, s, block, steps, active, start, width, listed, bounds, scratch, lasting)
+            else:
+                _run_block(blocks, s, block, steps, active, start, width, listed, bounds, scratch, None)
         active, start, width, count = scratch.raster, steps * begin, end - begin, scratch.spikes[begin * LANES :]
     _list(active, start, width, steps, bounds, count)
 
