@@ -211,7 +211,7 @@ def test_a_misspelt_word_is_answered_with_the_near_one(capsys, words, meant):
     assert f"did you mean {meant}?" in capsys.readouterr().err
 
 
-HEAVY = "torch numba scipy.stats matplotlib onnx onnxruntime networkx h5py jinja2"
+HEAVY = "torch tqdm numba scipy.stats matplotlib onnx onnxruntime networkx h5py jinja2"
 """Packages that take a tenth of a second and more to load."""
 
 NEEDED = {
@@ -226,7 +226,7 @@ NEEDED = {
     "verify --help": "numba",
     "run g.loom --data synthetic": "",
     "estimate g.loom --data synthetic": "",
-    "verify g.loom --checkpoint pretrained:grasps --data synthetic --limit 2": "torch",
+    "verify g.loom --checkpoint pretrained:grasps --data synthetic --limit 2": "",
 }
 """Those that a command may load beyond what the commands above it do."""
 
