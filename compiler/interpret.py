@@ -61,16 +61,17 @@ class Layer:
         """Spikes, and membranes, of recordings from the spikes of `pres`, all (samples, steps, neurons)."""
         shape = *sources[0].shape[:2], self.size
         spikes, kept = np.empty(shape, np.bool_), np.empty(shape if membranes else _NONE, self._kind)
-        self.kernel(raster(sources), *self.fixed, spikes.view(np.uint8), kept, *_compared(None, self.size))
+        moved = np.zeros((2, 0), np.int32)
+        self.kernel(raster(sources), *self.fixed, spikes.view(np.uint8), kept, np.empty(_NONE, np.uint8), moved)
         return spikes, kept if membranes else None
 
-    def moved(self, sources: Raster, wanted: BoolArray) -> npt.NDArray[np.int32]:
-        """Entries in which neurons differ from those `wanted`, (samples, steps, neurons), and spikes more than there.
+    def moved(self, sources: Raster, wanted: npt.NDArray[np.uint8]) -> npt.NDArray[np.int32]:
+        """Entries in which neurons differ from those `wanted`, and spikes more than there; (2, neurons).
 
-        The shape is (2, neurons).
+        `wanted` (samples, steps, bytes) has a bit for each neuron, the first lowest.
         """
-        spikes, (theirs, moved) = np.empty(wanted.shape, np.uint8), _compared(wanted, self.size)
-        self.kernel(sources, *self.fixed, spikes, np.empty(_NONE, self._kind), theirs, moved)
+        moved, fired = np.zeros((2, self.size), np.int32), np.empty((1, 2, self.size), np.uint8)
+        self.kernel(sources, *self.fixed, fired, np.empty(_NONE, self._kind), np.ascontiguousarray(wanted), moved)
         return moved
 
     @property
@@ -80,11 +81,6 @@ class Layer:
 
 
 _NONE = (0, 0, 0)
-
-
-def _compared(wanted: BoolArray | None, size: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int32]]:
-    theirs = np.empty(_NONE, np.uint8) if wanted is None else np.ascontiguousarray(wanted).view(np.uint8)
-    return theirs, np.zeros((2, size), np.int32)
 
 
 def raster(sources: Sequence[BoolArray]) -> Raster:

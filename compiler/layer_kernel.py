@@ -145,6 +145,28 @@ def copy(values: Any, out: Any) -> None:
 
 
 @compiled
+def _ones(word: Any) -> Any:
+    # the compiler knows this sum of ever wider fields as one instruction
+    word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
+
+
+@compiled_and_cached
+def coincidences(times: Any) -> Any:
+    """How often each two inputs spike together, from the steps of each at a bit a step: uint64, (inputs, words)."""
+    together = np.empty((len(times), len(times)), np.float64)
+    for i in range(len(times)):
+        for j in range(i + 1):
+            count = np.uint64(0)
+            for k in range(times.shape[1]):
+                count += _ones(times[i, k] & times[j, k])
+            together[i, j] = together[j, i] = count
+    return together
+
+
+@compiled
 def keep(values: Any, factor: Any) -> None:
     """Let values decay."""
     for i in range(len(values)):
@@ -181,9 +203,13 @@ def _list_rows(rows: Any, source: Any, bounds: Any) -> None:
 
 @compiled
 def _compare(fired: Any, wanted: Any, moved: Any, more: Any) -> None:
-    for i in range(len(moved)):
-        moved[i] += fired[i] != wanted[i]
-        more[i] += np.int32(fired[i]) - np.int32(wanted[i])
+    # byte by byte, and unsigned: only then is the inner loop vectorised
+    for byte in range(np.uint64(len(wanted))):
+        first, bits = np.uint64(8) * byte, np.int32(wanted[byte])
+        for k in range(min(np.uint64(8), np.uint64(len(moved)) - first)):
+            ours, theirs = np.int32(fired[first + k]), (bits >> np.int32(k)) & np.int32(1)
+            moved[first + k] += ours ^ theirs
+            more[first + k] += ours - theirs
 
 
 @compiled
@@ -213,10 +239,11 @@ def float_layer(
     """Run the recordings of a raster in the float type of all arguments, each from rest.
 
     `fired` (recordings, steps, neurons) uint8 is filled, and `membranes`, likewise and before the reset, unless it is
-    empty. Unless `wanted`, shaped as `fired`, is empty, `moved` (2, neurons) int32 counts in which entries each neuron
-    differs from it, and the spikes that it has more.
+    empty. Unless `wanted`, the same at a bit a neuron, is empty, `moved` (2, neurons) int32 counts in which entries a
+    neuron differs from it, and the spikes that it has more; `fired` then needs one recording of two steps, no more.
     """
-    recordings, steps, size = fired.shape
+    recordings, steps = (wanted if len(wanted) else fired).shape[:2]
+    kept, last, size = fired.shape
     before = np.empty(size, np.int32)
     membrane, current = np.zeros(size, bias.dtype), np.zeros(size, bias.dtype)
     least = bias.dtype.type(DENORMAL)
@@ -228,15 +255,15 @@ def float_layer(
                 keep(current, alpha)
             else:
                 current[:] = 0
-            at = recording * steps + t
+            at, now = recording * steps + t, fired[recording % kept, t % last]
             arrive(current, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
             if len(own.run) and t:
-                arrive(current, own, before, 0, list_fired(fired[recording, t - 1], before))
-            integrate_float(membrane, current, bias, beta, theta, fired[recording, t])
+                arrive(current, own, before, 0, list_fired(fired[recording % kept, (t - 1) % last], before))
+            integrate_float(membrane, current, bias, beta, theta, now)
             if len(membranes):
                 copy(membrane, membranes[recording, t])
             if len(wanted):
-                _compare(fired[recording, t], wanted[recording, t], moved[0], moved[1])
+                _compare(now, wanted[recording, t], moved[0], moved[1])
             if t % 16 == 15:
                 flush(membrane, least)
                 flush(current, least)
@@ -287,7 +314,8 @@ def integer_layer(
     `bias` and `threshold` are in membrane units, `keep_u` and `keep_v` in 1/4096, and no membrane passes `limit`. What
     is filled is as for :func:`float_layer`.
     """
-    recordings, steps, size = fired.shape
+    recordings, steps = (wanted if len(wanted) else fired).shape[:2]
+    kept, last, size = fired.shape
     before = np.empty(size, np.int32)
     membrane, current, sums = np.zeros(size, bias.dtype), np.zeros(size, bias.dtype), np.zeros(size, bias.dtype)
     for recording in range(recordings):
@@ -295,12 +323,12 @@ def integer_layer(
         current[:] = 0
         for t in range(steps):
             sums[:] = 0
-            at = recording * steps + t
+            at, now = recording * steps + t, fired[recording % kept, t % last]
             arrive(sums, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
             if len(own.run) and t:
-                arrive(sums, own, before, 0, list_fired(fired[recording, t - 1], before))
-            _integrate_integer(membrane, current, sums, bias, threshold, keep_u, keep_v, limit, fired[recording, t])
+                arrive(sums, own, before, 0, list_fired(fired[recording % kept, (t - 1) % last], before))
+            _integrate_integer(membrane, current, sums, bias, threshold, keep_u, keep_v, limit, now)
             if len(membranes):
                 copy(membrane, membranes[recording, t])
             if len(wanted):
-                _compare(fired[recording, t], wanted[recording, t], moved[0], moved[1])
+                _compare(now, wanted[recording, t], moved[0], moved[1])

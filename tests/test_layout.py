@@ -25,7 +25,7 @@ from random_networks import (
 from spikeloom.compiler.errors import CapacityError, NumericRangeError, OptionError
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.ir import depths
-from spikeloom.compiler.passes.calibrate import Calibration
+from spikeloom.compiler.passes.calibrate import Calibration, packed
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
@@ -48,7 +48,7 @@ WITHOUT_SHRINKING = tuple(phase for phase in Phase if phase is not Phase.shrink)
 def spikes_for(network, events, rng, rate=0.4):
     """A calibration with these events and random spikes."""
     return Calibration(
-        events=events, spikes=tuple(rng.random((*events.shape[:2], p.size)) < rate for p in network.populations)
+        events=events, spikes=tuple(packed(rng.random((*events.shape[:2], p.size)) < rate) for p in network.populations)
     )
 
 
@@ -59,7 +59,7 @@ def busy(sizes, *, steps=60, seed=0, rates=None):
     rates = [0.3] * len(sizes) if rates is None else rates
     return network, Calibration(
         events=rng.random((2, steps, sizes[0])) < rates[0],
-        spikes=tuple(rng.random((2, steps, n)) < rate for n, rate in zip(sizes[1:], rates[1:], strict=True)),
+        spikes=tuple(packed(rng.random((2, steps, n)) < rate) for n, rate in zip(sizes[1:], rates[1:], strict=True)),
     )
 
 
@@ -100,7 +100,7 @@ def test_expectations_are_the_simple_model_of_the_same_spikes(data):
 def test_a_step_by_hand():
     """Two inputs, three neurons on one core, one of which fires in one step of two."""
     network = integer_chain(np.full((2, 2), 2), np.full((1, 2), 2))
-    spikes = (np.array([[[1, 0], [0, 0]]], bool), np.zeros((1, 2, 1), bool))
+    spikes = tuple(map(packed, (np.array([[[1, 0], [0, 0]]], bool), np.zeros((1, 2, 1), bool))))
     calibration = Calibration(events=np.array([[[1, 1], [0, 0]]], bool), spikes=spikes)
     layout, usual = lay_out(network, LOIHI, calibration=calibration)
     assert layout is usual
@@ -115,7 +115,7 @@ def test_the_mean_of_the_longest_is_not_the_longest_of_the_means():
     target = small_target(core_compartments=40)
     events = np.zeros((1, 10, 40), bool)
     events[:, ::2] = True
-    calibration = Calibration(events=events, spikes=(events[:, :, :8], np.zeros((1, 10, 40), bool)))
+    calibration = Calibration(events=events, spikes=(packed(events[:, :, :8]), packed(np.zeros((1, 10, 40), bool))))
     expected = lay_out(network, target, calibration=calibration)[0].expected
     # fc1 hears in even chip steps, fc2 too: what fc1 fires in step t it sends in step t
     work = [40 * (16 + 8 * 3.8), 8 * (16 + 40 * 3.8)]

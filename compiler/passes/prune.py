@@ -108,8 +108,7 @@ def _never_fires(network: Network, post: int, silent: Known) -> Mask:
 
 def never_fired(network: Network, calibration: Calibration) -> Masks:
     """Neurons that did not fire on the calibration recordings; never among them are those that vote."""
-    fired = [np.asarray(spikes.any(axis=(0, 1)), np.bool_) for spikes in calibration.spikes]
-    return _without_voters(network, tuple(~mask for mask in fired))
+    return _without_voters(network, tuple(rate == 0 for rate in calibration.rates))
 
 
 def none_of(network: Network | IntegerNetwork) -> Masks:

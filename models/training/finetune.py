@@ -207,7 +207,7 @@ def initial_forms(
     for post, (population, width) in enumerate(zip(network.populations, bits, strict=True)):
         incoming = [p for p in network.projections if p.post == post]
         weight = np.concatenate([p.weight.toarray() for p in incoming], axis=1)
-        rate = np.concatenate([calibration.source(p.pre, p.post).mean(axis=(0, 1)) for p in incoming]) + SILENT_RATE
+        rate = np.concatenate([calibration.rate(p.pre, p.post) for p in incoming]) + SILENT_RATE
         step = _grouped(_nearest_steps(weight, rate, reach(width, (0,))), groups)  # model units in one step
         for exponent in sorted(exponents):
             threshold = np.rint(population.theta * step_units(width, (exponent,)) / step).astype(np.int64)

@@ -92,7 +92,7 @@ def _calibrate(done: Compilation) -> Compilation:
         several = any(packing.planes > 1 for packing in options.packings or ())
         events = calibration.evenly_spaced(events, calibration.MANY if several else calibration.FEW)
     found = calibration.calibrate(done.network, events)
-    return replace(done, calibration=found, rates=tuple(spikes.mean(axis=(0, 1)) for spikes in found.spikes))
+    return replace(done, calibration=found, rates=found.rates)
 
 
 def _disconnect(done: Compilation) -> Compilation:

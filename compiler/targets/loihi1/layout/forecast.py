@@ -24,7 +24,7 @@ from scipy import sparse
 
 from spikeloom.compiler.errors import CapacityError, OptionError
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, depths
-from spikeloom.compiler.passes.calibrate import Calibration, fewer
+from spikeloom.compiler.passes.calibrate import Calibration, Spikes, fewer
 from spikeloom.compiler.targets.base import PICOSECONDS, TimeTable
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Core, Cores, Needs, choose_dense
 from spikeloom.compiler.targets.loihi1.layout.partition import chunks_of, cut, cut_layer
@@ -70,13 +70,13 @@ def sample(network: IntegerNetwork, calibration: Calibration, identity: tuple[In
     chosen = np.linspace(0, every - 1, min(every, SAMPLES)).round().astype(np.int64)
     recording, step = np.divmod(chosen, length + max(late))
 
-    def seen(values: BoolArray, depth: int) -> sparse.csc_array:
+    def seen(values: Spikes | BoolArray, depth: int, ids: IntArray | slice = slice(None)) -> sparse.csc_array:
         at = step - depth
         runs = (0 <= at) & (at < length)
-        return sparse.csc_array((values[recording, np.where(runs, at, 0)] & runs[:, None]).astype(np.float64))
+        return sparse.csc_array((values[recording, np.where(runs, at, 0)][:, ids] & runs[:, None]).astype(np.float64))
 
-    layers = zip(calibration.spikes, identity, late, strict=True)
-    return (*(seen(spikes[:, :, ids], depth) for spikes, ids, depth in layers), seen(calibration.events, 0))
+    layers = zip(calibration.spikes, late, identity, strict=True)
+    return (*(seen(*layer) for layer in layers), seen(calibration.events, 0))
 
 
 class Forecast:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -34,19 +35,19 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     FloatLayer,
     Rounded,
     candidate,
-    flips,
     grouped,
+    judged,
     layer_of,
     rounded,
 )
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load, loads
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import FloatArray
 
 CLIPPING = tuple(2 ** (k / 4) for k in range(21))
 """Factors by which a scale may exceed the one that just holds the largest weight; larger weights are clipped."""
 
-SAMPLE, FINALISTS = 8, 4
-"""Recordings on which all scales of a layer are compared, and how many of them are compared on all recordings."""
+FINALISTS = 4
+"""Scales of a layer that are compared on all recordings, after all were on the first part of them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,22 +78,23 @@ def _register(population: Population) -> str:
     return "current" if current_load(decay_registers(population.beta, population.alpha)[0]) > 1 else "accumulator"
 
 
-def _counted(stored: Rounded, layer: FloatLayer, *, tried: int) -> Rounded:
-    """The same with the calibration spikes that differ from float64, where there is a calibration."""
-    moved = None if layer.calibration is None else int(flips(stored, layer.post, layer.calibration).sum())
-    return replace(stored, flips=moved, tried=tried)
-
-
 def best_scale(layer: FloatLayer, packing: Packing, exponents: tuple[int, ...], *, clip: bool = True) -> Rounded:
     """Scale of one population that keeps most calibration spikes; ModelError if there is none.
 
     Without `clip` every weight must fit its planes.
     """
     population = layer.population
-    factors = CLIPPING if clip and layer.calibration is not None and packing.planes == 1 else (1.0,)
-    fitted = [candidate(layer, packing, factor, exponents) for factor in factors]
+    calibration, post = layer.calibration, layer.post
+    factors = CLIPPING if clip and calibration is not None and packing.planes == 1 else (1.0,)
     # one scale at two exponents is two candidates: mantissas and clipping differ
-    found = list({(c.form.exponents, int(c.form.threshold[0])): c for c in fitted if c is not None}.values())
+    scales = dict[tuple[tuple[int, ...], int], Rounded]()
+    for factor in factors:
+        stored, limited = candidate(layer, packing, factor, exponents)
+        if stored is not None:
+            scales[stored.form.exponents, int(stored.form.threshold[0])] = stored
+        if limited:
+            break
+    found = list(scales.values())
     if not found:
         register = _register(population)
         lasting = f" and its current, of which a step keeps {population.alpha:g}, within its register"
@@ -102,31 +104,26 @@ def best_scale(layer: FloatLayer, packing: Packing, exponents: tuple[int, ...], 
             "or smaller weights"
         )
     tried = len(found)
-    if layer.calibration is not None and tried > FINALISTS:
-        sample = fewer(layer.calibration, SAMPLE)
-        found = sorted(found, key=lambda c: int(flips(c, layer.post, sample).sum()))[:FINALISTS]
-    best = min((_counted(stored, layer, tried=tried) for stored in found), key=lambda c: c.fewest)
+    if calibration is not None and tried > FINALISTS:
+        found = sorted(found, key=lambda c: judged(c, post, calibration, 1).flips)[:FINALISTS]
+    best = min((judged(stored, post, calibration) for stored in found), key=attrgetter("flips"))
     if packing.groups > 1:
         several = grouped(layer, best, packing.groups, factors[-1])
         if several is not None:
-            best = min(_counted(several, layer, tried=tried), best, key=lambda c: c.fewest)
-    if layer.calibration is not None:
-        other = compensated(layer, best.form, layer.calibration)
-        if other is not None:
-            best = min(best, _counted(other, layer, tried=tried), key=lambda c: c.fewest)
-    return best
+            best = min(judged(several, post, calibration), best, key=attrgetter("flips"))
+    if calibration is not None:
+        best = compensated(layer, best, calibration) or best
+    return replace(best, tried=tried)
 
 
-def round_with_more(layer: FloatLayer, candidate: Rounded, calibration: Calibration) -> Rounded:
+def round_with_more(layer: FloatLayer, chosen: Rounded, calibration: Calibration) -> Rounded:
     """Let the errors of a layer cancel on ``MANY`` recordings at the storage that was chosen on ``FEW``.
 
     What keeps fewer spikes there is dropped.
     """
-    many = fewer(calibration, MANY)
-    stored = compensated(layer, candidate.form, many)
-    if stored is None or flips(stored, layer.post, many).sum() > flips(candidate, layer.post, many).sum():
-        return candidate
-    return replace(stored, flips=int(flips(stored, layer.post, fewer(many)).sum()), tried=candidate.tried)
+    many, plain = fewer(calibration, MANY), rounded(layer, chosen.form)
+    stored = plain and compensated(layer, judged(plain, layer.post, many), many)
+    return min(judged(chosen, layer.post, many), stored or chosen, key=attrgetter("flips"))
 
 
 def nudged(layer: FloatLayer, stored: Rounded, calibration: Calibration) -> Rounded:
@@ -139,20 +136,16 @@ def nudged(layer: FloatLayer, stored: Rounded, calibration: Calibration) -> Roun
         mantissa, exponent = encode_bias(np.clip(bias, -most, most))
         return replace(before, bias_mantissa=mantissa, bias_exponent=exponent)
 
-    def lost(population: IntegerPopulation) -> IntArray:
-        ready = integer_layer(population, stored.projections, loops=False)
-        differ, more = calibration.moved(ready, layer.post)
-        over = loads(population, stored.projections) > ONE_STEP_SUM_MAX
-        return np.where(over, np.iinfo(np.int64).max, differ + np.abs(more))
-
-    bias, fewest = before.bias.astype(np.float64), lost(before)
+    bias, fewest = before.bias.astype(np.float64), judged(stored, layer.post, calibration).moved
     for share in (sign * nudge for nudge in NUDGES for sign in (1, -1)):
-        trial = bias + share * unit
-        found = lost(at(trial))
-        bias, fewest = np.where(found < fewest, trial, bias), np.minimum(found, fewest)
+        trial = at(bias + share * unit)
+        found = judged(replace(stored, population=trial), layer.post, calibration).moved
+        better = found[0] + np.abs(found[1]) < fewest[0] + np.abs(fewest[1])
+        better &= loads(trial, stored.projections) <= ONE_STEP_SUM_MAX
+        bias, fewest = np.where(better, bias + share * unit, bias), np.where(better, found, fewest)
     after = at(bias)
-    moved = bool(np.any(after.bias != before.bias))
-    return replace(stored, population=after, compensated=stored.compensated or moved)
+    nudged = bool(np.any(after.bias != before.bias))
+    return replace(stored, population=after, moved=fewest, compensated=stored.compensated or nudged)
 
 
 def assemble(network: Network, layers: Sequence[Rounded]) -> IntegerNetwork:
@@ -194,8 +187,8 @@ def explain_choice(layer: FloatLayer, chosen: Rounded) -> Choice:
         weights=weights,
         compensated=chosen.compensated,
         candidates=chosen.tried,
-        flips=chosen.flips,
-        spikes=None if layer.calibration is None else int(np.count_nonzero(layer.calibration.spikes[layer.post])),
+        flips=None if layer.calibration is None else chosen.flips,
+        spikes=None if layer.calibration is None else layer.calibration.spikes[layer.post].total,
         headroom=1 - chosen.reached / ONE_STEP_SUM_MAX,
     )
 
@@ -226,8 +219,8 @@ def choose_storage(
         if calibration is not None and known is not None:
             if packing.planes > 1:
                 best = round_with_more(layer, best, calibration)
-            best = _counted(nudged(layer, best, known), layer, tried=best.tried)
-            known = known.after(integer_layer(best.population, best.projections), post)
+            best = nudged(layer, best, known)
+            known = known.after(integer_layer(best.population, best.projections))
         layers.append(layer)
         chosen.append(best)
     if faults:
@@ -250,5 +243,5 @@ def round_to_forms(
             overflow = f"the {_register(layer.population)} may overflow"
             what = "a bias has no register value" if stored is None else overflow
             raise ModelError(f"{name}: at the scale that it was fine-tuned for, {what}; fine-tune it again")
-        chosen.append(_counted(stored, layer, tried=1))
+        chosen.append(judged(stored, layer.post, calibration))
     return assemble(network, chosen), tuple(map(explain_choice, layers, chosen))

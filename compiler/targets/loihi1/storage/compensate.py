@@ -9,109 +9,135 @@ References
 .. [1] B. Hassibi, D. Stork, "Second order derivatives for network pruning: Optimal Brain Surgeon", NIPS 1992.
 .. [2] E. Frantar et al., "GPTQ: Accurate post-training quantization for generative pre-trained transformers", 2022,
    arXiv:2210.17323: the order-by-order update through a Cholesky factor.
+.. [3] L. Babai, "On Lovász' lattice reduction and the nearest lattice point problem", Combinatorica 6, 1986: the same
+   integers without an inverse.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy import sparse
-from scipy.linalg import solve_triangular
+import numpy.typing as npt
 
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, reach, step_units
-from spikeloom.compiler.ir import Form
+from spikeloom.compiler.ir import PART, Projection
 from spikeloom.compiler.passes.calibrate import Calibration
-from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, flips, rounded
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, scales
+from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, judged, rounded
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, nearest_steps, scales
 from spikeloom.compiler.types import FloatArray, IntArray
 
-DAMPING = 1e-3
-"""Share of the mean activity that is added to each input's own: inputs that never spiked are rounded to nearest."""
+DAMPING = 0.03
+"""Share of the mean activity that is added to each input's own."""
 
 BLOCK = 64
-"""Columns whose errors are passed on to all later ones at once: the same sums, as one matrix product."""
+"""Columns to which the errors of all earlier ones are passed on at once: the same sums, as one matrix product."""
+
+INPUTS = 4096
+"""The most active inputs of a neuron, whose errors cancel: no more fit a core. All others are rounded to nearest."""
 
 
-def compensated(layer: FloatLayer, form: Form, calibration: Calibration) -> Rounded | None:
-    """Round one population with compensation; None where a bias has no register value.
+def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> Rounded | None:
+    """Round one population as `plain`, which was judged, is stored; None where a bias has no register value.
 
-    Weights that the range cuts off stay at its end: their errors are not passed on. A neuron whose sums would leave
-    the accumulator, or that keeps fewer of its spikes (one that fires from its bias alone, say), is rounded to
-    nearest instead.
+    Weights that the range cuts off stay at its end: their errors are not passed on. The bias takes up what the mean sum
+    is then off, also because layers before were rounded. A neuron whose sums would leave the accumulator, or that keeps
+    fewer of its spikes (one that fires from its bias alone, say), is rounded to nearest instead.
     """
-    population, projections, post = layer.population, layer.projections, layer.post
+    from spikeloom.compiler.layer_kernel import coincidences
+
+    population, projections, form = layer.population, layer.projections, plain.form
     scale, step = scales(population, form), step_units(form.bits, form.exponents)
-    offset, width = 0, sum(p.weight.shape[1] for p in projections)
-    wanted, connected = np.zeros((population.size, width)), np.zeros((population.size, width), np.bool_)
-    places, sources = [], []
-    limit = reach(form.bits, form.exponents)
-    for p in projections:
-        row = np.repeat(np.arange(population.size), np.diff(p.weight.indptr))
-        place = row, offset + p.weight.indices
-        wanted[place] = p.weight.data * scale[row] / step
-        connected[place] = True
-        places.append(place)
-        sources.append(calibration.source(p.pre, post).reshape(-1, p.weight.shape[1]))
-        offset += p.weight.shape[1]
-    held = np.clip(wanted, -limit, limit)
-    active = sparse.csr_array(np.concatenate(sources, axis=1), dtype=np.float32)
-    together = (active.T @ active).toarray().astype(np.float64) / active.shape[0]
-    rate = np.diag(together)
-    steps = np.zeros(wanted.shape, np.int64)
-    kinds, kind = np.unique(connected, axis=0, return_inverse=True)
-    for index, inputs in enumerate(kinds):  # neurons with synapses from the same inputs are rounded together
-        columns = np.flatnonzero(inputs)
-        part = np.ix_(np.flatnonzero(kind == index), columns)
-        steps[part] = np.clip(_round_in_turn(held[part], together[np.ix_(columns, columns)]), -limit, limit)
-
-    def stored_as(steps: IntArray, errors: FloatArray) -> Rounded | None:
-        return rounded(layer, form, [steps[place] for place in places], population.bias + errors)
-
-    nearest = np.rint(held).astype(np.int64)
-    plain = stored_as(nearest, np.zeros(population.size))
-    errors = (held - steps) @ rate * step / scale
-    errors[population.size - population.relays :] = 0  # a relay has no bias
-    found = stored_as(steps, errors)
-    if found is None or plain is None:
-        return None
-    back = flips(found, post, calibration) > flips(plain, post, calibration)
-    back |= loads(found.population, found.projections) > ONE_STEP_SUM_MAX
-    steps[back], errors[back] = nearest[back], 0
-    found = stored_as(steps, errors)
-    return None if found is None else replace(found, compensated=True)
-
-
-def _round_in_turn(weight: FloatArray, together: FloatArray) -> FloatArray:
-    """Round columns one after the other, the most active first, each error passed on to the columns that follow.
-
-    Weights (neurons, inputs) are in steps; `together` (inputs, inputs) is the mean of ``x x^T``.
-    """
-    inputs = weight.shape[1]
-    order = np.argsort(-np.diag(together), kind="stable")
-    follow = _follow(
-        together[np.ix_(order, order)] + np.eye(inputs) * (DAMPING * np.trace(together) / max(inputs, 1) + 1e-12)
+    limit, times = reach(form.bits, form.exponents), _spike_times(layer, calibration)
+    rate, meant = (
+        np.concatenate([source.rate(p.pre, layer.post) for p in projections])
+        for source in (calibration, replace(calibration, sent=()))
     )
-    left = weight[:, order]
-    rounded = np.empty_like(left)
-    for start in range(0, inputs, BLOCK):
-        end = min(start + BLOCK, inputs)
-        errors = np.empty((len(left), end - start))
-        for j in range(start, end):
-            rounded[:, j] = np.rint(left[:, j])
-            errors[:, j - start] = left[:, j] - rounded[:, j]
-            left[:, j + 1 : end] -= np.outer(errors[:, j - start], follow[j, j + 1 : end])
-        left[:, end:] -= errors @ follow[start:end, end:]
-    back = np.empty_like(rounded)
-    back[:, order] = rounded
-    return back
+    nearest = [nearest_steps(population, p, form) for p in projections]
+    steps, errors = [each.copy() for each in nearest], np.zeros(population.size)
+    for neurons, inputs in _alike(layer):
+        shown = np.argsort(-rate[inputs], kind="stable")[:INPUTS]
+        shown = shown[rate[inputs[shown]] > 0]
+        share = _share(coincidences(times[inputs[shown]]))
+        for rows in np.array_split(neurons, -(-len(neurons) * len(inputs) // PART) or 1):
+            places = [_places(p, rows) for p in projections]
+            weight = np.concatenate([p.weight.data[at] for p, at in zip(projections, places, strict=True)], axis=1)
+            whole = weight * (scale[rows] / step)[:, None]
+            held = np.clip(whole, -limit, limit)
+            found = np.rint(held)
+            found[:, shown] = np.clip(_round_in_turn(held[:, shown], share), -limit, limit)
+            errors[rows] = (whole @ meant[inputs] - found @ rate[inputs]) * step / scale[rows]
+            ends = np.cumsum([at.shape[1] for at in places])[:-1]
+            for each, at, part in zip(steps, places, np.split(found, ends, axis=1), strict=True):
+                each[at] = part
+    errors[population.size - population.relays :] = 0  # a relay has no bias
+    stored = rounded(layer, form, steps, population.bias + errors)
+    if stored is None:
+        return None
+    before, after = plain.moved, judged(stored, layer.post, calibration).moved
+    back = (after > before)[0] | (loads(stored.population, stored.projections) > ONE_STEP_SUM_MAX)
+    for p, each, instead in zip(projections, steps, nearest, strict=True):
+        np.copyto(each, instead, where=np.repeat(back, np.diff(p.weight.indptr)))
+    stored = rounded(layer, form, steps, population.bias + np.where(back, 0, errors))
+    # judged without its loops, no neuron of a layer depends on another
+    return stored and replace(stored, compensated=True, moved=np.where(back, before, after))
 
 
-def _follow(together: FloatArray) -> FloatArray:
-    """Share of each input's error that each later one makes up for: the Cholesky factor of the inverse, rows scaled.
+def _alike(layer: FloatLayer) -> Iterator[tuple[IntArray, IntArray]]:
+    """Neurons with synapses from the same inputs, and these, numbered one projection after another."""
+    weights = [p.weight for p in layer.projections]
+    firsts = np.cumsum([0, *(weight.shape[1] for weight in weights)])
+    kinds = defaultdict(list)
+    for neuron in range(layer.population.size):
+        inputs = [w.indices[w.indptr[neuron] : w.indptr[neuron + 1]] for w in weights]
+        kinds[tuple(each.tobytes() for each in inputs)].append(neuron)
+    for neurons in kinds.values():
+        ends = [w.indptr[neurons[0] : neurons[0] + 2] for w in weights]
+        inputs = [first + w.indices[slice(*end)] for w, first, end in zip(weights, firsts, ends, strict=False)]
+        yield np.array(neurons), np.concatenate(inputs)
 
-    The factor is that of the reversed matrix, inverted and turned round, so that the inverse itself is never formed.
+
+def _places(projection: Projection, rows: IntArray) -> IntArray:
+    """Where a projection holds the weights of equally many synapses of each row; (rows, synapses)."""
+    begins = projection.weight.indptr[rows]
+    places: IntArray = begins[:, None] + np.arange(projection.weight.indptr[rows[0] + 1] - begins[0])
+    return places
+
+
+def _spike_times(layer: FloatLayer, calibration: Calibration) -> npt.NDArray[np.uint64]:
+    """Steps in which each input of a layer spikes, a bit each; (inputs, words)."""
+    times = []
+    for rows in calibration.parts():
+        sources = [calibration.source(p.pre, layer.post, rows) for p in layer.projections]
+        spikes = np.concatenate(sources, axis=2)
+        bits = np.packbits(spikes.reshape(-1, spikes.shape[2]), axis=0)
+        times.append(np.pad(bits, ((0, -len(bits) % 8), (0, 0))).T)
+    return np.ascontiguousarray(np.concatenate(times, axis=1)).view(np.uint64)
+
+
+def _share(together: IntArray) -> FloatArray:
+    """How much of each input's error the later ones make up for: a Cholesky factor, columns scaled.
+
+    `together` (inputs, inputs) says how often two inputs spiked in the same step.
     """
-    lower = np.linalg.cholesky(together[::-1, ::-1])
-    upper: FloatArray = solve_triangular(lower, np.eye(len(lower)), lower=True)[::-1, ::-1]
-    return upper / np.diag(upper)[:, None]
+    damped = together + np.eye(len(together)) * (DAMPING * np.trace(together) / max(len(together), 1))
+    factor: FloatArray = np.linalg.cholesky(damped[::-1, ::-1])[::-1, ::-1]
+    return factor / np.diag(factor)
+
+
+def _round_in_turn(weight: FloatArray, share: FloatArray) -> FloatArray:
+    """Round columns one after the other, each error passed on to the columns that follow.
+
+    Weights (neurons, inputs) are in steps, `share` (inputs, inputs) is of :func:`_share`.
+    """
+    rounded, errors = np.empty_like(weight), np.empty_like(weight)
+    for start in range(0, weight.shape[1], BLOCK):
+        block = slice(start, start + BLOCK)
+        wanted = weight[:, block] + errors[:, :start] @ share[:start, block]
+        for j in range(start, start + wanted.shape[1]):
+            rounded[:, j] = np.rint(wanted[:, j - start])
+            errors[:, j] = weight[:, j] - rounded[:, j]
+            wanted[:, j + 1 - start :] += np.outer(errors[:, j], share[j, j + 1 : start + BLOCK])
+    return rounded

@@ -6,7 +6,7 @@ Nothing here looks at the rest of the network; :mod:`storage.choose_storage` cho
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -73,14 +73,15 @@ class Rounded:
     # Largest one-sided sum of one step that any input brings, weight units. A current that outlasts its step counts as
     # the sum that fills the accumulator as far as it fills its own register.
     reached: float
-    flips: int | None = None  # Calibration spikes that differ from float64, where they were counted
+    # Calibration spikes of each neuron that differ from float64, and how many more there are: (2, neurons) once judged
+    moved: IntArray = field(default_factory=lambda: np.zeros((2, 0), np.int64))
     tried: int = 1  # Scales that were compared
     compensated: bool = False  # Whether weights were rounded so that their errors cancel
 
     @property
-    def fewest(self) -> int:
-        """What candidates are sorted by."""
-        return self.flips or 0
+    def flips(self) -> int:
+        """Calibration spikes that differ from float64."""
+        return int(self.moved[0].sum())
 
 
 def rounded(
@@ -107,10 +108,12 @@ def _relays_follow(population: Population, integer: IntegerPopulation, planes: t
     return bool(np.all(weight > integer.threshold[first:]))
 
 
-def flips(layer: Rounded, post: int, calibration: Calibration) -> IntArray:
-    """Calibration spikes of each neuron that differ from float64, given what the layers before it send."""
-    moved: IntArray = calibration.moved(integer_layer(layer.population, layer.projections, loops=False), post)[0]
-    return moved
+def judged(layer: Rounded, post: int, calibration: Calibration | None, parts: int | None = None) -> Rounded:
+    """The same with what the calibration says of it, or its first `parts`, given what the layers before it send."""
+    if calibration is None:
+        return layer
+    ready = integer_layer(layer.population, layer.projections, loops=False)
+    return replace(layer, moved=calibration.moved(ready, post, parts))
 
 
 def planes_from(exponent: int, bits: int, planes: int, largest: int) -> tuple[int, ...]:
@@ -177,14 +180,16 @@ def mantissa_scale(layer: Rounded) -> float:
     return float(layer.population.scale.min()) / 2.0 ** layer.form.exponents[0]
 
 
-def candidate(layer: FloatLayer, packing: Packing, factor: float, exponents: tuple[int, ...]) -> Rounded | None:
+def candidate(
+    layer: FloatLayer, packing: Packing, factor: float, exponents: tuple[int, ...]
+) -> tuple[Rounded | None, bool]:
     """Best compromise between a fine weight scale and a fine threshold, see ``WORTHWHILE``.
 
-    `factor` says how far the scale may exceed the one that just holds the largest weight; the rest is clipped.
+    `factor` says how far the scale may exceed the one that just holds the largest weight; the rest is clipped. Also
+    whether registers, not that, limit the scale: a larger factor gives the same.
     """
     bits, peak = packing.bits, float(layer.peaks().max(initial=0))
-    chosen: Rounded | None = None
-    finest = 0.0
+    chosen, limited, finest = None, False, 0.0
     for exponent in sorted(exponents):
         stored = planes_from(exponent, bits, packing.planes, max(exponents))
         held = reach(bits, stored) * weight_step(bits) / peak if peak else 1.0 / layer.population.theta
@@ -193,9 +198,9 @@ def candidate(layer: FloatLayer, packing: Packing, factor: float, exponents: tup
             continue  # the threshold is less than a unit, a larger exponent makes it more
         if fitted is None or mantissa_scale(fitted) < WORTHWHILE * finest:
             break
-        finest = max(finest, mantissa_scale(fitted))
-        chosen = fitted
-    return chosen
+        chosen, finest = fitted, max(finest, mantissa_scale(fitted))
+        limited = finest < WORTHWHILE * held * factor
+    return chosen, limited
 
 
 # -- a scale for each group of neurons ---------------------------------------------------------------------------------
@@ -306,7 +311,8 @@ def grouped(layer: FloatLayer, uniform: Rounded, groups: int, factor: float) -> 
         for column, level in enumerate(ladder):
             stored = rounded(layer, Form(bits=bits, exponents=exponents, threshold=np.minimum(level, finest)))
             assert stored is not None, "finest thresholds hold every bias"
-            cost[:, column] = np.where(level <= finest, flips(stored, layer.post, layer.calibration), np.inf)
+            moved, _ = judged(stored, layer.post, layer.calibration).moved
+            cost[:, column] = np.where(level <= finest, moved, np.inf)
         picked = choose_levels(cost, groups)
         # among equals the finest, which is the last
         best = len(picked) - 1 - np.argmin(cost[:, picked][:, ::-1], axis=1)

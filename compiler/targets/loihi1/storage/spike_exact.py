@@ -28,7 +28,7 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     FloatLayer,
     Rounded,
     finest_thresholds,
-    flips,
+    judged,
     layer_of,
 )
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
@@ -75,22 +75,23 @@ def make_exact(
             if packing.planes > 2 and best is not None and not _full_range(layer, best).any():
                 break  # the planes hold every weight already
             candidate = best_scale(layer, packing, exponents, clip=False)
-            moved = candidate.fewest
+            moved = candidate.flips
             tried.append((packing.planes, packing.groups, moved))
-            if best is None or moved <= best.fewest:
+            if best is None or moved <= best.flips:
                 best = candidate
-            if not moved and not flips(candidate, layer.post, calibration).any():
+            if not moved and not judged(candidate, layer.post, calibration).flips:
                 break
         assert best is not None, "the ladder has steps"
         if best.flips:
             best = round_with_more(layer, best, calibration)
-        moved_by = flips(best, layer.post, calibration)
-        chosen.append(replace(best, flips=int(moved_by.sum())))
+        best = judged(best, layer.post, calibration)
+        moved_by = best.moved[0]
+        chosen.append(best)
         found.append(
             Exactness(
                 layer=layer.population.name,
                 tried=tuple(tried),
-                spikes=int(np.count_nonzero(calibration.spikes[layer.post])),
+                spikes=calibration.spikes[layer.post].total,
                 flips=int(moved_by.sum()),
                 limits=_limits(layer, best, moved_by, slots) if moved_by.any() else (),
                 decay=_decay_flips(layer, calibration) if moved_by.any() else 0,

@@ -161,7 +161,7 @@ def search_widths(
             at = max(narrower, key=lambda p: (getattr(p, figure), -p.words))
 
     # the front is drawn anew with the figures of what was built, until all that is on it was built
-    rates = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
+    rates = calibration.rates
     current, built = dict(tried), dict[Widths, WidthPoint | None]()
     while best := {p.bits for figure in figures for p in widths_front(current.values(), figure)} - built.keys():
         tell(f"building the best of them: {len(built) + len(best)}")
