@@ -15,6 +15,7 @@ import pytest
 import torch
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file, state_dict
 from made_files import weights as made_weights
+from numpy.testing import assert_array_equal
 from random_netlists import Axon, Neuron, build, large_netlist
 
 from spikeloom.__main__ import main as start
@@ -30,7 +31,9 @@ from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence import reference
 from spikeloom.runtime.inputs import network
 from spikeloom.runtime.inputs import recordings as recordings_input
+from spikeloom.runtime.machines import base
 from spikeloom.runtime.machines.loihi1 import blocks, engine
+from spikeloom.runtime.machines.loihi1.costs import estimate
 
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
 
@@ -320,6 +323,30 @@ def passes(monkeypatch):
 
     monkeypatch.setattr(engine, "simulate", counted)
     return found
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        (*RUNNING, "--spikes", "out.npz"),
+        *(("estimate", *RUNNING[1:], "--detail", detail) for detail in ("counts", "cycle")),
+        VERIFYING,
+    ],
+)
+def test_it_does_not_matter_how_many_recordings_are_held_at_a_time(as_json, monkeypatch, words):
+    def found():
+        report = as_json(*words, codes=(0, 1))
+        return report, dict(np.load("out.npz")) if "--spikes" in words else {}
+
+    report, spikes = found()
+    monkeypatch.setattr(base, "HELD", 1)
+    monkeypatch.setattr(estimate, "HELD", 1)
+    monkeypatch.setattr("spikeloom.models.networks.reference.STEPS", 7)
+    again, parts = found()
+    assert again == report
+    assert list(spikes) == (LAYERS if spikes else [])
+    for name, each in spikes.items():
+        assert_array_equal(parts[name], each, strict=True)
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,9 @@ STOPPED = -1
 HELD = 1 << 23
 """Entries (recording, step, neuron) that run together."""
 
+STEPS = 4096
+"""Chip steps whose spikes are counted at a time."""
+
 _ALONE = Lock()
 """For recordings that are longer than that, of which one may take some hundred megabytes: one at a time."""
 
@@ -160,8 +163,12 @@ def _ones(packed: Words, ids: IntArray, counts: BoolArray) -> int:
     mask = np.zeros(packed.shape[2], np.uint64)
     np.bitwise_or.at(mask, ids // 64, np.left_shift(np.uint64(1), (ids % 64).astype(np.uint64)))
     words = np.flatnonzero(mask)
-    ones = np.bitwise_count(packed[..., words] & mask[words]).sum(axis=2, dtype=np.int64)
-    return int(ones[counts].sum())
+    found = 0
+    for first in range(0, packed.shape[1], STEPS):
+        steps = slice(first, first + STEPS)
+        ones = np.bitwise_count(packed[:, steps, words] & mask[words]).sum(axis=2, dtype=np.int64)
+        found += int(ones[counts[:, steps]].sum())
+    return found
 
 
 # -- perturbations -----------------------------------------------------------------------------------------------------
