@@ -21,7 +21,6 @@ from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_stor
 from spikeloom.compiler.targets.loihi1.storage.compensate import DAMPING, _round_in_turn, _share, compensated
 from spikeloom.compiler.targets.loihi1.storage.scales import (
     SCALE_STEPS,
-    choose_levels,
     finest_thresholds,
     fit,
     group_by_fineness,
@@ -127,20 +126,6 @@ def test_grouping_by_fineness_is_optimal(finest, groups):
         if min(chosen) == min(finest)
     )
     assert np.sum(1 / shared) == pytest.approx(best)
-
-
-@settings(max_examples=40)
-@given(st.integers(0, 2**31), st.integers(1, 4))
-def test_no_exchange_of_levels_is_better(seed, groups):
-    rng = np.random.default_rng(seed)
-    cost = rng.integers(0, 50, (12, 6)).astype(float)
-    cost[:, 1:][rng.random((12, 5)) < 0.3] = np.inf
-    picked = choose_levels(cost, groups)
-    assert len(picked) <= groups
-    total = cost[:, picked].min(axis=1).sum()
-    assert total <= min(cost[:, [level]].min(axis=1).sum() for level in range(6)) < np.inf
-    for i, level in itertools.product(range(len(picked)), range(6)):
-        assert cost[:, [*np.delete(picked, i), level]].min(axis=1).sum() >= total
 
 
 @pytest.mark.parametrize(("bits", "exponents"), [(8, (-1, 6)), (8, (3,)), (4, (0, 3))])

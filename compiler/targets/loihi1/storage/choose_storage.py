@@ -108,7 +108,7 @@ def best_scale(layer: FloatLayer, packing: Packing, exponents: tuple[int, ...], 
         found = sorted(found, key=lambda c: judged(c, post, calibration, 1).flips)[:FINALISTS]
     best = min((judged(stored, post, calibration) for stored in found), key=attrgetter("flips"))
     if packing.groups > 1:
-        several = grouped(layer, best, packing.groups, factors[-1])
+        several = grouped(layer, best, packing.groups)
         if several is not None:
             best = min(judged(several, post, calibration), best, key=attrgetter("flips"))
     if calibration is not None:
@@ -215,6 +215,7 @@ def choose_storage(
             best = best_scale(layer, packing, target.choices["synapse.exponent"])
         except ModelError as error:
             faults.append(str(error))
+            calibration = known = None  # later layers can only be found faulty, too
             continue
         if calibration is not None and known is not None:
             if packing.planes > 1:

@@ -35,9 +35,6 @@ bias round twice as finely (a proof at exponent 0 costs fc1 of the released netw
 SCALE_STEPS = 1024
 """A scale that the accumulator limits is the finest to one part in this many."""
 
-LEVELS = 24
-"""Thresholds that are tried on the calibration recordings where neurons are grouped by the spikes that they keep."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FloatLayer:
@@ -206,11 +203,11 @@ def candidate(
 # -- a scale for each group of neurons ---------------------------------------------------------------------------------
 
 
-def finest_thresholds(layer: FloatLayer, bits: int, exponents: tuple[int, ...], factor: float = 1.0) -> IntArray:
-    """Largest threshold of each neuron that registers allow, and `factor` beyond its largest weight; 0 if none."""
+def finest_thresholds(layer: FloatLayer, bits: int, exponents: tuple[int, ...]) -> IntArray:
+    """Largest threshold of each neuron that registers and its largest weight allow; 0 if none."""
     population = layer.population
     with np.errstate(divide="ignore"):
-        held = population.theta * reach(bits, exponents) * step_units(bits, exponents) * factor / layer.peaks()
+        held = population.theta * reach(bits, exponents) * step_units(bits, exponents) / layer.peaks()
     high = np.minimum(held, _largest_threshold(population)).astype(np.int64) + 1  # one more than allowed
     low = np.zeros(population.size, np.int64)
     while np.any(high - low > np.maximum(1, low // SCALE_STEPS)):
@@ -258,63 +255,13 @@ def group_by_fineness(finest: IntArray, groups: int) -> IntArray:
     return shared[np.searchsorted(value, finest)]
 
 
-def choose_levels(cost: FloatArray, groups: int) -> IntArray:
-    """Pick at most `groups` columns so that the sum over rows of the cheapest picked entry is least, by exchange.
+def grouped(layer: FloatLayer, uniform: Rounded, groups: int) -> Rounded | None:
+    """Population with up to `groups` thresholds, each as fine as its neurons allow, stored as a `uniform` one.
 
-    `cost` is (neurons, levels), infinite where a level is not allowed; the first is allowed for every row.
-
-    Examples
-    --------
-    >>> choose_levels(np.array([[1.0, 0.0, np.inf], [2.0, 2.0, 0.0], [0.0, 5.0, 5.0]]), 2).tolist()
-    [0, 2]
-    """
-
-    def best_beside(others: list[int]) -> tuple[int, float]:
-        cheapest = cost[:, others].min(axis=1, initial=np.inf)
-        sums = np.minimum(cheapest[:, None], cost).sum(axis=0)
-        return int(np.argmin(sums)), float(sums.min())
-
-    picked, total = [0], float(cost[:, 0].sum())
-    while len(picked) < min(groups, cost.shape[1]):
-        level, less = best_beside(picked)
-        if less >= total:
-            break
-        picked, total = [*picked, level], less
-    improved = True
-    while improved:
-        improved = False
-        for i in range(len(picked)):
-            level, less = best_beside(picked[:i] + picked[i + 1 :])
-            if less < total:
-                picked[i], total, improved = level, less, True
-    return np.array(sorted(set(picked)))
-
-
-def grouped(layer: FloatLayer, uniform: Rounded, groups: int, factor: float) -> Rounded | None:
-    """Population with up to `groups` thresholds, stored with the width and planes of a `uniform` one.
-
-    With several planes, or without calibration, neurons are grouped by the finest threshold that each allows; else
-    by the calibration spikes that each keeps under ``LEVELS`` thresholds, clipped up to `factor`. None where some
-    neurons relay clocks: these bind the threshold of all.
+    None where some neurons relay clocks: these bind the threshold of all.
     """
     if layer.population.relays:
         return None
-    bits, exponents, floor = uniform.form.bits, uniform.form.exponents, int(uniform.form.threshold[0])
-    unclipped = finest_thresholds(layer, bits, exponents)
-    if layer.calibration is None or len(exponents) > 1:
-        threshold = group_by_fineness(np.maximum(unclipped, floor), groups)
-    else:
-        finest = np.maximum(finest_thresholds(layer, bits, exponents, factor), floor)
-        bottom = min(floor, int(unclipped.min()))
-        ladder = np.unique(np.geomspace(max(bottom, 1), finest.max(), LEVELS).astype(np.int64))
-        cost = np.empty((layer.population.size, len(ladder)))
-        for column, level in enumerate(ladder):
-            stored = rounded(layer, Form(bits=bits, exponents=exponents, threshold=np.minimum(level, finest)))
-            assert stored is not None, "finest thresholds hold every bias"
-            moved, _ = judged(stored, layer.post, layer.calibration).moved
-            cost[:, column] = np.where(level <= finest, moved, np.inf)
-        picked = choose_levels(cost, groups)
-        # among equals the finest, which is the last
-        best = len(picked) - 1 - np.argmin(cost[:, picked][:, ::-1], axis=1)
-        threshold = ladder[picked][best]
-    return rounded(layer, Form(bits=bits, exponents=exponents, threshold=threshold))
+    finest = finest_thresholds(layer, uniform.form.bits, uniform.form.exponents)
+    threshold = group_by_fineness(np.maximum(finest, uniform.form.threshold), groups)
+    return rounded(layer, replace(uniform.form, threshold=threshold))

@@ -6,6 +6,7 @@ moves a spike, the whole network does not. Where spikes still move, it is said w
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,7 +33,6 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     layer_of,
 )
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
-from spikeloom.compiler.types import IntArray
 
 SHARED = 0.8
 """A neuron whose threshold is below this share of its own finest is held back by those it shares the threshold with."""
@@ -65,41 +65,36 @@ def make_exact(
     steps = (1, 1), (2, 1), (2, slots), (3, slots)
     ladder = [Packing(bits=bits, planes=planes, groups=groups) for planes, groups in steps]
     exponents = target.choices["synapse.exponent"]
-    few = fewer(calibration)
-    chosen, found = [], []
-    layers = [layer_of(network, post, few) for post in range(len(network.populations))]
-    for layer in layers:
-        best: Rounded | None = None
+    few, layers, chosen, found = fewer(calibration), [], [], []
+    for post in range(len(network.populations)):
+        layer, best = layer_of(network, post, few), None
         tried: list[tuple[int, int, int]] = []
         for packing in ladder:
             if packing.planes > 2 and best is not None and not _full_range(layer, best).any():
                 break  # the planes hold every weight already
             candidate = best_scale(layer, packing, exponents, clip=False)
-            moved = candidate.flips
-            tried.append((packing.planes, packing.groups, moved))
-            if best is None or moved <= best.flips:
+            tried.append((packing.planes, packing.groups, candidate.flips))
+            if best is None or candidate.flips <= best.flips:
                 best = candidate
-            if not moved and not judged(candidate, layer.post, calibration).flips:
+            if not candidate.flips and not judged(candidate, post, calibration).flips:
                 break
         assert best is not None, "the ladder has steps"
         if best.flips:
             best = round_with_more(layer, best, calibration)
-        best = judged(best, layer.post, calibration)
-        moved_by = best.moved[0]
+        best, layer = judged(best, post, calibration), replace(layer, calibration=calibration)
+        layers.append(layer)
         chosen.append(best)
         found.append(
             Exactness(
                 layer=layer.population.name,
                 tried=tuple(tried),
-                spikes=calibration.spikes[layer.post].total,
-                flips=int(moved_by.sum()),
-                limits=_limits(layer, best, moved_by, slots) if moved_by.any() else (),
-                decay=_decay_flips(layer, calibration) if moved_by.any() else 0,
+                spikes=calibration.spikes[post].total,
+                flips=best.flips,
+                limits=_limits(layer, best, slots) if best.flips else (),
+                decay=_decay_flips(layer, calibration) if best.flips else 0,
             )
         )
-    on_all = [replace(layer, calibration=calibration) for layer in layers]
-    choices = tuple(map(explain_choice, on_all, chosen))
-    return assemble(network, chosen), choices, tuple(found)
+    return assemble(network, chosen), tuple(map(explain_choice, layers, chosen)), tuple(found)
 
 
 def _full_range(layer: FloatLayer, candidate: Rounded) -> npt.NDArray[np.bool_]:
@@ -110,16 +105,19 @@ def _full_range(layer: FloatLayer, candidate: Rounded) -> npt.NDArray[np.bool_]:
     return full
 
 
-def _limits(layer: FloatLayer, candidate: Rounded, moved: IntArray, slots: int) -> tuple[tuple[str, int], ...]:
-    form = candidate.form
+def _limits(layer: FloatLayer, stored: Rounded, slots: int) -> tuple[tuple[str, int], ...]:
+    """Spikes that still move, by what keeps their neuron's scale from being finer, most first."""
+    form = stored.form
     finest = finest_thresholds(layer, form.bits, form.exponents)
-    fullest = "24-bit current" if current_load(candidate.population.decay_u) > 1 else "21-bit accumulator"
+    fullest = "24-bit current" if current_load(stored.population.decay_u) > 1 else "21-bit accumulator"
     cause = np.full(layer.population.size, fullest, dtype=object)
-    cause[_full_range(layer, candidate)] = "range of the planes"
+    cause[_full_range(layer, stored)] = "range of the planes"
     cause[form.threshold >= AT_LIMIT * THRESHOLD_MANTISSA_MAX] = "17-bit threshold"
     cause[form.threshold < SHARED * finest] = f"{slots} thresholds a core"
-    counted = {str(name): int(moved[cause == name].sum()) for name in sorted(set(cause))}
-    return tuple((name, count) for name, count in sorted(counted.items(), key=lambda pair: -pair[1]) if count)
+    counted = Counter[str]()
+    for name, count in zip(cause, stored.moved[0].tolist(), strict=True):
+        counted[name] += count
+    return tuple((name, count) for name, count in counted.most_common() if count)
 
 
 def _decay_flips(layer: FloatLayer, calibration: Calibration) -> int:
