@@ -7,6 +7,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +17,10 @@ from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.base import EventArray, Machine, Price, machine_for, machine_of
-from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.report.sections import Block
+
+if TYPE_CHECKING:
+    from spikeloom.runtime.machines.core_map import CoreMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -14,21 +15,20 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import with_tables
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.base import EventArray, Price, Run, T, one_by_one
-from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
-from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
-from spikeloom.runtime.machines.loihi1.costs import cumulative
-from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
-from spikeloom.runtime.machines.loihi1.costs.result import cost_report
-from spikeloom.runtime.machines.loihi1.costs.sections import sections
 from spikeloom.runtime.machines.loihi1.stream import Stream
 from spikeloom.runtime.machines.loihi1.trace import aligned, differences
 from spikeloom.runtime.report.sections import Block, Outcome
+
+if TYPE_CHECKING:
+    from spikeloom.runtime.machines.core_map import CoreMap
+
+# What only some commands need is imported where it is used: a tenth of a second that `run` need not wait.
 
 SUMS = 1 << 24
 """Sums of the time model that are held at a time: 128 MiB."""
@@ -84,6 +84,7 @@ class Loihi(IntegerMachine):
 
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Every spike, membrane, update and count, one recording after another."""
+        from spikeloom.runtime.machines.loihi1 import spec
 
         def found(sample: EventArray) -> int:
             fast = engine.simulate(self._engine, sample[None], spikes=True, membranes=True, updated=True)
@@ -105,16 +106,22 @@ class Loihi(IntegerMachine):
     @cached_property
     def integer(self) -> IntegerNetwork:
         """Compartments as populations, axons as projections."""
+        from spikeloom.compiler.targets.loihi1.lift import lift
+
         return lift(self.netlist)
 
     def cumulative(self, events: EventArray, lengths: IntArray) -> Cumulative:
         """Sums that the engine adds up itself: no spike is kept."""
+        from spikeloom.runtime.machines.loihi1.costs import cumulative
+
         channels = with_clocks(events, self.netlist.clocks)
         return cumulative.run(self._engine, self.target, channels, lengths, lag=self.read_out_lag)
 
     @property
     def least_intervals(self) -> IntArray:
         """From the largest sums of each compartment that votes."""
+        from spikeloom.runtime.machines.loihi1.costs import cumulative
+
         return cumulative.least_intervals(self.netlist)
 
     def packed(self, channels: EventArray, lengths: IntArray) -> tuple[npt.NDArray[np.uint64], IntArray]:
@@ -148,6 +155,10 @@ class Loihi(IntegerMachine):
         progress: Callable[[int], object] | None = None,
     ) -> tuple[Run, Price]:
         """Decisions and costs, of the cores' tiles and times too."""
+        from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
+        from spikeloom.runtime.machines.loihi1.costs.result import cost_report
+        from spikeloom.runtime.machines.loihi1.costs.sections import sections
+
         self.require_detail(detail)
         chip = self.target if table is None else with_tables(self.target, table)
         trace, found = estimate(
