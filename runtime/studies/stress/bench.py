@@ -57,6 +57,8 @@ def whole(events: Events, netlist: Netlist, lengths: IntArray) -> Inputs:
 
 def by_length(events: Events, lengths: IntArray, change: Callable[[Events], Events]) -> Events:
     """Disturb recordings of equal length together, none beyond its own."""
+    if (lengths == events.shape[-1]).all():
+        return change(events)
     changed = np.zeros_like(events)
     for length in np.unique(lengths).tolist():
         those = np.flatnonzero(lengths == length)

@@ -90,7 +90,10 @@ def events_spurious(events: Events, share: float, rng: np.random.Generator) -> E
 
 def _one_by_one(events: Events, change: Callable[[Events], Events]) -> Events:
     """Change each recording on its own: numbers that are drawn for all entries of all would fill the memory."""
-    return np.stack([change(one) for one in events])
+    changed = np.empty_like(events)
+    for one, to in zip(events, changed, strict=True):
+        to[...] = change(one)
+    return changed
 
 
 @perturbation("steps, standard deviation", (1, 2, 5, 10, 25), most=MOST_STEPS)

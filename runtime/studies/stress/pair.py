@@ -39,8 +39,10 @@ HELD = 1 << 23
 STEPS = 4096
 """Chip steps whose spikes are counted at a time."""
 
+LONG = 1 << 25
+"""Entries of a recording that runs alone: its spikes may take some hundred megabytes."""
+
 _ALONE = Lock()
-"""For recordings that are longer than that, of which one may take some hundred megabytes: one at a time."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,7 +95,7 @@ def evaluate(pair: Pair, inputs: Inputs) -> Outcome:
     held = int(inputs.lengths.max()) * pair.netlist.n_compartments
     size, parts = max(1, HELD // held), []
     for first in range(0, len(inputs.lengths), size):
-        with _ALONE if held > HELD else nullcontext():
+        with _ALONE if held > LONG else nullcontext():
             parts += _part(pair, inputs, slice(first, min(first + size, len(inputs.lengths))))
     return Outcome(
         votes={side: np.concatenate([part.votes[side] for part in parts]) for side in SIDES},
