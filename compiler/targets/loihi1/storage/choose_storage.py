@@ -1,9 +1,9 @@
 """Round a network to chip integers: choose width, planes and scales of every population.
 
 Spikes change. Which scale is best is decided on the calibration recordings, by the spikes of a layer that differ from
-the float64 model's when it receives what the rounded layers before it send. Weights are then rounded so that their
-errors cancel, where that keeps more spikes, and biases, which are 64 times finer, take up what is left. Without
-calibration the weights alone decide.
+the float64 model's, and by how many more or fewer there are, when it receives what the rounded layers before it send.
+Weights are then rounded so that their errors cancel, where that keeps more spikes, and biases, which are 64 times
+finer, take up what is left. Without calibration the weights alone decide.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     grouped,
     judged,
     layer_of,
+    lost,
     rounded,
 )
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load, loads
@@ -105,12 +106,12 @@ def best_scale(layer: FloatLayer, packing: Packing, exponents: tuple[int, ...], 
         )
     tried = len(found)
     if calibration is not None and tried > FINALISTS:
-        found = sorted(found, key=lambda c: judged(c, post, calibration, 1).flips)[:FINALISTS]
-    best = min((judged(stored, post, calibration) for stored in found), key=attrgetter("flips"))
+        found = sorted(found, key=lambda c: judged(c, post, calibration, 1).cost)[:FINALISTS]
+    best = min((judged(stored, post, calibration) for stored in found), key=attrgetter("cost"))
     if packing.groups > 1:
         several = grouped(layer, best, packing.groups)
         if several is not None:
-            best = min(judged(several, post, calibration), best, key=attrgetter("flips"))
+            best = min(judged(several, post, calibration), best, key=attrgetter("cost"))
     if calibration is not None:
         best = compensated(layer, best, calibration) or best
     return replace(best, tried=tried)
@@ -123,7 +124,7 @@ def round_with_more(layer: FloatLayer, chosen: Rounded, calibration: Calibration
     """
     many, plain = fewer(calibration, MANY), rounded(layer, chosen.form)
     stored = plain and compensated(layer, judged(plain, layer.post, many), many)
-    return min(judged(chosen, layer.post, many), stored or chosen, key=attrgetter("flips"))
+    return min(judged(chosen, layer.post, many), stored or chosen, key=attrgetter("cost"))
 
 
 def nudged(layer: FloatLayer, stored: Rounded, calibration: Calibration) -> Rounded:
@@ -140,7 +141,7 @@ def nudged(layer: FloatLayer, stored: Rounded, calibration: Calibration) -> Roun
     for share in (sign * nudge for nudge in NUDGES for sign in (1, -1)):
         trial = at(bias + share * unit)
         found = judged(replace(stored, population=trial), layer.post, calibration).moved
-        better = found[0] + np.abs(found[1]) < fewest[0] + np.abs(fewest[1])
+        better = lost(found) < lost(fewest)
         better &= loads(trial, stored.projections) <= ONE_STEP_SUM_MAX
         bias, fewest = np.where(better, bias + share * unit, bias), np.where(better, found, fewest)
     after = at(bias)

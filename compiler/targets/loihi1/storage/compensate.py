@@ -25,7 +25,7 @@ import numpy.typing as npt
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, reach, step_units
 from spikeloom.compiler.ir import PART, Projection
 from spikeloom.compiler.passes.calibrate import Calibration
-from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, judged, rounded
+from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, judged, lost, rounded
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, nearest_steps, scales
 from spikeloom.compiler.types import FloatArray, IntArray
 
@@ -77,7 +77,7 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
     if stored is None:
         return None
     before, after = plain.moved, judged(stored, layer.post, calibration).moved
-    back = (after > before)[0] | (loads(stored.population, stored.projections) > ONE_STEP_SUM_MAX)
+    back = (lost(after) > lost(before)) | (loads(stored.population, stored.projections) > ONE_STEP_SUM_MAX)
     for p, each, instead in zip(projections, steps, nearest, strict=True):
         np.copyto(each, instead, where=np.repeat(back, np.diff(p.weight.indptr)))
     stored = rounded(layer, form, steps, population.bias + np.where(back, 0, errors))

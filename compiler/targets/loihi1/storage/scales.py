@@ -76,9 +76,20 @@ class Rounded:
     compensated: bool = False  # Whether weights were rounded so that their errors cancel
 
     @property
+    def cost(self) -> int:
+        """What candidates are compared by."""
+        return int(lost(self.moved).sum())
+
+    @property
     def flips(self) -> int:
         """Calibration spikes that differ from float64."""
         return int(self.moved[0].sum())
+
+
+def lost(moved: IntArray) -> IntArray:
+    """What each neuron loses: spikes that differ, and how many more or fewer there are, or silence would be cheap."""
+    total: IntArray = moved[0] + np.abs(moved[1])
+    return total
 
 
 def rounded(
