@@ -43,8 +43,9 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
     """Round one population as `plain`, which was judged, is stored; None where a bias has no register value.
 
     Weights that the range cuts off stay at its end: their errors are not passed on. The bias takes up what the mean sum
-    is then off, also because layers before were rounded. A neuron whose sums would leave the accumulator, or that keeps
-    fewer of its spikes (one that fires from its bias alone, say), is rounded to nearest instead.
+    is then off, also because layers before were rounded, but no more than the weights have lost. A neuron whose sums
+    would leave the accumulator, or that keeps fewer of its spikes (one that fires from its bias alone, say), is rounded
+    to nearest instead.
     """
     from spikeloom.compiler.layer_kernel import coincidences
 
@@ -64,11 +65,12 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
         for rows in np.array_split(neurons, -(-len(neurons) * len(inputs) // PART) or 1):
             places = [_places(p, rows) for p in projections]
             weight = np.concatenate([p.weight.data[at] for p, at in zip(projections, places, strict=True)], axis=1)
-            whole = weight * (scale[rows] / step)[:, None]
-            held = np.clip(whole, -limit, limit)
+            held = np.clip(weight * (scale[rows] / step)[:, None], -limit, limit)
             found = np.rint(held)
             found[:, shown] = np.clip(_round_in_turn(held[:, shown], share), -limit, limit)
-            errors[rows] = (whole @ meant[inputs] - found @ rate[inputs]) * step / scale[rows]
+            less, wanted = (held - found)[:, shown], held @ meant[inputs] - found @ rate[inputs]
+            most = (np.sum(sign * np.maximum(sign * less, 0), axis=1) for sign in (-1, 1))
+            errors[rows] = np.clip(wanted, *most) * step / scale[rows]
             ends = np.cumsum([at.shape[1] for at in places])[:-1]
             for each, at, part in zip(steps, places, np.split(found, ends, axis=1), strict=True):
                 each[at] = part
