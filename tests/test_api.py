@@ -170,7 +170,7 @@ def test_the_shipped_network_of_longer_bins(tmp_path, objects_zip):
     netlist = tmp_path / "n.loom"
     as_json("compile", "pretrained:objects-200ms", "--calibrate", objects_zip, "-o", netlist)
     report = as_json("run", netlist, "--data", objects_zip, "--detail", "counts")
-    assert report["accuracy"] == 131 / 144
+    assert report["accuracy"] == 130 / 144
     assert report["costs"]["pace"]["bin_s"] == pytest.approx(0.2)
     mean = report["costs"]["per_inference"]
     assert 1.1e6 < mean["synaptic_operations"] < 1.2e6

@@ -78,7 +78,7 @@ def test_provenance_names_everything_that_decided(as_json, place):
         "keep_all": False,
         "prune_unused": False,
         "calibrated": True,
-        "compensated": ["conv1", "fc1", "fc3"],
+        "compensated": ["conv1", "fc1", "fc2", "fc3"],
     }
 
 

@@ -149,8 +149,11 @@ def removable(network: IntegerNetwork) -> tuple[Masks, Masks]:
         if pre == network.readout.population:
             silent[pre] = np.zeros(network.populations[pre].size, np.bool_)
         _grow(network, pre, unread, lambda net, at, known: _unread(net, at, known, silent))
-        if np.all(silent[pre] | unread[pre]):
-            silent[pre][0] = unread[pre][0] = False
+        if np.all(unread[pre]):
+            kept = slice(None) if any(p.pre == p.post == pre for p in network.projections) else 0
+            unread[pre][kept] = False  # all that a neuron's spikes may depend on
+        elif np.all(silent[pre] | unread[pre]):
+            silent[pre][np.argmax(silent[pre])] = False  # whatever else goes
     indices = range(len(network.populations))
     return tuple(silent[i] for i in indices), tuple(unread[i] for i in indices)
 
