@@ -42,7 +42,12 @@ def write_state(
         "kept": {which: {name: torch.tensor(array) for name, array in held.items()} for which, held in weights.items()},
     }
     with write_atomically(path) as file:
-        torch.save(state, file)
+        try:
+            torch.save(state, file)
+        except RuntimeError as error:
+            if isinstance(error.__context__, KeyboardInterrupt):  # torch then finds its file cut short
+                raise error.__context__ from None
+            raise
 
 
 def restore(
