@@ -26,7 +26,6 @@ Function = Callable[..., Any]
 DENORMAL = 1e-30
 """Membranes and currents below this are flushed to zero; beside a threshold they are nothing."""
 
-
 GAP = 16
 """Targets this near are joined in one run, with weights of zero in between: a vector costs no more than a weight."""
 

@@ -78,11 +78,9 @@ class Calibration:
         """
         if pre == INPUT:
             return self.events[rows]
-        return (
-            step_late(self.spikes[pre][rows])
-            if pre == post
-            else (*self.sent, *self.spikes[len(self.sent) :])[pre][rows]
-        )
+        if pre == post:
+            return step_late(self.spikes[pre][rows])
+        return (self.sent if pre < len(self.sent) else self.spikes)[pre][rows]
 
     def rate(self, pre: int, post: int) -> FloatArray:
         """Spikes a step that a projection brings from each neuron."""
