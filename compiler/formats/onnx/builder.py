@@ -92,7 +92,7 @@ class Nodes:
 
 
 Model = tuple[Nodes, list[Port], list[Port]]
-"""Nodes, inputs and outputs. Of the form ``step`` the first input is ``events`` (batch, channels)."""
+"""Nodes, inputs and outputs. Inputs of the form ``step`` are ``events`` (batch, channels), ``length``, then states."""
 
 
 def _onnx() -> Any:
@@ -115,11 +115,6 @@ def require_room(size: int) -> None:
         )
 
 
-def next_of(port: Port) -> Port:
-    """What a step leaves of a state."""
-    return Port(name=f"{port.name}_next", kind=port.kind, shape=port.shape)
-
-
 def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes: int) -> Model:
     """The form ``scan`` of a form ``step``: a loop over its steps, as many more as the deepest layer lags behind.
 
@@ -128,9 +123,8 @@ def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes
     classes: for the votes.
     """
     onnx = _onnx()
-    nodes, inputs, outputs = step
-    left = {port.name for port in outputs}
-    states = [port for port in inputs if f"{port.name}_next" in left]
+    nodes, inputs, left = step
+    states = inputs[2:]
     channels, drain = inputs[0].shape[1], max(depth for _, depth in layers.values())
     graph, sequence = Nodes(), "events"
     graph.add("Shape", ["events"], "duration", start=0, end=1)
@@ -141,8 +135,7 @@ def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes
         sequence = graph.add("Concat", ["events", tail], "filled", axis=0)
     begun = [_rest(graph, state) for state in states]
     kept = [Port(name=f"{name}/fired", kind=np.bool_, shape=("batch", size)) for name, (size, _) in layers.items()]
-    kept += [port for port in outputs if port.name == "overflow"]
-    body = nodes.graph("steps", [*states, inputs[0]], [*map(next_of, states), *kept])
+    body = nodes.graph("steps", [*states, inputs[0]], [*left, *kept])
     graph.nodes.append(
         onnx.helper.make_node(
             "Scan",
@@ -169,10 +162,6 @@ def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes
         graph.add("ArgMax", ["votes"], "class", axis=1, keepdims=0)  # the lowest on a tie
         found.append(Port(name="votes", kind=np.int32, shape=("batch", classes)))
         found.append(Port(name="class", kind=np.int64, shape=("batch",)))
-    if "overflow" in left:
-        numbers = graph.cast("overflow/steps", "overflow/numbers", np.int32)
-        graph.cast(graph.add("ReduceMax", [numbers], "overflow/most", axes=[0], keepdims=0), "overflow", np.bool_)
-        found.append(kept[-1])
     return graph, [Port(name="events", kind=np.uint8, shape=("time", "batch", channels))], found
 
 

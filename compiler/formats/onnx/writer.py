@@ -14,7 +14,6 @@ Form ``step``: one chip step. Feed every output ``X_next`` back as input ``X``; 
 ``LAYER.membrane``     (batch, neurons)   after the reset
 ``LAYER.current``      (batch, neurons)   only where a current outlasts its step
 ``votes``              (batch, classes)   int32, summed up; only where a layer votes
-``overflow``           (batch,)           output, bool, only where ranges are not proven: this step would stop the chip
 ====================== ================== =============================================================================
 
 Weights become matrices of int8 digits: ``weight = unit * sum_k digit_k * 256**k`` with digits from -128 to 127 and a
@@ -31,19 +30,19 @@ Form ``scan``: whole recordings of the same length, a loop over the form ``step`
 ``LAYER.counts``       (batch, neurons)        int32, spikes of the recording
 ``votes``              (batch, classes)        int32
 ``class``              (batch,)                int64, most votes, the lowest on a tie
-``overflow``           (batch,)                bool, only where ranges are not proven: the chip would have stopped
 ====================== ======================= ========================================================================
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.formats.onnx.builder import (
@@ -51,7 +50,6 @@ from spikeloom.compiler.formats.onnx.builder import (
     Nodes,
     Port,
     model_bytes,
-    next_of,
     one_each,
     require_room,
     whole_recordings,
@@ -69,15 +67,6 @@ NARROW = 2**31 - 1
 Digit = tuple[npt.NDArray[np.int8], IntArray]
 """Matrix (sources, neurons) of a digit, and what a one in it adds to each neuron, in weight units."""
 
-Weights = tuple[IntArray, IntArray]
-"""Sums of positive and of negative effective weights, as magnitudes, (neurons of the source, neurons)."""
-
-
-def of_sign(weights: Weights, sign: int) -> IntArray:
-    """All weights (0), or magnitudes of the positive (1) or the negative ones (-1)."""
-    positive, negative = weights
-    return {0: positive - negative, 1: positive, -1: negative}[sign]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Layer:
@@ -87,14 +76,13 @@ class Layer:
     name: str  # unique, without dots
     ids: IntArray  # compartments
     depth: int  # steps that it lags behind the data
-    sources: dict[int, Weights]  # by the index of a layer in ``netlist.layers``, or ``INPUT``
+    sources: dict[int, IntArray]  # weights (sources, neurons) by the index of a layer, or ``INPUT``
     decay_u: IntArray
     decay_v: IntArray
     threshold: IntArray  # membrane units, as the bias
     bias: IntArray
     label: IntArray  # class of a vote, -1 for none
     remembers: bool  # a current outlasts its step
-    checked: bool  # some input could make the synaptic sum or the current overflow
     saturates: bool  # some input could bring the membrane to the end of its register
     kind: type[np.int32] | type[np.int64]  # int32 where no input brings any product or sum beyond it
 
@@ -130,8 +118,13 @@ def digits(weight: IntArray) -> tuple[Digit, ...]:
 def plan(netlist: Netlist) -> tuple[Layer, ...]:
     """Layers that have compartments, in the order of their depth.
 
-    Raises ModelError if their weights as dense matrices are more than a file holds.
+    Raises ModelError if their weights as dense matrices are more than a file holds, or some input may overflow a sum
+    or a current, where the chip is not defined.
     """
+    reached = reach(netlist)
+    if np.any(over := (reached.sums > ACCUMULATOR_MAX) | (reached.current > CURRENT_MAX)):
+        name = netlist.layers[netlist.layer[np.argmax(over)]].name
+        raise ModelError(f"onnx: some input may overflow a register of {name}; train it with smaller weights")
     names = plain_names([layer.name for layer in netlist.layers], taken=["input"])
     pre_of_axon = np.append(np.full(netlist.n_inputs, INPUT), netlist.layer)[netlist.axon_source]
     # zeros of dense lists are no synapses
@@ -145,13 +138,12 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
     require_room(sum(counts[a] * counts[b] for b, a in pairs.tolist()))
     row = np.append(np.arange(netlist.n_inputs), place)[netlist.axon_source[axon]]
 
-    def weights(a: int, b: int) -> Weights:
-        found = [(pre == a) & (post == b) & side for side in (weight > 0, weight < 0)]
-        entries = [(np.abs(weight[side]), (row[side], place[target[side]])) for side in found]
-        positive, negative = (sparse.coo_array(each, shape=(counts[a], counts[b])).toarray() for each in entries)
-        return positive, negative
+    def weights(a: int, b: int) -> IntArray:
+        here = (pre == a) & (post == b)
+        entries = weight[here], (row[here], place[target[here]])
+        matrix: IntArray = sparse.coo_array(entries, shape=(counts[a], counts[b])).toarray()
+        return matrix
 
-    reached = reach(netlist)
     layers = [
         _layer(netlist, index, name, {a: weights(a, b) for b, a in pairs.tolist() if b == index}, reached)
         for index, name in enumerate(names)
@@ -160,17 +152,17 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
     return tuple(sorted(layers, key=lambda layer: layer.depth))
 
 
-def _layer(netlist: Netlist, index: int, name: str, sources: dict[int, Weights], reached: Reach) -> Layer:
+def _layer(netlist: Netlist, index: int, name: str, sources: dict[int, IntArray], reached: Reach) -> Layer:
     ids = netlist.compartments_of(index)
-    sums, current, highest, stored = (bound[ids] for bound in reached)
+    _, current, highest, stored = (bound[ids] for bound in reached)
     lost_u, lost_v = netlist.decay_u[ids] + 1, netlist.decay_v[ids]
     threshold = netlist.threshold[ids] << MEMBRANE_SHIFT
     bias = netlist.bias_mantissa[ids] << netlist.bias_exponent[ids]
-    held_current, held = np.minimum(current, CURRENT_MAX), np.minimum(stored, MEMBRANE_MAX)
+    held = np.minimum(stored, MEMBRANE_MAX)
     widest = max(
         int((held * (ONE - lost_v)).max()),
-        int((held_current * (ONE - lost_u)).max()),
-        int((held + held_current + np.abs(bias)).max()) + _gathered(sources),
+        int((current * (ONE - lost_u)).max()),
+        int((held + current + np.abs(bias)).max()) + _gathered(sources),
     )
     return Layer(
         index=index,
@@ -184,15 +176,14 @@ def _layer(netlist: Netlist, index: int, name: str, sources: dict[int, Weights],
         bias=bias,
         label=netlist.readout_class[ids],
         remembers=bool(np.any(lost_u != ONE)),
-        checked=bool(np.any(sums > ACCUMULATOR_MAX) or np.any(current > CURRENT_MAX)),
         saturates=bool(np.any(np.maximum(highest, stored) > MEMBRANE_MAX)),
         kind=np.int32 if widest <= NARROW else np.int64,
     )
 
 
-def _gathered(sources: dict[int, Weights]) -> int:
+def _gathered(sources: dict[int, IntArray]) -> int:
     """Bound of any partial result while products with digits are added up, membrane units."""
-    every = [digit for weights in sources.values() for sign in (0, 1, -1) for digit in digits(of_sign(weights, sign))]
+    every = [digit for weight in sources.values() for digit in digits(weight)]
     sums = [(np.abs(digit.astype(np.int64)).sum(axis=0) * factor).max(initial=0) for digit, factor in every]
     return int(sum(sums)) << MEMBRANE_SHIFT
 
@@ -200,7 +191,7 @@ def _gathered(sources: dict[int, Weights]) -> int:
 def export(netlist: Netlist, form: str) -> tuple[bytes, list[Port], list[Port]]:
     """Content of the ONNX file of a netlist in a form, see the module, its inputs and its outputs.
 
-    Equal netlists give equal bytes. Raises ModelError if its weights as dense matrices are more than a file holds.
+    Equal netlists give equal bytes; raises as :func:`plan`.
     """
     layers = plan(netlist)
     model = _chip_step(netlist, layers)
@@ -249,7 +240,6 @@ def _chip_step(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
     received = {INPUT: "events"} | {layer.index: f"{layer.name}.spikes" for layer in layers}
     graph.add("Add", ["step", np.int64(1)], "step_next")
     windows = {depth: _window(graph, depth) for depth in sorted({layer.depth for layer in layers})}
-    flags: list[str] = []
     for layer in layers:
         size = ("batch", layer.size)
         states.append(Port(name=f"{layer.name}.spikes", kind=np.uint8, shape=size))
@@ -257,11 +247,7 @@ def _chip_step(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
         if layer.remembers:
             states.append(Port(name=f"{layer.name}.current", kind=layer.kind, shape=size))
         spikes = [received[pre] for pre in layer.sources]
-        flags += _integrate(graph, layer, spikes, windows[layer.depth])
-    outputs = []
-    if flags:
-        graph.add("Greater", [graph.add("Max", flags, "overflow/most"), np.int32(0)], "overflow")
-        outputs.append(Port(name="overflow", kind=np.bool_, shape=("batch",)))
+        _integrate(graph, layer, spikes, windows[layer.depth])
     votes, voting = "votes", [layer for layer in layers if np.any(layer.label >= 0)]
     for layer in voting:
         poll = (layer.label[:, None] == np.arange(netlist.classes)).astype(np.uint8)
@@ -270,12 +256,9 @@ def _chip_step(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
         votes = graph.add("Add", [votes, more], last)
     if voting:
         states.append(Port(name="votes", kind=np.int32, shape=("batch", netlist.classes)))
-    inputs = [
-        Port(name="events", kind=np.uint8, shape=("batch", netlist.n_inputs)),
-        Port(name="length", kind=np.int64, shape=()),
-        *states,
-    ]
-    return graph, inputs, [*map(next_of, states), *outputs]
+    events = Port(name="events", kind=np.uint8, shape=("batch", netlist.n_inputs))
+    length = Port(name="length", kind=np.int64, shape=())
+    return graph, [events, length, *states], [replace(state, name=f"{state.name}_next") for state in states]
 
 
 def _window(graph: Nodes, depth: int) -> str:
@@ -286,21 +269,15 @@ def _window(graph: Nodes, depth: int) -> str:
     return graph.add("And", [begun, graph.add("Less", [since, "length"], f"{name}/lasts")], name)
 
 
-def _integrate(graph: Nodes, layer: Layer, spikes: list[str], is_open: str) -> list[str]:
-    """One step of the neurons, as :mod:`loihi1.spec` defines them; the name of its overflow where that is checked.
-
-    A closed window holds all registers at zero.
-    """
+def _integrate(graph: Nodes, layer: Layer, spikes: list[str], is_open: str) -> None:
+    """One step of the neurons, as :mod:`loihi1.spec` defines them; a closed window holds all registers at zero."""
     name, kind = layer.name, layer.kind
     window = graph.cast(is_open, f"{name}/window", kind)
-    sums = [_sums(graph, layer, spikes, sign) for sign in ((1, -1) if layer.checked else (0,))]
-    inflow = graph.add("Sub", sums, f"{name}/sum") if layer.checked else sums[0]
-    current = ""
+    inflow = _sum(graph, layer, spikes)
     if layer.remembers:
         lasting = _decayed(graph, layer, f"{name}.current", layer.decay_u + 1, f"{name}/lasting")
-        current = inflow = graph.add("Add", [lasting, inflow], f"{name}/current") if inflow else lasting
-        graph.add("Mul", [current, window], f"{name}.current_next")
-    overflow = [_overflow(graph, layer, sums, current, is_open)] if layer.checked else []
+        inflow = graph.add("Add", [lasting, inflow], f"{name}/current") if inflow else lasting
+        graph.add("Mul", [inflow, window], f"{name}.current_next")
     if layer.bias.any():
         bias = graph.constant(f"{name}/bias", one_each(layer.bias, kind))
         inflow = graph.add("Add", [inflow, bias], f"{name}/inflow") if inflow else bias
@@ -313,22 +290,19 @@ def _integrate(graph: Nodes, layer: Layer, spikes: list[str], is_open: str) -> l
     fired = graph.add("Greater", [value, one_each(layer.threshold, kind)], f"{name}/fired")
     graph.add("Where", [fired, kind(0), value], f"{name}.membrane_next")
     graph.cast(fired, f"{name}.spikes_next", np.uint8)
-    return overflow
 
 
-def _sums(graph: Nodes, layer: Layer, spikes: list[str], sign: int) -> str:
-    """Synaptic sums, membrane units, of all weights (0) or magnitudes of those of a sign; empty where none feeds it."""
-    name = f"{layer.name}/{('product', 'positive', 'negative')[sign]}"
-    total, count = "", 0
-    for received, weights in zip(spikes, layer.sources.values(), strict=True):
-        for digit, factor in digits(of_sign(weights, sign)):
-            own = f"{name}/{count}"
-            product = graph.add("MatMulInteger", [received, digit], own)
-            if layer.kind is not np.int32:
-                product = graph.cast(product, f"{own}/wide", layer.kind)
-            scaled = graph.add("Mul", [product, one_each(factor << MEMBRANE_SHIFT, layer.kind)], f"{own}/scaled")
-            total = graph.add("Add", [total, scaled], f"{own}/sum") if total else scaled
-            count += 1
+def _sum(graph: Nodes, layer: Layer, spikes: list[str]) -> str:
+    """Synaptic sums, membrane units; empty where no layer feeds it."""
+    total, every = "", zip(spikes, map(digits, layer.sources.values()), strict=True)
+    parts = [(received, digit, factor) for received, found in every for digit, factor in found]
+    for count, (received, digit, factor) in enumerate(parts):
+        own = f"{layer.name}/product/{count}"
+        product = graph.add("MatMulInteger", [received, digit], own)
+        if layer.kind is not np.int32:
+            product = graph.cast(product, f"{own}/wide", layer.kind)
+        scaled = graph.add("Mul", [product, one_each(factor << MEMBRANE_SHIFT, layer.kind)], f"{own}/scaled")
+        total = graph.add("Add", [total, scaled], f"{own}/sum") if total else scaled
     return total
 
 
@@ -336,17 +310,3 @@ def _decayed(graph: Nodes, layer: Layer, register: str, lost: IntArray, name: st
     """Keep ``(4096 - lost) / 4096``: a product and an integer division, which truncates toward zero."""
     product = graph.add("Mul", [register, one_each(2**DECAY_BITS - lost, layer.kind)], f"{name}/product")
     return graph.add("Div", [product, layer.kind(2**DECAY_BITS)], name)
-
-
-def _overflow(graph: Nodes, layer: Layer, sums: list[str], current: str, is_open: str) -> str:
-    """Whether the chip would stop here, 0 or 1 (batch,): a sum of weights of one sign, or the current, is too large."""
-    name = f"{layer.name}/overflow"
-    found = [(register, ACCUMULATOR_MAX) for register in sums]
-    if current:
-        found.append((graph.add("Abs", [current], f"{name}/size"), CURRENT_MAX))
-    over = [graph.add("Greater", [one, layer.kind(most)], f"{name}/over{i}") for i, (one, most) in enumerate(found)]
-    total = over[0]
-    for i, each in enumerate(over[1:], 1):
-        total = graph.add("Or", [total, each], f"{name}/any{i}")
-    gated = graph.add("And", [total, is_open], f"{name}/gated")
-    return graph.add("ReduceMax", [graph.cast(gated, f"{name}/number", np.int32)], name, axes=[-1], keepdims=0)

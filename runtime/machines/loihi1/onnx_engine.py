@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.formats.onnx.writer import Layer, plan
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
@@ -44,7 +43,7 @@ def open_session(model: bytes) -> Any:
 
 
 def prepare(netlist: Netlist) -> OnnxEngine:
-    """Export a netlist and load the file's content; ModelError if a file cannot hold the network."""
+    """Export a netlist and load the file's content; raises as :func:`onnx_writer.plan`."""
     return OnnxEngine(
         netlist=netlist, layers=plan(netlist), session=open_session(onnx_writer.export(netlist, "scan")[0])
     )
@@ -56,8 +55,7 @@ def simulate(
     """Run recordings (recordings, n_inputs, T), each from rest; of so many steps where some are shorter than T.
 
     Returns spikes (recordings, chip steps, compartments), as in :class:`trace.Trace`, and the votes (recordings,
-    classes) that the graph counts. Raises DataError if the recordings have other channels than the network,
-    NumericRangeError if a register overflows, where the chip is not defined.
+    classes) that the graph counts. Raises DataError if the recordings have other channels than the network.
     """
     netlist = prepared.netlist
     check_channels(netlist, events.shape[1])
@@ -70,9 +68,6 @@ def simulate(
         which = np.flatnonzero(ends == end)
         given = np.ascontiguousarray((events[which, :, :end] != 0).transpose(2, 0, 1)).view(np.uint8)
         found = dict(zip(names, prepared.session.run(names, {"events": given}), strict=True))
-        if "overflow" in found and found["overflow"].any():
-            recording = which[found["overflow"]][0]
-            raise NumericRangeError(f"onnx: recording {recording}: a register overflows, where the chip is not defined")
         for layer in prepared.layers:
             window = np.arange(layer.depth, layer.depth + end)
             spikes[np.ix_(which, window, layer.ids)] = found[f"{layer.name}.spikes"].transpose(1, 0, 2)
