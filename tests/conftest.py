@@ -12,7 +12,6 @@ import commands
 import pytest
 from made_files import own_file, recordings_folder
 
-from spikeloom.compiler.formats import hdf5
 from spikeloom.runtime import cli
 
 SHARED = Path(os.environ.get("SPIKELOOM_SHARED", Path(__file__).resolve().parents[2] / "shared"))
@@ -81,12 +80,6 @@ def write(tmp_path) -> Callable[[str, str], Path]:
         return path
 
     return write
-
-
-@pytest.fixture
-def hdf5_in_one_process(monkeypatch):
-    """Read HDF5 files at once: those of most tests make no library spin."""
-    monkeypatch.setattr(hdf5, "try_reading", len)
 
 
 @pytest.fixture(scope="module")

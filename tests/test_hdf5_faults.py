@@ -36,21 +36,6 @@ def test_bytes_that_the_library_cannot_read():
             hdf5.tree_of(bytes(content))
 
 
-@pytest.mark.parametrize(
-    ("trial", "said"),
-    [
-        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "the HDF5 library gave up"),
-        ("raise SystemExit(3)", "the HDF5 library gave up"),
-        ("import time; time.sleep(60)", "cannot be read within 0.4 s"),
-    ],
-)
-def test_a_library_that_dies_or_spins(monkeypatch, trial, said):
-    monkeypatch.setattr(hdf5, "TRIAL", trial)
-    monkeypatch.setattr(hdf5, "SECONDS", 0.2)
-    with pytest.raises(ModelError, match=said):
-        hdf5.try_reading(b"")
-
-
 FILES = Path(__file__).parent / "nir"
 
 TYPES = ("Affine", "AvgPool2d", "Conv1d", "Conv2d", "CubaLIF", "Delay", "Flatten", "I", "IF", "Identity", "Input", "LI")

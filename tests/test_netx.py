@@ -29,8 +29,6 @@ from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.runtime.machines.loihi1 import engine
 
-pytestmark = pytest.mark.usefixtures("hdf5_in_one_process")
-
 W = np.full((4, 6), 2)
 
 

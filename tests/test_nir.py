@@ -22,8 +22,6 @@ from spikeloom.compiler.interpret import run_float
 from spikeloom.compiler.ir import recurrent
 from spikeloom.runtime.machines.loihi1 import engine
 
-pytestmark = pytest.mark.usefixtures("hdf5_in_one_process")
-
 FILES = Path(__file__).parent / "nir"
 
 

@@ -3,3 +3,6 @@
 Checkpoints: ``checkpoint_reader`` takes any, our own format among them, ``torch_checkpoint`` is the released one.
 Networks of other frameworks: ``onnx``, ``nir``, ``netx``. For other simulators: ``sanafe``, ``ranc``.
 """
+
+ONNX, NIR, NETX = ".onnx", ".nir", ".net"
+"""How names of files from other frameworks end."""

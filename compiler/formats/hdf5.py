@@ -1,16 +1,9 @@
-"""Read an HDF5 file as plain data, trusting nothing in it: no size, no link, not even that it can be read.
-
-On crafted files the library behind h5py can spin or crash, so a file is read in a process of its own first; one that
-survives within its time and memory is read again here.
-"""
+"""Read an HDF5 file as plain data, trusting nothing in it: no size, no link to elsewhere."""
 
 from __future__ import annotations
 
 import hashlib
 import io
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,33 +23,7 @@ Array = npt.NDArray[Any]
 Tree = dict[str, Any]
 """By name a further Tree, an Array of numbers or truth values, a string, lists of strings, or None for other things."""
 
-ITEM_LIMIT = 100_000
-NESTING = 64
-DIMENSIONS = 8
-"""Groups and arrays of a file, groups within groups (a nested graph takes two), and axes of an array."""
-
-FILTERS = frozenset({1, 2, 3, 32000})
-"""Deflate, shuffle, Fletcher-32 and LZF: what h5py itself brings. Others would load code from elsewhere."""
-
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
-
-SECONDS, MEMORY = 30, 4 * 2**30
-"""What reading a file may take."""
-
-TRIAL = f"""
-import sys
-try:
-    import resource
-    resource.setrlimit(resource.RLIMIT_CPU, ({SECONDS}, {SECONDS}))
-    resource.setrlimit(resource.RLIMIT_AS, ({MEMORY}, {MEMORY}))
-except ImportError:
-    pass  # not on this system; the time limit remains
-from {__name__} import ModelError, tree_of
-try:
-    tree_of(sys.stdin.buffer.read())
-except ModelError:
-    pass  # refused, as it will be here
-"""
 
 AGAIN = "export it again"
 
@@ -120,27 +87,9 @@ def read_hdf5(path: Path, what: str) -> tuple[Tree, str]:
     if not content.startswith(SIGNATURE):
         raise ModelError(f"is no HDF5 file, as a {what} is; {AGAIN}")
     try:
-        try_reading(content)
         return tree_of(content), hashlib.sha256(content).hexdigest()
     except ModelError as error:
         raise ModelError(f"{error}; {AGAIN}") from error
-
-
-def try_reading(content: bytes) -> None:
-    """Read a file in a process of its own; ModelError if the library spins, crashes, or runs out of its memory."""
-    try:
-        done = subprocess.run(  # noqa: S603
-            [sys.executable, "-P", "-c", TRIAL],
-            input=content,
-            capture_output=True,
-            timeout=2 * SECONDS,
-            check=False,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-        )
-    except subprocess.TimeoutExpired:
-        raise ModelError(f"cannot be read within {2 * SECONDS:g} s") from None
-    if done.returncode:
-        raise ModelError("is truncated or damaged (the HDF5 library gave up)")
 
 
 def tree_of(content: bytes) -> Tree:
@@ -149,61 +98,41 @@ def tree_of(content: bytes) -> Tree:
 
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
-            return _Walk().group(file, [])
+            return _group(file, [files.SIZE_LIMIT])
     except ModelError:
         raise
     except Exception as error:  # h5py raises nearly anything on damaged files
         raise ModelError(f"is truncated or damaged ({type(error).__name__})") from error
 
 
-class _Walk:
-    """A way through all groups of a file, with what it may still take."""
+def _group(group: Any, room: list[int]) -> Tree:
+    """Content of a group; the only element of `room` is the bytes of numbers that may still come."""
+    return {str(key): _entry(group, key, room) for key in group}
 
-    def __init__(self) -> None:
-        self.items = ITEM_LIMIT
-        self.bytes = files.SIZE_LIMIT
 
-    def group(self, group: Any, above: list[str]) -> Tree:
-        import h5py
+def _entry(group: Any, key: str, room: list[int]) -> Any:
+    """A further group, or numbers or words of an array, whose declared size is checked before it is read; else None."""
+    import h5py
 
-        if len(above) > NESTING:
-            raise ModelError(f"has groups nested deeper than {NESTING}")
-        found: Tree = {}
-        for key in group:
-            path = [*above, str(key)]
-            self.items -= 1
-            if self.items < 0:
-                raise ModelError(f"has more than {ITEM_LIMIT} groups and arrays")
-            if not isinstance(group.get(key, getlink=True), h5py.HardLink):
-                raise ModelError(f"{'/'.join(path)} is a link to elsewhere, allowed are arrays in the file itself")
-            item = group[key]
-            if isinstance(item, h5py.Group):
-                found[path[-1]] = self.group(item, path)
-            else:
-                found[path[-1]] = self.array(item, "/".join(path)) if isinstance(item, h5py.Dataset) else None
-        return found
-
-    def array(self, item: Any, path: str) -> Any:
-        """Numbers or words of an array; None for anything else. Its declared size is checked before it is read."""
-        import h5py
-
-        if item.external or item.is_virtual:
-            raise ModelError(f"{path} keeps its numbers in another file, allowed is this file alone")
-        filters = item.id.get_create_plist()
-        if any(filters.get_filter(place)[0] not in FILTERS for place in range(filters.get_nfilters())):
-            raise ModelError(f"{path} is compressed in a way that is not known, allowed are gzip, LZF and shuffle")
-        if item.shape is None or len(item.shape) > DIMENSIONS:
-            return None
-        self.bytes -= item.dtype.itemsize * max(item.size, int(np.prod(item.chunks or (0,), dtype=object)))
-        if self.bytes < 0:
-            raise ModelError(f"announces more than {files.SIZE_LIMIT} bytes of numbers")
-        if item.dtype.kind == "S" or h5py.check_string_dtype(item.dtype) is not None:
-            values = item[()]
-            return _decoded(values.tolist() if isinstance(values, np.ndarray) else values)
-        if item.dtype.kind not in "biuf" or item.dtype.itemsize > 8:
-            return None
-        values = np.asarray(item[()])
-        return np.ascontiguousarray(values, values.dtype.newbyteorder("<")).reshape(values.shape)
+    if not isinstance(group.get(key, getlink=True), h5py.HardLink):
+        raise ModelError(f"{key} is a link to elsewhere, allowed are arrays in the file itself")
+    item = group[key]
+    if isinstance(item, h5py.Group):
+        return _group(item, room)
+    if not isinstance(item, h5py.Dataset) or item.shape is None:
+        return None
+    if item.external or item.is_virtual:
+        raise ModelError(f"{key} keeps its numbers in another file, allowed is this file alone")
+    room[0] -= item.dtype.itemsize * max(item.size, int(np.prod(item.chunks or (0,), dtype=object)))
+    if room[0] < 0:
+        raise ModelError(f"announces more than {files.SIZE_LIMIT} bytes of numbers")
+    if item.dtype.kind == "S" or h5py.check_string_dtype(item.dtype) is not None:
+        values = item[()]
+        return _decoded(values.tolist() if isinstance(values, np.ndarray) else values)
+    if item.dtype.kind not in "biuf" or item.dtype.itemsize > 8:
+        return None
+    values = np.asarray(item[()])
+    return np.ascontiguousarray(values, values.dtype.newbyteorder("<")).reshape(values.shape)
 
 
 def _decoded(value: Any) -> Any:

@@ -15,10 +15,8 @@ import numpy as np
 from spikeloom.compiler.archive import FORMATS, TRAINED, is_netlist, stated
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.formats import NETX, NIR, ONNX
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.netx import SUFFIX as NETX
-from spikeloom.compiler.formats.nir import SUFFIX as NIR
-from spikeloom.compiler.formats.onnx import SUFFIX as ONNX
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES

@@ -1,3 +1,1 @@
 """lava-dl's ``.net`` files: reader and writer."""
-
-SUFFIX = ".net"

@@ -1,6 +1,4 @@
 """NIR files: reader and writer."""
 
-SUFFIX = ".nir"
-
 CONVENTIONS = ("euler", "exponential")
 """What a step keeps of a time constant, by default the first."""

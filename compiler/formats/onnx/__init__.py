@@ -1,3 +1,1 @@
 """ONNX files: reader and writer."""
-
-SUFFIX = ".onnx"

@@ -19,7 +19,7 @@ from spikeloom.compiler import (
     write_netlist,
 )
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.formats.netx import SUFFIX as NETX
+from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.text import text

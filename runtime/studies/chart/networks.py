@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 from spikeloom.compiler import Packing, check_packings
 from spikeloom.compiler.archive import arrays_digest, is_netlist
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.onnx import SUFFIX
+from spikeloom.compiler.formats import ONNX
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.types import JsonObject
@@ -142,7 +142,7 @@ def read_networks(arguments: argparse.Namespace) -> tuple[NetworkFile, ...]:
 
 
 def _read(path: str, arguments: argparse.Namespace) -> NetworkFile:
-    if path.endswith(SUFFIX):
+    if path.endswith(ONNX):
         raise ModelError(f"{path}: is an ONNX file, a chart takes checkpoints; give the checkpoint that it was made of")
     file = shipped(path)
     name = Path(path.removeprefix(PRETRAINED)).stem
