@@ -79,6 +79,7 @@ def looped():
     return model([scan], [("events", [3, 4])], ["end0"])
 
 
+BRAIN = helper.make_tensor("w", TensorProto.BFLOAT16, (4, 3), [1] * 12)
 STAGES = [
     (f"node stage (Relu): {AFFINE}", "stage = Relu(current)"),
     (f"node stage (Mul): multiplies x by x, so it {AFFINE}", "stage = Mul(x, x)"),
@@ -90,7 +91,7 @@ STAGES = [
 NODES = [
     ("node stage (Einsum): cannot be evaluated", node("Einsum", "current b b", "stage", equation="ij,j,k->ij")),
     (f"node stage (Cast): rounds its input to whole numbers, so it {AFFINE}", node("Cast", "current", "stage", to=7)),
-    ("node stage (LSTM): keeps a state that is no leaky", node("LSTM", "current w w", "stage", hidden_size=3)),
+    (f"node stage (LSTM): {AFFINE}", node("LSTM", "current w w", "stage", hidden_size=3)),
     (
         "node stage (Strange): is of the domain my.own, allowed are the",
         helper.make_node("Strange", ["current"], ["stage"], domain="my.own"),
@@ -131,7 +132,7 @@ REFUSED = [
     ("is not an ONNX file, or is truncated", b"PK\x03\x04 not at all"),
     ("no such file", None),
     ("too small for the declared shape", changed(lambda w, _: w.dims.__setitem__(0, 2 * 10**12))),
-    ("tensor w: has element type 16", changed(lambda w, _: setattr(w, "data_type", TensorProto.BFLOAT16))),
+    ("tensor w: has element type 16", changed(lambda w, _: w.CopyFrom(BRAIN))),
     ("makes 1000000000000 values or", layer(GOOD, inputs=[("x", [10**6, 10**6]), *STATE_IN[:2]])),
     ("input x: has an open size 'taxels', allowed", layer(GOOD, inputs=[("x", [1, "taxels"]), *STATE_IN[:2]])),
 ]

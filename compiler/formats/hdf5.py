@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,14 +35,6 @@ class Part:
     def fail(self, problem: str) -> ModelError:
         """An error about this part, to be raised."""
         return ModelError(f"{self}: {problem}")
-
-    @contextmanager
-    def named(self) -> Iterator[None]:
-        """Let errors of what is done to this part say so."""
-        try:
-            yield
-        except ModelError as error:
-            raise self.fail(str(error)) from error
 
     def has(self, key: str) -> bool:
         """Whether there is such an entry."""

@@ -3,7 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+
+from spikeloom.compiler.errors import ModelError
+
+
+@contextmanager
+def named(where: object) -> Iterator[None]:
+    """Let a ModelError of what is done say where: of which file, or which part of it."""
+    try:
+        yield
+    except ModelError as error:
+        raise ModelError(f"{where}: {error}") from error
 
 
 def printable(name: str) -> str:

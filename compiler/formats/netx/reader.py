@@ -26,7 +26,7 @@ from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_
 from spikeloom.compiler.formats.affine import convolution
 from spikeloom.compiler.formats.assemble import ReadNetwork
 from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, read_hdf5
-from spikeloom.compiler.formats.names import printable
+from spikeloom.compiler.formats.names import named, printable
 from spikeloom.compiler.ir import (
     INPUT,
     MANTISSA,
@@ -111,12 +111,10 @@ def read_netx(
     Raises ModelError if the file cannot be read, or holds what the chip's neurons here do not do, naming the layer;
     OptionError if there are no such polarities.
     """
-    try:
+    with named(path):
         tree, sha256 = read_hdf5(Path(path), "netx file")
         network, facts = integers_of(tree, polarities, polarities_first)
-        return ReadNetwork(network=network, facts=tuple(facts), sha256=sha256)
-    except ModelError as error:
-        raise ModelError(f"{path}: {error}") from error
+    return ReadNetwork(network=network, facts=tuple(facts), sha256=sha256)
 
 
 def integers_of(
@@ -215,7 +213,7 @@ def _conv(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]
         )
     stride, dilation, groups = block.few("stride", 2), block.few("dilation", 2), block.few("groups")[0]
     padding = [(zeros, zeros) for zeros in block.few("padding", 2)]
-    with block.named():
+    with named(block):
         matrix, out = convolution(
             shape, weight.astype(np.float64), stride=stride, padding=padding, dilation=dilation, groups=groups
         )

@@ -17,7 +17,7 @@ from spikeloom.compiler.fixedpoint import decay_registers, kept_shares
 from spikeloom.compiler.formats.affine import scaled, shifted
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble, class_of_each, in_order
 from spikeloom.compiler.formats.hdf5 import read_hdf5
-from spikeloom.compiler.formats.names import printable, unique_names
+from spikeloom.compiler.formats.names import named, printable, unique_names
 from spikeloom.compiler.formats.nir import CONVENTIONS
 from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, graph_of, loops
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
@@ -64,7 +64,7 @@ def read_nir(
     Raises ModelError if the file cannot be read, or holds something else than a network that spikes, feed-forward but
     for recurrent layers, naming the node; OptionError if there is no time step, or an option has no such value.
     """
-    try:
+    with named(path):
         graph = graph_of(*read_hdf5(Path(path), "NIR file"))
         dt = stated_step(graph) if dt is None else dt
         if dt is None:
@@ -75,8 +75,6 @@ def read_nir(
         require_step(dt)
         with np.errstate(all="ignore"):  # what is not finite is refused at the end
             return network_of(graph, steps, polarities, polarities_first)
-    except ModelError as error:
-        raise ModelError(f"{path}: {error}") from error
 
 
 def network_of(
@@ -116,7 +114,7 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Neur
                 raise node.fail("gets values from other nodes; remove these edges")
             values[name] = spikes_of(INPUT, shape)
             continue
-        with node.named():
+        with named(node):
             value = added([values[source] for source in received[name] if source not in late.get(name, ())])
         if node.type in SPIKING:
             values[name] = spikes_of(len(spiking), value.shape)
@@ -129,7 +127,7 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Neur
             raise node.fail(KNOWN.get(node.type, f"is of a type that is not known here, known are {known}; replace it"))
     for place, one in enumerate(spiking):
         if one.node.name in late:
-            with one.node.named():
+            with named(one.node):
                 value = added([forward[place], *(values[source] for source in late[one.node.name])])
             spiking[place] = _neurons(one.node, value, steps)
     return spiking, values[graph.one(OUTPUT_NODE).name]
@@ -249,7 +247,7 @@ def _neurons(node: Node, value: Value, steps: Steps) -> Neurons:
         gain = np.where(np.abs(gain - 1) < TOLERANCE, 1.0, gain)
     if np.any(theta <= 0):
         raise node.fail(f"fires {theta.min():g} above its reset, allowed are thresholds above it; train it again")
-    with node.named():
+    with named(node):
         own = shifted(filtered(value, alpha, gain, nothing), drive)  # a leak acts past the current
     return Neurons(node=node, value=own, beta=beta, gain=gain, theta=theta, reset=reset)
 

@@ -21,6 +21,7 @@ from scipy import sparse
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import affine
 from spikeloom.compiler.formats.affine import Affine, Padding, block_diagonal, convolution, scaled, shifted, through
+from spikeloom.compiler.formats.names import named
 from spikeloom.compiler.formats.nir.file import SPIKING, Graph, Node
 from spikeloom.compiler.types import FloatArray
 
@@ -236,7 +237,7 @@ def _conv(node: Node, value: Value, _steps: Steps) -> Value:
             raise node.fail(f"is for inputs of {list(declared)}, it gets {list(shape[1:])}; export it again")
     stride, dilation = node.few("stride", axes), node.few("dilation", axes)
     padding, groups = _padding(node, kernel, dilation, stride), node.few("groups")[0]
-    with node.named():
+    with named(node):
         matrix, out = convolution(shape, weight, stride=stride, padding=padding, dilation=dilation, groups=groups)
     result = through(matrix, value, out)
     if not node.has("bias"):
@@ -252,7 +253,7 @@ def _pool(node: Node, value: Value, _steps: Steps) -> Value:
         raise node.fail(f"has a window of {list(kernel)} for {list(shape[1:])} places; export it again")
     share = 1 / math.prod(kernel) if node.type == "AvgPool2d" else 1.0
     weight = np.full((shape[0], 1, *kernel), share)  # zeros of the padding count
-    with node.named():
+    with named(node):
         matrix, out = convolution(shape, weight, stride=stride, padding=padding, dilation=(1, 1), groups=shape[0])
     return through(matrix, value, out)
 
@@ -277,7 +278,7 @@ def _integrator(node: Node, value: Value, steps: Steps) -> Value:
     alpha = shared(node, "tau", kept)
     gain = (1 - kept) * spread(node, "r", value.size, value.shape)
     drive = (1 - kept) * spread(node, "v_leak", value.size, value.shape)
-    with node.named():
+    with named(node):
         return filtered(value, alpha, gain, drive)
 
 

@@ -24,11 +24,10 @@ from spikeloom.compiler.types import FloatArray, IntArray
 VALUE_LIMIT, COEFFICIENT_LIMIT = 2**22, 2**24
 """Elements of a value, and coefficients of an operator: more than the synapses of a chip."""
 
+DIMENSIONS = 32
+
 ATOM_LIMIT = 2**20
 """Elements of an input, over all steps, or of a layer."""
-
-WORK_LIMIT = 2**30
-"""Elements and coefficients of all values together; bounds the time that a file can take."""
 
 INPUT_ATOM, MEMBRANE, SPIKE, PRODUCT = "input", "membrane", "spike", "product"
 
@@ -62,7 +61,7 @@ class Atom:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Table:
-    """What is met while a graph runs: atoms, and the work done so far.
+    """What is met while a graph runs.
 
     Matrices of linear operators are kept with the constants that they were made from, so that nothing else can come to
     lie at the same address.
@@ -72,21 +71,13 @@ class Table:
     atoms: list[Atom] = field(default_factory=list)
     known: dict[tuple[object, ...], int] = field(default_factory=dict)
     matrices: dict[tuple[object, ...], tuple[Sparse, tuple[int, ...], list[Value]]] = field(default_factory=dict)
-    done: int = 0
 
     def room(self, shape: Sequence[int], limit: int = VALUE_LIMIT) -> tuple[int, ...]:
         """The shape itself, if a value of it, or an operator of so many coefficients, may be made."""
         size = math.prod(int(length) for length in shape)
-        if size > limit or any(length < 0 for length in shape):
+        if size > limit or min(shape, default=0) < 0 or len(shape) > DIMENSIONS:
             raise ModelError(f"makes {size} values or coefficients, allowed are {limit}; no chip holds such a network")
-        self.spend(size)
         return tuple(int(length) for length in shape)
-
-    def spend(self, work: int) -> None:
-        """Count work; refuse more than a network of any use needs."""
-        self.done += work
-        if self.done > WORK_LIMIT:
-            raise ModelError(f"needs more than {WORK_LIMIT} coefficients in all; export one step instead of all")
 
     def atom(self, kind: str, label: str, size: int, **facts: Any) -> int:
         """Add an atom, if there may be one of that size; `facts` are more fields of it."""

@@ -56,9 +56,6 @@ ReduceProd ReduceSum Relu Sigmoid Sign Sqrt Sub Sum Tanh Xor
 NUMERIC = frozenset(MOVES) | frozenset(_OTHERS.split())
 """Operators that are run on numbers. Others are refused, or are linear and run as their matrix."""
 
-LOOPS, LOOP_WORK = ("GatherND", "ScatterElements", "ScatterND"), 64
-"""Operators that the reference runs element by element, and what one counts for."""
-
 SMALL = 64
 """Elements of an operand that may decide the shape of a result."""
 
@@ -75,8 +72,6 @@ def evaluate(node: Node, table: Table, operands: Operands) -> list[Array]:
     if node.op == "BatchNormalization" and node.attributes.get("training_mode", 0):
         raise ModelError("is in training mode; export the module after eval()")
     shapes_of(node, table, operands)
-    if node.op in LOOPS:
-        table.spend(LOOP_WORK * max(operand.size for operand in operands if operand is not None))
     if node.op == "GatherElements":  # which the reference takes too long for
         data, indices = map(np.asarray, operands)
         axis = range(data.ndim)[int(node.attributes.get("axis", 0))]

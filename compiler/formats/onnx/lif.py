@@ -17,7 +17,7 @@ import numpy as np
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.affine import Affine, diagonal
 from spikeloom.compiler.formats.assemble import class_of_each
-from spikeloom.compiler.formats.names import printable
+from spikeloom.compiler.formats.names import named, printable
 from spikeloom.compiler.formats.onnx.atoms import INPUT_ATOM, MEMBRANE, PRODUCT, SPIKE, Table
 from spikeloom.compiler.ir import INPUT, Sparse
 from spikeloom.compiler.types import FloatArray, IntArray
@@ -58,10 +58,8 @@ def neurons_of(table: Table, outputs: Mapping[str, Affine]) -> list[Neurons]:
             spikes.setdefault(atom.of[0], []).append(index)
     found = []
     for membrane in sorted(spikes):
-        try:
+        with named(table.atoms[membrane].node):
             found.append(_read(table, membrane, spikes[membrane], outputs))
-        except ModelError as error:
-            raise ModelError(f"{table.atoms[membrane].node}: {error}") from error
     return found
 
 

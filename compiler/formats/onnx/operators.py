@@ -32,9 +32,6 @@ from spikeloom.compiler.formats.onnx.atoms import (
 from spikeloom.compiler.formats.onnx.evaluate import FLOATING, LINEAR, MOVES, NUMERIC, evaluate, shapes_of
 from spikeloom.compiler.formats.onnx.file import BOOL, Graph, Node
 
-NODE_WORK = 2**14
-"""What running one operator counts for beside its elements."""
-
 _SHIFTS = frozenset(("Add", "Cast", "Div", "Identity", "Mul", "Sub"))
 """Operators that may stand between a membrane and its comparison, as in ``u - theta > 0``."""
 
@@ -45,9 +42,6 @@ MIRRORED = {
     "LessOrEqual": "GreaterOrEqual",
 }
 """Comparisons with a threshold, and each with its sides exchanged."""
-
-NO_LIF = "keeps a state that is no leaky integrate-and-fire neuron; only such neurons can be lowered"
-STATEFUL = ("GRU", "LSTM", "RNN")
 
 CONSTANT = "is computed from constants by an operator that is not known here; fold constants before the export"
 
@@ -63,7 +57,6 @@ def run(graph: Graph, given: Mapping[str, Value], table: Table) -> list[Value]:
     last = {name: index for index, node in enumerate(order) for name in reads(node)}
     for index, node in enumerate(order):
         try:
-            table.spend(NODE_WORK)
             results = apply(node, table, [values[name] if name else None for name in node.inputs])
             for name, result in zip(node.outputs, results, strict=False):
                 values[name] = _set_apart(node, name, result, table) if name in held else result
@@ -176,7 +169,7 @@ def _constant(node: Node, table: Table, operands: Sequence[Value | None]) -> lis
     if node.op in NUMERIC:
         return list(evaluate(node, table, operands))  # type: ignore[arg-type]
     if node.op not in LINEAR:
-        raise ModelError(NO_LIF if node.op in STATEFUL else CONSTANT)
+        raise ModelError(CONSTANT)
     result = _linear(node, table, [as_affine(operands[0]), *operands[1:]], [0])
     return [result.bias.reshape(result.shape)]
 
@@ -300,7 +293,7 @@ def _elementwise(node: Node, table: Table, operands: Sequence[Value | None], var
     op, values = node.op, [as_affine(operand) for operand in operands]
     weights = {"Add": 1.0, "Mean": 1 / len(values), "Neg": -1.0, "Sub": 1.0, "Sum": 1.0}
     if op not in (*weights, "Cast", "Div", "Mul", "Not"):
-        raise ModelError(NO_LIF if op in STATEFUL else NOT_AFFINE)
+        raise ModelError(NOT_AFFINE)
     shape = table.room(np.broadcast_shapes(*(value.shape for value in values)))
     parts = [spread(value, shape) for value in values]
     value, other = parts[0], parts[-1]
