@@ -61,26 +61,19 @@ def class_of_each(counts: Sparse) -> IntArray | None:
     return label
 
 
-def in_order(layers: Sequence[Layer]) -> list[int]:
-    """Places of the layers, each after the others that feed it.
+def by_depth(layers: Sequence[Layer]) -> list[list[int]]:
+    """Places of the layers by how many others lie between them and the input at most.
 
     Raises ModelError if some feed each other in a circle.
     """
-    placed: list[int] = []
-    while len(placed) < len(layers):
-        ready = [
-            index
-            for index, layer in enumerate(layers)
-            if index not in placed and all(source in placed or source in (INPUT, index) for source in layer.sources)
-        ]
-        if not ready:
-            stuck = [printable(layer.name) for index, layer in enumerate(layers) if index not in placed]
-            raise ModelError(
-                f"layers {', '.join(stuck)} feed each other in a circle; a layer may feed itself, but no "
-                "layer that feeds it"
-            )
-        placed += ready
-    return placed
+    left, found = {index: layer.sources.keys() - {INPUT, index} for index, layer in enumerate(layers)}, []
+    while left:
+        found.append([index for index, sources in left.items() if not sources & left.keys()])
+        if not found[-1]:
+            stuck = ", ".join(printable(layers[index].name) for index in left)
+            raise ModelError(f"layers {stuck} feed each other in a circle; a layer may feed itself, no layer before it")
+        left = {index: sources for index, sources in left.items() if index not in found[-1]}
+    return found
 
 
 def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArray) -> Network:
@@ -89,7 +82,7 @@ def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArra
     Raises ModelError if the layers are in a circle, some are not reached from the input, skip a layer, or have
     constants or weights that no chip's neuron has.
     """
-    order = in_order(layers)
+    order = [index for ready in by_depth(layers) for index in ready]
     place = {INPUT: INPUT} | {old: new for new, old in enumerate(order)}
     populations: list[Population] = []
     projections = []
@@ -112,17 +105,15 @@ def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArra
 
 
 def _require_neuron(layer: Layer) -> None:
-    where = f"layer {printable(layer.name)}"
-    if not 0 <= layer.beta <= 1:
-        raise ModelError(f"{where}: keeps {layer.beta:g} of its membrane in a step, allowed are 0 to 1; train it again")
-    if not 0 <= layer.alpha < 1:
-        raise ModelError(
-            f"{where}: keeps {layer.alpha:g} of its current in a step, allowed is less than 1; train again"
-        )
-    if not 0 < layer.theta < np.inf:
-        raise ModelError(f"{where}: has the threshold {layer.theta:g}, allowed are numbers above 0; train it again")
-    if not all(np.all(np.isfinite(values)) for values in (layer.bias, *(w.data for w in layer.sources.values()))):
-        raise ModelError(f"{where}: has weights or biases that are not finite; train it again")
+    numbers = (layer.bias, *(weight.data for weight in layer.sources.values()))
+    rules = {
+        f"keeps {layer.beta:g} of its membrane in a step, allowed are 0 to 1": 0 <= layer.beta <= 1,
+        f"keeps {layer.alpha:g} of its current in a step, allowed is less than 1": 0 <= layer.alpha < 1,
+        f"has the threshold {layer.theta:g}, allowed are numbers above 0": 0 < layer.theta < np.inf,
+        "has weights or biases that are not finite": all(np.all(np.isfinite(values)) for values in numbers),
+    }
+    for fault in [words for words, holds in rules.items() if not holds]:
+        raise ModelError(f"layer {printable(layer.name)}: {fault}; train it again")
 
 
 def _require_reach(network: Network) -> None:

@@ -6,7 +6,7 @@ import hashlib
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,8 @@ Array = npt.NDArray[Any]
 
 Tree = dict[str, Any]
 """By name a further Tree, an Array of numbers or truth values, a string, lists of strings, or None for other things."""
+
+E = TypeVar("E")
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -66,6 +68,12 @@ class Part:
         if len(values) not in (1, count):
             raise self.fail(f"{key} has {len(values)} values, wanted {count}; {AGAIN}")
         return tuple(values * count if len(values) == 1 else values)
+
+
+def entry_of(group: Tree, key: str, kind: type[E]) -> E:
+    """An entry of a group that is of a kind, else an empty one of that kind."""
+    found = group.get(key)
+    return found if isinstance(found, kind) else kind()
 
 
 def read_hdf5(path: Path, what: str) -> tuple[Tree, str]:

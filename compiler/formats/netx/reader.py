@@ -25,7 +25,7 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, kept_shares
 from spikeloom.compiler.formats.affine import convolution
 from spikeloom.compiler.formats.assemble import ReadNetwork
-from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, read_hdf5
+from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, entry_of, read_hdf5
 from spikeloom.compiler.formats.names import named, printable
 from spikeloom.compiler.ir import (
     INPUT,
@@ -44,8 +44,6 @@ BIAS_EXPONENT = 6
 """Biases are in whole weight steps."""
 
 DEFAULT_INPUT_WEIGHT = 64
-
-LAYER_LIMIT = 1000
 
 NEURONS = ("CUBA", "LOIHI")
 
@@ -86,16 +84,14 @@ class Block(Part):
 
 def blocks_of(tree: Tree) -> list[Block]:
     """Layers in the content of a file; ModelError if it is none."""
-    layers = tree.get("layer")
-    if not isinstance(layers, dict) or not layers:
+    layers = entry_of(tree, "layer", dict)
+    if not layers:
         raise ModelError(f"has no layers, so it is no netx file; {AGAIN}")
-    if len(layers) > LAYER_LIMIT or set(layers) != {str(number) for number in range(len(layers))}:
-        raise ModelError(f"has layers that are not numbered from 0 to {len(layers) - 1}; {AGAIN}")
     found = []
     for number in range(len(layers)):
-        entries = layers[str(number)]
+        entries = layers.get(str(number))
         if not isinstance(entries, dict):
-            raise ModelError(f"layer {number} is no group; {AGAIN}")
+            raise ModelError(f"has no layer {number}, but {len(layers)} layers; {AGAIN}")
         kind = entries.get("type")
         while isinstance(kind, list) and kind:
             kind = kind[0]

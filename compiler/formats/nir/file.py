@@ -19,16 +19,12 @@ import networkx as nx
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree
-from spikeloom.compiler.formats.names import printable
+from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, entry_of
+from spikeloom.compiler.formats.names import named, printable
 
 GRAPH, INPUT_NODE, OUTPUT_NODE = "NIRGraph", "Input", "Output"
 
 SPIKING = ("CubaLIF", "IF", "LIF", "Threshold")
-
-NODE_LIMIT = 10_000
-NESTING = 8
-"""Nodes of a file and graphs within graphs that are read."""
 
 SHOWN = 8
 """Nodes of a circle that are named."""
@@ -59,71 +55,49 @@ class Graph:
     metadata: Tree  # Of the whole
     sha256: str  # Of the file
 
-    def one(self, kind: str) -> Node:
-        """The only node of a type; ModelError if there are none or several."""
-        found = [node for node in self.nodes.values() if node.type == kind]
-        if len(found) != 1:
-            shown = f" ({', '.join(printable(node.name) for node in found)})" if found else ""
-            raise ModelError(f"has {len(found)} nodes of type {kind}{shown}, one is allowed; export one network")
-        return found[0]
-
 
 def graph_of(tree: Tree, sha256: str) -> Graph:
     """Graph of the content of a file; ModelError, without the path, if it is none or inconsistent."""
-    root = tree.get("node")
-    if not isinstance(root, dict) or "type" not in root:
+    root = entry_of(tree, "node", dict)
+    if "type" not in root:
         raise ModelError(f"has no node, so it is no NIR file; {AGAIN}")
-    if _type(root) != GRAPH:
+    if entry_of(root, "type", str) != GRAPH:
         root = {"type": GRAPH, "nodes": {"node": root}, "edges": []}
-    nodes, edges = _flat(root, "", NESTING, [NODE_LIMIT])
-    version = tree.get("version")
+    nodes, edges = _flat(root, "")
     return Graph(
         nodes=nodes,
         edges=tuple(dict.fromkeys(edges)),
-        version=version if isinstance(version, str) else "",
-        metadata=_metadata(root),
+        version=entry_of(tree, "version", str),
+        metadata=entry_of(root, "metadata", dict),
         sha256=sha256,
     )
 
 
-def _type(entry: Tree) -> str:
-    kind = entry.get("type")
-    return kind if isinstance(kind, str) else ""
-
-
-def _metadata(entry: Tree) -> Tree:
-    found = entry.get("metadata")
-    return found if isinstance(found, dict) else {}
-
-
-def _flat(graph: Tree, above: str, nesting: int, left: list[int]) -> tuple[dict[str, Node], list[tuple[str, str]]]:
+def _flat(graph: Tree, above: str) -> tuple[dict[str, Node], list[tuple[str, str]]]:
     """Nodes and edges of a graph, with those of the graphs in it in place of these."""
     where = f"graph {printable(above)}" if above else "the graph"
-    if nesting < 0:
-        raise ModelError(f"has graphs nested deeper than {NESTING}; export a flat one")
-    members = graph.get("nodes")
-    if not isinstance(members, dict) or not members:
+    members = entry_of(graph, "nodes", dict)
+    if not members:
         raise ModelError(f"{where} has no nodes; {AGAIN}")
     nodes: dict[str, Node] = {}
     edges: list[tuple[str, str]] = []
     ends: dict[str, tuple[str, str]] = {}
     for name, entry in members.items():
         full = f"{above}.{name}" if above else name
-        left[0] -= 1
-        if left[0] < 0:
-            raise ModelError(f"has more than {NODE_LIMIT} nodes; this is no network of one chip")
-        if not isinstance(entry, dict) or not _type(entry):
+        kind = entry_of(entry, "type", str) if isinstance(entry, dict) else ""
+        if not kind:
             raise ModelError(f"node {printable(full)} has no type; {AGAIN}")
-        if _type(entry) == GRAPH:
-            inner, pairs = _flat(entry, full, nesting - 1, left)
-            ends[name] = (_end(inner, full, INPUT_NODE), _end(inner, full, OUTPUT_NODE))
+        if kind == GRAPH:
+            inner, pairs = _flat(entry, full)
+            with named(f"graph {printable(full)}"):
+                ends[name] = only(inner, INPUT_NODE).name, only(inner, OUTPUT_NODE).name
             # Input and Output of a nested graph pass on what they get
             inner |= {end: replace(inner[end], type="Identity", values={}) for end in ends[name]}
             nodes |= inner
             edges += pairs
         else:
             values = {key: value for key, value in entry.items() if key not in ("type", "metadata")}
-            nodes[full] = Node(name=full, type=_type(entry), values=values, metadata=_metadata(entry))
+            nodes[full] = Node(name=full, type=kind, values=values, metadata=entry_of(entry, "metadata", dict))
             ends[name] = (full, full)
     for source, target in _pairs(graph, where):
         for name in (source, target):
@@ -136,11 +110,12 @@ def _flat(graph: Tree, above: str, nesting: int, left: list[int]) -> tuple[dict[
     return nodes, edges
 
 
-def _end(inner: Mapping[str, Node], where: str, kind: str) -> str:
-    """The only Input or Output of a nested graph itself, not of those in it."""
-    found = [name for name, node in inner.items() if node.type == kind]
+def only(nodes: Mapping[str, Node], kind: str) -> Node:
+    """The only node of a type; ModelError if there are none or several."""
+    found = [node for node in nodes.values() if node.type == kind]
     if len(found) != 1:
-        raise ModelError(f"graph {printable(where)} has {len(found)} nodes of type {kind}, one is allowed; {AGAIN}")
+        shown = f" ({', '.join(printable(node.name) for node in found)})" if found else ""
+        raise ModelError(f"has {len(found)} nodes of type {kind}{shown}, one is allowed; export one network")
     return found[0]
 
 

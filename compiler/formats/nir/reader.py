@@ -15,11 +15,11 @@ from spikeloom.compiler.dynamics import MOST_STEPS, RELAY_WEIGHT, Clocks
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import decay_registers, kept_shares
 from spikeloom.compiler.formats.affine import scaled, shifted
-from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble, class_of_each, in_order
+from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble, by_depth, class_of_each
 from spikeloom.compiler.formats.hdf5 import read_hdf5
 from spikeloom.compiler.formats.names import named, printable, unique_names
 from spikeloom.compiler.formats.nir import CONVENTIONS
-from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, graph_of, loops
+from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, graph_of, loops, only
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
 from spikeloom.compiler.formats.nir.stages import (
     ALWAYS,
@@ -81,7 +81,7 @@ def network_of(
     graph: Graph, steps: Steps, polarities: int | None = None, polarities_first: bool | None = None
 ) -> ReadNetwork[Network]:
     """Network of a graph that was read; parameters and errors as of :func:`read_nir`, without the path."""
-    entry, end = graph.one(INPUT_NODE), graph.one(OUTPUT_NODE)
+    entry, end = only(graph.nodes, INPUT_NODE), only(graph.nodes, OUTPUT_NODE)
     shape = tuple(entry.integers("shape").ravel().tolist()) if entry.has("shape") else ()
     if not shape or len(shape) > AXES or min(shape) < 1 or math.prod(shape) > ELEMENTS:
         raise entry.fail(f"has the shape {list(shape[:AXES])}, allowed are up to {ELEMENTS} values; export it again")
@@ -104,8 +104,7 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Neur
     for source, target in graph.edges:
         received[target].append(source)
     values: dict[str, Value] = {}
-    forward: list[Value] = []
-    spiking: list[Neurons] = []
+    spiking: list[tuple[Node, Value]] = []
     late = loops(graph)
     for name in nodes_in_order(graph, late):
         node = graph.nodes[name]
@@ -118,19 +117,18 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Neur
             value = added([values[source] for source in received[name] if source not in late.get(name, ())])
         if node.type in SPIKING:
             values[name] = spikes_of(len(spiking), value.shape)
-            spiking.append(_neurons(node, value, steps))
-            forward.append(value)
+            spiking.append((node, value))
         elif node.type in STAGES:
             values[name] = STAGES[node.type](node, value, steps)
         else:
             known = ", ".join(sorted([*SPIKING, *STAGES]))
             raise node.fail(KNOWN.get(node.type, f"is of a type that is not known here, known are {known}; replace it"))
-    for place, one in enumerate(spiking):
-        if one.node.name in late:
-            with named(one.node):
-                value = added([forward[place], *(values[source] for source in late[one.node.name])])
-            spiking[place] = _neurons(one.node, value, steps)
-    return spiking, values[graph.one(OUTPUT_NODE).name]
+    found = []
+    for node, value in spiking:
+        with named(node):
+            every = added([value, *(values[source] for source in late.get(node.name, ()))])
+        found.append(_neurons(node, every, steps))
+    return found, values[only(graph.nodes, OUTPUT_NODE).name]
 
 
 def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer], list[Sparse | None]]:
@@ -162,9 +160,7 @@ def _with_held(layers: list[Layer], held: list[Sparse | None], sensor: Input) ->
     lasting = [index for index, channel in enumerate(held) if channel is not None]
     if not lasting:
         return layers, sensor
-    depth: dict[int, int] = {INPUT: -1}
-    for index in in_order(layers):
-        depth[index] = max((depth[source] + 1 for source in layers[index].sources if source != index), default=0)
+    depth = {index: deep for deep, ready in enumerate(by_depth(layers)) for index in ready}
 
     def with_channel(size: int, weight: Sparse | None, channel: Sparse | None) -> Sparse:
         """Weights of the input into so many neurons, if there are any, and beside them those of the channel."""
