@@ -17,7 +17,7 @@ import pickle
 import re
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 import numpy as np
@@ -160,26 +160,21 @@ def _refuse(faults: list[str]) -> NoReturn:
 
 def _training(loaded: Mapping[str, Any], run: int, runs: int) -> JsonObject:
     """What the released script stored beside the weights, as JSON values; unknown where it is not as it wrote it."""
-    epochs = loaded.get("num_epochs")
     training: dict[str, Any] = {"runs": runs, "weights": "last epoch"}
-    if isinstance(epochs, int):
+    if isinstance(epochs := loaded.get("num_epochs"), int):
         training["epochs"] = epochs
-        accuracies = loaded.get("acc_list")  # the tensor of a run is listed once per epoch
-        if isinstance(accuracies, list | tuple) and 0 <= (run + 1) * epochs - 1 < len(accuracies):
-            last = _number(accuracies[(run + 1) * epochs - 1], -1)
-            if last is not None:
-                training["last_acc"] = last
-    best = _number(loaded.get("best_acc"), run)
-    if best is not None:
-        training["best_acc"] = best
-        training["best_acc_note"] = "of the best epoch on the test split, not of these weights"
+        # the tensor of a run is listed once per epoch
+        last = _number(lambda: loaded["acc_list"][(run + 1) * epochs - 1][-1])
+        training |= {} if last is None else {"last_acc": last}
+    if (best := _number(lambda: loaded["best_acc"][run])) is not None:
+        note = "of the best epoch on the test split, not of these weights"
+        training |= {"best_acc": best, "best_acc_note": note}
     return training
 
 
-def _number(values: Any, index: int) -> float | None:
-    import torch
-
-    if not isinstance(values, torch.Tensor) or values.dim() != 1 or not -len(values) <= index < len(values):
+def _number(find: Callable[[], Any]) -> float | None:
+    try:
+        number = round(float(find()), 4)
+    except Exception:  # what is not there, or no number
         return None
-    number = float(values[index])
-    return round(number, 4) if math.isfinite(number) else None
+    return number if math.isfinite(number) else None

@@ -14,13 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler import __version__
-from spikeloom.compiler.errors import ModelError
 
 OPSET = 17
 IR_VERSION = 8
-
-SIZE_LIMIT = 2**31 - 2**20
-"""Bytes of weights that a file of this format can hold, a little below protobuf's 2 GiB."""
 
 INNER = "step/"
 """Names inside the loop over steps start with this."""
@@ -106,15 +102,6 @@ def _type(kind: npt.DTypeLike) -> int:
     return int(_onnx().helper.np_dtype_to_tensor_dtype(np.dtype(kind)))
 
 
-def require_room(size: int) -> None:
-    """Refuse weights of more bytes than a file of this format can hold: ModelError."""
-    if size > SIZE_LIMIT:
-        raise ModelError(
-            f"onnx: the weights need {size} bytes as dense matrices, a file holds {SIZE_LIMIT}; "
-            "export a smaller network"
-        )
-
-
 def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes: int) -> Model:
     """The form ``scan`` of a form ``step``: a loop over its steps, as many more as the deepest layer lags behind.
 
@@ -133,7 +120,12 @@ def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes
     if drain:
         tail = graph.filled("tail", np.uint8(0), [np.array([drain]), "batch", np.array([channels])])
         sequence = graph.add("Concat", ["events", tail], "filled", axis=0)
-    begun = [_rest(graph, state) for state in states]
+    begun = [
+        graph.filled(f"{state.name}/rest", np.zeros((), state.kind), ["batch", np.array(state.shape[1:])])
+        if state.shape
+        else graph.constant(f"{state.name}/rest", np.zeros((), state.kind))
+        for state in states
+    ]
     kept = [Port(name=f"{name}/fired", kind=np.bool_, shape=("batch", size)) for name, (size, _) in layers.items()]
     body = nodes.graph("steps", [*states, inputs[0]], [*left, *kept])
     graph.nodes.append(
@@ -163,14 +155,6 @@ def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes
         found.append(Port(name="votes", kind=np.int32, shape=("batch", classes)))
         found.append(Port(name="class", kind=np.int64, shape=("batch",)))
     return graph, [Port(name="events", kind=np.uint8, shape=("time", "batch", channels))], found
-
-
-def _rest(graph: Nodes, state: Port) -> str:
-    """Zeros at the start of recordings, (batch, neurons) or a scalar."""
-    name, zero = f"{state.name}/rest", np.zeros((), state.kind)
-    if not state.shape:
-        return graph.constant(name, zero)
-    return graph.filled(name, zero, ["batch", np.array(state.shape[1:])])
 
 
 def _counted(graph: Nodes, name: str, size: int) -> str:

@@ -138,25 +138,14 @@ Matrix = Callable[[Node, Table, Sequence[Any], int], Sparse]
 """Of an operator, from the operand of that place, flat in C order; who asks for it adds the biases of Conv and Gemm."""
 
 
-def _matrix(out: Array, place: Array, weight: Array, shape: tuple[int, int]) -> Sparse:
-    """csr_array of the weights that are not zero, between broadcast positions; a position of -1 is no element."""
-    rows, columns, values = (flat.ravel() for flat in np.broadcast_arrays(out, place, weight))
-    kept = (values != 0) & (columns >= 0)
-    matrix = sparse.coo_array((values[kept].astype(np.float64), (rows[kept], columns[kept])), shape=shape).tocsr()
-    matrix.sum_duplicates()
-    matrix.sort_indices()
-    return matrix
-
-
-def _contract(table: Table, spelled: str, place: Array, weight: Array, columns: int) -> Sparse:
-    """Matrix of ``einsum("place,weight->out")``; `place` holds positions of the operand, -1 for none."""
-    (left, right), out = spelled.split("->", maxsplit=1)[0].split(","), spelled.split("->")[1]
-    if any(len(set(labels)) != len(labels) for labels in (left, right, out)) or not set(out) <= set(left + right):
+def _contract(table: Table, labels: Sequence[str], out: str, sides: Sequence[Array], which: int) -> Sparse:
+    """Matrix of the einsum of two sides by their labels; the side `which` holds positions of an operand."""
+    every = out + "".join(sorted({*labels[0], *labels[1]} - {*out}))
+    if any(len(set(each)) != len(each) for each in (*labels, out)) or not set(out) <= {*labels[0], *labels[1]}:
         raise ValueError("a sum that is not known")
-    every = out + "".join(sorted(set(left + right) - set(out)))
     sizes: dict[str, int] = {}
-    for labels, shape in ((left, place.shape), (right, weight.shape)):
-        for label, size in zip(labels, shape, strict=True):
+    for each, side in zip(labels, sides, strict=True):
+        for label, size in zip(each, side.shape, strict=True):
             if sizes.setdefault(label, size) != size:
                 raise ValueError("sizes that do not fit each other")
     table.room([sizes[label] for label in every], COEFFICIENT_LIMIT)
@@ -166,30 +155,34 @@ def _contract(table: Table, spelled: str, place: Array, weight: Array, columns: 
         return array.transpose(order).reshape([sizes[label] if label in labels else 1 for label in every])
 
     target = np.arange(math.prod([sizes[label] for label in out])).reshape([sizes[label] for label in out])
-    return _matrix(spread(target, out), spread(place, left), spread(weight, right), (target.size, columns))
+    parts = spread(target, out), *(spread(sides[place], labels[place]) for place in (which, 1 - which))
+    rows, columns, values = (flat.ravel() for flat in np.broadcast_arrays(*parts))
+    kept = values != 0
+    entries = values[kept].astype(np.float64), (rows[kept], columns[kept])
+    return sparse.coo_array(entries, shape=(target.size, int(sides[which].max(initial=-1)) + 1)).tocsr()
 
 
-def _positions(array: Array) -> Array:
-    return np.arange(array.size).reshape(array.shape)
+def _sides(operands: Sequence[Any], which: int) -> list[Array]:
+    """Operands, with positions in place of one."""
+    place = operands[which]
+    return [np.arange(place.size).reshape(place.shape) if each is place else each for each in operands]
 
 
 def _matmul_matrix(_node: Node, table: Table, operands: Sequence[Any], which: int) -> Sparse:
-    sides = [_positions(each) if place == which else each for place, each in enumerate(operands)]
+    sides = _sides(operands, which)
     sides[0] = sides[0][None] if sides[0].ndim == 1 else sides[0]
     sides[1] = sides[1][:, None] if sides[1].ndim == 1 else sides[1]
     batch = table.room(np.broadcast_shapes(sides[0].shape[:-2], sides[1].shape[:-2]))
     sides = [np.broadcast_to(each, table.room((*batch, *each.shape[-2:]))) for each in sides]
     letters = string.ascii_lowercase[: len(batch)]
-    labels = [f"{letters}yz", f"{letters}zx"]
-    spelled = f"{labels[which]},{labels[1 - which]}->{letters}yx"
-    return _contract(table, spelled, sides[which], sides[1 - which], operands[which].size)
+    return _contract(table, [f"{letters}yz", f"{letters}zx"], f"{letters}yx", sides, which)
 
 
 def _gemm_matrix(node: Node, table: Table, operands: Sequence[Any], which: int) -> Sparse:
     labels = ["zy" if node.attributes.get("transA", 0) else "yz", "xz" if node.attributes.get("transB", 0) else "zx"]
-    weight = node.attributes.get("alpha", 1.0) * operands[1 - which]
-    spelled = f"{labels[which]},{labels[1 - which]}->yx"
-    return _contract(table, spelled, _positions(operands[which]), weight, operands[which].size)
+    sides = _sides(operands, which)
+    sides[1 - which] = node.attributes.get("alpha", 1.0) * sides[1 - which]
+    return _contract(table, labels, "yx", sides, which)
 
 
 def _einsum_matrix(node: Node, table: Table, operands: Sequence[Any], which: int) -> Sparse:
@@ -197,10 +190,8 @@ def _einsum_matrix(node: Node, table: Table, operands: Sequence[Any], which: int
     if "->" not in spelled or "." in spelled or spelled.count(",") > 1:
         raise ValueError("an equation that is not known")
     inputs, out = spelled.split("->")
-    labels = [*inputs.split(","), ""]
-    weight = operands[1 - which] if len(operands) == 2 else np.array(1.0)
-    spelled = f"{labels[which]},{labels[1 - which]}->{out}"
-    return _contract(table, spelled, _positions(operands[which]), weight, operands[which].size)
+    labels, sides = inputs.split(","), _sides(operands, which)
+    return _contract(table, [*labels, ""][:2], out, [*sides, np.array(1.0)][:2], which)
 
 
 def _reduce_axes(node: Node, operands: Sequence[Any]) -> tuple[int, ...]:
@@ -218,7 +209,7 @@ def _reduce_matrix(node: Node, table: Table, operands: Sequence[Any], _which: in
     letters = string.ascii_lowercase[: len(shape)]
     out = "".join(label for axis, label in enumerate(letters) if axis not in axes)
     share = 1.0 if node.op == "ReduceSum" else 1 / math.prod([shape[axis] for axis in axes])
-    return _contract(table, f"{letters},->{out}", _positions(operands[0]), np.array(share), operands[0].size)
+    return _contract(table, [letters, ""], out, [_sides(operands[:1], 0)[0], np.array(share)], 0)
 
 
 def _conv_matrix(node: Node, table: Table, operands: Sequence[Any], _which: int) -> Sparse:

@@ -330,12 +330,7 @@ def _require_like(layer: list[Neurons], step: int, every: list[dict[int, Sparse]
 
 
 def _equal(first: Sparse, second: Sparse) -> bool:
-    return first is second or (
-        first.shape == second.shape
-        and np.array_equal(first.indptr, second.indptr)
-        and np.array_equal(first.indices, second.indices)
-        and np.allclose(first.data, second.data, rtol=EQUAL, atol=0)
-    )
+    return first is second or (first.shape == second.shape and not (abs(first - second) > EQUAL * abs(first)).nnz)
 
 
 def readout(table: Table, found: Unrolled, outputs: Mapping[str, Affine]) -> tuple[int, IntArray, str]:

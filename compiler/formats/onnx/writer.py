@@ -51,7 +51,6 @@ from spikeloom.compiler.formats.onnx.builder import (
     Port,
     model_bytes,
     one_each,
-    require_room,
     whole_recordings,
 )
 from spikeloom.compiler.ir import INPUT
@@ -61,6 +60,9 @@ from spikeloom.compiler.types import IntArray
 FORMS = ("step", "scan")
 
 ONE = 2**DECAY_BITS
+SIZE_LIMIT = 2**31 - 2**20
+"""Bytes of weights that a file of this format can hold, a little below protobuf's 2 GiB."""
+
 NARROW = 2**31 - 1
 """Largest number of an int32 layer."""
 
@@ -135,7 +137,10 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
     pairs = np.unique(np.stack([post, pre], axis=1), axis=0)
     place = netlist.number_in_layer()
     counts = {INPUT: netlist.n_inputs} | dict(enumerate(np.bincount(netlist.layer, minlength=len(names)).tolist()))
-    require_room(sum(counts[a] * counts[b] for b, a in pairs.tolist()))
+    if (size := sum(counts[a] * counts[b] for b, a in pairs.tolist())) > SIZE_LIMIT:
+        raise ModelError(
+            f"onnx: dense, the weights need {size} bytes, a file holds {SIZE_LIMIT}; export a smaller network"
+        )
     row = np.append(np.arange(netlist.n_inputs), place)[netlist.axon_source[axon]]
 
     def weights(a: int, b: int) -> IntArray:
