@@ -7,7 +7,7 @@ receives what it fired in the step before. The integer stage is exact.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
@@ -52,8 +52,8 @@ class Layer:
 
     pres: tuple[int, ...]
     size: int
-    kernel: Callable[..., None]
-    fixed: tuple[Any, ...]  # What the kernel takes between the raster of `pres` and what it fills
+    # What :func:`layer_kernel.run_layer` takes between the raster of `pres` and what it fills
+    fixed: tuple[Any, ...]
 
     def run(
         self, sources: Sequence[BoolArray], *, membranes: bool = False
@@ -62,7 +62,7 @@ class Layer:
         shape = *sources[0].shape[:2], self.size
         spikes, kept = np.empty(shape, np.bool_), np.empty(shape if membranes else _NONE, self._kind)
         moved = np.zeros((2, 0), np.int32)
-        self.kernel(raster(sources), *self.fixed, spikes.view(np.uint8), kept, np.empty(_NONE, np.uint8), moved)
+        self._run(raster(sources), spikes.view(np.uint8), kept, np.empty(_NONE, np.uint8), moved)
         return spikes, kept if membranes else None
 
     def moved(self, sources: Raster, wanted: npt.NDArray[np.uint8]) -> npt.NDArray[np.int32]:
@@ -71,8 +71,13 @@ class Layer:
         `wanted` (samples, steps, bytes) has a bit for each neuron, the first lowest.
         """
         moved, fired = np.zeros((2, self.size), np.int32), np.empty((1, 2, self.size), np.uint8)
-        self.kernel(sources, *self.fixed, fired, np.empty(_NONE, self._kind), np.ascontiguousarray(wanted), moved)
+        self._run(sources, fired, np.empty(_NONE, self._kind), np.ascontiguousarray(wanted), moved)
         return moved
+
+    def _run(self, *arrays: Any) -> None:
+        from spikeloom.compiler.layer_kernel import run_layer
+
+        run_layer(arrays[0], *self.fixed, *arrays[1:])
 
     @property
     def _kind(self) -> np.dtype[Any]:
@@ -97,12 +102,9 @@ def float_layer(
 
     Without `loops` what it receives from itself comes from outside, too, as from other populations.
     """
-    from spikeloom.compiler import layer_kernel
-
-    constants = np.array([population.alpha, population.beta, population.theta], dtype)
+    registers = tuple(np.array([population.alpha, population.beta, population.theta], dtype))
     pres, synapses = _synapses([(p, p.weight) for p in projections], dtype, loops=loops)
-    fixed = *synapses, population.bias.astype(dtype), *constants
-    return Layer(pres=pres, size=population.size, kernel=layer_kernel.float_layer, fixed=fixed)
+    return Layer(pres=pres, size=population.size, fixed=(*synapses, population.bias.astype(dtype), registers))
 
 
 def integer_layer(
@@ -117,8 +119,6 @@ def integer_layer(
     With `saturates` off the membrane has no limits, which tells what saturation does; `loops` as of
     :func:`float_layer`.
     """
-    from spikeloom.compiler import layer_kernel
-
     keep_u, keep_v = (round(kept * DECAY_ONE) for kept in (population.realised_alpha, population.realised_beta))
     weights = [(p, p.effective()) for p in projections]
     largest = sum(abs(weight).sum(axis=1).max(initial=0) for _, weight in weights) << MEMBRANE_SHIFT
@@ -128,8 +128,8 @@ def integer_layer(
     limit = MEMBRANE_MAX if saturates else 2**62
     pres, synapses = _synapses(weights, dtype, loops=loops)
     threshold = (population.threshold << MEMBRANE_SHIFT).astype(dtype)
-    fixed = *synapses, population.bias.astype(dtype), threshold, *(dtype(value) for value in (keep_u, keep_v, limit))
-    return Layer(pres=pres, size=population.size, kernel=layer_kernel.integer_layer, fixed=fixed)
+    registers = threshold, *(dtype(value) for value in (keep_u, keep_v, limit))
+    return Layer(pres=pres, size=population.size, fixed=(*synapses, population.bias.astype(dtype), registers))
 
 
 def _synapses(

@@ -221,58 +221,10 @@ def integrate_float(membrane: Any, current: Any, bias: Any, beta: Any, theta: An
         fired[i] = u > theta
 
 
-@compiled_and_cached
-def float_layer(
-    raster: Any,
-    synapses: Any,
-    own: Any,
-    bias: Any,
-    alpha: Any,
-    beta: Any,
-    theta: Any,
-    fired: Any,
-    membranes: Any,
-    wanted: Any,
-    moved: Any,
-) -> None:
-    """Run the recordings of a raster in the float type of all arguments, each from rest.
-
-    `fired` (recordings, steps, neurons) uint8 is filled, and `membranes`, likewise and before the reset, unless it is
-    empty. Unless `wanted`, the same at a bit a neuron, is empty, `moved` (2, neurons) int32 counts in which entries a
-    neuron differs from it, and the spikes that it has more; `fired` then needs one recording of two steps, no more.
-    """
-    recordings, steps = (wanted if len(wanted) else fired).shape[:2]
-    kept, last, size = fired.shape
-    before = np.empty(size, np.int32)
-    membrane, current = np.zeros(size, bias.dtype), np.zeros(size, bias.dtype)
-    least = bias.dtype.type(DENORMAL)
-    for recording in range(recordings):
-        membrane[:] = 0
-        current[:] = 0
-        for t in range(steps):
-            if alpha:
-                keep(current, alpha)
-            else:
-                current[:] = 0
-            at, now = recording * steps + t, fired[recording % kept, t % last]
-            arrive(current, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
-            if len(own.run) and t:
-                arrive(current, own, before, 0, list_fired(fired[recording % kept, (t - 1) % last], before))
-            integrate_float(membrane, current, bias, beta, theta, now)
-            if len(membranes):
-                copy(membrane, membranes[recording, t])
-            if len(wanted):
-                _compare(now, wanted[recording, t], moved[0], moved[1])
-            if t % 16 == 15:
-                flush(membrane, least)
-                flush(current, least)
-
-
 @compiled
-def _integrate_integer(
-    membrane: Any, current: Any, sums: Any, bias: Any, threshold: Any, keep_u: Any, keep_v: Any, limit: Any, fired: Any
-) -> None:
+def _integrate_integer(membrane: Any, current: Any, sums: Any, bias: Any, registers: Any, fired: Any) -> None:
     # every result is cast: otherwise they are 64 bits wide, and half as many fit a vector
+    threshold, keep_u, keep_v, limit = registers
     kind = membrane.dtype.type
     zero, low = kind(0), kind(2**DECAY_BITS - 1)
     for i in range(len(bias)):
@@ -294,24 +246,25 @@ def _integrate_integer(
 
 
 @compiled_and_cached
-def integer_layer(
+def run_layer(
     raster: Any,
     synapses: Any,
     own: Any,
     bias: Any,
-    threshold: Any,
-    keep_u: Any,
-    keep_v: Any,
-    limit: Any,
+    registers: Any,
     fired: Any,
     membranes: Any,
     wanted: Any,
     moved: Any,
 ) -> None:
-    """Run the recordings of a raster in registers of the integer type of all arguments, each from rest.
+    """Run the recordings of a raster in the number type of `bias`, each from rest.
 
-    `bias` and `threshold` are in membrane units, `keep_u` and `keep_v` in 1/4096, and no membrane passes `limit`. What
-    is filled is as for :func:`float_layer`.
+    `registers` are the alpha, beta and theta of floats. Of integers they are the thresholds, in membrane units as
+    `bias` is, the shares that current and membrane keep, in 1/4096, and what no membrane passes.
+
+    `fired` (recordings, steps, neurons) uint8 is filled, and `membranes`, likewise and before the reset, unless it is
+    empty. Unless `wanted`, the same at a bit a neuron, is empty, `moved` (2, neurons) int32 counts in which entries a
+    neuron differs from it, and the spikes that it has more; `fired` then needs one recording of two steps, no more.
     """
     recordings, steps = (wanted if len(wanted) else fired).shape[:2]
     kept, last, size = fired.shape
@@ -321,13 +274,25 @@ def integer_layer(
         membrane[:] = 0
         current[:] = 0
         for t in range(steps):
-            sums[:] = 0
+            # how many registers there are is known when this is compiled: only one branch is
+            if len(registers) == 3:
+                arriving = current
+                keep(current, registers[0])
+            else:
+                arriving = sums
+                sums[:] = 0
             at, now = recording * steps + t, fired[recording % kept, t % last]
-            arrive(sums, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
+            arrive(arriving, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
             if len(own.run) and t:
-                arrive(sums, own, before, 0, list_fired(fired[recording % kept, (t - 1) % last], before))
-            _integrate_integer(membrane, current, sums, bias, threshold, keep_u, keep_v, limit, now)
+                arrive(arriving, own, before, 0, list_fired(fired[recording % kept, (t - 1) % last], before))
+            if len(registers) == 3:
+                integrate_float(membrane, current, bias, registers[1], registers[2], now)
+            else:
+                _integrate_integer(membrane, current, sums, bias, registers, now)
             if len(membranes):
                 copy(membrane, membranes[recording, t])
             if len(wanted):
                 _compare(now, wanted[recording, t], moved[0], moved[1])
+            if len(registers) == 3 and t % 16 == 15:
+                flush(membrane, membrane.dtype.type(DENORMAL))
+                flush(current, current.dtype.type(DENORMAL))

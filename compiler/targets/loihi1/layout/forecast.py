@@ -209,13 +209,22 @@ class _Search:
                 self._cuts[key] = chunks, slowest, self.needs.source_axons(chunks)
         return self._cuts[key]
 
-    def attempt(self, least: dict[int, int]) -> Trial | None:
-        """Judge the cut into so many chunks, or None if there is no such cut."""
+    def attempt(self, counts: dict[int, int], allowed: float | None = None) -> Trial | None:
+        """Judge the cut into so many chunks, or None if there is no such cut.
+
+        Where a mean time is `allowed`, a layer whose slowest chunk takes longer is cut into more.
+        """
         self.needs.forget()
         chunks: list[Chunk] = []
         times = {}
-        for population in sorted(least, reverse=True):
-            found = self._cut(population, least[population])
+        for population in sorted(counts, reverse=True):
+            count = counts[population]
+            found = self._cut(population, count)
+            while allowed is not None and (found is None or found[1].mean() > allowed):
+                more = self._near(population, count, 1)
+                if more is None:
+                    return None
+                count, found = more, self._cut(population, more)
             if found is None:
                 return None
             chunks += found[0]
@@ -244,17 +253,7 @@ class _Search:
         trial = self.attempt(chunks_of(cut(self.needs, {})))
         while trial is not None and trial.longest > 0:
             trials.append(trial)
-            allowed = trial.longest * SHORTER
-            counts = chunks_of(trial.chunks)
-            self.needs.forget()
-            for population in sorted(counts, reverse=True):
-                while (found := self._cut(population, counts[population])) is None or found[1].mean() > allowed:
-                    more = self._near(population, counts[population], 1)
-                    if more is None:
-                        return trials
-                    counts[population] = more
-                self.needs.charge(found[2])
-            trial = self.attempt(counts)
+            trial = self.attempt(chunks_of(trial.chunks), trial.longest * SHORTER)
         return trials
 
     def polish(self, trial: Trial) -> Trial:
