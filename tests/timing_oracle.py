@@ -16,8 +16,8 @@ from spikeloom.compiler.targets.base import Target, TimeTable
 from spikeloom.compiler.targets.loihi1.layout.place import hops
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray
+from spikeloom.runtime.machines.base import EventArray
 from spikeloom.runtime.machines.loihi1.costs import cost
-from spikeloom.runtime.machines.loihi1.engine import EventArray
 from spikeloom.runtime.machines.loihi1.timing import SimpleTimes, simple_times
 from spikeloom.runtime.machines.loihi1.timing_kernel import Tables
 

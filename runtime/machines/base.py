@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
@@ -22,9 +22,10 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.archive import TRAINED, stated
+from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.interpret import vote
-from spikeloom.compiler.targets.base import Target, load_target
+from spikeloom.compiler.targets.base import Target, load_target, with_tables
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
@@ -34,6 +35,9 @@ from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
 
 EventArray = npt.NDArray[np.uint8 | np.bool_]
+
+Done = Callable[[int], object] | None
+"""Called with the number of recordings done."""
 
 T = TypeVar("T", bound=np.generic)
 
@@ -113,6 +117,29 @@ def one_by_one(channels: EventArray, lengths: IntArray | None) -> Iterator[Event
         yield each if lengths is None else each[:, : lengths[index]]
 
 
+def differences(slow: Any, fast: Any) -> int:
+    """Entries of a trace and its counts that differ where `slow` has any; `fast` is a batch of the one recording."""
+    found = 0
+    for name, one in ((field.name, getattr(slow, field.name)) for field in fields(slow)):
+        batch = getattr(fast, name)
+        if is_dataclass(one):
+            found += differences(one, batch)
+        elif one is not None:
+            found += int(np.count_nonzero(one != batch[0]))
+    return found
+
+
+def require_channels(netlist: Netlist, channels: int) -> None:
+    """Raise DataError unless recordings of so many input channels fit the network."""
+    if channels != netlist.n_inputs:
+        ticking = netlist.clocks.channels
+        clocks = f", {ticking} of them clocks (spikeloom.compiler.dynamics.with_clocks)" if ticking else ""
+        raise DataError(
+            f"recordings: {channels} input channels found, the netlist has {netlist.n_inputs}{clocks}; "
+            "use recordings of the sensor that the network was compiled for"
+        )
+
+
 class Stream(Protocol):
     """State of one grasp on one sensor."""
 
@@ -155,12 +182,6 @@ class Machine(ABC):
     def kernel(self) -> str:
         """How the simulator goes through a recording, in a few words."""
 
-    def require_detail(self, detail: str) -> None:
-        """Refuse a depth that the chip's price model has not; the OptionError names those that it has."""
-        if detail not in self.details:
-            allowed = ", ".join(self.details)
-            raise OptionError(f"--detail {detail}: {self.netlist.target} has no such price model; allowed: {allowed}")
-
     @abstractmethod
     def legal(self) -> None:
         """Hold the netlist against every limit of the chip; the SpikeloomError names each that it breaks."""
@@ -169,8 +190,22 @@ class Machine(ABC):
     def of_layer(self, array: npt.NDArray[T], index: int) -> npt.NDArray[T]:
         """Cut one layer out of spikes or membranes of a trace, (samples, steps, neurons)."""
 
-    def _run(self, trace: Any, voting: IntArray) -> Run:
-        """What a trace comes to; `voting` are the spikes of each neuron that count as votes."""
+    @abstractmethod
+    def simulate(self, channels: EventArray, lengths: IntArray | None, *, spikes: bool, membranes: bool) -> Any:
+        """Trace of recordings (samples, channels, steps), clocks among the channels; the rest is as for :meth:`run`."""
+
+    @abstractmethod
+    def twice(self, channels: EventArray) -> tuple[Any, Any]:
+        """All that the specification keeps of one recording (channels, steps), and a batch of it by the simulator."""
+
+    @abstractmethod
+    def priced(
+        self, channels: EventArray, lengths: IntArray | None, chip: Target, bin_s: float, detail: str, progress: Done
+    ) -> tuple[Any, Price]:
+        """Trace and price of recordings (samples, channels, steps), by the tables of a chip; see :meth:`price`."""
+
+    def _run(self, trace: Any) -> Run:
+        """What a trace comes to."""
 
         def by_layer(array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]] | None:
             if array is None:
@@ -178,13 +213,12 @@ class Machine(ABC):
             return {name: self.of_layer(array, index) for index, name in enumerate(self.layers)}
 
         return Run(
-            votes=class_counts(self.netlist, voting),
+            votes=class_counts(self.netlist, trace.counts.votes),
             counts=trace.counts.spikes,
             spikes=by_layer(trace.spikes),
             membranes=by_layer(trace.membranes),
         )
 
-    @abstractmethod
     def run(
         self,
         events: EventArray,
@@ -199,12 +233,13 @@ class Machine(ABC):
         themselves. `lengths` (samples,) are the data steps of each; `spikes` and `membranes` say what to keep. Raises
         DataError for another sensor, NumericRangeError where a register overflows.
         """
+        channels = with_clocks(events, self.netlist.clocks)
+        return self._run(self.simulate(channels, lengths, spikes=spikes, membranes=membranes))
 
     def parts(self, recordings: int, steps: int) -> Iterator[slice]:
         """Recordings of so many data steps, some at a time: spikes that are held do not grow with their number."""
         return parts_of(recordings, steps * len(self.netlist.readout_class))
 
-    @abstractmethod
     def price(
         self,
         events: EventArray,
@@ -213,7 +248,7 @@ class Machine(ABC):
         lengths: IntArray | None = None,
         detail: str = "counts",
         table: str | None = None,
-        progress: Callable[[int], object] | None = None,
+        progress: Done = None,
     ) -> tuple[Run, Price]:
         """Run recordings as :meth:`run` does, keep no spikes, and price them.
 
@@ -221,10 +256,18 @@ class Machine(ABC):
         table of prices or a TOML file with some; `progress` is called with the number of recordings done. Raises
         OptionError if there is no such table or detail.
         """
+        if detail not in self.details:
+            allowed = ", ".join(self.details)
+            raise OptionError(f"--detail {detail}: {self.netlist.target} has no such price model; allowed: {allowed}")
+        chip = self.target if table is None else with_tables(self.target, table)
+        channels = with_clocks(events, self.netlist.clocks)
+        trace, price = self.priced(channels, lengths, chip, bin_s, detail, progress)
+        return self._run(trace), price
 
-    @abstractmethod
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Spikes, membranes and counts in which simulator and specification differ; events and lengths as for `run`."""
+        channels = with_clocks(events, self.netlist.clocks)
+        return sum(differences(*self.twice(sample)) for sample in one_by_one(channels, lengths))
 
     def beside(self, engine: str) -> Callable[[EventArray, IntArray | None], int] | None:
         """Make one of ``ENGINES`` ready to run recordings of some lengths; None for our own.

@@ -10,7 +10,6 @@ state by any number of chip steps.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ import numpy.typing as npt
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.runtime.machines.base import Done, EventArray, require_channels
 from spikeloom.runtime.machines.loihi1.block_kernel import CHARGES, Blocks, add_charges, run_recordings
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.kernel import State, Tables, chip_steps, state_of, tables_of
@@ -30,13 +30,11 @@ from spikeloom.runtime.machines.loihi1.trace import (
     Counts,
     MembraneArray,
     Trace,
-    check_channels,
     pack,
     range_error,
     unpack,
 )
 
-EventArray = npt.NDArray[np.uint8 | np.bool_]
 WordArray = npt.NDArray[np.uint64]
 
 PART = 4
@@ -82,7 +80,7 @@ def advance(
     :class:`trace.Trace`. Raises DataError and NumericRangeError as :func:`spec.simulate` does, with the same message;
     after that the state is of no further use.
     """
-    check_channels(engine.netlist, events.shape[0])
+    require_channels(engine.netlist, events.shape[0])
     assert engine.tables is not None, "single steps need prepare(netlist, stepwise=True)"
     n = engine.netlist.n_compartments
     step, compartment, register, value = chip_steps(
@@ -110,7 +108,7 @@ def simulate(
     packed: bool = False,
     charges: Charges | None = None,
     threads: int | None = None,
-    progress: Callable[[int], object] | None = None,
+    progress: Done = None,
 ) -> Trace:
     """Run a batch of recordings (recordings, n_inputs, T) uint8 or bool, each from rest; the trace has a leading axis.
 
@@ -125,7 +123,7 @@ def simulate(
     """
     engine = netlist if isinstance(netlist, Engine) else prepare(netlist)
     netlist = engine.netlist
-    check_channels(netlist, events.shape[1])
+    require_channels(netlist, events.shape[1])
     recordings, _, length = events.shape
     shape = (recordings, length + netlist.max_depth, netlist.n_compartments)
     trace = Trace(

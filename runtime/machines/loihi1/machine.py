@@ -13,16 +13,16 @@ import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.ir import IntegerNetwork
-from spikeloom.compiler.targets.base import with_tables
+from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.machines.base import EventArray, Price, Run, T, one_by_one
+from spikeloom.runtime.machines.base import Done, EventArray, Price, T
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.stream import Stream
-from spikeloom.runtime.machines.loihi1.trace import aligned, differences
+from spikeloom.runtime.machines.loihi1.trace import Trace, aligned
 from spikeloom.runtime.report.sections import Block, Outcome
 
 if TYPE_CHECKING:
@@ -69,28 +69,16 @@ class Loihi(IntegerMachine):
         """Refuse a netlist that uses too much of a limit."""
         require_legal(self.netlist, self.target)
 
-    def run(
-        self,
-        events: EventArray,
-        *,
-        lengths: IntArray | None = None,
-        spikes: bool = False,
-        membranes: bool = False,
-    ) -> Run:
-        """Decisions, and spikes as the float model counts time."""
-        channels = with_clocks(events, self.netlist.clocks)
-        trace = engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
-        return self._run(trace, trace.counts.spikes)
+    def simulate(self, channels: EventArray, lengths: IntArray | None, *, spikes: bool, membranes: bool) -> Trace:
+        """Spikes and membranes by chip step."""
+        return engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
 
-    def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
-        """Every spike, membrane, update and count, one recording after another."""
+    def twice(self, channels: EventArray) -> tuple[Trace, Trace]:
+        """Every spike, membrane, update and count."""
         from spikeloom.runtime.machines.loihi1 import spec
 
-        def found(sample: EventArray) -> int:
-            fast = engine.simulate(self._engine, sample[None], spikes=True, membranes=True, updated=True)
-            return differences(spec.simulate(self.netlist, sample), fast)
-
-        return sum(map(found, one_by_one(with_clocks(events, self.netlist.clocks), lengths)))
+        fast = engine.simulate(self._engine, channels[None], spikes=True, membranes=True, updated=True)
+        return spec.simulate(self.netlist, channels), fast
 
     def beside(self, engine: str) -> Callable[[EventArray, IntArray | None], int] | None:
         """The integer graph in onnxruntime."""
@@ -144,33 +132,17 @@ class Loihi(IntegerMachine):
 
         return page.figures(price.outcome.result)
 
-    def price(
-        self,
-        events: EventArray,
-        *,
-        bin_s: float,
-        lengths: IntArray | None = None,
-        detail: str = "counts",
-        table: str | None = None,
-        progress: Callable[[int], object] | None = None,
-    ) -> tuple[Run, Price]:
-        """Decisions and costs, of the cores' tiles and times too."""
+    def priced(
+        self, channels: EventArray, lengths: IntArray | None, chip: Target, bin_s: float, detail: str, progress: Done
+    ) -> tuple[Trace, Price]:
+        """Costs, of the cores' tiles and times too."""
         from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
         from spikeloom.runtime.machines.loihi1.costs.result import cost_report
         from spikeloom.runtime.machines.loihi1.costs.sections import sections
 
-        self.require_detail(detail)
-        chip = self.target if table is None else with_tables(self.target, table)
-        trace, found = estimate(
-            self._engine,
-            chip,
-            with_clocks(events, self.netlist.clocks),
-            lengths=lengths,
-            detail=detail,
-            progress=progress,
-        )
+        trace, found = estimate(self._engine, chip, channels, lengths=lengths, detail=detail, progress=progress)
         report = cost_report(self.netlist, chip, found, bin_s=bin_s * self.netlist.bins)
-        return self._run(trace, trace.counts.spikes), Price(
+        return trace, Price(
             synaptic_operations=found.costs.synaptic_operations.sum(axis=1),
             energy_j={name: each.sum(axis=1) for name, each in found.costs.energy.items()},
             time_s={name: times.seconds for name, times in found.simple.items()},

@@ -14,9 +14,9 @@ from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.formats.onnx.writer import Layer, plan
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.runtime.machines.base import EventArray, require_channels
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.engine import Engine, EventArray
-from spikeloom.runtime.machines.loihi1.trace import check_channels
+from spikeloom.runtime.machines.loihi1.engine import Engine
 from spikeloom.runtime.machines.votes import class_counts
 
 PART = 16
@@ -58,7 +58,7 @@ def simulate(
     classes) that the graph counts. Raises DataError if the recordings have other channels than the network.
     """
     netlist = prepared.netlist
-    check_channels(netlist, events.shape[1])
+    require_channels(netlist, events.shape[1])
     recordings, _, length = events.shape
     spikes = np.zeros((recordings, length + netlist.max_depth, netlist.n_compartments), np.bool_)
     votes = np.zeros((recordings, netlist.classes), np.int64)

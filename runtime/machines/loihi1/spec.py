@@ -32,7 +32,8 @@ import numpy.typing as npt
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, IntArray
-from spikeloom.runtime.machines.loihi1.trace import Counts, Trace, check_channels, range_error
+from spikeloom.runtime.machines.base import require_channels
+from spikeloom.runtime.machines.loihi1.trace import Counts, Trace, range_error
 
 DECAY_ONE: int = 2**DECAY_BITS  # decay registers count in 1/4096
 UNIT: int = 2**MEMBRANE_SHIFT  # a weight or a threshold of one, in membrane units
@@ -80,7 +81,7 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trac
     the first register that would overflow: the lowest chip step, then the lowest compartment id, the synaptic sum
     before the current.
     """
-    check_channels(netlist, events.shape[0])
+    require_channels(netlist, events.shape[0])
     n_inputs, length = events.shape
     neurons, chip_steps = netlist.n_compartments, length + netlist.max_depth
     synapses = read_synapses(netlist)

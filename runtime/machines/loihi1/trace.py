@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.errors import DataError, NumericRangeError
+from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, IntArray
@@ -35,6 +35,11 @@ class Counts:
     # (whatever the weight), or its bias is not zero
     updates: IntArray
     saturations: IntArray  # (…, layers) int64; compartment-steps whose membrane was clipped to its register
+
+    @property
+    def votes(self) -> IntArray:
+        """Spikes that count where a compartment votes: all."""
+        return self.spikes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,24 +105,6 @@ def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArra
     whole = np.zeros((*held.shape[:-1], netlist.layers[layer].neurons), held.dtype)
     whole[..., netlist.neuron[ids]] = held
     return whole
-
-
-def differences(slow: Trace, fast: Trace) -> int:
-    """Spikes, membranes, updates and counts that differ; `fast` is a batch of the one recording."""
-    pairs = [(getattr(slow, name), getattr(fast, name)) for name in ("spikes", "membranes", "updated")]
-    pairs += [(getattr(slow.counts, name), getattr(fast.counts, name)) for name in Counts.__slots__]
-    return sum(int(np.count_nonzero(one != batch[0])) for one, batch in pairs)
-
-
-def check_channels(netlist: Netlist, channels: int) -> None:
-    """Raise DataError unless recordings of so many input channels fit the network."""
-    if channels != netlist.n_inputs:
-        ticking = netlist.clocks.channels
-        clocks = f", {ticking} of them clocks (spikeloom.compiler.dynamics.with_clocks)" if ticking else ""
-        raise DataError(
-            f"recordings: {channels} input channels found, the netlist has {netlist.n_inputs}{clocks}; "
-            "use recordings of the sensor that the network was compiled for"
-        )
 
 
 def range_error(netlist: Netlist, register: str, compartment: int, chip_step: int, value: int) -> NumericRangeError:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler import __version__
+from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.ir import Network
@@ -180,7 +181,7 @@ def compare(
     for index in range(len(data)):
         count(index, "comparing")
         events = data.events[index : index + 1, ..., : data.steps_of(index)]
-        trace = machine.simulate(events, spikes=True)
+        trace = machine.simulate(with_clocks(events, netlist.clocks), spikes=True)
         assert trace.spikes is not None, "spikes are kept"
         expected = model(events[0])
         steps = events.shape[-1]

@@ -13,8 +13,9 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.legalize import signed_range
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO, CrossbarNetlist
 from spikeloom.compiler.types import IntArray
+from spikeloom.runtime.machines.base import EventArray, require_channels
 from spikeloom.runtime.machines.truenorth import kernel
-from spikeloom.runtime.machines.truenorth.spec import Counts, EventArray, Trace, check_channels
+from spikeloom.runtime.machines.truenorth.spec import Counts, Trace
 from spikeloom.runtime.machines.truenorth.twins import Twins, find_twins
 
 LONGEST_GAP = 8
@@ -177,7 +178,7 @@ def simulate(
     """
     engine = network if isinstance(network, Engine) else prepare(network)
     netlist = engine.netlist
-    check_channels(netlist, events.shape[1])
+    require_channels(netlist, events.shape[1])
     samples, _, whole = events.shape
     steps = np.full(samples, whole) if lengths is None else np.asarray(lengths, np.int64)
     most = netlist.ticks(whole)

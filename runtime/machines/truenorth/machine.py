@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NoReturn
 
 import numpy.typing as npt
 
-from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.targets.base import with_tables
+from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars
 from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.machines.base import EventArray, Machine, Price, Run, T, one_by_one
+from spikeloom.runtime.machines.base import Done, EventArray, Machine, Price, T
 from spikeloom.runtime.machines.truenorth import cost, engine, spec
-from spikeloom.runtime.machines.truenorth.spec import Trace, differences
+from spikeloom.runtime.machines.truenorth.spec import Trace
 
 
 @dataclass(frozen=True)
@@ -47,41 +45,23 @@ class TrueNorth(Machine):
         """Refuse a netlist that breaks a rule."""
         require_legal(self.netlist, self.target)
 
-    def run(
-        self,
-        events: EventArray,
-        *,
-        lengths: IntArray | None = None,
-        spikes: bool = False,
-        membranes: bool = False,
-    ) -> Run:
-        """Decisions, and spikes by tick."""
-        trace = self.simulate(events, lengths, spikes=spikes, membranes=membranes)
-        return self._run(trace, trace.counts.votes)
+    def simulate(
+        self, channels: EventArray, lengths: IntArray | None = None, *, spikes: bool, membranes: bool = False
+    ) -> Trace:
+        """Spikes and membranes by tick."""
+        return engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
 
-    def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
-        """Every spike, membrane, vote and spike on an axon, one recording after another."""
-        found = 0
-        for sample in one_by_one(with_clocks(events, self.netlist.clocks), lengths):
-            fast = engine.simulate(self._engine, sample[None], spikes=True, membranes=True)
-            found += differences(spec.simulate(self.netlist, sample), fast)
-        return found
+    def twice(self, channels: EventArray) -> tuple[Trace, Trace]:
+        """Every spike, membrane, vote and spike on an axon."""
+        fast = engine.simulate(self._engine, channels[None], spikes=True, membranes=True)
+        return spec.simulate(self.netlist, channels), fast
 
-    def price(
-        self,
-        events: EventArray,
-        *,
-        bin_s: float,
-        lengths: IntArray | None = None,
-        detail: str = "counts",
-        table: str | None = None,
-        progress: Callable[[int], object] | None = None,
-    ) -> tuple[Run, Price]:
-        """Decisions and costs."""
-        self.require_detail(detail)
-        chip = self.target if table is None else with_tables(self.target, table)
-        trace = self.simulate(events, lengths, spikes=False)
-        return self._run(trace, trace.counts.votes), cost.price(self.netlist, chip, trace.counts, bin_s)
+    def priced(
+        self, channels: EventArray, lengths: IntArray | None, chip: Target, bin_s: float, detail: str, progress: Done
+    ) -> tuple[Trace, Price]:
+        """By synaptic events and ticks."""
+        trace = self.simulate(channels, lengths, spikes=False)
+        return trace, cost.price(self.netlist, chip, trace.counts, bin_s)
 
     def batch(self, steps: int) -> int:
         """Recordings whose counts are held at a time."""
@@ -92,13 +72,6 @@ class TrueNorth(Machine):
         raise OptionError(
             f"{self.target.title}: runs whole recordings, not bin after bin; give a netlist for another chip"
         )
-
-    def simulate(
-        self, events: EventArray, lengths: IntArray | None = None, *, spikes: bool, membranes: bool = False
-    ) -> Trace:
-        """Everything that the engine counts and keeps; see :meth:`run`."""
-        channels = with_clocks(events, self.netlist.clocks)
-        return engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
 
 
 machine_of = TrueNorth

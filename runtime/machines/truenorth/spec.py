@@ -32,14 +32,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.legalize import signed_range
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO, CrossbarNetlist
 from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.runtime.machines.base import EventArray, require_channels
 
 MembraneArray = npt.NDArray[np.int32]
-EventArray = npt.NDArray[np.uint8 | np.bool_]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,22 +65,6 @@ class Trace:
     # (…, ticks, neurons) int32, or None; membranes at the end of each tick, after resets; None unless wanted. In a
     # batch a shorter recording is filled up with zeros after its last tick.
     membranes: MembraneArray | None
-
-
-def differences(slow: Trace, fast: Trace) -> int:
-    """Spikes, membranes, votes and spikes on axons that differ; `fast` is a batch of the one recording."""
-    pairs = [(getattr(slow, name), getattr(fast, name)) for name in ("spikes", "membranes")]
-    pairs += [(getattr(slow.counts, name), getattr(fast.counts, name)) for name in ("axons", "votes")]
-    return sum(int(np.count_nonzero(one != batch[0])) for one, batch in pairs)
-
-
-def check_channels(netlist: CrossbarNetlist, channels: int) -> None:
-    """Raise DataError unless recordings of so many input channels fit the network."""
-    if channels != netlist.n_inputs:
-        raise DataError(
-            f"recordings have {channels} input channels, the network has {netlist.n_inputs}; "
-            "use recordings of its sensor"
-        )
 
 
 # -- the definition ----------------------------------------------------------------------------------------------------
@@ -185,7 +168,7 @@ def simulate(netlist: CrossbarNetlist, events: EventArray) -> Trace:
     Any value but zero is an event. The trace holds spikes and membranes and has no leading axis. DataError if the
     recording has another number of input channels than the network.
     """
-    check_channels(netlist, events.shape[0])
+    require_channels(netlist, events.shape[0])
     bits = load_target(netlist.target).limit("neuron.membrane_bits")
     steps = events.shape[1]
     ticks = netlist.ticks(steps)

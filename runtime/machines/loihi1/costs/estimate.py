@@ -5,7 +5,7 @@ Every message is scheduled for these, and energy is told by core. Spikes are the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
@@ -15,6 +15,7 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.place import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.runtime.machines.base import Done, EventArray
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.cost import Costs
@@ -45,11 +46,11 @@ class Estimate:
 def estimate(
     netlist: Netlist | engine.Engine,
     target: Target,
-    events: engine.EventArray,
+    events: EventArray,
     *,
     lengths: IntArray | None = None,
     detail: str = "counts",
-    progress: Callable[[int], object] | None = None,
+    progress: Done = None,
 ) -> tuple[Trace, Estimate]:
     """Run recordings, some at a time, and say what they cost.
 
