@@ -9,13 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from spikeloom.compiler.types import FloatArray
-from spikeloom.runtime.machines.core_map import Core, CoreMap, Way
+from spikeloom.runtime.machines.core_map import Core, CoreMap
 from spikeloom.runtime.page.recording import Trace
 from spikeloom.runtime.page.results import Taxels
 from spikeloom.runtime.report.drawing import CHIP, COLOURS, DASHES, FLOAT, GREY, Drawing, sheet, styled
-
-DRAWN = 80
-"""Connections that are drawn, the busiest first; the table has all."""
 
 DETAILED = 1000
 """Taxels up to which their graph is drawn and each tells its values."""
@@ -29,21 +26,19 @@ Place = tuple[float, float]
 
 @styled
 def mesh(cores: CoreMap) -> Drawing:
-    """Used part of each chip's mesh: tiles, their cores, how full the fullest limit is, and who sends how much."""
-    from matplotlib.patches import FancyArrowPatch, Rectangle
+    """Used part of each chip's mesh: tiles, their cores, and how full the fullest limit is."""
+    from matplotlib.patches import Rectangle
 
     places, size, tiles, chips = _places(cores)
     across = max(x for x, _ in tiles) + 1
     down = max(y for _, y in tiles) + 1
-    drawing = sheet("Cores on the mesh, how full they are and the packets between them", max(2.8, 1.1 * down + 0.6))
+    drawing = sheet("Cores on the mesh and how full they are", max(2.8, 1.1 * down + 0.6))
     axes = drawing.figure.subplots()
     for (x, y), tile in tiles.items():
         axes.add_patch(Rectangle((x, y), 0.92, 0.9, fill=False, edgecolor=GREY, alpha=0.5))
         axes.text(x + 0.02, y + 0.06, f"tile {tile}", fontsize=7, va="center")
     for y, chip in chips.items():
-        axes.text(-0.3, y - 0.08, f"chip {chip}", fontsize=8)
-    axes.add_patch(Rectangle((-0.3, 0), 0.12, down - 0.1, facecolor=GREY, alpha=0.25))
-    axes.text(-0.24, down / 2, "input", rotation=90, ha="center", va="center", fontsize=8)
+        axes.text(0, y - 0.08, f"chip {chip}", fontsize=8)
     wide, high = size
     for core in cores.cores:
         (x, y), fill = places[core.core], core.fill[core.fullest]
@@ -53,29 +48,7 @@ def mesh(cores: CoreMap) -> Drawing:
         label = f"{core.core}: {' '.join(core.layers)}" if across <= 4 and wide > 0.3 else str(core.core)
         axes.text(x + wide / 2, y + 0.06, label, fontsize=7, ha="center", va="center")
         drawing.tips.append((axes, x + wide / 2, y + high / 2, _core_tip(core)))
-    ways = sorted((way for way in cores.traffic if way.packets > 0), key=lambda way: -way.packets)
-    for way in ways[:DRAWN]:
-        x, y = places[way.to]
-        end = x + 0.6 * wide, y + 0.65 * high
-        start = (-0.18, end[1])
-        if way.source is not None:
-            x, y = places[way.source]
-            start = x + 0.35 * wide, y + 0.65 * high
-        width = 0.6 + 3 * math.sqrt(way.packets / ways[0].packets)
-        colour = GREY if way.source is None else FLOAT
-        arrow = FancyArrowPatch(
-            start,
-            end,
-            connectionstyle="arc3,rad=0.15" if way.source != way.to else "arc3,rad=0.8",
-            arrowstyle="-|>",
-            mutation_scale=7 + width,
-            color=colour,
-            alpha=0.6,
-            lw=width,
-        )
-        axes.add_patch(arrow)
-        drawing.tips.append((axes, (start[0] + end[0]) / 2, (start[1] + end[1]) / 2, _way_tip(way)))
-    axes.set(xlim=(-0.32, across), ylim=(down + 0.1, -0.15))
+    axes.set(xlim=(-0.04, across), ylim=(down + 0.1, -0.15))
     axes.axis("off")
     return drawing
 
@@ -108,11 +81,6 @@ def _places(cores: CoreMap) -> tuple[dict[int, Place], Place, dict[Place, int], 
 def _core_tip(core: Core) -> str:
     limits = ", ".join(f"{name} {100 * use.share:.0f} %" for name, use in core.fill.items())
     return f"core {core.core}, {' '.join(core.layers)}, {core.compartments:,} compartments; {limits}"
-
-
-def _way_tip(way: Way) -> str:
-    hops = "" if way.hops is None else f", {way.hops} hops"
-    return f"{way.sender} to core {way.to}: {way.packets:,.0f} packets in a mean recording{hops}"
 
 
 # -- taxels ------------------------------------------------------------------------------------------------------------

@@ -139,8 +139,7 @@ def _cores(found: CoreMap) -> list[Block]:
     figure = Figure(
         "cores-map",
         partial(pictures.mesh, found),
-        "A core is filled as far as the fullest of its compartments, synaptic memory and axons; lines are packets in a "
-        "mean recording.",
+        "A core is filled as far as the fullest of its compartments, synaptic memory and axons.",
         [
             Table(["core", "tile", "layers", "compartments", "fullest limit", "fill"], places, "Cores"),
             Table(["core", *short], fill, "What each core uses of each limit", most=0),
