@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from operator import add
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.dynamics import with_clocks
@@ -18,8 +18,8 @@ from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored
-from spikeloom.compiler.targets.base import Target, load_target
-from spikeloom.compiler.targets.truenorth.codebook import PartialSums, in_levels, run_levels
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.truenorth.codebook import LevelNetwork, PartialSums, in_levels, run_levels
 from spikeloom.compiler.targets.truenorth.in_time import first_spikes
 from spikeloom.compiler.targets.truenorth.native import NativeNetwork
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
@@ -108,6 +108,9 @@ def provenance(trained: Trained) -> JsonObject:
 
 # -- chip against definition and model: every spike of every copy of every neuron --------------------------------------
 
+Model = Callable[[npt.NDArray[np.uint8]], tuple[Mapping[str, BoolArray], tuple[PartialSums, ...]]]
+"""Spikes (steps, neurons) of each layer for events (taxels, polarities, steps); partial sums that travel in time."""
+
 
 @dataclass(frozen=True, slots=True)
 class AgainstSpec:
@@ -161,41 +164,40 @@ class Verdict:
 
 def compare(
     netlist: CrossbarNetlist,
-    model: Callable[[Any], Mapping[str, BoolArray]],
+    model: Model,
     first: Mapping[str, int],
     data: Recordings,
     *,
     spec_samples: int,
-    spec_steps: int | None = None,
+    spec_steps: int | None,
 ) -> Verdict:
     """Run the chip and the model on recordings, and count every spike that differs.
 
-    The `model` gives the spikes (steps, neurons) of each layer for events (taxels, polarities, steps); `first` is the
-    tick in which a layer spikes for the first data step. The specification runs on the first recordings, too, and
-    there on the first steps, where `spec_steps` says so.
+    `first` is the tick in which a layer spikes for the first data step. The specification runs on the first
+    recordings, too, and there on the first steps, where `spec_steps` says so.
     """
     machine, layers = machine_of(netlist), list(netlist.layers)
     spikes, differences = dict.fromkeys(first, 0), dict.fromkeys(first, 0)
     votes, overflows, wrong = np.zeros((len(data), netlist.classes), np.int64), 0, 0
+    sums: tuple[PartialSums, ...] = ()
     count = Progress(len(data))
     for index in range(len(data)):
         count(index, "comparing")
         events = data.events[index : index + 1, ..., : data.steps_of(index)]
         trace = machine.simulate(with_clocks(events, netlist.clocks), spikes=True)
         assert trace.spikes is not None, "spikes are kept"
-        expected = model(events[0])
-        steps = events.shape[-1]
+        expected, counts = model(events[0])
+        sums = tuple(map(add, sums, counts)) or counts
         for name, late in first.items():
             chosen = np.flatnonzero(netlist.layer == layers.index(name))
-            on_chip = trace.spikes[0, late : late + steps * netlist.bin_ticks][:, chosen]
+            on_chip = trace.spikes[0, late : late + events.shape[-1] * netlist.bin_ticks][:, chosen]
             due = np.zeros_like(on_chip)
             due[:: netlist.bin_ticks] = expected[name][:, netlist.neuron[chosen]]
             spikes[name] += int(expected[name].sum())
             differences[name] += int(np.count_nonzero(on_chip != due))
         overflows += int(trace.counts.overflows.sum())
         votes[index] = class_counts(netlist, trace.counts.votes)[0]
-        if index < spec_samples:
-            wrong += machine.check(events[..., :spec_steps])
+        wrong += machine.check(events[..., :spec_steps]) if index < spec_samples else 0
     return Verdict(
         target=netlist.target,
         samples=len(data),
@@ -204,6 +206,7 @@ def compare(
         membranes_saturated=overflows,
         correct=int(np.count_nonzero(vote(votes) == data.labels)),
         spec_steps=spec_steps,
+        sums=sums or None,
     )
 
 
@@ -238,53 +241,35 @@ def _differences(differences: int, samples: int) -> str:
 
 def verify(arguments: argparse.Namespace) -> Outcome:
     """Compare chip, specification and model; exit code 1 where one spike differs."""
-    why = f"a network for {TITLE} has one model, whose every spike must be the chip's"
-    refuse(arguments, VERIFY, why)
+    refuse(arguments, VERIFY, f"a network for {TITLE} has one model, whose every spike must be the chip's")
     machine = load(arguments.netlist)
-    check = _verify_in_time if "in_time" in machine.netlist.provenance else _verify_trained
-    verdict = check(arguments, machine.netlist, machine.target)
-    return Outcome(verdict, sections, 0 if verdict.exact else 1)
-
-
-def _require_same(arguments: argparse.Namespace, netlist: CrossbarNetlist, network: Trained | LoadedNetwork) -> None:
-    """Refuse a network that the netlist was not compiled from."""
-    made = netlist.provenance
+    netlist, made = machine.netlist, machine.netlist.provenance
+    copies: int = made.get("in_time", 0)
+    network = load_network(arguments.checkpoint, arguments) if copies else read(arguments.checkpoint, arguments)
     if made.get("checkpoint_sha256") != network.sha256:
         raise OptionError(
             f"--checkpoint {arguments.checkpoint}: {arguments.netlist} was compiled from another file; give that one"
         )
-    if isinstance(network, Trained) and made.get("weights") != network.weights:
+    if isinstance(network, LoadedNetwork):
+        levels = in_levels(network.network, copies, machine.target)
+        model, first = _level_model(levels), first_spikes(levels)
+    elif made.get("weights") != network.weights:
         raise OptionError(
             f"--weights {network.weights}: {arguments.netlist} was compiled from {made.get('weights')}; give the same"
         )
-
-
-def _verify_trained(arguments: argparse.Namespace, netlist: CrossbarNetlist, _: Target) -> Verdict:
-    trained = read(arguments.checkpoint, arguments)
-    _require_same(arguments, netlist, trained)
+    else:
+        model, first = _trained_model(network.network), {s.name: n for n, s in enumerate(network.network.stages)}
     data = netlist_recordings(arguments, netlist, labels_for="verify")
+    steps = SPEC_STEPS if copies else None
+    verdict = compare(netlist, model, first, data, spec_samples=arguments.spec_samples, spec_steps=steps)
+    return Outcome(verdict, sections, 0 if verdict.exact else 1)
+
+
+def _level_model(levels: LevelNetwork) -> Model:
+    return lambda events: run_levels(levels, events.reshape(-1, events.shape[-1]))
+
+
+def _trained_model(network: NativeNetwork) -> Model:
     from spikeloom.models.truenorth.network import run_network  # torch, so only here
 
-    def spikes(events: Any) -> dict[str, BoolArray]:
-        return {name: held[0] for name, held in run_network(trained.network, events[None]).items()}
-
-    first = {stage.name: number for number, stage in enumerate(trained.network.stages)}
-    return compare(netlist, spikes, first, data, spec_samples=arguments.spec_samples)
-
-
-def _verify_in_time(arguments: argparse.Namespace, netlist: CrossbarNetlist, chip: Target) -> Verdict:
-    loaded = load_network(arguments.checkpoint, arguments)
-    _require_same(arguments, netlist, loaded)
-    levels = in_levels(loaded.network, int(netlist.provenance["in_time"]), chip)
-    data = netlist_recordings(arguments, netlist, labels_for="verify")
-    sums = tuple(PartialSums(layer.name, 0, 0, 0) for layer in levels.layers if layer.is_split)
-
-    def spikes(events: Any) -> dict[str, BoolArray]:
-        nonlocal sums
-        spikes, counts = run_levels(levels, events.reshape(-1, events.shape[-1]))
-        sums = tuple(map(add, sums, counts))
-        return spikes
-
-    samples = arguments.spec_samples
-    verdict = compare(netlist, spikes, first_spikes(levels), data, spec_samples=samples, spec_steps=SPEC_STEPS)
-    return replace(verdict, sums=sums)
+    return lambda events: ({name: held[0] for name, held in run_network(network, events[None]).items()}, ())
