@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import read_whole, require_size
-from spikeloom.compiler.formats.names import one_line, printable
+from spikeloom.compiler.formats.names import named, one_line, printable
 
 Array = npt.NDArray[Any]
 """float64, int64 or bool."""
@@ -177,26 +177,23 @@ def _declared(proto: Any) -> Declared:
 
 
 def _node(proto: Any) -> Node:
-    named = _text(proto.name or (proto.output[0] if proto.output else "?"))
     node = Node(
-        name=named,
+        name=_text(proto.name or (proto.output[0] if proto.output else "?")),
         op=_text(proto.op_type),
         inputs=tuple(map(_text, proto.input)),
         outputs=tuple(map(_text, proto.output)),
         attributes={},
     )
-    if _text(proto.domain) not in ("", "ai.onnx"):
-        raise ModelError(
-            f"{node}: is of the domain {printable(_text(proto.domain))}, allowed are the operators of ONNX itself; "
-            "export without custom operators"
-        )
-    attributes = {_text(entry.name): _attribute(entry, node) for entry in proto.attribute}
-    if node.op == "Dropout":  # passes on what it gets, outside training
-        return replace(node, op="Identity", inputs=node.inputs[:1], outputs=node.outputs[:1])
-    return replace(node, attributes=attributes)
+    with named(node):
+        if _text(proto.domain) not in ("", "ai.onnx"):
+            raise ModelError(
+                f"is of the domain {printable(_text(proto.domain))}, allowed are the operators of ONNX itself; "
+                "export without custom operators"
+            )
+        return replace(node, attributes={_text(entry.name): _attribute(entry) for entry in proto.attribute})
 
 
-def _attribute(entry: Any, node: Node) -> Any:
+def _attribute(entry: Any) -> Any:
     match entry.type:
         case entry.FLOAT:
             return decimal(entry.f)
@@ -207,12 +204,12 @@ def _attribute(entry: Any, node: Node) -> Any:
         case entry.TENSOR:
             return _array(entry.t)
         case entry.GRAPH:
-            raise ModelError(f"{node}: holds a graph, a loop or a choice; export one step, or unroll all of them")
+            raise ModelError("holds a graph, a loop or a choice; export one step, or unroll all of them")
         case entry.FLOATS:
             return [decimal(number) for number in entry.floats]
         case entry.INTS:
             return [int(number) for number in entry.ints]
-    raise ModelError(f"{node}: attribute {printable(_text(entry.name))} is of a kind that is not known; {DAMAGED}")
+    raise ModelError(f"attribute {printable(_text(entry.name))} is of a kind that is not known; {DAMAGED}")
 
 
 def _array(proto: Any) -> Array:

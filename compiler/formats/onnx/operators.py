@@ -141,6 +141,8 @@ def apply(node: Node, table: Table, operands: Sequence[Value | None]) -> list[Va
         if not numbers:
             raise ModelError("holds no number")
         return [np.asarray(numbers[0])]
+    if op == "Dropout" and operands[0] is not None:  # passes on what it gets, outside training
+        return [operands[0]]
     if op in ("Shape", "Size"):
         shape = np.array(as_affine(operands[0]).shape, np.int64)
         cut = shape[node.attributes.get("start", 0) : node.attributes.get("end", len(shape))]

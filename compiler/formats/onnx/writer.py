@@ -79,11 +79,6 @@ class Layer:
     ids: IntArray  # compartments
     depth: int  # steps that it lags behind the data
     sources: dict[int, IntArray]  # weights (sources, neurons) by the index of a layer, or ``INPUT``
-    decay_u: IntArray
-    decay_v: IntArray
-    threshold: IntArray  # membrane units, as the bias
-    bias: IntArray
-    label: IntArray  # class of a vote, -1 for none
     remembers: bool  # a current outlasts its step
     saturates: bool  # some input could bring the membrane to the end of its register
     kind: type[np.int32] | type[np.int64]  # int32 where no input brings any product or sum beyond it
@@ -161,7 +156,6 @@ def _layer(netlist: Netlist, index: int, name: str, sources: dict[int, IntArray]
     ids = netlist.compartments_of(index)
     _, current, highest, stored = (bound[ids] for bound in reached)
     lost_u, lost_v = netlist.decay_u[ids] + 1, netlist.decay_v[ids]
-    threshold = netlist.threshold[ids] << MEMBRANE_SHIFT
     bias = netlist.bias_mantissa[ids] << netlist.bias_exponent[ids]
     held = np.minimum(stored, MEMBRANE_MAX)
     widest = max(
@@ -175,11 +169,6 @@ def _layer(netlist: Netlist, index: int, name: str, sources: dict[int, IntArray]
         ids=ids,
         depth=netlist.layers[index].depth,
         sources=sources,
-        decay_u=netlist.decay_u[ids],
-        decay_v=lost_v,
-        threshold=threshold,
-        bias=bias,
-        label=netlist.readout_class[ids],
         remembers=bool(np.any(lost_u != ONE)),
         saturates=bool(np.any(np.maximum(highest, stored) > MEMBRANE_MAX)),
         kind=np.int32 if widest <= NARROW else np.int64,
@@ -252,10 +241,10 @@ def _chip_step(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
         if layer.remembers:
             states.append(Port(name=f"{layer.name}.current", kind=layer.kind, shape=size))
         spikes = [received[pre] for pre in layer.sources]
-        _integrate(graph, layer, spikes, windows[layer.depth])
-    votes, voting = "votes", [layer for layer in layers if np.any(layer.label >= 0)]
+        _integrate(graph, netlist, layer, spikes, windows[layer.depth])
+    votes, voting = "votes", [layer for layer in layers if np.any(netlist.readout_class[layer.ids] >= 0)]
     for layer in voting:
-        poll = (layer.label[:, None] == np.arange(netlist.classes)).astype(np.uint8)
+        poll = (netlist.readout_class[layer.ids, None] == np.arange(netlist.classes)).astype(np.uint8)
         more = graph.add("MatMulInteger", [f"{layer.name}.spikes_next", poll], f"{layer.name}/votes")
         last = "votes_next" if layer is voting[-1] else f"{layer.name}/voted"
         votes = graph.add("Add", [votes, more], last)
@@ -274,25 +263,26 @@ def _window(graph: Nodes, depth: int) -> str:
     return graph.add("And", [begun, graph.add("Less", [since, "length"], f"{name}/lasts")], name)
 
 
-def _integrate(graph: Nodes, layer: Layer, spikes: list[str], is_open: str) -> None:
+def _integrate(graph: Nodes, netlist: Netlist, layer: Layer, spikes: list[str], is_open: str) -> None:
     """One step of the neurons, as :mod:`loihi1.spec` defines them; a closed window holds all registers at zero."""
-    name, kind = layer.name, layer.kind
+    name, kind, ids = layer.name, layer.kind, layer.ids
     window = graph.cast(is_open, f"{name}/window", kind)
     inflow = _sum(graph, layer, spikes)
     if layer.remembers:
-        lasting = _decayed(graph, layer, f"{name}.current", layer.decay_u + 1, f"{name}/lasting")
+        lasting = _decayed(graph, layer, f"{name}.current", netlist.decay_u[ids] + 1, f"{name}/lasting")
         inflow = graph.add("Add", [lasting, inflow], f"{name}/current") if inflow else lasting
         graph.add("Mul", [inflow, window], f"{name}.current_next")
-    if layer.bias.any():
-        bias = graph.constant(f"{name}/bias", one_each(layer.bias, kind))
+    biases = netlist.bias_mantissa[ids] << netlist.bias_exponent[ids]
+    if biases.any():
+        bias = graph.constant(f"{name}/bias", one_each(biases, kind))
         inflow = graph.add("Add", [inflow, bias], f"{name}/inflow") if inflow else bias
-    value = _decayed(graph, layer, f"{name}.membrane", layer.decay_v, f"{name}/decayed")
+    value = _decayed(graph, layer, f"{name}.membrane", netlist.decay_v[ids], f"{name}/decayed")
     if inflow:
         value = graph.add("Add", [value, inflow], f"{name}/driven")
     if layer.saturates:
         value = graph.add("Clip", [value, kind(-MEMBRANE_MAX), kind(MEMBRANE_MAX)], f"{name}/clipped")
     value = graph.add("Mul", [value, window], f"{name}/gated")
-    fired = graph.add("Greater", [value, one_each(layer.threshold, kind)], f"{name}/fired")
+    fired = graph.add("Greater", [value, one_each(netlist.threshold[ids] << MEMBRANE_SHIFT, kind)], f"{name}/fired")
     graph.add("Where", [fired, kind(0), value], f"{name}.membrane_next")
     graph.cast(fired, f"{name}.spikes_next", np.uint8)
 
