@@ -69,11 +69,6 @@ class Block(Part):
     def __str__(self) -> str:
         return f"layer {self.number} ({printable(self.type) or 'no type'})"
 
-    def inner(self, key: str) -> Tree | None:
-        """A group of entries, or None."""
-        found = self.values.get(key)
-        return found if isinstance(found, dict) else None
-
     def sizes(self) -> tuple[int, ...]:
         """Its ``shape``."""
         values = tuple(self.integers("shape").ravel().tolist())
@@ -127,7 +122,7 @@ def integers_of(
         if block.type == "flatten":
             shape = (math.prod(shape),)
             continue
-        if block.type == "input" and block.inner("neuron") is None:
+        if block.type == "input" and not entry_of(block.values, "neuron", dict):
             continue
         weight, shape = _synapses(block, shape)
         post = len(populations)
@@ -178,7 +173,7 @@ def _synapses(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, 
             raise block.fail("is not the first; export one network")
         gain = block.few("weight")[0] if "weight" in block.values else DEFAULT_INPUT_WEIGHT
         return sparse.csr_array(sparse.identity(math.prod(shape), dtype=np.int64, format="csr") * gain), shape
-    if "weight" in block.values and block.inner("weight") is not None:
+    if isinstance(block.values.get("weight"), dict):
         raise block.fail("has complex weights, allowed are real ones; use CUBA neurons")
     if block.type in ("dense", "dense_rec"):
         neurons = math.prod(block.sizes())
@@ -239,8 +234,8 @@ def _planes(block: Block, weight: Sparse) -> list[tuple[Sparse, int]]:
 
 
 def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopulation:
-    entries = block.inner("neuron")
-    if entries is None:
+    entries: Tree = entry_of(block.values, "neuron", dict)
+    if not entries:
         raise block.fail("has no neuron, so its membranes are the result, and a chip counts spikes; remove it")
     neuron, kind = replace(block, values=entries), entries.get("type")
     if kind not in NEURONS:

@@ -111,7 +111,9 @@ def _carried(
     if abs(beta + removed) > EQUAL * max(abs(beta), abs(removed)):
         raise ModelError(f"keeps {beta:g} of a membrane and {beta + removed:g} of it after a spike; {RESET}")
     if table.atoms[gate].kind == SPIKE:
-        _require_same_threshold(table, previous, gate, spike)
+        old, new = table.atoms[gate], table.atoms[spike]
+        if not np.array_equal(old.theta, new.theta) or old.strict != new.strict:
+            raise ModelError(f"resets {table.atoms[previous]} by another threshold than it fires by; {RESET}")
     if table.atoms[previous].kind == INPUT_ATOM:
         _require_output(outputs, {membrane: 1.0}, f"membrane of {table.atoms[previous]}")
         if table.atoms[gate].kind == INPUT_ATOM:
@@ -157,13 +159,6 @@ def is_output(outputs: Mapping[str, Affine], wanted: Mapping[int, float]) -> str
 def _require_output(outputs: Mapping[str, Affine], wanted: Mapping[int, float], what: str) -> None:
     if is_output(outputs, wanted) is None:
         raise ModelError(f"takes the {what} as a state, and no output gives it back; add it to the outputs")
-
-
-def _require_same_threshold(table: Table, previous: int, gate: int, spike: int) -> None:
-    """A reset by a comparison of the state itself must use the comparison that makes the spikes."""
-    old, new = (table.atoms[atom] for atom in (gate, spike))
-    if not np.array_equal(old.theta, new.theta) or old.strict != new.strict:
-        raise ModelError(f"resets {table.atoms[previous]} by another threshold than it fires by; {RESET}")
 
 
 def _require_current(table: Table, atom: int, terms: Sparse, previous: int | None, membrane: int) -> None:
@@ -295,16 +290,10 @@ def _sources(
     for atom, weight in n.current.items():
         if atom in inputs:
             found[INPUT] = weight[:, inputs[atom]]
-        elif atom not in step_of:
-            raise ModelError(f"{n.node}: takes {table.atoms[atom]}, which is no spike of a layer; {RESET}")
+        elif atom in step_of and step_of[atom][1] == step:
+            found[step_of[atom][0]] = weight
         else:
-            layer, when = step_of[atom]
-            if when != step:
-                raise ModelError(
-                    f"{n.node}: receives {table.atoms[atom]} of another step; only spikes of the "
-                    "same step can be lowered"
-                )
-            found[layer] = weight
+            raise ModelError(f"{n.node}: takes {table.atoms[atom]}, which is no spike of a layer in this step; {RESET}")
     for weight in found.values():
         weight.sort_indices()
     return found
