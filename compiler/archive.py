@@ -28,10 +28,14 @@ Array = np.ndarray[Any, Any]
 TRAINED = "spikeloom-native"
 """Trained in the whole numbers of a chip."""
 
+COUNTERS = "spikeloom-counters"
+"""A counting network."""
+
 FORMATS = {
     "spikeloom-netlist": "cores of compartments (Loihi)",
     "spikeloom-crossbars": "crossbar cores (TrueNorth)",
     TRAINED: "a network trained for TrueNorth, not yet compiled",
+    COUNTERS: "a counting network, not yet compiled",
 }
 """What a manifest may say that an archive is."""
 
@@ -152,14 +156,15 @@ def stated(path: Path, name: str) -> str | None:
 
 def is_netlist(path: str | os.PathLike[str]) -> bool:
     """Whether a file claims to be a netlist: an archive with a manifest, or a name that ends in ``.loom``."""
-    return str(path).endswith(".loom") or stated(Path(path), "format") is not None
+    return str(path).endswith(".loom") or stated(Path(path), "format") not in (None, COUNTERS)
 
 
 Kind = type | tuple[int, int] | dict[str, Any] | list[Any]
 """What an entry of a manifest must be: of a type (``float``: from 0, finite), a whole number within bounds (both
-allowed), an object of exactly these entries, or a list of such things, ``[kind, ...]`` of at least one."""
+allowed), an object of exactly these entries (``NAME?`` may be missing), or a list of such things, ``[kind, ...]`` of at
+least one."""
 
-CLOCKS: Kind = {"channels": (0, MOST_CLOCKS), "steps": (1, MOST_STEPS)}
+CLOCKS: Kind = {"channels": (0, MOST_CLOCKS), "steps": (1, MOST_STEPS), "length?": (1, MOST_STEPS)}
 
 
 def entry_faults(manifest: Mapping[str, Any], kinds: Mapping[str, Kind]) -> list[str]:
@@ -182,7 +187,10 @@ def _is(value: Any, kind: Kind) -> bool:
         case tuple():
             return type(value) is int and kind[0] <= value <= kind[1]
         case dict():
-            return isinstance(value, dict) and set(value) == set(kind) and all(_is(value[k], kind[k]) for k in kind)
+            known = {name.removesuffix("?"): name for name in kind}
+            if not isinstance(value, dict) or not {name for name in kind if name in known} <= set(value) <= set(known):
+                return False
+            return all(_is(each, kind[known[name]]) for name, each in value.items())
     return isinstance(value, list) and len(value) >= len(kind) - 1 and all(_is(one, kind[0]) for one in value)
 
 

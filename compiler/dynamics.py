@@ -13,7 +13,7 @@ first dense layer they are a bias that changes with time.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,8 @@ class Clocks:
 
     channels: int = 0  # How many; none by default
     steps: int = 1  # How long each of them has events
+    # Steps that every recording is run: shorter ones end in silence, longer ones are cut; their own by default
+    length: int | None = field(default=None, metadata={"optional": True})
 
     def events(self, steps: int, *, first: int = 0) -> npt.NDArray[np.uint8]:
         """Events of the steps ``first … first + steps - 1``, (channels, steps).
@@ -49,6 +51,10 @@ class Clocks:
         part = np.arange(first, first + steps) // self.steps
         ticks: npt.NDArray[np.uint8] = (part == np.arange(self.channels)[:, None]).astype(np.uint8)
         return ticks
+
+    def to_json(self) -> JsonObject:
+        """JSON values."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 NO_CLOCKS = Clocks()
@@ -103,7 +109,7 @@ class Dynamics:
 
     def to_json(self) -> JsonObject:
         """JSON values."""
-        return {"betas": list(self.betas), "alphas": list(self.alphas), "clocks": asdict(self.clocks)}
+        return {"betas": list(self.betas), "alphas": list(self.alphas), "clocks": self.clocks.to_json()}
 
 
 PLAIN = Dynamics()

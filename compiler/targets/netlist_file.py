@@ -117,7 +117,7 @@ class NetlistFile(Generic[N]):
             "format": self.format,
             "version": self.version,
             "layers": [layer if isinstance(layer, str) else asdict(layer) for layer in manifest["layers"]],
-            "clocks": asdict(manifest["clocks"]),
+            "clocks": manifest["clocks"].to_json(),
             "provenance": dict(manifest["provenance"]),
         }
         return archive_bytes(manifest, {name: getattr(netlist, name) for name in self.arrays})

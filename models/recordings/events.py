@@ -234,6 +234,25 @@ def join_bins(events: NDArray[Any], bins: int) -> NDArray[Any]:
     return joined
 
 
+def of_length(recordings: Recordings, steps: int | None) -> Recordings:
+    """Recordings of so many steps each: shorter ones end in silence that counts, longer ones are cut; None: as is."""
+    if steps is None:
+        return recordings
+    return replace(recordings, events=fitted(recordings.events, steps), lengths=None)
+
+
+def fitted(events: NDArray[Any], steps: int) -> NDArray[Any]:
+    """Events (..., steps) cut to so many steps, or filled up with silence.
+
+    Examples
+    --------
+    >>> fitted(np.array([[1, 1, 1]]), 2).tolist(), fitted(np.array([[1]]), 3).tolist()
+    ([[1, 1]], [[1, 0, 0]])
+    """
+    missing = max(steps - events.shape[-1], 0)
+    return np.pad(events[..., :steps], [(0, 0)] * (events.ndim - 1) + [(0, missing)])
+
+
 @contextmanager
 def _data_set(path: Path, split: str = "test") -> Iterator[tuple[Members, dict[str, dict[str, str]]]]:
     """What opens each file, and their names and members by split, ``""`` for any; DataError if there are none."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.archive import FORMATS, TRAINED, is_netlist, stated
+from spikeloom.compiler.archive import COUNTERS, FORMATS, TRAINED, is_netlist, stated
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import NETX, NIR, ONNX
@@ -30,7 +30,8 @@ from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.repeat import NETWORK, refuse
 from spikeloom.runtime.report.console import progress
 
-NETWORKS = {ONNX: "ONNX", NIR: "NIR"}
+NETWORKS = {ONNX: "ONNX", NIR: "NIR", COUNTERS: "counting"}
+"""Networks that a file holds whole, by its ending, or by what it says of itself."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,9 +86,9 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
         # a network that Python made, as if it came from a file
         sha256 = hashlib.sha256(text(path).encode()).hexdigest()
         return LoadedNetwork(network=path, sha256=sha256, format="module")
-    suffix = next((suffix for suffix in (ONNX, NIR) if path.endswith(suffix)), None)
-    _require_fit(path, suffix, arguments)
-    if suffix is None:
+    kind = network_kind(path)
+    _require_fit(path, kind, arguments)
+    if kind is None:
         checkpoint = load_checkpoint(path, arguments)
         if netlist is not None and arguments.weights is None and _from_file(netlist, checkpoint):
             made = netlist.provenance["weights"]
@@ -102,7 +103,11 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
         )
     progress("reading the network")
     layout = {"polarities": arguments.polarities, "polarities_first": arguments.polarities_first}
-    if suffix == ONNX:
+    if kind == COUNTERS:
+        from spikeloom.compiler.formats.counters import read_network
+
+        found = read_network(shipped(path))
+    elif kind == ONNX:
         from spikeloom.compiler.formats.onnx.reader import read_onnx
 
         found = read_onnx(path, **layout)
@@ -114,9 +119,15 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
         network=found.network,
         sha256=found.sha256,
         facts=found.facts,
-        format=NETWORKS[suffix].lower(),
+        format=NETWORKS[kind].lower(),
         read_as=found.read_as,
     )
+
+
+def network_kind(path: str) -> str | None:
+    """Which of ``NETWORKS`` a file holds; None for a checkpoint, or nothing of ours."""
+    suffix = next((suffix for suffix in (ONNX, NIR) if path.endswith(suffix)), None)
+    return suffix or (COUNTERS if stated(Path(shipped(path)), "format") == COUNTERS else None)
 
 
 def _from_file(netlist: Netlist, checkpoint: Checkpoint) -> bool:
@@ -127,18 +138,18 @@ def _from_file(netlist: Netlist, checkpoint: Checkpoint) -> bool:
     return made.get("weights") in checkpoint.sets and made["weights"] != checkpoint.weights
 
 
-def _require_fit(path: str, suffix: str | None, arguments: argparse.Namespace) -> None:
+def _require_fit(path: str, kind: str | None, arguments: argparse.Namespace) -> None:
     """Refuse options that are for another kind of file, and files that hold no float network."""
     if path.endswith(NETX):
         raise OptionError(f"{path}: holds integers, no float network to compare with; compile, inspect and run it")
-    if suffix is None:
+    if kind not in (ONNX, NIR):
         why = f"is for ONNX and NIR files, {path} is none"
         refuse(arguments, ("polarities",), why)
         if arguments.polarities_first is not None:
             raise OptionError(f"--polarities-first or -last: {why}; omit it")
-    else:
-        refuse(arguments, NETWORK, f"is for checkpoints, the {NETWORKS[suffix]} file {path} holds all it needs")
-    if suffix != NIR:
+    if kind is not None:
+        refuse(arguments, NETWORK, f"is for checkpoints, the {NETWORKS[kind]} file {path} holds all it needs")
+    if kind != NIR:
         refuse(arguments, ("dt", "convention"), f"is for NIR files, {path} is none")
 
 

@@ -8,7 +8,15 @@ from difflib import get_close_matches
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.models.recordings.counts import show_counts
-from spikeloom.models.recordings.events import BIN_S, MAX_STEPS, joined_bins, load_data, need_labels, require_events
+from spikeloom.models.recordings.events import (
+    BIN_S,
+    MAX_STEPS,
+    joined_bins,
+    load_data,
+    need_labels,
+    of_length,
+    require_events,
+)
 from spikeloom.models.recordings.evtouch import Recordings, first_part, parse_window
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
 from spikeloom.runtime.report.console import progress
@@ -96,7 +104,8 @@ def load_recordings(
 def netlist_recordings(arguments: argparse.Namespace, netlist: Netlist, *, labels_for: str | None = None) -> Recordings:
     """Recordings that a netlist can take, as long a part of each as ``--window`` says."""
     percent = parse_window(arguments.window)
-    return first_part(load_recordings(arguments, netlist, labels_for=labels_for), percent)
+    data = first_part(load_recordings(arguments, netlist, labels_for=labels_for), percent)
+    return of_length(data, netlist.clocks.length)
 
 
 def find_recording(data: Recordings, wanted: str, option: str) -> int:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -78,7 +78,7 @@ def write_trained(
         "format": FORMAT,
         "version": VERSION,
         **{name: getattr(one, name) for name in ("taxels", "polarities", "classes", "copies")},
-        "clocks": asdict(one.clocks),
+        "clocks": one.clocks.to_json(),
         "graph": {"name": graph, "edges": edges.tolist()},
         "layers": [stage.name for stage in one.stages],
         "towers": 1,

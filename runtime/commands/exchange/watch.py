@@ -245,7 +245,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             display=Display(bin_s=bin_s, as_json=arguments.json),
             column=np.zeros(netlist.taxels * netlist.polarities, np.uint8),
             bin_s=bin_s,
-            bins=arguments.bins,
+            bins=arguments.bins or netlist.clocks.length,
             from_first=arguments.origin == "first",
             real=arguments.speed == "real",
             may_end=None if factor is None else exits.live(integer_machine(machine), arguments.bins, factor),

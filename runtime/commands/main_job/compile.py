@@ -23,6 +23,7 @@ from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.text import text
+from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_bin_option, add_network, group
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.files import require_place
@@ -119,14 +120,15 @@ def run(arguments: argparse.Namespace) -> Outcome:
     checkpoint, training = asked.checkpoint, None
     if arguments.calibrate is not None:
         progress("reading the recordings")
-        training = recordings(
+        found = recordings(
             arguments.calibrate,
             "train",
             classes=asked.network.classes,
             taxels=asked.network.input.taxels,
             bin_s=arguments.bin,
             bins=asked.network.input.bins,
-        ).events
+        )
+        training = of_length(found, asked.network.input.clocks.length).events
     progress("compiling")
 
     def dump(name: str, done: Compilation) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.files import write_atomically
+from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS, TACTILESGNET, TITLES, Grid
 from spikeloom.compiler.targets.native import BASES, USUAL_COPIES
 from spikeloom.compiler.targets.native import SYSTEM as NATIVE
@@ -30,6 +31,7 @@ from spikeloom.models.training.recipes import (
 )
 from spikeloom.runtime.commands.options import add_data, add_graph_options, group
 from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_graph, sensor_places
 from spikeloom.runtime.inputs.recordings import recordings, require_bins
@@ -57,8 +59,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     needing = ", ".join((*GRAPH_SYSTEMS, NATIVE))
     group(parser, "network").add_argument(
         "--system",
-        choices=(*SYSTEMS, NATIVE),
-        help=f"{', '.join((*SYSTEMS, NATIVE))} (default: {TACTILESGNET}; {needing} need a graph)",
+        choices=(*SYSTEMS, NATIVE, COUNTING),
+        help=f"{', '.join((*SYSTEMS, NATIVE, COUNTING))} (default: {TACTILESGNET}; {needing} need a graph)",
     )
     parser.add_argument(
         "--padding",
@@ -84,6 +86,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--copies", type=int, choices=tuple(BASES), help=f"axons of an input of {NATIVE} (default: {USUAL_COPIES})"
     )
+    counting = group(parser, "counters")
+    counting.add_argument("--thresholds", metavar="K[,K]", help="events at which counters spike (default: 1,4,16,64)")
+    counting.add_argument(
+        "--parts", type=int, metavar="N", help="equal parts of a recording, counted apart (default: 1)"
+    )
+    counting.add_argument("--window", type=int, metavar="P", help="per cent of a recording that count (default: 100)")
+    counting.add_argument("--ramp", type=int, metavar="N", help="silent steps of the read-out (default: 32)")
     parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
     parser.add_argument(
         "--spike-penalty", type=float, metavar="X", help="loss of a spike on every synapse in every step: fewer spikes"
@@ -110,6 +119,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Train every seed, write the checkpoints, report."""
+    if arguments.system == COUNTING:
+        return _count(arguments)
+    repeat.refuse(arguments, COUNTERS_ONLY, "is for --system counters")
     if arguments.seeds < 1:
         raise OptionError(f"--seeds {arguments.seeds}: at least 1 is needed; give a positive number")
     require_bins(arguments.join)
@@ -131,7 +143,38 @@ def run(arguments: argparse.Namespace) -> Outcome:
     return Outcome(TrainingReport(runs=records, protocols=summary(records)), training_sections)
 
 
-def both_splits(data: str, taxels: int, bin_s: float) -> tuple[Recordings, Recordings]:
+COUNTERS_ONLY = ("thresholds", "parts", "window", "ramp")
+NOT_COUNTERS = (
+    *("padding", "graph", "edges", "directed", "copies", "current_decay", "membrane_decay", "clocks", "features"),
+    *("batch", "spike_penalty", "epochs", "decay_epochs", "resume", "keep", "picture"),
+)
+
+
+def _count(arguments: argparse.Namespace) -> Outcome:
+    """Train a counting network: no epochs, no seeds."""
+    from spikeloom.models.training.counters import Plan
+    from spikeloom.runtime.studies.counting import counters_sections, train_counters
+
+    repeat.refuse(arguments, NOT_COUNTERS, "counters are trained without")
+    if (arguments.recipe, arguments.seed, arguments.seeds) != (RELEASED.name, 0, 1):
+        raise OptionError("--system counters: one rule without chance; omit --recipe, --seed and --seeds")
+    require_bins(arguments.join)
+    require_place(arguments.output, "-o", arguments)
+    asked = {name: value for name, value in repeat.given(arguments, COUNTERS_ONLY).items() if value is not None}
+    typed = repeat.words({"data": Path(arguments.data).name, "system": COUNTING, **asked})
+    if arguments.join > 1:
+        typed += ["--join", str(arguments.join)]
+    if "thresholds" in asked:
+        asked["thresholds"] = tuple(whole_numbers(asked["thresholds"], "--thresholds"))
+    plan = Plan(bins=arguments.join, **asked)
+    plan.require_possible()
+    taxels = None if arguments.taxels is None else len(sensor_places(arguments.taxels))
+    training, test = both_splits(arguments.data, taxels, arguments.bin)
+    report = train_counters(plan, training, test, repeat.command("train", *typed), arguments.output)
+    return Outcome(report, counters_sections)
+
+
+def both_splits(data: str, taxels: int | None, bin_s: float) -> tuple[Recordings, Recordings]:
     """Training and test recordings of a sensor, every one with its label."""
     progress("reading the recordings")
     shared: dict[str, Any] = {"taxels": taxels, "bin_s": bin_s, "labels_for": "training", "classes": None}

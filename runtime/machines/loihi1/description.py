@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.dynamics import Clocks
+from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
 from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.fixedpoint import kept_shares
 from spikeloom.compiler.targets.base import load_target
@@ -83,7 +83,7 @@ def describe(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Netlist
     return NetlistFacts(
         target=netlist.target,
         taxels=netlist.taxels,
-        clocks=netlist.clocks if netlist.clocks.channels else None,
+        clocks=None if netlist.clocks == NO_CLOCKS else netlist.clocks,
         bins=netlist.bins if netlist.bins > 1 else None,
         classes=netlist.classes,
         neurons=sum(layer.neurons for layer in netlist.layers),
@@ -143,9 +143,11 @@ def sections(facts: NetlistFacts) -> Iterator[Section]:
         f"{facts.target}: {facts.neurons:,} neurons{left}, {facts.synapses:,} synapses "
         f"({facts.synapses_stored:,} stored, {facts.synapses_nonzero:,} non-zero), {facts.cores} cores on {where}",
     ]
-    if facts.clocks is not None:
+    if facts.clocks is not None and facts.clocks.channels:
         channels, steps = facts.clocks.channels, facts.clocks.steps
         lines.append(f"  {channels} clocks of {steps} steps each, {channels * steps} in all, beside the sensor")
+    if facts.clocks is not None and facts.clocks.length is not None:
+        lines.append(f"  a recording is run for {facts.clocks.length} steps, whatever its own length")
     if facts.bins is not None:
         lines.append(f"  a step joins {facts.bins} bins of the recordings")
     yield Section("", [*map(Text, lines), _layer_table(facts.layers)])

@@ -14,7 +14,7 @@ from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.graphs import NEUTOUCH
-from spikeloom.models.recordings.events import join_bins
+from spikeloom.models.recordings.events import fitted, join_bins
 from spikeloom.models.sensors import read_layout
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_graph, load_network
@@ -39,8 +39,15 @@ class Bench:
 
     def steps(self) -> tuple[Events, IntArray]:
         """Recordings in steps of the network, and how many steps each has."""
-        bins = self.pair.netlist.bins
-        return join_bins(self.events, bins), -(-self.lengths // bins)
+        return in_steps(self.events, self.lengths, self.pair.netlist)
+
+
+def in_steps(events: Events, lengths: IntArray, netlist: Netlist) -> tuple[Events, IntArray]:
+    """Recordings in steps of a network, and how many steps of each count."""
+    joined, steps = join_bins(events, netlist.bins), netlist.clocks.length
+    if steps is None:
+        return joined, -(-lengths // netlist.bins)
+    return fitted(joined, steps), np.full_like(lengths, steps)
 
 
 # -- inputs ------------------------------------------------------------------------------------------------------------
@@ -50,9 +57,9 @@ def whole(events: Events, netlist: Netlist, lengths: IntArray) -> Inputs:
     """Recordings from their first bin on."""
 
     def channels(rows: slice) -> Events:
-        return with_clocks(join_bins(events[rows], netlist.bins), netlist.clocks)
+        return with_clocks(in_steps(events[rows], lengths[rows], netlist)[0], netlist.clocks)
 
-    return Inputs(channels=channels, lengths=-(-lengths // netlist.bins), begin=np.zeros_like(lengths))
+    return Inputs(channels=channels, lengths=in_steps(events[:1], lengths, netlist)[1], begin=np.zeros_like(lengths))
 
 
 def by_length(events: Events, lengths: IntArray, change: Callable[[Events], Events]) -> Events:

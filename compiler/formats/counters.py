@@ -1,0 +1,165 @@
+"""Counting networks: what one is, its file, and the spiking network that it stands for. Whole numbers from end to end.
+
+A *counter* is a neuron without leak that receives one channel with weight 1 and itself with ``-BLOCK``: it spikes when
+the channel has had `count` events, and then not before the ``2 * count + BLOCK``-th. *Sums*, one neuron a class, add up
+the weights of the counters that spiked. A bias, the same for all, is a ramp: after the data the largest sum crosses the
+threshold first. The *vote* of a class spikes from then on in every step, so that spikes order the classes as sums do.
+
+Where the recording has several parts, a *gate* for each channel and part spikes when the channel and the clock of the
+part do, and the counters of the part receive the gate.
+
+The file is an archive of :mod:`compiler.archive`: the ``manifest`` has the sizes and constants of :class:`Counters` and
+``training`` (how it was made and what it reached), ``counter`` and ``weight`` are arrays.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from spikeloom.compiler.archive import COUNTERS, Array, archive_bytes, entry_faults, read_archive, write_archive
+from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, Clocks
+from spikeloom.compiler.errors import FormatError, ModelError
+from spikeloom.compiler.files import sha256_of
+from spikeloom.compiler.fixedpoint import read_only
+from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble
+from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
+from spikeloom.compiler.types import IntArray
+
+VERSION = 1
+
+SYSTEM = "counters"
+"""Name of such networks among the systems that are trained."""
+
+BLOCK = 127
+"""What a counter's spike takes from its membrane: the largest weight beside one of 1 in a mantissa of 8 bits."""
+
+SIZES = ("taxels", "polarities", "classes", "bins", "steps", "parts", "ramp")
+CONSTANTS = ("slope", "threshold")
+LARGEST = {"bins": MOST_STEPS, "steps": MOST_STEPS, "ramp": MOST_STEPS, "parts": MOST_CLOCKS}
+
+_AGAIN = "copy or train it again"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Counters:
+    """A counting network."""
+
+    taxels: int
+    polarities: int
+    classes: int
+    bins: int  # Bins of the recordings that a step joins
+    steps: int  # That count; whatever comes later is not looked at
+    parts: int  # Equal parts of these
+    ramp: int  # Silent steps after them, in which the classes are read out
+    counter: IntArray  # (counters, 3) int64; channel, part, and the event at which it spikes
+    weight: IntArray  # (classes, counters) int64; to the sums
+    # slope, threshold: Of the sums: what each step adds to them, and where they spike
+    slope: float
+    threshold: float
+    training: Mapping[str, Any] = field(default_factory=dict)  # JSON values: how it was made and what it reached
+
+    @property
+    def clocks(self) -> Clocks:
+        """Clocks of the parts, and how long a recording is run."""
+        length = self.steps + self.ramp
+        if self.parts == 1:
+            return Clocks(length=length)
+        return Clocks(channels=self.parts, steps=-(-self.steps // self.parts), length=length)
+
+    def trained(self, record: Mapping[str, Any]) -> Counters:
+        """The same with how it was made."""
+        return replace(self, training=record)
+
+
+def counting_network(counters: Counters) -> Network:
+    """The populations and synapses of a counting network."""
+    channels, clocks = counters.taxels * counters.polarities, counters.clocks
+    layers: list[Layer] = []
+
+    def add(name: str, beta: float, theta: float, sources: Mapping[int, Sparse], bias: float = 0.0) -> int:
+        neurons = next(iter(sources.values())).shape[0]
+        layers.append(Layer(name=name, beta=beta, theta=theta, bias=np.full(neurons, bias), sources=sources))
+        return len(layers) - 1
+
+    source, width = INPUT, channels
+    if clocks.channels:
+        width = channels * counters.parts
+        every = sparse.vstack([sparse.eye_array(channels)] * counters.parts)
+        own = sparse.kron(sparse.eye_array(counters.parts), np.ones((channels, 1)))
+        gates = sparse.csr_array(sparse.hstack([every, own]))
+        source = add("gates", 0.0, 1.5, {INPUT: gates})
+    channel, part, count = counters.counter.T
+    summed = {}
+    for each in np.unique(count).tolist():
+        rows = np.flatnonzero(count == each)
+        ones = np.ones(len(rows))
+        place = np.arange(len(rows)), part[rows] * channels + channel[rows]
+        into = {source: sparse.csr_array((ones, place), shape=(len(rows), width))}
+        into[len(layers)] = sparse.csr_array(sparse.diags_array(-BLOCK * ones))
+        reached = add(f"count{each}", 1.0, each - 0.5, into)
+        summed[reached] = sparse.csr_array(counters.weight[:, rows].astype(np.float64))
+    sums = add("sums", 1.0, counters.threshold, summed, counters.slope)
+    one = sparse.csr_array(sparse.eye_array(counters.classes))
+    votes = add("votes", 0.0, 0.5, {sums: one, sums + 1: one.copy()})
+    sensor = Input(taxels=counters.taxels, polarities=counters.polarities, clocks=clocks, bins=counters.bins)
+    return assemble(layers, sensor, votes, np.arange(counters.classes))
+
+
+def write_counters(path: str | os.PathLike[str], counters: Counters) -> str:
+    """Write a file, whole or not at all; return its sha256. Equal input gives equal bytes."""
+    manifest = {name: getattr(counters, name) for name in (*SIZES, *CONSTANTS)}
+    manifest |= {"format": COUNTERS, "version": VERSION, "training": dict(counters.training)}
+    arrays = {name: getattr(counters, name) for name in ("counter", "weight")}
+    return write_archive(archive_bytes(manifest, arrays), path)
+
+
+def read_counters(path: str | os.PathLike[str]) -> tuple[Counters, str]:
+    """Read and check a file; also its sha256. ModelError if it is damaged, altered, newer or inconsistent."""
+    path = Path(path)
+    try:
+        manifest, members = read_archive(path, COUNTERS, VERSION, lambda _: ("counter", "weight"))
+    except FormatError as error:
+        said = str(error).rpartition("; ")[0].replace("netlist", "network")  # without the remedy, which is a netlist's
+        raise ModelError(f"{said}; {_AGAIN}") from error
+    kinds = {name: (0 if name == "ramp" else 1, LARGEST.get(name, 2**20)) for name in SIZES}
+    wrong = entry_faults(manifest, kinds | dict.fromkeys(CONSTANTS, float) | {"training": dict})
+    if not wrong:
+        wrong = _array_faults(manifest, members["counter"], members["weight"])
+    if wrong:
+        raise ModelError(f"{path}: {'; '.join(wrong)}; {_AGAIN}")
+    counters = Counters(
+        **{name: manifest[name] for name in (*SIZES, *CONSTANTS, "training")},
+        counter=read_only(members["counter"]),
+        weight=read_only(members["weight"]),
+    )
+    return counters, sha256_of(path)
+
+
+def _array_faults(sizes: Mapping[str, Any], counter: Array, weight: Array) -> list[str]:
+    """What in the arrays does not suit the sizes, or each other."""
+    if (counter.dtype.kind, weight.dtype.kind) != ("i", "i") or counter.shape[1:] != (3,) or not len(counter):
+        return ["counter is no table of whole numbers"]
+    if weight.shape != (sizes["classes"], len(counter)) or np.abs(weight.astype(np.int64)).max() > BLOCK:
+        return ["weight is no table of whole numbers for these counters"]
+    most = sizes["taxels"] * sizes["polarities"] - 1, sizes["parts"] - 1, MOST_STEPS
+    inside = bool(np.all((counter >= (0, 0, 1)) & (counter <= most)))
+    return [] if inside else ["counters of channels, parts or counts that do not exist"]
+
+
+def read_network(path: str | os.PathLike[str]) -> ReadNetwork[Network]:
+    """Read a file as the spiking network that it stands for; raises as :func:`read_counters`."""
+    counters, sha256 = read_counters(path)
+    thresholds = ", ".join(map(str, np.unique(counters.counter[:, 2]).tolist()))
+    parts = f" in each of {counters.parts} parts" if counters.parts > 1 else ""
+    fact = (
+        f"{len(counters.counter)} counters of {thresholds} events{parts}; {counters.steps} steps count, then "
+        f"{counters.ramp} to read out"
+    )
+    return ReadNetwork(network=counting_network(counters), facts=(fact,), sha256=sha256)

@@ -1,0 +1,220 @@
+"""Train counting networks: a linear rule on what counters say, rounded to whole weights.
+
+Every recording becomes the spikes of a few hundred counters (:mod:`formats.counters`); a linear support vector machine
+(one class against the rest, squared hinge [1]_) on these is the weights of the sums. Its strength is chosen by
+cross-validation inside the training recordings.
+
+References
+----------
+.. [1] R.-E. Fan et al., "LIBLINEAR: A Library for Large Linear Classification", JMLR 9, 2008: L2-loss SVC.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from spikeloom.compiler.dynamics import MOST_CLOCKS
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.fixedpoint import read_only
+from spikeloom.compiler.formats.counters import BLOCK, Counters
+from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.models.recordings.events import joined_bins
+from spikeloom.models.recordings.evtouch import WHOLE, Recordings
+
+THRESHOLDS = (1, 4, 16, 64)
+"""Events at which the counters of a channel spike, unless others are asked for."""
+
+STRENGTHS = (0.01, 0.03, 0.1, 0.3)
+"""Weight of a training error against that of large weights, of which cross-validation chooses one."""
+
+FOLDS = 5
+LEAST = 3
+"""Recordings in which a counter must spike, and in which it must not, to be worth a neuron."""
+
+MOST = 64
+"""Thresholds at most."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What a counting network is to be."""
+
+    thresholds: tuple[int, ...] = THRESHOLDS
+    parts: int = 1  # Equal parts of the recording that are counted apart
+    bins: int = 1  # Bins of the recordings that a step joins
+    window: int = 100  # Per cent of the recording that counts
+    ramp: int = 32  # Steps of the read-out
+    bits: int = 8  # Width of a weight
+    strengths: tuple[float, ...] = STRENGTHS
+
+    def require_possible(self) -> None:
+        """Refuse numbers that no network has."""
+        if not 1 <= self.parts <= MOST_CLOCKS:
+            raise OptionError(f"--parts {self.parts}: allowed are 1 to {MOST_CLOCKS}; choose another")
+        if not 1 <= self.window <= WHOLE:
+            raise OptionError(f"--window {self.window}: allowed are 1 to {WHOLE} per cent; choose another")
+        if not 1 <= len(set(self.thresholds)) == len(self.thresholds) <= MOST or min(self.thresholds) < 1:
+            words = ",".join(map(str, self.thresholds))
+            raise OptionError(f"--thresholds {words}: give up to {MOST} different numbers from 1, as in 1,4,16,64")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Counted:
+    """Spikes of all counters of a plan that a sensor could have, step by step."""
+
+    plan: Plan
+    steps: int
+    counter: IntArray  # (counters, 3) int64; see :class:`Counters`
+    spikes: NDArray[np.int8]  # (samples, counters); how often each has spiked in the end
+    at: NDArray[np.int32]  # (samples, counters); step of the first spike, `steps` where there is none
+    labels: IntArray
+
+    def part(self, rows: Any) -> Counted:
+        """Some of the recordings."""
+        return replace(self, spikes=self.spikes[rows], at=self.at[rows], labels=self.labels[rows])
+
+
+def counted(data: Recordings, plan: Plan, steps: int | None = None) -> Counted:
+    """Run the counters on recordings; `steps` of the training recordings, where these are others."""
+    plan.require_possible()
+    events = joined_bins(data, plan.bins).events
+    if steps is None:
+        steps = max(1, math.ceil(events.shape[-1] * plan.window / 100))
+    if plan.parts > steps:
+        raise OptionError(f"--parts {plan.parts}: a recording has {steps} steps; give fewer")
+    flat = events.reshape(len(events), -1, events.shape[-1])[..., :steps]
+    length = -(-steps // plan.parts)
+    rows, kinds = [], []
+    for part in range(plan.parts):
+        first = part * length
+        total = np.cumsum(flat[..., first : first + length], axis=-1, dtype=np.int16)
+        for threshold in plan.thresholds:
+            fired = total >= threshold
+            last = total[..., -1].astype(np.int64)
+            times = np.where(last >= threshold, 1 + (last - threshold) // (threshold + BLOCK), 0)
+            when = np.where(fired[..., -1], first + fired.argmax(axis=-1), steps)
+            rows.append((times, when))
+            kinds.append([(channel, part, threshold) for channel in range(flat.shape[1])])
+    return Counted(
+        plan=plan,
+        steps=steps,
+        counter=np.array(kinds, np.int64).reshape(-1, 3),
+        spikes=np.concatenate([times for times, _ in rows], axis=1).astype(np.int8),
+        at=np.concatenate([when for _, when in rows], axis=1).astype(np.int32),
+        labels=data.labels,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rule:
+    """A linear rule on counters: the class of the largest sum of weights of those that spiked."""
+
+    used: IntArray  # Counters that it looks at
+    weight: FloatArray  # (classes, used)
+
+    def right(self, data: Counted) -> NDArray[np.bool_]:
+        """Which recordings it decides rightly; (samples,)."""
+        return np.asarray(self.sums(data).argmax(axis=1) == data.labels)
+
+    def sums(self, data: Counted, step: int | None = None) -> FloatArray:
+        """Sums of each class, (samples, classes), in the end or before a step; second spikes count as the first."""
+        spikes = data.spikes[:, self.used]
+        found: FloatArray = (
+            spikes if step is None else np.where(data.at[:, self.used] < step, spikes, 0)
+        ) @ self.weight.T
+        return found
+
+
+def linear_rule(data: Counted, classes: int, strength: float) -> Rule:
+    """A support vector machine without bias, one class against the rest, on the counters that spike now and then."""
+    used = np.flatnonzero((data.spikes > 0).sum(axis=0) >= LEAST)
+    if not len(used):
+        raise DataError("counters: none of them spikes; give other --thresholds, or recordings with events")
+    spikes = data.spikes[:, used].astype(np.float64)
+    # in coordinates of the recordings where these are fewer than counters: the best weights are sums of recordings
+    basis = np.linalg.svd(spikes, full_matrices=False)[2] if len(used) > len(spikes) else np.eye(len(used))
+    seen = spikes @ basis.T
+    sign = np.where(data.labels[:, None] == np.arange(classes), 1.0, -1.0)
+
+    def loss(flat: FloatArray) -> tuple[float, FloatArray]:
+        weight = flat.reshape(-1, classes)
+        short = np.maximum(1 - sign * (seen @ weight), 0)
+        gradient = weight - 2 * strength * (seen.T @ (sign * short))
+        return 0.5 * float((weight**2).sum()) + strength * float((short**2).sum()), gradient.ravel()
+
+    start = np.zeros(seen.shape[1] * classes)
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", options={"maxiter": 200, "ftol": 1e-6, "gtol": 1e-4})
+    return Rule(used=used, weight=(basis.T @ found.x.reshape(-1, classes)).T)
+
+
+def folds(labels: IntArray, parts: int, rng: np.random.Generator) -> IntArray:
+    """Part of each recording, so that all parts have the same share of every class; (samples,)."""
+    found = np.empty(len(labels), np.int64)
+    first = 0
+    for each in np.unique(labels):
+        own = rng.permutation(np.flatnonzero(labels == each))
+        found[own] = (np.arange(len(own)) + first) % parts
+        first += len(own)
+    return found
+
+
+def held_out(data: Counted, classes: int, strength: float, *, seed: int = 0) -> FloatArray:
+    """Sums of each class, (samples, classes), by rules that did not see the recording."""
+    fold = folds(data.labels, FOLDS, np.random.default_rng(seed))
+    found = np.zeros((len(fold), classes))
+    for held in range(FOLDS):
+        rule = linear_rule(data.part(fold != held), classes, strength)
+        found[fold == held] = rule.sums(data.part(fold == held))
+    return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fitted:
+    """A rule, and what cross-validation said."""
+
+    rule: Rule
+    strength: float  # The weakest of those that did best
+    accuracy: Mapping[float, float]  # Of each strength
+    lowest: float  # Largest sum of the recording in which it is least, by rules that did not see it
+
+
+def fit(data: Counted, classes: int) -> Fitted:
+    """Fit the rule on all recordings, at the strength that cross-validation chooses."""
+    sums = {strength: held_out(data, classes, strength) for strength in sorted(data.plan.strengths)}
+    accuracy = {strength: float(np.mean(each.argmax(axis=1) == data.labels)) for strength, each in sums.items()}
+    best = max(accuracy, key=accuracy.__getitem__)
+    rule = linear_rule(data, classes, best)
+    return Fitted(rule=rule, strength=best, accuracy=accuracy, lowest=float(sums[best].max(axis=1).min()))
+
+
+def counters_of(data: Counted, fitted: Fitted, recordings: Recordings, classes: int) -> Counters:
+    """The network of a rule in whole weights; counters whose weights are all zero are left out.
+
+    Its ramp leads from the largest sum that the training recordings ever reach down to the lowest that may win.
+    """
+    plan, unit = data.plan, float(np.abs(fitted.rule.weight).max()) / ((1 << (data.plan.bits - 1)) - 1)
+    weight = np.rint(fitted.rule.weight / unit)
+    kept = weight.any(axis=0)
+    rule = Rule(used=fitted.rule.used[kept], weight=weight[:, kept])
+    highest = max(float(rule.sums(data, step).max()) for step in range(1, data.steps + 1))
+    slope = math.ceil((highest - fitted.lowest / unit) / max(plan.ramp - 2, 1))
+    return Counters(
+        taxels=recordings.taxels,
+        polarities=recordings.events.shape[2],
+        classes=classes,
+        bins=plan.bins,
+        steps=data.steps,
+        parts=plan.parts,
+        ramp=plan.ramp,
+        counter=read_only(data.counter[rule.used]),
+        weight=read_only(np.ascontiguousarray(rule.weight, np.int64)),
+        slope=float(slope),
+        threshold=highest + slope * data.steps + 0.5,
+    )

@@ -1,0 +1,99 @@
+"""What ``train --system counters`` does: choose the strength of the rule, fit it, and read the test split once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from spikeloom.compiler import __version__
+from spikeloom.compiler.formats.counters import Counters, counting_network, write_counters
+from spikeloom.compiler.interpret import channels_last, float_simulation
+from spikeloom.compiler.types import IntArray
+from spikeloom.models.recordings.events import joined_bins, of_length
+from spikeloom.models.recordings.evtouch import Recordings, data_digest
+from spikeloom.models.training.counters import Plan, counted, counters_of, fit
+from spikeloom.runtime.machines.votes import readout_counts
+from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.numbers import percent
+from spikeloom.runtime.report.sections import Section, Table, Text
+
+PART = 64
+"""Recordings whose spikes are held at a time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CountersRecord:
+    """How a counting network was made, and what it reached."""
+
+    command: str
+    spikeloom: str
+    data: str
+    data_sha256: str
+    plan: Plan
+    strength: float  # Of the rule, chosen by cross-validation
+    cross_validation: Mapping[str, float]  # Accuracy of each strength on training recordings that it did not see
+    samples: int  # Training recordings
+    counters: int
+    test_correct: int
+    test_samples: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CountersReport:
+    """A counting network that was trained and written."""
+
+    file: str
+    sha256: str
+    record: CountersRecord
+
+
+def decisions_of(counters: Counters, data: Recordings) -> IntArray:
+    """Class of each recording, as the spiking network decides."""
+    network = counting_network(counters)
+    ready, found = float_simulation(network), []
+    steps = of_length(joined_bins(data, counters.bins), counters.clocks.length)
+    for first in range(0, len(data), PART):
+        events = channels_last(steps.events[first : first + PART], counters.clocks)
+        votes = ready.run(events).spikes[network.readout.population]
+        found.append(readout_counts(network.readout, network.classes, votes).argmax(axis=1))
+    return np.concatenate(found)
+
+
+def train_counters(plan: Plan, training: Recordings, test: Recordings, command: str, output: str) -> CountersReport:
+    """Train a counting network, write it, and read the test split."""
+    progress("cross-validation")
+    classes = int(training.labels.max()) + 1
+    data = counted(training, plan)
+    fitted = fit(data, classes)
+    made = counters_of(data, fitted, training, classes)
+    progress("test split")
+    record = CountersRecord(
+        command=command,
+        spikeloom=__version__,
+        data=training.source,
+        data_sha256=data_digest(training, test),
+        plan=plan,
+        strength=fitted.strength,
+        cross_validation={f"{each:g}": accuracy for each, accuracy in fitted.accuracy.items()},
+        samples=len(training),
+        counters=len(made.counter),
+        test_correct=int(np.sum(decisions_of(made, test) == test.labels)),
+        test_samples=len(test),
+    )
+    sha256 = write_counters(output, made.trained(asdict(record)))
+    return CountersReport(file=Path(output).name, sha256=sha256, record=record)
+
+
+def counters_sections(report: CountersReport) -> Iterator[Section]:
+    """What was trained, for people."""
+    made = report.record
+    rows = [[strength, f"{100 * share:.1f} %"] for strength, share in made.cross_validation.items()]
+    lines = [
+        f"{made.counters} counters; strength {made.strength:g}, by cross-validation in {made.samples} recordings",
+        f"test accuracy: {percent(made.test_correct, made.test_samples)}",
+        f"written: {report.file}, sha256 {report.sha256}",
+    ]
+    yield Section("Training", [Text(made.command), Table(["strength", "right when left out"], rows), *map(Text, lines)])
