@@ -77,7 +77,8 @@ class Layer:
     def _run(self, *arrays: Any) -> None:
         from spikeloom.compiler.layer_kernel import run_layer
 
-        run_layer(arrays[0], *self.fixed, *arrays[1:])
+        state, listed = np.empty((3, self.size), self._kind), np.empty(self.size, np.int32)
+        run_layer(arrays[0], *self.fixed, state, listed, *arrays[1:])
 
     @property
     def _kind(self) -> np.dtype[Any]:

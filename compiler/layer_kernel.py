@@ -6,6 +6,7 @@ as the spikes that arrive in it, and a pass over the neurons.
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
@@ -25,6 +26,9 @@ Function = Callable[..., Any]
 
 DENORMAL = 1e-30
 """Membranes and currents below this are flushed to zero; beside a threshold they are nothing."""
+
+FIRST = np.int64(0)
+"""A plain 0 is a type of its own to numba, and what is called with it compiled once more."""
 
 GAP = 16
 """Targets this near are joined in one run, with weights of zero in between: a vector costs no more than a weight."""
@@ -71,18 +75,28 @@ def no_synapses(dtype: npt.DTypeLike) -> Synapses:
 
 
 class _Notice(numba_event.Listener):
-    """Says once on a terminal that machine code is being compiled, which takes seconds."""
+    """Says once on a terminal that machine code is being compiled, which takes seconds.
 
-    said = False
+    Meanwhile no garbage is collected: the compiler makes so many objects that a tenth of its time would go into it.
+    """
+
+    said, depth, collects = False, 0, True
 
     def on_start(self, _event: Any) -> None:
-        """The first of many functions."""
+        """A function, or one that it calls."""
+        if not self.depth:
+            self.collects = gc.isenabled()
+            gc.disable()
+        self.depth += 1
         if not self.said and sys.stderr.isatty():
             sys.stderr.write("\r\x1b[Kcompiling the simulator's machine code, once after an installation\n")
         self.said = True
 
     def on_end(self, _event: Any) -> None:
-        """Nothing more to say."""
+        """Compiled, or refused."""
+        self.depth -= 1
+        if not self.depth and self.collects:
+            gc.enable()
 
 
 _events: Any = numba_event  # without types
@@ -144,6 +158,13 @@ def copy(values: Any, out: Any) -> None:
 
 
 @compiled
+def clear(values: Any) -> None:
+    """As ``values[:] = 0``, which takes longer to compile."""
+    for i in range(len(values)):
+        values[i] = 0
+
+
+@compiled
 def _ones(word: Any) -> Any:
     # the compiler knows this sum of ever wider fields as one instruction
     word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
@@ -153,16 +174,14 @@ def _ones(word: Any) -> Any:
 
 
 @compiled_and_cached
-def coincidences(times: Any) -> Any:
-    """How often each two inputs spike together, from the steps of each at a bit a step: uint64, (inputs, words)."""
-    together = np.empty((len(times), len(times)), np.float64)
+def coincidences(times: Any, together: Any) -> None:
+    """Fill in how often each two inputs spike together, from steps at a bit each: uint64, (inputs, words)."""
     for i in range(len(times)):
         for j in range(i + 1):
             count = np.uint64(0)
             for k in range(times.shape[1]):
                 count += _ones(times[i, k] & times[j, k])
             together[i, j] = together[j, i] = count
-    return together
 
 
 @compiled
@@ -252,6 +271,8 @@ def run_layer(
     own: Any,
     bias: Any,
     registers: Any,
+    state: Any,
+    before: Any,
     fired: Any,
     membranes: Any,
     wanted: Any,
@@ -260,19 +281,19 @@ def run_layer(
     """Run the recordings of a raster in the number type of `bias`, each from rest.
 
     `registers` are the alpha, beta and theta of floats. Of integers they are the thresholds, in membrane units as
-    `bias` is, the shares that current and membrane keep, in 1/4096, and what no membrane passes.
+    `bias` is, the shares that current and membrane keep, in 1/4096, and what no membrane passes. `state` (3, neurons)
+    and `before` (neurons,) int32 are for its own use: making them here would take compilation.
 
     `fired` (recordings, steps, neurons) uint8 is filled, and `membranes`, likewise and before the reset, unless it is
     empty. Unless `wanted`, the same at a bit a neuron, is empty, `moved` (2, neurons) int32 counts in which entries a
     neuron differs from it, and the spikes that it has more; `fired` then needs one recording of two steps, no more.
     """
     recordings, steps = (wanted if len(wanted) else fired).shape[:2]
-    kept, last, size = fired.shape
-    before = np.empty(size, np.int32)
-    membrane, current, sums = np.zeros(size, bias.dtype), np.zeros(size, bias.dtype), np.zeros(size, bias.dtype)
+    kept, last, _ = fired.shape
+    membrane, current, sums = state[0], state[1], state[2]
     for recording in range(recordings):
-        membrane[:] = 0
-        current[:] = 0
+        clear(membrane)
+        clear(current)
         for t in range(steps):
             # how many registers there are is known when this is compiled: only one branch is
             if len(registers) == 3:
@@ -280,11 +301,11 @@ def run_layer(
                 keep(current, registers[0])
             else:
                 arriving = sums
-                sums[:] = 0
+                clear(sums)
             at, now = recording * steps + t, fired[recording % kept, t % last]
             arrive(arriving, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
             if len(own.run) and t:
-                arrive(arriving, own, before, 0, list_fired(fired[recording % kept, (t - 1) % last], before))
+                arrive(arriving, own, before, FIRST, list_fired(fired[recording % kept, (t - 1) % last], before))
             if len(registers) == 3:
                 integrate_float(membrane, current, bias, registers[1], registers[2], now)
             else:

@@ -24,9 +24,11 @@ from spikeloom.compiler.interpret import BATCH, channels_last, raster, threads
 from spikeloom.compiler.ir import INPUT, Network, Population, Sparse
 from spikeloom.compiler.layer_kernel import (
     DENORMAL,
+    FIRST,
     Synapses,
     arrive,
     by_source,
+    clear,
     compiled,
     compiled_and_cached,
     flush,
@@ -168,17 +170,25 @@ def _run(
     constants: Any,
     roundings: Any,
     per_spike: Any,
+    state: Any,
+    listed: Any,
     fired: Any,
     unsure: Any,
 ) -> None:
-    """Run recordings through a layer; `fired` and `unsure` (recordings, steps, neurons) uint8 are filled."""
+    """Run recordings through a layer; `fired` and `unsure` (recordings, steps, neurons) uint8 are filled.
+
+    It uses `state` (9, neurons) and `listed` (neurons,) int32.
+    """
     alpha, beta, least, most = constants
-    recordings, steps, size = fired.shape
-    listed, nothing = np.empty(size, np.int32), np.zeros(size)
+    recordings, steps, _ = fired.shape
+    c, half, r, doubtful, nothing = state[0], state[1], state[2], state[3], state[4]
+    centre, radius, before_c, before_r = state[5], state[6], state[7], state[8]
     for recording in range(recordings):
-        centre, radius, before_c, before_r = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
+        for row in range(len(state)):
+            clear(state[row])
         for t in range(steps):
-            c, half, r, doubtful = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
+            for row in range(4):
+                clear(state[row])
             at = recording * steps + t
             first, last = sure.bounds[at], sure.bounds[at + 1]
             arrive(c, weight, sure.source, first, last)
@@ -190,12 +200,12 @@ def _run(
             spikes += last - first
             if len(own.run) and t:  # what was uncertain in a step is so in the next
                 found = list_fired(fired[recording, t - 1], listed)
-                arrive(c, own, listed, 0, found)
-                arrive(r, own_magnitude, listed, 0, found)
+                arrive(c, own, listed, FIRST, found)
+                arrive(r, own_magnitude, listed, FIRST, found)
                 spikes += found
                 found = list_fired(unsure[recording, t - 1], listed)
-                arrive(half, own, listed, 0, found)
-                arrive(doubtful, own_magnitude, listed, 0, found)
+                arrive(half, own, listed, FIRST, found)
+                arrive(doubtful, own_magnitude, listed, FIRST, found)
                 spikes += found
             added = (roundings + (spikes if per_spike else 0)) * UNIT
             _currents(c, half, r, doubtful, nothing if alpha else bias, SLACK * added / (1 - added))
@@ -243,6 +253,8 @@ class Certainty:
                 (population.alpha, population.beta, *sorted((population.theta, float(np.float32(population.theta))))),
                 layer.roundings,
                 layer.per_spike,
+                np.empty((9, population.size)),
+                np.empty(population.size, np.int32),
                 fired.view(np.uint8),
                 unsure.view(np.uint8),
             )

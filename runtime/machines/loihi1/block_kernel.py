@@ -93,14 +93,17 @@ class Blocks(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What a recording leaves behind; made anew for each."""
+    """What a recording leaves behind, for the next to use again."""
 
     words: AnyArray  # (steps * words of the inputs,) uint64; channels with an event in each step
+    # listed, bounds: as many int32 as bits can be set in a stage and LISTED more, and (steps + 1,) int64; sources of a
+    # stage and the bounds of its steps
+    listed: AnyArray
+    bounds: IntArray
     # raster, idle: (steps * blocks,) uint64; who spiked and who was idle, stage after stage; within a stage step after
     # step
     raster: AnyArray
     idle: AnyArray
-    inputs: AnyArray  # (words of the inputs * 64,) int64; events of each channel
     spikes: AnyArray  # (blocks * 64,) int64; spikes of each position
     membrane: AnyArray  # (blocks * 64,) int32; last membranes
     before: AnyArray  # (blocks * 64,) int16; synaptic sums of the last step: what the current register still holds
@@ -133,9 +136,14 @@ def _all(kind: Any, value: int) -> Any:
 def _arrays(context: Any, builder: Any, kind: Any, value: Any) -> dict[str, Any]:
     """Where the arrays of a named tuple begin."""
     return {
-        name: context.make_array(part)(context, builder, builder.extract_value(value, i)).data
+        name: _begin(context, builder, part, builder.extract_value(value, i))
         for i, (name, part) in enumerate(zip(kind.fields, kind.types, strict=True))
     }
+
+
+def _begin(context: Any, builder: Any, kind: Any, array: Any) -> Any:
+    """Where an array begins: one instruction, where numba's own accessor emits a dozen."""
+    return builder.extract_value(array, context.data_model_manager[kind].get_field_position("data"))
 
 
 def _element(builder: Any, array: Any, index: Any) -> Any:
@@ -319,7 +327,7 @@ def _block_step(*, listed: bool, rests: bool, lasts: bool) -> Function:
             table = _arrays(context, builder, tables, values[0])
             own = _arrays(context, builder, scratch, values[5])
             currents = _arrays(context, builder, lasting, values[6]) if lasts else None
-            sources = context.make_array(active)(context, builder, values[1]).data
+            sources = _begin(context, builder, active, values[1])
             (at, end, block), (place, kept_at) = values[2:5], values[7:9]
             if listed:
                 sums, arrived = _sum_listed(builder, table, sources, (at, end), block, marks=rests)
@@ -356,11 +364,11 @@ def _lowest(typing: Any, word: Any) -> Any:
 
 @_intrinsic
 def _gathered(typing: Any, flags: Any, at: Any) -> Any:
-    """One word of 64 bytes: which are not zero."""
+    """One word of 64 bytes of an array of any shape: which are not zero."""
     kind = ir.VectorType(ir.IntType(8), LANES)
 
     def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
-        array = context.make_array(flags)(context, builder, values[0]).data
+        array = _begin(context, builder, flags, values[0])
         found = builder.icmp_unsigned("!=", _vector(builder, array, values[1], kind)[0], _all(kind, 0))
         return builder.bitcast(found, _WORD)
 
@@ -377,19 +385,38 @@ def _bits(typing: Any, word: Any) -> Any:
     return types.int64(types.uint64), emit
 
 
+def scratch_of(blocks: Blocks, channels: int, steps: int, *, membranes: bool) -> tuple[Scratch, Lasting | None]:
+    """What recordings of up to so many steps are run in; networks without lasting currents do without the code."""
+    n_words, n_blocks = -(-channels // LANES), blocks.keep.size
+    widest, positions = max(n_words, int(np.diff(blocks.stage).max(initial=0))), n_blocks * LANES
+    scratch = Scratch(
+        words=np.empty(steps * n_words, np.uint64),
+        listed=np.empty(steps * widest * LANES + LISTED, np.int32),
+        bounds=np.empty(steps + 1, np.int64),
+        raster=np.empty(steps * n_blocks, np.uint64),
+        idle=np.empty(steps * n_blocks, np.uint64),
+        spikes=np.empty(positions, np.int64),
+        membrane=np.empty(positions, np.int32),
+        before=np.empty(positions, np.int16),
+        membranes=np.empty(steps * positions if membranes else 0, np.int32),
+    )
+    return scratch, Lasting(blocks.keep_u, np.empty(positions, np.int32)) if blocks.keep_u.any() else None
+
+
 # -- recordings --------------------------------------------------------------------------------------------------------
 
 
 @compiled
 def _pack(events: AnyArray, steps: int, words: AnyArray) -> None:
     """Turn the events of a recording into words, channel after channel."""
-    n_words = (events.shape[0] + LANES - 1) // LANES
-    flat, columns = events.reshape(-1), events.shape[1]
+    n_words, columns = (events.shape[0] + LANES - 1) // LANES, events.shape[1]
+    for at in range(steps * n_words):
+        words[at] = 0
     for channel in range(events.shape[0]):
         place, bit = channel >> 6, np.uint64(channel & 63)
         whole = steps - steps % LANES
         for begin in range(0, whole, LANES):
-            left = _gathered(flat, channel * columns + begin)
+            left = _gathered(events, channel * columns + begin)
             while left:
                 words[(begin + _lowest(left)) * n_words + place] |= np.uint64(1) << bit
                 left &= left - np.uint64(1)
@@ -398,12 +425,9 @@ def _pack(events: AnyArray, steps: int, words: AnyArray) -> None:
 
 
 @compiled
-def _list(words: AnyArray, start: int, width: int, steps: int, bounds: AnyArray, count: AnyArray) -> AnyArray:
-    """List the bits that are set in each step, and count them; fills the bounds of the steps."""
-    total = 0
-    for w in range(start, start + steps * width):
-        total += _bits(words[w])
-    listed = np.empty(total + LISTED, np.int32)
+def _list(words: AnyArray, start: int, width: int, steps: int, scratch: Scratch, count: AnyArray) -> None:
+    """List the bits that are set in each step, and count them."""
+    listed, bounds = scratch.listed, scratch.bounds
     n = 0
     for t in range(steps):
         bounds[t] = n
@@ -420,7 +444,6 @@ def _list(words: AnyArray, start: int, width: int, steps: int, bounds: AnyArray,
     bounds[steps] = n
     for i in range(n):
         count[listed[i]] += 1
-    return listed
 
 
 def _block_runner(*, lasts: bool) -> Function:
@@ -438,11 +461,10 @@ def _block_runner(*, lasts: bool) -> Function:
         words: AnyArray,
         start: int,
         width: int,
-        listed: AnyArray,
-        bounds: IntArray,
         scratch: Scratch,
         lasting: Lasting | None,
     ) -> None:
+        listed, bounds = scratch.listed, scratch.bounds
         begin, end = blocks.stage[s], blocks.stage[s + 1]
         rests = blocks.restful[block] != 0
         for t in range(steps):
@@ -467,20 +489,19 @@ _run_block, _run_lasting_block = (_block_runner(lasts=lasts) for lasts in (False
 
 
 @compiled
-def _run_stages(blocks: Blocks, n_words: int, steps: int, scratch: Scratch, lasting: Lasting | None) -> None:
+def _run_stages(blocks: Blocks, inputs: IntArray, steps: int, scratch: Scratch, lasting: Lasting | None) -> None:
     """Let all stages integrate, one after the other, and count spikes and events."""
-    bounds = np.empty(steps + 1, np.int64)
-    active, start, width, count = scratch.words, np.int64(0), n_words, scratch.inputs
+    active, start, width, count = scratch.words, np.int64(0), (inputs.size + LANES - 1) // LANES, inputs
     for s in range(blocks.stage.size - 1):
-        listed = _list(active, start, width, steps, bounds, count)
+        _list(active, start, width, steps, scratch, count)
         begin, end = blocks.stage[s], blocks.stage[s + 1]
         for block in range(begin, end):  # one after another: their rows and membranes stay in cache
             if lasting is not None and lasting.keep_u[block] != 0:
-                _run_lasting_block(blocks, s, block, steps, active, start, width, listed, bounds, scratch, lasting)
+                _run_lasting_block(blocks, s, block, steps, active, start, width, scratch, lasting)
             else:
-                _run_block(blocks, s, block, steps, active, start, width, listed, bounds, scratch, None)
+                _run_block(blocks, s, block, steps, active, start, width, scratch, None)
         active, start, width, count = scratch.raster, steps * begin, end - begin, scratch.spikes[begin * LANES :]
-    _list(active, start, width, steps, bounds, count)
+    _list(active, start, width, steps, scratch, count)
 
 
 @compiled
@@ -489,8 +510,6 @@ def _pack_compartments(blocks: Blocks, steps: int, words: AnyArray, out: AnyArra
 
     Inverted, those of positions that hold a compartment.
     """
-    n_words = out.shape[1]
-    flat = out.reshape(-1)
     for s in range(blocks.stage.size - 1):
         begin, end = blocks.stage[s], blocks.stage[s + 1]
         for t in range(steps):
@@ -498,17 +517,17 @@ def _pack_compartments(blocks: Blocks, steps: int, words: AnyArray, out: AnyArra
                 left = words[steps * begin + t * (end - begin) + block - begin]
                 if inverse:
                     left = ~left & blocks.held[block]
-                row = (t + blocks.depth[block]) * n_words
+                row = t + blocks.depth[block]
                 if blocks.whole[block] >= 0:
-                    to, by = row + (blocks.whole[block] >> 6), np.uint64(blocks.whole[block] & 63)
-                    flat[to] |= left << by
+                    to, by = blocks.whole[block] >> 6, np.uint64(blocks.whole[block] & 63)
+                    out[row, to] |= left << by
                     rest = left >> np.uint64(1) >> (np.uint64(LANES - 1) - by)  # a shift by 64 is not defined
                     if rest:
-                        flat[to + 1] |= rest
+                        out[row, to + 1] |= rest
                     continue
                 while left:
                     compartment = blocks.compartment[block * LANES + _lowest(left)]
-                    flat[row + (compartment >> 6)] |= np.uint64(1) << np.uint64(compartment & 63)
+                    out[row, compartment >> 6] |= np.uint64(1) << np.uint64(compartment & 63)
                     left &= left - np.uint64(1)
 
 
@@ -535,9 +554,21 @@ def _copy_membranes(blocks: Blocks, steps: int, kept: AnyArray, out: AnyArray) -
                     place += 1
 
 
+@compiled
+def _clear(scratch: Scratch, lasting: Lasting | None) -> None:
+    for place in range(scratch.idle.size):
+        scratch.idle[place] = 0
+    for position in range(scratch.spikes.size):
+        scratch.spikes[position], scratch.membrane[position], scratch.before[position] = 0, 0, 0
+        if lasting is not None:
+            lasting.current[position] = 0
+
+
 @compiled_and_cached
 def run_recordings(
     blocks: Blocks,
+    scratch: Scratch,
+    lasting: Lasting | None,
     events: AnyArray,
     lengths: IntArray,
     inputs: IntArray,
@@ -546,37 +577,19 @@ def run_recordings(
     fired: AnyArray,
     membranes: AnyArray,
     updated: AnyArray,
-    keep_u: AnyArray | None,
 ) -> None:
     """Run some recordings: `events` (recordings, channels, columns) uint8, not zero where there is one.
 
     Filled, from zeros, are the counts `inputs`, `spikes`, `updates`; `fired` and `updated` (recordings, chip steps,
     words) uint64 and `membranes` (recordings, chip steps, compartments) int32, or no recordings of what is not wanted.
-    `keep_u` is that of the blocks where some current outlasts its step: other networks do without the code for it.
+    Arrays for its own use come from :func:`scratch_of`, as they cost no compilation there.
     """
-    n_words, n_blocks = (events.shape[1] + LANES - 1) // LANES, blocks.keep.size
     for r in range(events.shape[0]):
         steps = lengths[r]
-        scratch = Scratch(
-            np.zeros(steps * n_words, np.uint64),
-            np.empty(steps * n_blocks, np.uint64),
-            np.zeros(steps * n_blocks, np.uint64),
-            np.zeros(n_words * LANES, np.int64),
-            np.zeros(n_blocks * LANES, np.int64),
-            np.zeros(n_blocks * LANES, np.int32),
-            np.zeros(n_blocks * LANES, np.int16),
-            np.empty(steps * n_blocks * LANES if membranes.shape[0] else 0, np.int32),
-        )
         _pack(events[r], steps, scratch.words)
-        if keep_u is None:
-            _run_stages(blocks, n_words, steps, scratch, None)
-        else:
-            lasting = Lasting(keep_u, np.zeros(n_blocks * LANES, np.int32))
-            _run_stages(blocks, n_words, steps, scratch, lasting)
-
-        for channel in range(events.shape[1]):
-            inputs[r, channel] = scratch.inputs[channel]
-        for position in range(n_blocks * LANES):
+        _clear(scratch, lasting)
+        _run_stages(blocks, inputs[r], steps, scratch, lasting)
+        for position in range(scratch.spikes.size):
             if blocks.compartment[position] >= 0:
                 spikes[r, blocks.compartment[position]] = scratch.spikes[position]
         for s in range(blocks.stage.size - 1):
@@ -616,13 +629,14 @@ def add_charges(
     kinds: IntArray,
     members: AnyArray,
     charged: IntArray,
+    totals: IntArray,
 ) -> None:
     """Add what happened in some recordings to the sums of each chip step, `charged` (recordings, chip steps, sums).
 
     `events`, `fired` and `updated` are as in :func:`run_recordings`; `sources` those of :class:`trace.Charges`,
     padded. An update adds one of few `kinds` (kinds, sums); bits of `members` (kinds, words) are compartments of each.
+    In `totals`, as long as a row of `sources`, a step is added up.
     """
-    totals = np.empty(sources.shape[1], np.int64)
     for r in range(events.shape[0]):
         for channel in range(events.shape[1]):
             for t in range(lengths[r]):
@@ -630,7 +644,8 @@ def add_charges(
                     for i in range(kinds.shape[1]):
                         charged[r, t, i] += sources[channel, i]
         for t in range(fired.shape[1]):
-            totals[:] = 0
+            for i in range(totals.size):
+                totals[i] = 0
             _add_rows(sources[events.shape[1] :], fired[r, t], totals)
             for kind in range(kinds.shape[0]):
                 count = 0

@@ -21,7 +21,7 @@ from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.base import Done, EventArray, require_channels
-from spikeloom.runtime.machines.loihi1.block_kernel import CHARGES, Blocks, add_charges, run_recordings
+from spikeloom.runtime.machines.loihi1.block_kernel import CHARGES, Blocks, add_charges, run_recordings, scratch_of
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.kernel import State, Tables, chip_steps, state_of, tables_of
 from spikeloom.runtime.machines.loihi1.trace import (
@@ -151,7 +151,8 @@ def simulate(
     def run(part: slice) -> None:
         fired, worked = run_part(engine, given[part], ends[part], trace, part)
         if charges is not None and trace.charged is not None:
-            add_charges(given[part], ends[part], fired, worked, sources, kinds, members, trace.charged[part])
+            totals = np.empty(sources.shape[1], np.int64)
+            add_charges(given[part], ends[part], fired, worked, sources, kinds, members, trace.charged[part], totals)
 
     parts = [slice(i, min(i + size, recordings)) for i in range(0, recordings, size)]
     workers = min(threads or os.cpu_count() or 1, len(parts))
@@ -178,6 +179,7 @@ def _run_layers(
         spikes = trace.packed[part]
     run_recordings(
         blocks,
+        *scratch_of(blocks, events.shape[1], int(ends.max(initial=0)), membranes=trace.membranes is not None),
         events,
         ends,
         trace.counts.inputs[part],
@@ -186,7 +188,6 @@ def _run_layers(
         spikes,
         np.zeros(nothing, np.int32) if trace.membranes is None else trace.membranes[part],
         updated,
-        blocks.keep_u if blocks.keep_u.any() else None,
     )
     if trace.spikes is not None:
         trace.spikes[part] = unpack(spikes, n)

@@ -61,7 +61,9 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
     for neurons, inputs in _alike(layer):
         shown = np.argsort(-rate[inputs], kind="stable")[:INPUTS]
         shown = shown[rate[inputs[shown]] > 0]
-        share = _share(coincidences(times[inputs[shown]]))
+        together = np.empty((len(shown), len(shown)))
+        coincidences(times[inputs[shown]], together)
+        share = _share(together)
         for rows in np.array_split(neurons, -(-len(neurons) * len(inputs) // PART) or 1):
             places = [_places(p, rows) for p in projections]
             weight = np.concatenate([p.weight.data[at] for p, at in zip(projections, places, strict=True)], axis=1)
@@ -119,7 +121,7 @@ def _spike_times(layer: FloatLayer, calibration: Calibration) -> npt.NDArray[np.
     return np.ascontiguousarray(np.concatenate(times, axis=1)).view(np.uint64)
 
 
-def _share(together: IntArray) -> FloatArray:
+def _share(together: FloatArray) -> FloatArray:
     """How much of each input's error the later ones make up for: a Cholesky factor, columns scaled.
 
     `together` (inputs, inputs) says how often two inputs spiked in the same step.
