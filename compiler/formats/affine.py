@@ -154,11 +154,7 @@ def convolution(
             raise ModelError(f"has a kernel of {taps} for {size} places; export it again")
     out = [(room - span) // step + 1 for room, span, step in zip(padded_space, spans, stride, strict=True)]
     points, taps = math.prod(out), math.prod(kernel)
-    if max(weight.size * points, points, channels * math.prod(padded_space)) > COEFFICIENT_LIMIT:
-        raise ModelError(
-            f"has {weight.size * points:,} weights once written out, {COEFFICIENT_LIMIT:,} are allowed; this "
-            "is no network of one chip"
-        )
+    _require_few(max(weight.size * points, points, channels * math.prod(padded_space)))
     # where in the input each tap looks from each place; -1 is the padding
     positions = np.pad(np.arange(math.prod(shape)).reshape(shape), [(0, 0), *padding], constant_values=-1)
     windows = np.lib.stride_tricks.sliding_window_view(positions, (1, *spans))
@@ -172,10 +168,16 @@ def convolution(
     matrix = sparse.coo_array(
         (values.astype(np.float64), (rows, columns)), shape=(filters * points, math.prod(shape))
     ).tocsr()
-    matrix.sort_indices()
     return matrix, (filters, *out)
 
 
 def block_diagonal(matrix: Sparse, copies: int) -> Sparse:
-    """The same matrix for each of so many parts of a value."""
+    """The same matrix for each of so many parts of a value; ModelError if it would be too large."""
+    _require_few(copies * matrix.nnz)
     return matrix if copies == 1 else sparse.csr_array(sparse.kron(sparse.identity(copies), matrix, format="csr"))
+
+
+def _require_few(weights: int) -> None:
+    if weights > COEFFICIENT_LIMIT:
+        words = f"has {weights:,} weights once written out, {COEFFICIENT_LIMIT:,} are allowed"
+        raise ModelError(f"{words}; this is no network of one chip")

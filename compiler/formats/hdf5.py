@@ -23,8 +23,6 @@ Tree = dict[str, Any]
 
 E = TypeVar("E")
 
-SIGNATURE = b"\x89HDF\r\n\x1a\n"
-
 AGAIN = "export it again"
 
 
@@ -82,12 +80,7 @@ def read_hdf5(path: Path, what: str) -> tuple[Tree, str]:
     Raises ModelError, without the path, if it is missing, too large, no HDF5 file, or holds what may not be read.
     """
     content = read_whole(path, what, f"give a {what} of one chip")
-    if not content.startswith(SIGNATURE):
-        raise ModelError(f"is no HDF5 file, as a {what} is; {AGAIN}")
-    try:
-        return tree_of(content), hashlib.sha256(content).hexdigest()
-    except ModelError as error:
-        raise ModelError(f"{error}; {AGAIN}") from error
+    return tree_of(content), hashlib.sha256(content).hexdigest()
 
 
 def tree_of(content: bytes) -> Tree:
@@ -100,7 +93,7 @@ def tree_of(content: bytes) -> Tree:
     except ModelError:
         raise
     except Exception as error:  # h5py raises nearly anything on damaged files
-        raise ModelError(f"is truncated or damaged ({type(error).__name__})") from error
+        raise ModelError(f"is no HDF5 file, truncated or damaged ({type(error).__name__}); {AGAIN}") from error
 
 
 def _group(group: Any, room: list[int]) -> Tree:
@@ -113,17 +106,17 @@ def _entry(group: Any, key: str, room: list[int]) -> Any:
     import h5py
 
     if not isinstance(group.get(key, getlink=True), h5py.HardLink):
-        raise ModelError(f"{key} is a link to elsewhere, allowed are arrays in the file itself")
+        raise ModelError(f"{key} is a link to elsewhere, allowed are arrays in the file itself; {AGAIN}")
     item = group[key]
     if isinstance(item, h5py.Group):
         return _group(item, room)
     if not isinstance(item, h5py.Dataset) or item.shape is None:
         return None
     if item.external or item.is_virtual:
-        raise ModelError(f"{key} keeps its numbers in another file, allowed is this file alone")
+        raise ModelError(f"{key} keeps its numbers in another file, allowed is this file alone; {AGAIN}")
     room[0] -= item.dtype.itemsize * max(item.size, int(np.prod(item.chunks or (0,), dtype=object)))
     if room[0] < 0:
-        raise ModelError(f"announces more than {files.SIZE_LIMIT} bytes of numbers")
+        raise ModelError(f"announces more than {files.SIZE_LIMIT} bytes of numbers; {AGAIN}")
     if item.dtype.kind == "S" or h5py.check_string_dtype(item.dtype) is not None:
         values = item[()]
         return _decoded(values.tolist() if isinstance(values, np.ndarray) else values)

@@ -75,7 +75,7 @@ def export(netlist: CrossbarNetlist, events: EventArray | None = None) -> Iterat
     yield ",\n".join(json.dumps(tick, separators=(",", ":")) for tick in _packets(netlist, events, x, y))
     yield "],"
     yield '"cores": ['
-    aims = _aims(netlist, bus, voters)
+    aims = _aims(netlist, bus, voters, x, y)
     for core in range(netlist.n_cores):
         end = "," if core + 1 < netlist.n_cores else ""
         yield json.dumps(_core(netlist, core, int(x[core]), int(y[core]), aims), separators=(",", ":")) + end
@@ -108,16 +108,16 @@ def _packets(
     ]
 
 
-def _aims(netlist: CrossbarNetlist, bus: tuple[int, int], voters: IntArray) -> list[tuple[int, int, int, int]]:
-    """Offset, axon and destination tick of each neuron; the place of the `bus` is that in the file."""
-    left, low = netlist.core_x.min(), netlist.core_y.min()
-    x, y = netlist.core_x - left, netlist.core_y - low
+def _aims(
+    netlist: CrossbarNetlist, bus: tuple[int, int], voters: IntArray, x: IntArray, y: IntArray
+) -> list[tuple[int, int, int, int]]:
+    """Offset, axon and destination tick of each neuron; the place of the `bus` and of cores are those in the file."""
     core = netlist.core_of_neuron()
     aim = np.stack([bus[0] - x[core], bus[1] - y[core], np.full(len(core), len(voters)), np.zeros(len(core))], axis=1)
     aim[voters, 2] = np.arange(len(voters))
     source = netlist.wire_neuron
-    aim[source, 0] = netlist.wire_x - left - x[core[source]]
-    aim[source, 1] = netlist.wire_y - low - y[core[source]]
+    aim[source, 0] = netlist.wire_x - netlist.core_x[core[source]]
+    aim[source, 1] = netlist.wire_y - netlist.core_y[core[source]]
     aim[source, 2], aim[source, 3] = netlist.wire_line, netlist.wire_delay - 1
     return [(dx, dy, axon, tick) for dx, dy, axon, tick in aim.astype(np.int64).tolist()]
 

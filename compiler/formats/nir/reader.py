@@ -23,7 +23,6 @@ from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
 from spikeloom.compiler.formats.nir.stages import (
     ALWAYS,
-    KNOWN,
     STAGES,
     TOLERANCE,
     Steps,
@@ -122,7 +121,7 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Neur
             values[name] = STAGES[node.type](node, value, steps)
         else:
             known = ", ".join(sorted([*SPIKING, *STAGES]))
-            raise node.fail(KNOWN.get(node.type, f"is of a type that is not known here, known are {known}; replace it"))
+            raise node.fail(f"is of a type that has no place here, allowed are {known}; replace it")
     found = []
     for node, value in spiking:
         with named(node):

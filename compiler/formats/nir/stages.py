@@ -31,16 +31,6 @@ ALWAYS = -2
 TOLERANCE = 1e-6
 """What float32 leaves of equal numbers."""
 
-DENSE_LIMIT = 2**28
-"""Weights of a matrix that is written out once for each place of an axis."""
-
-KNOWN = {
-    "CubaLI": "its state is filtered twice, a neuron of the chip filters once; use LI",
-    "Delay": "delays spikes, which networks here do not; train without",
-    "I": "integrates without leak and never spikes; use IF",
-}
-"""Why nodes that NIR knows have no place here."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Steps:
@@ -179,9 +169,9 @@ def _linear(node: Node, value: Value, _steps: Steps) -> Value:
         missing = "a Flatten is missing before it" if value.size == columns else "the shapes disagree, export it again"
         raise node.fail(f"weight is for {columns} values, it gets {list(value.shape)}; {missing}")
     copies = math.prod(value.shape[:-1])
-    if copies * weight.size > DENSE_LIMIT:
-        raise node.fail(f"has {copies * weight.size:,} weights, {DENSE_LIMIT:,} are allowed; this fits no chip")
-    result = through(block_diagonal(sparse.csr_array(weight), copies), value, (*value.shape[:-1], rows))
+    with named(node):
+        matrix = block_diagonal(sparse.csr_array(weight), copies)
+    result = through(matrix, value, (*value.shape[:-1], rows))
     if node.type == "Linear":
         return result
     return shifted(result, np.tile(_each(node, "bias", rows), copies))

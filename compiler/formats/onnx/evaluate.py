@@ -212,14 +212,14 @@ def _reduce_matrix(node: Node, table: Table, operands: Sequence[Any], _which: in
     return _contract(table, [letters, ""], out, [_sides(operands[:1], 0)[0], np.array(share)], 0)
 
 
-def _conv_matrix(node: Node, table: Table, operands: Sequence[Any], _which: int) -> Sparse:
-    """Matrix of a convolution of each recording of a batch; its size is checked before."""
+def _conv_matrix(node: Node, _table: Table, operands: Sequence[Any], _which: int) -> Sparse:
+    """Matrix of a convolution of each recording of a batch."""
     data, weight = operands
     if node.attributes.get("auto_pad", "NOTSET") not in ("NOTSET", "VALID") or node.attributes.get("ceil_mode", 0):
         raise ValueError("auto_pad and ceil_mode are not known")
     axes = data.ndim - 2
     pads = node.attributes.get("pads", [0] * 2 * axes)
-    matrix, out = convolution(
+    matrix, _ = convolution(
         data.shape[1:],
         weight,
         stride=node.attributes.get("strides", [1] * axes),
@@ -227,7 +227,6 @@ def _conv_matrix(node: Node, table: Table, operands: Sequence[Any], _which: int)
         dilation=node.attributes.get("dilations", [1] * axes),
         groups=int(node.attributes.get("group", 1)),
     )
-    table.room([len(data), math.prod(out) * math.prod(weight.shape[1:])], COEFFICIENT_LIMIT)
     return block_diagonal(matrix, len(data))
 
 

@@ -114,21 +114,17 @@ def _threshold(neurons: Neurons, *, double: bool) -> float:
 def _names(graph: Graph, table: Table, found: Unrolled) -> tuple[str, ...]:
     """Names of the modules that the layers' weights belong to, as far as the file keeps them."""
     makers = {name: node for node in graph.nodes for name in node.outputs}
-    parameters = {name for name in graph.constants if re.search(r"[./]", name)}
     ends = {table.atoms[n.membrane].label for layer in found.layers for n in layer}
     names = []
     for layer in found.layers:
+        pending, owners = [table.atoms[layer[0].membrane].label], []
         seen: set[str] = set()
-        pending = [table.atoms[layer[0].membrane].label]
-        owners: list[list[str]] = []
-        while pending:
-            name = pending.pop()
-            if name in parameters:
+        for name in pending:
+            if name in graph.constants and re.search(r"[./]", name):
                 owners.append(re.split(r"[./]", name)[:-1])
-            if name in seen or name not in makers or (name in ends and seen):
-                continue
-            seen.add(name)
-            pending += makers[name].inputs
+            if name in makers and name not in seen and not (name in ends and seen):
+                seen.add(name)
+                pending += makers[name].inputs
         shared = [words[0] for words in zip(*owners, strict=False) if len(set(words)) == 1]
         names.append(shared[-1] if shared and not shared[-1].isdecimal() else "")
     return unique_names(names)
