@@ -59,18 +59,10 @@ class Stream:
     def step(self, events: npt.ArrayLike) -> Step:
         """Run the chip step of one bin.
 
-        Parameters
-        ----------
-        events : (taxels, polarities) or (taxels * polarities,)
-            1 where a taxel sent an event of that polarity within the bin, 0 elsewhere, of any number type or bool;
-            channel ``taxel * polarities + polarity`` in the flat form. Clocks of the network tick by themselves.
-
-        Raises
-        ------
-        DataError
-            If the events have another shape or other values, or the stream has ended.
-        NumericRangeError
-            If a register would overflow; that ends the stream.
+        `events` (taxels, polarities), or flat with channel ``taxel * polarities + polarity``, are 1 where a taxel sent
+        an event of that polarity within the bin, else 0, of any number type or bool; the network's clocks tick by
+        themselves. Raises DataError for another shape or other values, or after the end, NumericRangeError if a
+        register would overflow; that ends the stream.
         """
         if self._ended:
             raise DataError(

@@ -98,30 +98,14 @@ def search_widths(
     lengths: IntArray | None = None,
     tell: Callable[[str], None] = lambda _stage: None,
 ) -> WidthSearch:
-    """Narrow one layer after the other.
+    """Narrow one layer after the other, of storage `widths` with at most so many `groups` of scales.
 
-    Parameters
-    ----------
-    network : Network
-        Float stage.
-    target : Target
-        Chip.
-    events : (recordings, steps, channels) bool
-        Training recordings. Those that the compiler calibrates on choose the scales; `samples` of them at most, evenly
-        spaced, are decided.
-    labels : (recordings,) int64
-        Class of each, -1 where it is not known.
-    widths, groups
-        Storage widths of a mantissa; different scales in a layer, at most.
-    lengths : (recordings,) int64, optional
-        Steps of each recording that count.
-    tell : callable, optional
-        Called with what is being done.
+    `events` (recordings, steps, channels) bool are training recordings, `labels` (recordings,) the class of each, -1
+    where it is not known, `lengths` (recordings,) the steps that count. Those that the compiler calibrates on choose
+    the scales; `samples` of them at most, evenly spaced, are decided. `tell` is called with what is being done.
 
-    Raises
-    ------
-    DataError, OptionError, ModelError
-        If the recordings or the widths cannot be used, or a layer has no usable scale at any width.
+    DataError, OptionError or ModelError if the recordings or the widths cannot be used, or a layer has no usable scale
+    at any width.
     """
     widths = check_widths(widths, groups, len(network.populations), target)
     tell("running the float model")

@@ -57,13 +57,8 @@ def estimate(
     `events` are (samples, n_inputs, T), `lengths` (samples,) the data steps of each, `detail` is ``counts`` or
     ``cycle``; `progress` is called with the number of recordings done. The trace holds counts alone.
 
-    Raises
-    ------
-    DataError, NumericRangeError
-        As the engine says.
-    OptionError
-        If several chips shall be simulated by the cycle. Their events are counted and priced but not timed: links
-        between chips have no public latency.
+    DataError and NumericRangeError as the engine says; OptionError if several chips shall be simulated by the cycle.
+    Their events are counted and priced but not timed: links between chips have no public latency.
     """
     prepared = netlist if isinstance(netlist, engine.Engine) else engine.prepare(netlist)
     netlist, deep = prepared.netlist, detail == "cycle"

@@ -6,17 +6,6 @@ from spikeloom.runtime.machines.loihi1.costs.result import Amounts, CostReport
 from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Section, Table, Text
 
-COUNTED = (
-    "synaptic_operations",
-    "synaptic_operations_on_zeros",
-    "spikes",
-    "neuron_updates",
-    "neuron_accesses",
-    "packets",
-    "hops",
-    "packets_between_chips",
-)
-
 
 def sections(report: CostReport) -> list[Section]:
     """Amounts, layers, parts of the chip, cores, and what power and times come to."""
@@ -40,9 +29,9 @@ def inference_table(report: CostReport) -> Table:
     def counts(name: str) -> list[str]:
         return [f"{getattr(each, name):,.0f}" for each in columns]
 
-    rows = [
-        [name.replace("_", " "), *counts(name)] for name in COUNTED if getattr(report.per_inference, name) is not None
-    ]
+    *counted, _ = Amounts.__dataclass_fields__
+    known = [name for name in counted if getattr(report.per_inference, name) is not None]
+    rows = [[name.replace("_", " "), *counts(name)] for name in known]
     tables = report.per_inference.energy_j
     rows += [[f"energy, {name}", *(si(each.energy_j[name], "J") for each in columns)] for name in tables]
     rows += [
