@@ -25,7 +25,7 @@ from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerProjection, Readout
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, index_bits
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound, partition
-from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place, place_within
+from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place
 from spikeloom.compiler.targets.loihi1.legalize import REMEDIES, LimitUse, list_words, measure, require_legal
 
 
@@ -293,24 +293,6 @@ def test_many_cores_are_placed_well(cores, kind):
     shuffled = [cost(traffic, rng.permutation(128)[:cores] // 4, 8) for _ in range(50)]
     assert placement.spike_hops <= min(shuffled)
     assert placement.spike_hops <= cost(traffic, np.arange(cores) // 4, 8) * (1 + 1e-9)
-
-
-@pytest.mark.parametrize(("tiles", "cores"), [(1, 4), (2, 5), (3, 9), (3, 12), (12, 28)])
-def test_a_placement_within_few_tiles(tiles, cores):
-    """A ring of cores that would rather spread: each talks to the next but one."""
-    traffic = np.roll(np.eye(cores), 2, axis=1) + 0.1 * np.random.default_rng(0).random((cores, cores))
-    placement = place_within(traffic, LOIHI, tiles)
-    assert len(set(placement.tiles)) <= tiles
-    assert max(placement.tiles.count(tile) for tile in placement.tiles) <= 4
-    assert placement.spike_hops == pytest.approx(cost(traffic, placement.tiles, 8))
-
-
-def test_a_placement_keeps_to_few_tiles():
-    """Three pairs on tiles for four cores, or for three, where two tiles tear one pair apart."""
-    traffic = np.kron(np.eye(3), np.ones((2, 2)))
-    assert place_within(traffic, LOIHI, 2).spike_hops == 0
-    squeezed = place_within(traffic, small_target(mesh_tile_cores=3), 2)
-    assert (len(set(squeezed.tiles)), squeezed.spike_hops) == (2, 2)
 
 
 @settings(deadline=None, max_examples=20)

@@ -18,9 +18,9 @@ from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.base import PICOSECONDS, Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Cores, Needs
-from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation, Forecast, fastest, sample, tiles_for
+from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation, Forecast, fastest, sample
 from spikeloom.compiler.targets.loihi1.layout.partition import arrange, partition
-from spikeloom.compiler.targets.loihi1.layout.place import Placement, core_traffic, place_on_chips, place_within
+from spikeloom.compiler.targets.loihi1.layout.place import Placement, core_traffic, place_on_chips
 from spikeloom.compiler.types import FloatArray, IntArray
 
 
@@ -76,9 +76,8 @@ def lay_out(
         activity = sample(network, calibration, identity or all_neurons)
         forecast = Forecast(Needs(network, target), activity, target.time[0])
 
-    def placed(cores: Cores, tiles: int | None = None) -> Layout:
-        traffic = core_traffic(network, cores, rates)
-        placement = place_on_chips(traffic, target) if tiles is None else place_within(traffic, target, tiles)
+    def placed(cores: Cores) -> Layout:
+        placement = place_on_chips(core_traffic(network, cores, rates), target)
         expected = None
         if forecast is not None and len(cores) <= target.limit("chip.cores"):
             expected = forecast.expect(cores, len(set(placement.tiles)))
@@ -95,7 +94,6 @@ def lay_out(
     trial = fastest(forecast)
     if trial is None or trial.step >= usual.expected.step_ns * PICOSECONDS:
         return usual, usual
-    alone = arrange(forecast.needs, [(chunk,) for chunk in trial.chunks])
-    fast = placed(alone, tiles_for(forecast, len(trial.chunks)))
+    fast = placed(arrange(forecast.needs, [(chunk,) for chunk in trial.chunks]))
     assert fast.expected is not None, "likewise"
     return (fast if fast.expected.step_ns < usual.expected.step_ns else usual), usual

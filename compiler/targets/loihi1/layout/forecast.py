@@ -28,7 +28,6 @@ from spikeloom.compiler.passes.calibrate import Calibration, Spikes, fewer
 from spikeloom.compiler.targets.base import PICOSECONDS, TimeTable
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Core, Cores, Needs, choose_dense
 from spikeloom.compiler.targets.loihi1.layout.partition import chunks_of, cut, cut_layer
-from spikeloom.compiler.targets.loihi1.layout.place import chip_tiles
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
 SAMPLES = 1000
@@ -148,17 +147,6 @@ class Forecast:
 # -- search ------------------------------------------------------------------------------------------------------------
 
 
-def tiles_for(forecast: Forecast, cores: int) -> int:
-    """Most tiles for which the barrier is as short as for the fewest that hold so many cores."""
-    fewest = _fewest_tiles(forecast, cores)
-    shortest, most = forecast.time.barrier(fewest), chip_tiles(forecast.needs.target)
-    return max(tiles for tiles in range(fewest, most + 1) if forecast.time.barrier(tiles) == shortest)
-
-
-def _fewest_tiles(forecast: Forecast, cores: int) -> int:
-    return -(-cores // forecast.needs.target.limit("mesh.tile_cores"))
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trial:
     """Layers cut evenly, each chunk on a core of its own."""
@@ -233,10 +221,10 @@ class _Search:
         if len(chunks) > self.most:
             return None
         every = np.array([times[population] for population in sorted(times)])
-        barrier = self.forecast.time.barrier(_fewest_tiles(self.forecast, len(chunks)))
+        tiles = -(-len(chunks) // self.needs.target.limit("mesh.tile_cores"))
         return Trial(
             chunks=sorted(chunks),
-            step=float(every.max(axis=0).mean()) + barrier,
+            step=float(every.max(axis=0).mean()) + self.forecast.time.barrier(tiles),
             critical=sorted(times)[int(np.argmax(np.bincount(np.argmax(every, axis=0))))],
             longest=float(every.mean(axis=1).max()),
         )

@@ -12,7 +12,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -110,14 +110,14 @@ def _improve(between: FloatArray, price: FloatArray, tile_cores: int, site: IntA
             site[pair] = site[pair[::-1]]
 
 
-def place(traffic: FloatArray, target: Target, width: int | None = None, height: int | None = None) -> Placement:
+def place(traffic: FloatArray, target: Target) -> Placement:
     """Choose tiles of few spikes times hops; among equal ones those with more of the cheaper east-west hops.
 
     A layout is grown around each of the busiest cores and improved change by change, and the best of these is taken:
     the optimum, by branch and bound, on every network tried that has up to ten cores. `traffic` is packets per step,
-    (cores, cores). The mesh is the chip's, or one of another `width` and `height`.
+    (cores, cores).
     """
-    width, height = width or target.limit("mesh.width"), height or target.limit("mesh.height")
+    width, height = target.limit("mesh.width"), target.limit("mesh.height")
     cores, tile_cores = len(traffic), target.limit("mesh.tile_cores")
     if cores == 1:
         return Placement(tiles=(0,), spike_hops=0.0)
@@ -131,23 +131,6 @@ def place(traffic: FloatArray, target: Target, width: int | None = None, height:
     tiles = tuple(site.tolist())
     spent = sum(between[a, b] * sum(hops(tiles[a], tiles[b], width)) for a in range(cores) for b in range(a))
     return Placement(tiles=tiles, spike_hops=float(spent))
-
-
-def place_within(traffic: FloatArray, target: Target, tiles: int) -> Placement:
-    """Choose tiles as :func:`place` does, but at most so many; of several that fit the best rectangle is taken."""
-    free = place(traffic, target)
-    if len(set(free.tiles)) <= tiles:
-        return free
-    width, height = target.limit("mesh.width"), target.limit("mesh.height")
-    tile_cores = target.limit("mesh.tile_cores")
-    found = []
-    for columns in range(1, min(width, tiles) + 1):
-        rows = min(height, tiles // columns)
-        if columns * rows * tile_cores >= len(traffic):
-            inside = place(traffic, target, columns, rows)
-            moved = tuple(tile // columns * width + tile % columns for tile in inside.tiles)
-            found.append(replace(inside, tiles=moved))
-    return min(found, key=lambda placement: placement.spike_hops, default=free)
 
 
 # -- several chips -----------------------------------------------------------------------------------------------------
