@@ -319,15 +319,23 @@ class Request:
     dt: float | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Facts:
+    """What a file of any format holds."""
+
+    neurons: int
+    synapses: int
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Export:
-    """Content of a file, a dataclass of facts about it with ``neurons`` and ``synapses``, and lines for people.
+    """Content of a file, facts about it, and lines for people.
 
     `form` is which of several forms of the format it has.
     """
 
     content: Iterable[bytes]
-    facts: Any
+    facts: Facts
     form: str | None = None
     lines: tuple[str, ...] = ()
 

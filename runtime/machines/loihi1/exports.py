@@ -14,16 +14,14 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.models.recordings.events import BIN_S
-from spikeloom.runtime.machines.base import Export, Format, Request
+from spikeloom.runtime.machines.base import Export, Facts, Format, Request
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SanafeFacts:
+class SanafeFacts(Facts):
     """What a file for SANA-FE holds: groups of neurons, and the cores (``tile.core``) of layers and inputs."""
 
-    neurons: int
-    synapses: int
     groups: tuple[str, ...]
     cores: tuple[str, ...]
     input_cores: tuple[str, ...]
@@ -31,22 +29,18 @@ class SanafeFacts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OnnxFacts:
+class OnnxFacts(Facts):
     """What an ONNX file of a netlist holds, and what it takes and gives, as words."""
 
-    neurons: int
-    synapses: int
     form: str
     inputs: list[str]
     outputs: list[str]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NirFacts:
+class NirFacts(Facts):
     """What a NIR file holds, and how its time constants count: seconds of a step, and the convention."""
 
-    neurons: int
-    synapses: int
     dt: float
     convention: str
 
@@ -61,11 +55,9 @@ class NetxLayer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NetxFacts:
+class NetxFacts(Facts):
     """What a netx file holds; `exact` if it is the netlist as it was."""
 
-    neurons: int
-    synapses: int
     exact: bool
     layers: list[NetxLayer]
     recordings: int | None = field(default=None, metadata=OPTIONAL)

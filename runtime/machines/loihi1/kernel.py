@@ -9,8 +9,7 @@ to one of them, so that the low bits say whether anything arrived at all, which 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,8 +20,6 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import IntArray
 
 AnyArray = npt.NDArray[Any]
-Function = TypeVar("Function", bound=Callable[..., Any])
-
 
 ARRIVAL_BITS = 24
 """Bits of a sum that count synapses."""

@@ -65,16 +65,6 @@ def _inject(first: IntArray, destination: IntArray, cost: IntArray, events: AnyA
 
 
 @compiled
-def _earliest(times: FloatArray) -> int:
-    """Core whose time comes first; of equal times the lowest."""
-    earliest = 0
-    for core in range(1, times.size):
-        if times[core] < times[earliest]:
-            earliest = core
-    return earliest
-
-
-@compiled
 def _list_messages(
     tables: Tables, row: AnyArray, worked: AnyArray, delivery: IntArray, generation: IntArray, queue: IntArray
 ) -> None:
@@ -151,7 +141,7 @@ def _send_all(  # noqa: PLR0915 - one loop over local state, which numba passes 
     work_under_way: Any = 0
     blocked, peak = 0.0, 0
     while True:
-        core = _earliest(due)
+        core = int(np.argmin(due))
         if due[core] == np.inf:
             return blocked, peak / unit
         m = cursor[core]
@@ -159,7 +149,7 @@ def _send_all(  # noqa: PLR0915 - one loop over local state, which numba passes 
         a = delivery[m]
         if a >= 0:
             # what has arrived leaves the mesh
-            to = _earliest(arrives)
+            to = int(np.argmin(arrives))
             while arrives[to] <= sent:
                 gone = front[to]
                 other = delivery[gone]
@@ -169,7 +159,7 @@ def _send_all(  # noqa: PLR0915 - one loop over local state, which numba passes 
                 work_under_way -= processing[other]
                 front[to] = later[gone]
                 arrives[to] = np.inf if later[gone] < 0 else received[later[gone]]
-                to = _earliest(arrives)
+                to = int(np.argmin(arrives))
             # what is under way slows or blocks the message
             way = route[a]
             begin, end = route_first[way], route_first[way + 1]

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import ranc
-from spikeloom.runtime.machines.base import Export, Format, Request
+from spikeloom.runtime.machines.base import Export, Facts, Format, Request
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RancFacts:
+class RancFacts(Facts):
     """What a file for RANC holds; `ticks` to run it for, None without a recording."""
 
-    neurons: int
-    synapses: int
     ticks: int | None
 
 
