@@ -17,7 +17,7 @@ from spikeloom import models
 from spikeloom.compiler.systems import SYSTEMS, TACTILESGNET, Grid
 from spikeloom.compiler.types import FloatArray
 from spikeloom.models.graphs import Graph
-from spikeloom.models.systems import HOPS, filters_of, propagation_of
+from spikeloom.models.systems import filters_of, propagation_of
 from spikeloom.models.training.recipes import Recipe
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def kind_of(system: str) -> Kind:
 def seen_by(plan: Plan) -> FloatArray:
     """What the first layer sees; systems of a single chip convolve as TactileSGNet does."""
     taxels, system = plan.graph.n_taxels, plan.system if plan.system in SYSTEMS else TACTILESGNET
-    return propagation_of(system, plan.graph.edges, taxels, plan.grid, filters_of(system, taxels, HOPS))
+    return propagation_of(system, plan.graph.edges, taxels, plan.grid, filters_of(system, taxels, plan.recipe.hops))
 
 
 def same_graph(found: Any, plan: Plan) -> bool:

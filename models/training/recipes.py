@@ -20,6 +20,9 @@ from spikeloom.models.systems import HOPS
 DECAY_EPOCHS = 40
 """There the learning rate falls to a tenth after so many epochs; the first of each such block still has the old one."""
 
+HIDDEN = (128, 256)
+"""Dense layers of the released networks."""
+
 MSE, CROSS_ENTROPY = ("mse", "cross-entropy")
 ADAM, ADAMW = ("adam", "adamw")
 STEPS, COSINE = ("steps", "cosine")
@@ -50,6 +53,7 @@ class Recipe:
     # features, hops: Outputs of the first layer per place; K of a graph convolution
     features: int = 64
     hops: int = HOPS
+    hidden: tuple[int, ...] = HIDDEN  # Neurons of each dense layer but the last
     # betas, alphas: Membrane decays of single layers, all others have the common one; current decays that are not zero.
     # With the first, every layer's is rounded to what the chip holds.
     betas: Decays = ()
@@ -60,12 +64,18 @@ class Recipe:
     penalty: float = 0.0
 
     def to_json(self) -> JsonObject:
-        """JSON values; without the usual number of epochs, which a training states by itself, and a penalty of zero."""
+        """JSON values; without the number of epochs, which a training states by itself, usual sizes, and no penalty."""
         values = asdict(self) | {"betas": dict(self.betas), "alphas": dict(self.alphas)}
-        del values["epochs"]
+        if self.hidden == HIDDEN:
+            del values["hidden"]
         if not self.penalty:
             del values["penalty"]
-        return values
+        return {name: value for name, value in values.items() if name != "epochs"}
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the layers of a network."""
+        return ("conv1", *(f"fc{place}" for place in range(1, len(self.hidden) + 2)))
 
     def dynamics(self, layers: Iterable[str], beta: float, steps: int) -> Dynamics:
         """Dynamics of a network with these layers, a common membrane decay and recordings of so many steps.
@@ -99,9 +109,6 @@ TIMED = Recipe(
     clocks=8,
 )
 """For recordings that differ in when their events come: currents that last 20 steps, and clocks."""
-
-LAYERS = ("conv1", "fc1", "fc2", "fc3")
-"""Layers of the networks that are trained."""
 
 RECIPES = {recipe.name: recipe for recipe in (RELEASED, TIMED)}
 
@@ -145,11 +152,17 @@ def decays_asked(words: str, option: str, layers: tuple[str, ...]) -> Decays:
     return tuple(found.items())
 
 
+MOST_SIZE, MOST_HOPS = 1024, 16
+
+
 def check_recipe(recipe: Recipe) -> None:
     """Refuse sizes that no network has."""
-    for option, value, most in (("features", recipe.features, 1024), ("batch", recipe.batch, 1024)):
-        if not 1 <= value <= most:
-            raise OptionError(f"--{option} {value}: allowed are 1 to {most}; choose another")
+    sizes = (("features", recipe.features), ("batch", recipe.batch), *(("hidden", size) for size in recipe.hidden))
+    for option, value in sizes:
+        if not 1 <= value <= MOST_SIZE:
+            raise OptionError(f"--{option} {value}: allowed are 1 to {MOST_SIZE}; choose another")
+    if not 0 <= recipe.hops <= MOST_HOPS:
+        raise OptionError(f"--hops {recipe.hops}: allowed are 0 to {MOST_HOPS}; choose another")
     if not 0 <= recipe.penalty < math.inf:
         raise OptionError(f"--spike-penalty {recipe.penalty:g}: allowed are numbers from 0 up; choose another")
     if not 0 <= recipe.clocks <= MOST_CLOCKS:

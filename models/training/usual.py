@@ -14,7 +14,7 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.networks.networks import Architecture
 from spikeloom.models.training.kinds import Plan, same_graph
-from spikeloom.models.training.recipes import LAYERS, RECIPES, Recipe
+from spikeloom.models.training.recipes import RECIPES, Recipe
 
 SYSTEMS = systems.SYSTEMS
 COPIES: tuple[int, ...] = ()
@@ -40,8 +40,9 @@ def architecture(plan: Plan) -> Architecture:
         system=plan.system,
         features=plan.recipe.features,
         hops=plan.recipe.hops,
+        hidden=plan.recipe.hidden,
     )
-    return replace(plain, dynamics=plan.recipe.dynamics(LAYERS, plain.beta, -(-plan.steps // plan.bins)))
+    return replace(plain, dynamics=plan.recipe.dynamics(plan.recipe.layers, plain.beta, -(-plan.steps // plan.bins)))
 
 
 def save(path: Path, kept: Mapping[str, Any], plan: Plan, record: Mapping[str, Any]) -> None:

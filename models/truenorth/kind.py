@@ -41,6 +41,8 @@ REFUSED = {
     "--current-decay": "has no currents that decay",
     "--membrane-decay": "has no membranes that decay",
     "--join": "takes bins as they are; train on what spikeloom data convert --join makes",
+    "--hidden": "fills the axons of its cores",
+    "--hops": "has the hops of the released networks",
     "--spike-penalty": "is trained without",
 }
 

@@ -209,8 +209,8 @@ def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tupl
 def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
     """Read a checkpoint as the options say; OptionError or ModelError if it is not there, or not as they say."""
     progress("reading the checkpoint")
-    if (kind := stated(Path(shipped(path)), "format")) == TRAINED:
-        raise ModelError(f"{path}: is {FORMATS[kind]}; compile, verify, inspect and join take it, this is for others")
+    if (kind := stated(Path(shipped(path)), "format")) in (TRAINED, COUNTERS):
+        raise ModelError(f"{path}: is {FORMATS[kind]}; compile, verify and inspect take it, this is for others")
     if Path(shipped(path)).is_file() and is_netlist(shipped(path)):
         raise ModelError(f"{path}: is a netlist, its weights are rounded; give the checkpoint that it was made from")
     return read_checkpoint(

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from spikeloom.compiler.archive import is_netlist
+import numpy as np
+
+from spikeloom.compiler.archive import COUNTERS, is_netlist
 from spikeloom.compiler.dynamics import Dynamics
+from spikeloom.compiler.formats.counters import Counters, read_counters
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET
 from spikeloom.runtime.commands.options import add_model
-from spikeloom.runtime.inputs.files import require_inspectable
-from spikeloom.runtime.inputs.network import load_checkpoint
+from spikeloom.runtime.inputs.files import require_inspectable, shipped
+from spikeloom.runtime.inputs.network import load_checkpoint, network_kind
 from spikeloom.runtime.inputs.repeat import NETWORK, refuse
 from spikeloom.runtime.machines.base import describe, trained_for
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Text
+
+CLOCKING = ("parts", "bins", "steps", "ramp")
+"""What a counting network says of time."""
 
 LONG = 100
 """Letters of a training note that are shown."""
@@ -52,6 +58,39 @@ class CheckpointFacts:
     sha256: str
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CountingFacts:
+    """A counting network."""
+
+    taxels: int
+    classes: int
+    bins: int
+    steps: int
+    parts: int
+    ramp: int
+    counters: int
+    thresholds: Sequence[int]
+    training: Mapping[str, Any]
+    sha256: str
+
+    @classmethod
+    def of(cls, found: Counters, sha256: str) -> CountingFacts:
+        """Those of a file."""
+        same = {
+            name: getattr(found, name) for name in ("taxels", "classes", "bins", "steps", "parts", "ramp", "training")
+        }
+        thresholds = np.unique(found.counter[:, 2]).tolist()
+        return cls(**same, counters=len(found.counter), thresholds=thresholds, sha256=sha256)
+
+
+def counting_sections(facts: CountingFacts) -> Iterator[Section]:
+    """The same for people."""
+    lines = [f"counting network: {facts.taxels} taxels, {facts.counters} counters, {facts.classes} classes"]
+    known = asdict(facts) | dict(facts.training)
+    shown = ("thresholds", *CLOCKING, *facts.training, "sha256")
+    yield Section("", [*map(Text, [*lines, *_values({name: known[name] for name in shown})])])
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     parser.add_argument("path", help="netlist or checkpoint")
@@ -66,6 +105,10 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if is_netlist(arguments.path):
         refuse(arguments, NETWORK, f"is for checkpoints, {arguments.path} is a netlist")
         return describe(arguments.path)
+    if network_kind(arguments.path) == COUNTERS:
+        refuse(arguments, NETWORK, f"is for checkpoints, {arguments.path} is a counting network")
+        counters, sha256 = read_counters(shipped(arguments.path))
+        return Outcome(CountingFacts.of(counters, sha256), counting_sections)
     given = tuple(name for name in ("beta", "theta") if getattr(arguments, name) is not None)
     checkpoint = load_checkpoint(arguments.path, arguments)
     facts = CheckpointFacts(
@@ -118,10 +161,13 @@ def _lines(facts: CheckpointFacts) -> Iterator[str]:
         yield f"  {facts.towers} towers vote together, each with a neuron for every class"
         for index, tower in enumerate(training.pop("towers", ())):
             yield f"    {index}: {tower_line(tower)}"
-    for key, value in training.items():
+    yield from _values(training | {"sha256": facts.sha256})
+
+
+def _values(known: Mapping[str, Any]) -> Iterator[str]:
+    for key, value in known.items():
         text = str(value)
         yield f"  {key}: {text if len(text) <= LONG else text[: LONG - 3] + '…'}"
-    yield f"  sha256: {facts.sha256}"
 
 
 def _dynamics(layers: Sequence[LayerSize], dynamics: Dynamics) -> Iterator[str]:

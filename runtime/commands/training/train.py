@@ -15,13 +15,12 @@ from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS, TACTILE
 from spikeloom.compiler.targets.native import BASES, USUAL_COPIES
 from spikeloom.compiler.targets.native import SYSTEM as NATIVE
 from spikeloom.models.graphs import CHOICES, Graph
-from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part, parse_window
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.models.systems import PADDINGS, sensor_grid, taxels_alone
 from spikeloom.models.training.kinds import Plan
 from spikeloom.models.training.recipes import (
     DECAY_EPOCHS,
-    LAYERS,
     RECIPES,
     RELEASED,
     STEPS,
@@ -83,6 +82,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--clocks", type=int, metavar="K", help="inputs that tell which K-th of the recording it is")
     parser.add_argument("--features", type=int, metavar="N", help="of the first layer, per place")
+    parser.add_argument("--hops", type=int, metavar="K", help="of a tactilesgnet's graph convolution (default: 3)")
+    parser.add_argument("--hidden", metavar="N[,N]", help="neurons of each dense layer but the last (default: 128,256)")
     parser.add_argument(
         "--copies", type=int, choices=tuple(BASES), help=f"axons of an input of {NATIVE} (default: {USUAL_COPIES})"
     )
@@ -91,8 +92,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     counting.add_argument(
         "--parts", type=int, metavar="N", help="equal parts of a recording, counted apart (default: 1)"
     )
-    counting.add_argument("--window", type=int, metavar="P", help="per cent of a recording that count (default: 100)")
     counting.add_argument("--ramp", type=int, metavar="N", help="silent steps of the read-out (default: 32)")
+    parser.add_argument("--window", metavar="P%%", help="train on the first so many per cent of each recording")
     parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
     parser.add_argument(
         "--spike-penalty", type=float, metavar="X", help="loss of a spike on every synapse in every step: fewer spikes"
@@ -134,7 +135,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
             if output_of(arguments.output, seed, arguments.seeds).absolute() == Path(arguments.picture).absolute():
                 raise OptionError(f"--picture {arguments.picture}: is a network that -o names; give another name")
     graph, _ = _sensor(arguments)
-    training, test = both_splits(arguments.data, graph.n_taxels, arguments.bin)
+    percent = WHOLE if arguments.window is None else parse_window(arguments.window)
+    training, test = (first_part(each, percent) for each in both_splits(arguments.data, graph.n_taxels, arguments.bin))
     records = train_seeds(plan_jobs(arguments, training, test), resume=arguments.resume)
     if arguments.picture is not None:
         kind = Path(arguments.picture).suffix.removeprefix(".")
@@ -143,11 +145,12 @@ def run(arguments: argparse.Namespace) -> Outcome:
     return Outcome(TrainingReport(runs=records, protocols=summary(records)), training_sections)
 
 
-COUNTERS_ONLY = ("thresholds", "parts", "window", "ramp")
-NOT_COUNTERS = (
-    *("padding", "graph", "edges", "directed", "copies", "current_decay", "membrane_decay", "clocks", "features"),
-    *("batch", "spike_penalty", "epochs", "decay_epochs", "resume", "keep", "picture"),
-)
+SIZES = ("features", "hops", "hidden", "clocks")
+OVERRIDES = ("current_decay", "membrane_decay", *SIZES, "batch", "decay_epochs", "spike_penalty")
+"""Options that change single values of a recipe."""
+
+COUNTERS_ONLY = ("thresholds", "parts", "ramp")
+NOT_COUNTERS = ("padding", "graph", "edges", "directed", "copies", *OVERRIDES, "epochs", "resume", "keep", "picture")
 
 
 def _count(arguments: argparse.Namespace) -> Outcome:
@@ -161,6 +164,8 @@ def _count(arguments: argparse.Namespace) -> Outcome:
     require_bins(arguments.join)
     require_place(arguments.output, "-o", arguments)
     asked = {name: value for name, value in repeat.given(arguments, COUNTERS_ONLY).items() if value is not None}
+    if arguments.window is not None:
+        asked["window"] = parse_window(arguments.window)
     typed = repeat.words({"data": Path(arguments.data).name, "system": COUNTING, **asked})
     if arguments.join > 1:
         typed += ["--join", str(arguments.join)]
@@ -226,14 +231,12 @@ def plan_jobs(arguments: argparse.Namespace, training: Recordings, test: Recordi
     ]
 
 
-OVERRIDES = ("current_decay", "membrane_decay", "clocks", "features", "batch", "decay_epochs", "spike_penalty")
-"""Options that change single values of a recipe."""
-
-
 def _recipe(arguments: argparse.Namespace) -> Recipe:
     """The recipe that was named, with the values that were given beside it."""
     recipe = _named_recipe(arguments)
-    whole = {name: getattr(arguments, name) for name in ("clocks", "features", "batch", "decay_epochs")}
+    whole = repeat.given(arguments, ("clocks", "features", "hops", "batch", "decay_epochs"))
+    if arguments.hidden is not None:
+        whole["hidden"] = tuple(whole_numbers(arguments.hidden, "--hidden"))
     recipe = replace(recipe, **{name: value for name, value in whole.items() if value is not None})
     if arguments.decay_epochs is not None and recipe.schedule != STEPS:
         raise OptionError(
@@ -243,9 +246,11 @@ def _recipe(arguments: argparse.Namespace) -> Recipe:
     if arguments.spike_penalty is not None:
         recipe = replace(recipe, penalty=arguments.spike_penalty)
     if arguments.current_decay is not None:
-        recipe = replace(recipe, alphas=decays_asked(arguments.current_decay, "--current-decay", LAYERS))
+        recipe = replace(recipe, alphas=decays_asked(arguments.current_decay, "--current-decay", recipe.layers))
     if arguments.membrane_decay is not None:
-        recipe = replace(recipe, betas=decays_asked(arguments.membrane_decay, "--membrane-decay", LAYERS))
+        recipe = replace(recipe, betas=decays_asked(arguments.membrane_decay, "--membrane-decay", recipe.layers))
+    if arguments.hops is not None and arguments.system not in (None, TACTILESGNET):
+        raise OptionError(f"--hops {arguments.hops}: {TITLES[arguments.system]} has no hops to choose; omit it")
     check_recipe(recipe)
     return recipe
 
@@ -261,6 +266,8 @@ def _named_recipe(arguments: argparse.Namespace) -> Recipe:
         "join": 1,
         "spike_penalty": None,
         "copies": None,
+        "hidden": None,
+        "hops": None,
     }
     given = {name: getattr(arguments, name) for name, value in usual.items() if getattr(arguments, name) != value}
     options = {f"--{name.replace('_', '-')}": value for name, value in given.items()}
@@ -269,7 +276,7 @@ def _named_recipe(arguments: argparse.Namespace) -> Recipe:
 
 def _words(arguments: argparse.Namespace, first: dict[str, Any], last: dict[str, Any]) -> list[str]:
     """The words that ask for the same training, without the seed and the output."""
-    names = ("bin", "join", "system", "padding", "copies", "graph", "taxels", "edges", "directed", "recipe")
+    names = ("bin", "join", "window", "system", "padding", "copies", "graph", "taxels", "edges", "directed", "recipe")
     usual = {"join": 1, "system": TACTILESGNET, "copies": USUAL_COPIES, "recipe": RELEASED.name}
     recipe = _named_recipe(arguments)
     usual |= {name: getattr(recipe, name, None) for name in OVERRIDES}

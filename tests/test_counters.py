@@ -1,0 +1,190 @@
+"""Counting networks: what they count, what they decide, their file, and that the chip has every spike of theirs."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from commands import as_json, run
+from numpy.testing import assert_array_equal
+
+from spikeloom.compiler import compile_network
+from spikeloom.compiler.archive import read_members
+from spikeloom.compiler.errors import DataError, ModelError, OptionError
+from spikeloom.compiler.formats.counters import BLOCK, counting_network, read_counters, write_counters
+from spikeloom.compiler.interpret import channels_last, float_simulation
+from spikeloom.models.recordings.events import joined_bins, of_length
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds
+from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.studies.counting import decisions_of
+
+CLASSES, TAXELS, STEPS = 3, 4, 40
+PLANS = [
+    Plan(thresholds=(1, 3, 8), ramp=64),
+    Plan(thresholds=(2,), parts=3, ramp=40),
+    Plan(thresholds=(1, 4), parts=2, bins=2, window=75, bits=4),
+]
+
+
+def made(seed=0, samples=30, rate=0.3):
+    """Recordings of classes that differ in how often each taxel sends, and late or early."""
+    rng = np.random.default_rng(seed)
+    labels = np.arange(samples) % CLASSES
+    often = np.random.default_rng(9).random((CLASSES, TAXELS, 2, 4)).repeat(STEPS // 4, axis=3)
+    events = (rng.random((samples, TAXELS, 2, STEPS)) < 2 * rate * often[labels]).astype(np.uint8)
+    files = tuple(f"{each}.npy" for each in range(samples))
+    return Recordings(events=events, labels=labels, files=files, split="train", source="made")
+
+
+def network_spikes(counters, data):
+    network = counting_network(counters)
+    steps = of_length(joined_bins(data, counters.bins), counters.clocks.length)
+    spikes = float_simulation(network).run(channels_last(steps.events, counters.clocks)).spikes
+    return {population.name: each for population, each in zip(network.populations, spikes, strict=True)}
+
+
+@pytest.mark.parametrize("plan", PLANS, ids=str)
+def test_counters_spike_as_they_are_trained_to(plan):
+    data = counted(made(), plan)
+    fitted = fit(data, CLASSES)
+    counters = counters_of(data, fitted, made(), CLASSES)
+    found = network_spikes(counters, other := made(seed=1))
+    wanted = counted(other, plan, data.steps)
+    for threshold in plan.thresholds:
+        rows = np.flatnonzero(counters.counter[:, 2] == threshold)
+        places = [np.flatnonzero((wanted.counter == counters.counter[row]).all(axis=1))[0] for row in rows]
+        spikes = found[f"count{threshold}"][:, : data.steps]
+        assert_array_equal(spikes.sum(axis=1), wanted.spikes[:, places])
+        first = np.where(spikes.any(axis=1), spikes.argmax(axis=1), data.steps)
+        assert_array_equal(first, wanted.at[:, places])
+
+
+def test_a_counter_is_blocked_for_a_while_and_not_for_ever():
+    data = made(samples=3)
+    events = np.zeros((3, TAXELS, 2, 400), np.uint8)
+    for sample, ones in enumerate((2 * 3 + BLOCK - 1, 2 * 3 + BLOCK, 400)):
+        events[sample, 0, 0, :ones] = 1
+    spikes = counted(replace(data, events=events), Plan(thresholds=(3,))).spikes
+    assert spikes[:, 0].tolist() == [1, 2, 4]
+
+
+@pytest.mark.parametrize("plan", PLANS, ids=str)
+def test_network_decides_as_its_rule_and_the_chip_has_every_spike(plan):
+    training, other = made(), made(seed=1)
+    data = counted(training, plan)
+    fitted = fit(data, CLASSES)
+    counters = counters_of(data, fitted, training, CLASSES)
+    whole = counters.weight @ data.spikes[:, [*map(data.counter.tolist().index, counters.counter.tolist())]].T
+    decided = decisions_of(counters, training)
+    tie = np.sort(whole, axis=0)[-1] - np.sort(whole, axis=0)[-2] < 2 * counters.slope
+    assert_array_equal(decided[~tie], whole.argmax(axis=0)[~tie])
+    assert np.mean(decisions_of(counters, other) == other.labels) > 0.6
+    netlist = compile_network(counting_network(counters)).netlist
+    machine = machine_of(netlist)
+    steps = of_length(joined_bins(other, counters.bins), netlist.clocks.length).events
+    assert machine.check(steps[:4], lengths=None) == 0
+    ran = machine.run(steps, spikes=True)
+    for name, spikes in network_spikes(counters, other).items():
+        held = ~machine.unread[machine.layers.index(name)]
+        assert_array_equal(ran.spikes[name][..., held], spikes[..., held])
+    assert_array_equal(ran.decisions, decisions_of(counters, other))
+
+
+def counters_file(place):
+    data = counted(made(), PLANS[1])
+    counters = counters_of(data, fit(data, CLASSES), made(), CLASSES).trained({"seen": 3})
+    write_counters(place, counters)
+    return counters
+
+
+def test_file_and_back(tmp_path):
+    counters = counters_file(tmp_path / "c.pt")
+    again, _ = read_counters(tmp_path / "c.pt")
+    write_counters(tmp_path / "d.pt", again)
+    assert (tmp_path / "c.pt").read_bytes() == (tmp_path / "d.pt").read_bytes()
+    assert again.training == {"seen": 3}
+    assert_array_equal(again.weight, counters.weight)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda c: replace(c, weight=c.weight + 200), "weight is no table"),
+        (lambda c: replace(c, weight=c.weight[:, 1:]), "weight is no table"),
+        (lambda c: replace(c, counter=np.add(c.counter, (0, 3, 0))), "do not exist"),
+        (lambda c: replace(c, counter=c.counter * 0), "do not exist"),
+        (lambda c: replace(c, taxels=0), "no usable taxels"),
+        (lambda c: replace(c, threshold=-1.0), "no usable threshold"),
+    ],
+)
+def test_inconsistent_files_are_refused(tmp_path, change, said):
+    write_counters(tmp_path / "c.pt", change(counters_file(tmp_path / "c.pt")))
+    with pytest.raises(ModelError, match=said):
+        read_counters(tmp_path / "c.pt")
+
+
+def test_damaged_files_are_refused(tmp_path):
+    counters_file(tmp_path / "c.pt")
+    content = bytearray((tmp_path / "c.pt").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "c.pt").write_bytes(content)
+    with pytest.raises(ModelError, match=r"c\.pt: .*; copy or train it again"):
+        read_counters(tmp_path / "c.pt")
+
+
+@pytest.mark.parametrize(
+    ("plan", "said"),
+    [
+        (Plan(thresholds=(4, 4)), "--thresholds 4,4"),
+        (Plan(thresholds=(0,)), "--thresholds 0"),
+        (Plan(parts=0), "--parts 0"),
+        (Plan(parts=41), "--parts 41: a recording has 40 steps"),
+    ],
+)
+def test_impossible_plans_are_refused(plan, said):
+    with pytest.raises(OptionError, match=said):
+        counted(made(), plan)
+
+
+def test_recordings_without_events_are_refused():
+    silent = replace(made(), events=np.zeros((30, TAXELS, 2, STEPS), np.uint8))
+    with pytest.raises(DataError, match="none of them spikes"):
+        fit(counted(silent, PLANS[0]), CLASSES)
+
+
+def test_folds_share_out_every_class():
+    labels = np.repeat([0, 1, 2], [10, 7, 3])
+    fold = folds(labels, 5, np.random.default_rng(0))
+    assert np.ptp(np.bincount(fold)) == 0
+    assert all(np.ptp(np.bincount(fold[labels == each], minlength=5)) <= 1 for each in range(3))
+
+
+def test_commands_take_a_counting_network(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    train = ["train", "--data", "synthetic", "--system", "counters", "--join", "5", "--window", "50", "-o", "c.pt"]
+    record = as_json(*train)["record"]
+    assert record["test_correct"] > 100
+    assert as_json("inspect", "c.pt")["training"]["plan"]["bins"] == 5
+    assert "whatever its own length" in run("compile", "c.pt", "--calibrate", "synthetic", "-o", "c.loom")[1]
+    found = as_json("verify", "c.loom", "--checkpoint", "c.pt", "--data", "synthetic")
+    share = record["test_correct"] / record["test_samples"]
+    assert found["accuracy"] == {"float": share, "chip": share}
+    assert all(layer["different"] == 0 for layer in found["spikes"].values())
+    assert as_json("estimate", "c.loom", "--data", "synthetic", "--limit", "3")["samples"] == 3
+    assert json.loads(str(read_members(tmp_path / "c.pt")["manifest"]))["training"]["strength"] == record["strength"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--system", "counters", "--epochs", "3"], "--epochs 3: counters are trained without; omit it"),
+        (["--system", "counters", "--seed", "3"], "omit --recipe, --seed and --seeds"),
+        (["--system", "mlp", "--parts", "3"], "--parts 3: is for --system counters; omit it"),
+        (["--system", "mlp", "--hops", "2"], "--hops 2: an MLP has no hops to choose; omit it"),
+        (["--system", "mlp", "--hidden", "0"], "--hidden 0: allowed are 1 to 1024"),
+    ],
+)
+def test_options_of_others_are_refused(words, said):
+    code, _, err = run("train", "--data", "synthetic", *words, "-o", "x.pt")
+    assert (code, said in err) == (2, True)
