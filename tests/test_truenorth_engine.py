@@ -1,17 +1,19 @@
 """Crossbar cores: the specification against values worked out by hand, the engine against the specification; the
-smallest network that breaks each rule, and what is said about it.
+smallest network that breaks each rule, what is said about it, and needs of float networks.
 """
 
 from dataclasses import fields, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_crossbars import CHIP, alone, assert_same, both, crossbars, events, recording_of, relays, with_limit
+from random_networks import chain
 
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
-from spikeloom.compiler.targets.truenorth.legalize import faults
+from spikeloom.compiler.targets.truenorth.legalize import faults, needs
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE, RESET_TO, inconsistencies
 from spikeloom.runtime.machines.truenorth import engine, spec
 
@@ -250,3 +252,62 @@ def test_what_no_network_of_cores_is(netlist, words):
 def test_limits_are_parameters():
     assert broken(made(relays()), with_limit("mesh.reach", 0)) == [(SOURCE, "1 cores away", "mesh.reach")]
     assert broken(made(with_neuron(leak=2047)), with_limit("neuron.leak_bits", 12)) == []
+
+
+# -- needs of float networks -------------------------------------------------------------------------------------------
+def wide(inputs: int, *sizes: int, beta=0.0):
+    """A chain of full layers of equal weights."""
+    return chain(*(np.ones((after, before)) for before, after in pairwise((inputs, *sizes))), beta=beta)
+
+
+def needed(network) -> list[tuple[str, str]]:
+    return [(need.used, need.rule.removeprefix("truenorth.")) for need in needs(network, CHIP)]
+
+
+def test_every_need_of_every_layer():
+    rng = np.random.default_rng(0)
+    network = chain(rng.normal(size=(5, 300)), rng.normal(size=(3, 5)), beta=0.2)
+    assert needed(network) == [
+        ("keep 0.2 of their membranes a step", "neuron.leak"),
+        ("300 inputs", "core.axons"),
+        ("300 different weights", "neuron.weight_bits"),
+        ("send spikes to 2 axons at least", "neuron.targets"),
+        ("keep 0.2 of their membranes a step", "neuron.leak"),
+    ]
+    worst = needs(network, CHIP)[2]
+    assert (worst.owner, worst.allowed) == ("fc1, neuron 0 (and 4 more)", "1 with 1 axon an input")
+
+
+@pytest.mark.parametrize(
+    ("network", "found"),
+    [
+        (wide(256, 3), []),
+        (wide(257, 3), [("257 inputs", "core.axons")]),
+        (wide(2, 2, 256), [("send spikes to 2 axons at least", "neuron.targets")]),
+        (wide(2, 2, 257), [("send spikes to 4 axons at least", "neuron.targets")]),
+    ],
+)
+def test_limits_of_inputs_and_targets(network, found):
+    assert needed(network) == found
+
+
+@pytest.mark.parametrize(
+    ("inputs", "distinct", "over"),
+    [(64, 15, False), (64, 16, True), (85, 7, False), (86, 7, True), (128, 3, False), (129, 1, False), (129, 2, True)],
+)
+def test_the_limit_of_levels_follows_the_axons_that_are_left(inputs, distinct, over):
+    weight = np.resize(np.arange(1, distinct + 1), inputs)[None].astype(float)
+    assert needed(chain(weight, beta=0.0)) == [(f"{distinct} different weights", "neuron.weight_bits")] * over
+
+
+def test_zeros_are_no_level_and_the_worst_neuron_is_named():
+    weight = np.zeros((3, 129))
+    weight[0, :2], weight[2, :5] = 1, [1, 2, 3, 0, 4]
+    (need,) = needs(chain(weight, beta=0.0), CHIP)
+    assert (need.owner, need.used) == ("fc1, neuron 2", "4 different weights")
+
+
+def test_a_lasting_current():
+    network = wide(4, 2)
+    lasting = replace(network, populations=(replace(network.populations[0], alpha=0.5),))
+    assert needed(lasting) == [("keep 0.5 of their currents a step", "neuron.leak")]

@@ -10,14 +10,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.errors import CapacityError, ModelError, OptionError
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes import expand
 from spikeloom.compiler.pipeline import LATER, Pass
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.codebook import COPIES, LevelNetwork, in_levels
 from spikeloom.compiler.targets.truenorth.in_time import lower_in_time
-from spikeloom.compiler.targets.truenorth.legalize import require_legal
+from spikeloom.compiler.targets.truenorth.legalize import needs, require_legal
 from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork, lower
 from spikeloom.compiler.targets.truenorth.netlist import FILE, CrossbarNetlist
 
@@ -61,6 +61,12 @@ def _expand(done: Compilation) -> Compilation:
     source = done.source
     assert not isinstance(source, NativeNetwork), "whole numbers start behind the passes of float networks"
     network = source if isinstance(source, Network) else expand.expand(source.checkpoint, source.propagation)
+    if done.options.in_time is None:
+        error = CapacityError(needs(network, done.target))
+        if error.violations:
+            error.add_note(WAYS)
+            raise error
+        raise ModelError(f"a float network; {WAYS}")
     return replace(done, network=network)
 
 
@@ -88,7 +94,7 @@ def _legalize(done: Compilation) -> Compilation:
 PASSES = (
     Pass(
         name="expand",
-        does="writes the graph convolution out as synapses, in float64",
+        does="writes the graph convolution out as synapses, in float64; refuses what no layout could hold",
         keeps="every spike, up to the rounding of a differently ordered sum",
         apply=_expand,
     ),
@@ -117,15 +123,10 @@ PASSES = (
 def start(
     source: NativeNetwork | expand.Factored | Network, options: Options, target: Target
 ) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
-    """What the passes begin with, and which of them are due.
-
-    ModelError if a float network is to be placed as it is, OptionError if whole numbers are to be rounded again.
-    """
+    """What the passes begin with, and which of them are due; OptionError if whole numbers are to be rounded again."""
     native = isinstance(source, NativeNetwork)
     if native and options.in_time is not None:
         raise OptionError(f"--in-time {options.in_time}: the network was trained for the chip; omit it")
-    if not native and options.in_time is None:
-        raise ModelError(f"a float network; {WAYS}")
     if options.in_time not in (None, *COPIES):
         raise OptionError(f"--in-time {options.in_time}: allowed are {', '.join(map(str, COPIES))} axons an input")
     work = Compilation(source=source, options=options, target=target)
