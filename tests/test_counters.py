@@ -15,7 +15,7 @@ from spikeloom.compiler.formats.counters import BLOCK, counting_network, read_co
 from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds
+from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds, linear_rules
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.studies.counting import decisions_of
 
@@ -151,6 +151,16 @@ def test_recordings_without_events_are_refused():
     silent = replace(made(), events=np.zeros((30, TAXELS, 2, STEPS), np.uint8))
     with pytest.raises(DataError, match="none of them spikes"):
         fit(counted(silent, PLANS[0]), CLASSES)
+
+
+@pytest.mark.parametrize("plan", PLANS, ids=str)
+def test_rule_is_where_the_loss_is_flat(plan):
+    data = counted(made(rate=0.2), plan)
+    for strength, rule in linear_rules(data, CLASSES, [3.0, 0.01, 0.3]).items():
+        sign = np.where(data.labels[:, None] == np.arange(CLASSES), 1, -1)
+        short = np.maximum(1 - sign * rule.sums(data), 0)
+        slope = rule.weight.T - 2 * strength * data.spikes[:, rule.used].T @ (sign * short)
+        assert np.abs(slope).max() < 1e-8
 
 
 def test_folds_share_out_every_class():
