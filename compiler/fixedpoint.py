@@ -122,8 +122,7 @@ def plane_distance(bits: int) -> int:
     >>> [plane_distance(bits) for bits in (8, 4, 2)]
     [7, 3, 1]
     """
-    codes = (256 - weight_step(bits)) // weight_step(bits)
-    return (2 * codes + 1).bit_length() - 1
+    return bits - 1
 
 
 def reach(bits: int, exponents: tuple[int, ...]) -> int:
@@ -134,8 +133,7 @@ def reach(bits: int, exponents: tuple[int, ...]) -> int:
     >>> reach(8, (0,)), reach(8, (-1, 6)), reach(2, (0, 1))
     (127, 16383, 3)
     """
-    codes = (256 - weight_step(bits)) // weight_step(bits)
-    return codes * sum(1 << (exponent - exponents[0]) for exponent in exponents)
+    return ((1 << bits - 1) - 1) * sum(1 << (exponent - exponents[0]) for exponent in exponents)
 
 
 def step_units(bits: int, exponents: tuple[int, ...]) -> float:
@@ -167,8 +165,7 @@ def split_planes(steps: IntArray, bits: int, exponents: tuple[int, ...]) -> list
     >>> [plane.tolist() for plane in split_planes(np.array([5, 127, 128, -300]), 8, (-1, 6))]
     [[10, 254, 0, -88], [0, 0, 2, -4]]
     """
-    codes = (256 - weight_step(bits)) // weight_step(bits)
-    rest, mantissas = steps, []
+    codes, rest, mantissas = reach(bits, (0,)), steps, []
     for k in range(len(exponents) - 1, 0, -1):
         ratio = 1 << (exponents[k] - exponents[0])
         code = np.clip(round_half_even(rest / ratio), -codes, codes)

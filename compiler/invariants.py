@@ -6,7 +6,7 @@ refused by the front-ends and by the target's ``legalize`` before it gets here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -107,17 +107,10 @@ def _mantissas_hold(network: IntegerNetwork) -> Faults:
             yield f"projection {i} has exponent {projection.exponent}: below -1 its weights are no whole units"
 
 
-_SHARED: tuple[Callable[[Network | IntegerNetwork], Faults], ...] = (
-    _names_are_unique,
-    _projections_fit,
-    _steps_are_kept,
-    _readout_fits,
-)
-
-
 def verify(network: Network | IntegerNetwork) -> None:
     """Check every rule of the network's stage; VerifyError names all that are broken."""
-    faults = [fault for rule in _SHARED for fault in rule(network)]
+    faults = [*_names_are_unique(network), *_projections_fit(network)]
+    faults += [*_steps_are_kept(network), *_readout_fits(network)]
     if isinstance(network, Network):
         faults += _values_are_finite(network)
     else:

@@ -65,22 +65,16 @@ def lift(netlist: Netlist) -> IntegerNetwork:
     column = np.concatenate([np.arange(netlist.n_inputs), netlist.neuron])[source]
     post, row = netlist.layer[target], netlist.neuron[target]
     exponent, bits = netlist.format_exponent[form], netlist.format_weight_bits[form]
-    kinds = np.stack([post, pre, exponent, bits])
     sizes = {INPUT: netlist.n_inputs} | {i: layer.neurons for i, layer in enumerate(netlist.layers)}
     projections = []
     code = ((post * (len(netlist.layers) + 1) + pre + 1) * 64 + exponent + 32) * 16 + bits  # one number sorts faster
-    for kind in kinds[:, np.unique(code, return_index=True)[1]].T:
-        held = np.all(kinds == kind[:, None], axis=0) & (netlist.synapse_weight != 0)
-        weight = sparse.csr_array(
-            (netlist.synapse_weight[held].astype(np.int64), (row[held], column[held])),
-            shape=(sizes[int(kind[0])], sizes[int(kind[1])]),
-        )
+    for first in np.unique(code, return_index=True)[1]:
+        held = (code == code[first]) & (netlist.synapse_weight != 0)
+        to, origin, power, width = (int(each[first]) for each in (post, pre, exponent, bits))
+        mantissa = netlist.synapse_weight[held].astype(np.int64)
+        weight = sparse.csr_array((mantissa, (row[held], column[held])), shape=(sizes[to], sizes[origin]))
         weight.sum_duplicates()
-        projections.append(
-            IntegerProjection(
-                pre=int(kind[1]), post=int(kind[0]), weight=weight, exponent=int(kind[2]), bits=int(kind[3])
-            )
-        )
+        projections.append(IntegerProjection(pre=origin, post=to, weight=weight, exponent=power, bits=width))
     reached = {projection.post for projection in projections if projection.pre != projection.post}
     for index, layer in enumerate(netlist.layers):
         if index not in reached:

@@ -153,11 +153,9 @@ def search_widths(
             packings = [Packing(bits=width, groups=groups) for width in bits]
             integer, _ = choose_storage(network, target, packings=packings, calibration=calibration)
             size = _size(integer, target, rates)
-            made = None if size is None else point(bits, integer, *size)
-            built[bits] = made
-            if made is None:
-                del current[bits]
-            else:
+            del current[bits]
+            built[bits] = made = None if size is None else point(bits, integer, *size)
+            if made is not None:
                 current[bits] = replace(made, words=tried[bits].words)
     return WidthSearch(
         samples=len(chosen),
