@@ -164,7 +164,7 @@ def changed(*, old: bool = False, **tensors_too: object) -> bytes:
 
 NEITHER = "holds neither net_list nor weights of a TactileSGNet, but"
 REFUSED = {
-    "pickle of an empty dict": (lambda: b"\x80\x02}q\x00.", NOT_A_CHECKPOINT),
+    "pickle of an empty dict": (lambda: b"\x80\x02}q\x00.", DAMAGED),
     "other manifest": (lambda: zipped({"manifest.json": '{"format": "other", "files": []}'}), NOT_A_CHECKPOINT),
     "manifest that is no JSON": (lambda: zipped({"manifest.json": "{"}), DAMAGED),
     "nested": (lambda: torch_bytes({"epoch": 3, "model": tensors()}), f"{NEITHER} epoch, model"),

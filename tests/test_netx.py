@@ -58,22 +58,13 @@ REFUSED = [
     ),
     *[(f"1 ({kind}): is of a type that has no place", of_type(kind)) for kind in ("pool", "average", "strange")],
 ]
+REFUSED = [(f"layer {words}", layers) for words, layers in REFUSED]
+REFUSED += [("has no layers, so it is no netx file", []), ("has no layer of neurons", [given_input(6)])]
 
 
 @pytest.mark.parametrize(("words", "layers"), REFUSED, ids=[words for words, _ in REFUSED])
-def test_layers_that_cannot_be_used(tmp_path, words, layers):
-    refused(ModelError, f"{tmp_path}/bad.net: layer {words}", read_netx, write(tmp_path / "bad.net", *layers))
-
-
-@pytest.mark.parametrize(
-    ("words", "layers", "more"),
-    [
-        ("has no layers, so it is no netx file", [], {"other": {"a": 1}}),
-        ("has no layer of neurons", [given_input(6)], {}),
-    ],
-)
-def test_structure(tmp_path, words, layers, more):
-    refused(ModelError, words, read_netx, write(tmp_path / "bad.net", *layers, **more))
+def test_files_that_cannot_be_used(tmp_path, words, layers):
+    refused(ModelError, f"{tmp_path}/bad.net: {words}", read_netx, write(tmp_path / "bad.net", *layers))
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------

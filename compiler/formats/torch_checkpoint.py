@@ -16,7 +16,6 @@ import math
 import pickle
 import re
 import warnings
-import zipfile
 from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
@@ -33,7 +32,6 @@ CHANNELS = 2
 
 DENSE_STAGES = 3
 
-_OLD_TORCH = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."  # the pickled magic number that torch < 1.6 wrote first
 GIVE = "give a file of spikeloom train or of the released layout"
 NOT_A_CHECKPOINT = f"is not a checkpoint; {GIVE}"
 DAMAGED = "is truncated or damaged; copy it again"
@@ -67,13 +65,8 @@ def read_torch(content: bytes, run: int) -> Checkpoint:
 
 
 def _load(content: bytes) -> Any:
-    """Let torch read the content, after a look at what it is; a zip has been opened before."""
-    if content[:2] == b"PK":
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            torch_file = any(name.endswith("/data.pkl") for name in archive.namelist())
-    else:
-        torch_file = content[:1] == b"\x80"
-    if not torch_file:
+    """Let torch read the content if it looks like a zip or a pickle."""
+    if content[:2] != b"PK" and content[:1] != b"\x80":
         raise ModelError(NOT_A_CHECKPOINT)
     import torch
 
@@ -92,8 +85,7 @@ def _load(content: bytes) -> Any:
                 "is pickled with protocol 4 or newer, which torch does not read without running it; "
                 "save it with torch.save as it is by default"
             ) from error
-        known = content[:2] == b"PK" or content.startswith(_OLD_TORCH)
-        raise ModelError(DAMAGED if known else NOT_A_CHECKPOINT) from error
+        raise ModelError(f"is truncated or damaged, or no file of torch.save; {GIVE}") from error
 
 
 def _arrays(state: Any, file_size: int) -> Arrays:
