@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,58 +23,24 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.archive import COUNTERS, Array, archive_bytes, entry_faults, read_archive, write_archive
-from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, Clocks
+from spikeloom.compiler.counters import BLOCK, Counters
+from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS
 from spikeloom.compiler.errors import FormatError, ModelError
 from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble
 from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
-from spikeloom.compiler.types import IntArray
 
 VERSION = 1
 
 SYSTEM = "counters"
 """Name of such networks among the systems that are trained."""
 
-BLOCK = 127
-"""What a counter's spike takes from its membrane: the largest weight beside one of 1 in a mantissa of 8 bits."""
-
 SIZES = ("taxels", "polarities", "classes", "bins", "steps", "parts", "ramp")
 CONSTANTS = ("slope", "threshold")
 LARGEST = {"bins": MOST_STEPS, "steps": MOST_STEPS, "ramp": MOST_STEPS, "parts": MOST_CLOCKS}
 
 _AGAIN = "copy or train it again"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Counters:
-    """A counting network."""
-
-    taxels: int
-    polarities: int
-    classes: int
-    bins: int  # Bins of the recordings that a step joins
-    steps: int  # That count; whatever comes later is not looked at
-    parts: int  # Equal parts of these
-    ramp: int  # Silent steps after them, in which the classes are read out
-    counter: IntArray  # (counters, 3) int64; channel, part, and the event at which it spikes
-    weight: IntArray  # (classes, counters) int64; to the sums
-    # slope, threshold: Of the sums: what each step adds to them, and where they spike
-    slope: float
-    threshold: float
-    training: Mapping[str, Any] = field(default_factory=dict)  # JSON values: how it was made and what it reached
-
-    @property
-    def clocks(self) -> Clocks:
-        """Clocks of the parts, and how long a recording is run."""
-        length = self.steps + self.ramp
-        if self.parts == 1:
-            return Clocks(length=length)
-        return Clocks(channels=self.parts, steps=-(-self.steps // self.parts), length=length)
-
-    def trained(self, record: Mapping[str, Any]) -> Counters:
-        """The same with how it was made."""
-        return replace(self, training=record)
 
 
 def counting_network(counters: Counters) -> Network:

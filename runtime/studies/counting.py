@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from spikeloom.compiler import __version__
-from spikeloom.compiler.formats.counters import Counters, counting_network, write_counters
+from spikeloom.compiler.counters import Counters
+from spikeloom.compiler.formats.counters import counting_network, write_counters
 from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.events import joined_bins, of_length
