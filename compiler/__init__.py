@@ -14,13 +14,6 @@ if TYPE_CHECKING:
     from spikeloom.compiler.targets.loihi1.passes import Compilation, lay_out_again, to_integers, without
     from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
     from spikeloom.compiler.targets.loihi1.storage.scales import layer_of, rounded
-    from spikeloom.compiler.targets.loihi1.storage.width_search import (
-        WidthPoint,
-        WidthSearch,
-        check_widths,
-        search_widths,
-        widths_front,
-    )
 
 __version__ = "0.1.0"
 
@@ -33,7 +26,6 @@ _NAMES = {
     "passes": "Compilation lay_out_again to_integers without",
     "storage.choose_storage": "round_to_forms",
     "storage.scales": "layer_of rounded",
-    "storage.width_search": "WidthPoint WidthSearch check_widths search_widths widths_front",
 }
 _PLACES = {name: module for module, names in _NAMES.items() for name in names.split()}
 """Module of the target that each public name is imported from when it is first used."""

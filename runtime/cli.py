@@ -33,7 +33,6 @@ GROUPS: dict[str, dict[str, str]] = {
     },
     "choose": {
         "chart": "accuracy against energy, time and size for a grid of configurations, and which one to deploy",
-        "bits": "find the storage width of each layer that a wanted accuracy or agreement needs",
         "lean": "what of a network its recordings do not need, and a netlist without it",
         "anytime": "how early decisions could be taken, and what that saves",
     },

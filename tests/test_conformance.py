@@ -52,9 +52,6 @@ def float_side(made):
 LISTS = """
 anytime:
     bins chip_steps decisions files full labelled labels least_interval rules samples savings source split windows
-bits:
-    combinations command float_accuracy front layers netlist of recommended recordings scale_groups wanted
-    widths
 chart:
     budget chosen_by command data expected format grid networks points recommended refused saving
     spikeloom tables target
@@ -327,7 +324,6 @@ def test_explain_prints_the_keys_of_the_table(name):
 COMMANDS = {
     "report": ("timed", "report {net} --checkpoint {file} --data {data} -o {out}/page.html"),
     "anytime": ("timed", "anytime {net} --checkpoint {file} --data {data}"),
-    "bits": ("joined", "bits {file} --calibrate {data} --agreement 0.1 --widths 4,8"),
     "lean": ("joined-timed", "lean {file} --data {data} -o {out}/lean.loom"),
     "stress": ("recurrent", "stress {net} --checkpoint {file} --dt 0.02 --data {data} --seeds 1 --only taxels_dead"),
     "chart": ("binned", "chart {file} --data {data} --grid bits=8 --jobs 1 -o {out}/chart"),

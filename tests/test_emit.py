@@ -36,7 +36,6 @@ from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
-from spikeloom.compiler.targets.loihi1.storage.width_search import check_widths
 
 
 @settings(deadline=None, max_examples=25)
@@ -219,7 +218,6 @@ OPTIONS = [
     *((f"--planes {planes}|1 to 3", rounding(packings=(Packing(planes=planes),))) for planes in (0, 4)),
     *((f"--scale-groups {n}|8 thresholds|1 to 8", rounding(packings=(Packing(groups=n),))) for n in (0, 9)),
     ("--weight-bits: 2 layers|the network has 1", rounding(packings=(Packing(), Packing()))),
-    (f"--widths 7|{WIDTHS}", lambda: check_widths([7], 1, 4, LOIHI)),
     ("--optimize latency|no time", lambda: lay_out(full(2, 2), dataclasses.replace(LOIHI, time=()), goal="latency")),
     (
         "--optimize latency|links between chips|--chips",
@@ -275,8 +273,6 @@ def test_what_cannot_be_had_is_refused(error, words, call):
 def test_what_is_just_allowed():
     assert least_cores(full(2496, 128), {"fc1": 3}, LOIHI) == {0: 3}
     assert least_cores(full(6, 8), {"fc1": 6}, small_target(chip_cores=2), 3) == {0: 6}
-    assert check_widths([8, 2, 8], 1, 4, LOIHI) == (2, 8)
-    assert check_widths([2, 3, 4, 5, 6, 8], 1, 4, LOIHI) == (2, 3, 4, 5, 6, 8)
     assert len(partition(full(4096, 1), LOIHI)) == 1
     assert len(partition(full(1, 128 * 8), small_target(core_compartments=8))) == 128
     assert len(cutting((1, 1, 5), core_axons_out=5, core_compartments=1)()) == 6

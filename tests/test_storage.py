@@ -6,17 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_networks import BITS, LOIHI, chain, float_networks, moved, random_checkpoint, recordings_for, small_target
+from random_networks import BITS, LOIHI, chain, float_networks, moved, recordings_for
 
-from spikeloom.compiler import Options, Packing, compile_network
+from spikeloom.compiler import Packing
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, plane_distance, reach, split_planes, weight_step
-from spikeloom.compiler.interpret import channels_last, cut, run_float, run_integer, vote
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import Form, one_sided
 from spikeloom.compiler.passes.calibrate import calibrate
-from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.range_proof import prove_ranges
-from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.compiler.targets.loihi1.storage.compensate import DAMPING, _round_in_turn, _share, compensated
 from spikeloom.compiler.targets.loihi1.storage.scales import (
@@ -30,7 +27,6 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
 )
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import _decay_flips, make_exact
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import round_population, scales
-from spikeloom.compiler.targets.loihi1.storage.width_search import WidthPoint, search_widths, widths_front
 
 
 @st.composite
@@ -289,88 +285,3 @@ def test_spikes_that_the_decay_alone_moves_are_counted():
             s = u > 0.5
             differ += int((s != spikes[t]).sum())
     assert _decay_flips(layer_of(network, 0), calibration) == differ > 0
-
-
-# --- the search over widths -------------------------------------------------------------------------------------------
-WIDTHS = (2, 4, 8)
-
-
-def drawn(seed, *, samples=24, steps=16, taxels=5, rate=0.3):
-    """A small network, recordings and labels that it gets right half the time."""
-    rng = np.random.default_rng(seed + 100)
-    events = (rng.random((samples, taxels, 2, steps)) < rate).astype(np.uint8)
-    checkpoint = random_checkpoint(seed=seed, taxels=taxels, sizes=(7, 6, 4))
-    network = expand(checkpoint, np.full((taxels, taxels), 1 / taxels))
-    decided = vote(run_float(network, channels_last(events)).spikes[-1].sum(axis=1))
-    labels = np.where(rng.random(samples) < 0.5, decided, rng.integers(0, 4, samples))
-    return network, events, labels
-
-
-@pytest.mark.parametrize("shorter", [False, True])
-def test_figures_are_those_of_the_compiler(shorter):
-    """Every point that is built counts what the compiled netlist does; recordings count up to their own length."""
-    network, events, labels = drawn(2)
-    lengths = np.random.default_rng(0).integers(3, events.shape[3] + 1, len(events)) if shorter else None
-    for index, length in enumerate(lengths if shorter else ()):
-        events[index, ..., length:] = 0
-    samples, flat = 9, channels_last(events)
-    options = {"widths": (2, 8), "groups": 2, "samples": samples, "lengths": lengths}
-    made = search_widths(network, LOIHI, flat, labels, **options)
-    picked = np.linspace(0, len(events) - 1, samples).round().astype(int)
-
-    def decided(spikes):
-        return vote(cut(spikes, lengths[picked] if shorter else None).sum(axis=1))
-
-    wanted = decided(run_float(network, flat[picked]).spikes[-1])
-    assert (made.samples, made.float_right) == (samples, np.count_nonzero(wanted == labels[picked]))
-    assert {point.bits for point in made.built} <= {point.bits for point in made.points}
-    assert {(8,) * 4, (2,) * 4} <= {point.bits for point in made.points}
-    for point in made.built:
-        packings = [Packing(bits=bits, groups=2) for bits in point.bits]
-        compilation = compile_network(network, Options(packings=packings, training_events=events))
-        ours = decided(run_integer(compilation.integer, flat[picked]).spikes[-1])
-        assert point.equal == np.count_nonzero(ours == wanted)
-        assert point.right == np.count_nonzero(ours == labels[picked])
-        assert point.cores == compilation.netlist.n_cores
-        used = sum(use.used for use in measure(compilation.netlist, LOIHI) if use.name == "core.synapse_words")
-        assert point.words <= used
-
-
-def test_the_descent_takes_the_best_neighbour_and_builds_the_best():
-    network, events, labels = drawn(0)
-    made = search_widths(network, LOIHI, channels_last(events), labels, widths=WIDTHS)
-    best = {point.bits for by in ("equal", "right") for point in widths_front(made.built, by)}
-    assert best <= {point.bits for point in made.built} <= {point.bits for point in made.points}
-    points = {point.bits: point for point in made.points}
-    for figure in ("equal", "right"):
-        at = (8, 8, 8, 8)
-        while at != (2, 2, 2, 2):
-            below = [(*at[:i], WIDTHS[WIDTHS.index(b) - 1], *at[i + 1 :]) for i, b in enumerate(at) if b > 2]
-            at = max(below, key=lambda bits: (getattr(points[bits], figure), -points[bits].words))
-
-
-def test_memory_is_counted_list_by_list():
-    network = chain(np.full((70, 3), 0.3), np.full((2, 70), 0.1))
-    events = np.random.default_rng(0).random((8, 20, 3)) < 0.4
-    made = search_widths(network, LOIHI, events, np.zeros(8, int), widths=(8,))
-    # three lists of 70 in blocks of 64 and 6, seventy of 2, each block with 10 bits more, in whole words
-    assert [point.words for point in made.built] == [3 * (9 + 1) + 70]
-    assert [point.words for point in made.points] == [-(-8 * (3 * 70 + 70 * 2) // 64)]
-
-
-def test_what_does_not_fit_the_chip_is_not_built():
-    network = chain(np.random.default_rng(0).normal(0, 0.3, (40, 30)))
-    events = np.random.default_rng(1).random((8, 20, 30)) < 0.3
-    found = search_widths(
-        network, small_target(core_synapse_words=60, chip_cores=2), events, np.zeros(8, int), widths=(2, 8)
-    )
-    assert [point.bits for point in found.points] == [(8,), (2,)]
-    assert [point.bits for point in found.built] == [(2,)]
-
-
-def test_a_front_rises_with_memory():
-    figures = [(2, 9, 5), (3, 9, 7), (4, 12, 7), (5, 4, 1), (6, 20, 8), (8, 20, 8)]
-    points = [WidthPoint(bits=(b,), words=w, equal=e, right=10 - e) for b, w, e in figures]
-    assert [p.bits[0] for p in widths_front(points, "equal")] == [5, 3, 6]
-    assert [p.bits[0] for p in widths_front(points, "right")] == [5]
-    assert widths_front([], "equal") == ()
