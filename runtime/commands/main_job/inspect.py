@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.archive import COUNTERS, is_netlist
+from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.dynamics import Dynamics
-from spikeloom.compiler.formats.counters import Counters, read_counters
+from spikeloom.compiler.formats.counters import read_counters
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET
 from spikeloom.runtime.commands.options import add_model
 from spikeloom.runtime.inputs.files import require_inspectable, shipped
