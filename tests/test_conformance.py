@@ -33,8 +33,8 @@ from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
 from spikeloom.runtime.machines.truenorth import spec as crossbar_spec
 from spikeloom.runtime.report.encode import encode
 
-CHECKPOINTS = tuple(name for name in FLOAT if name not in ("recurrent", "onnx"))
-STEP_BY_STEP = ("recurrent", "onnx")
+CHECKPOINTS = tuple(name for name in FLOAT if name not in ("recurrent", "onnx", "counters"))
+STEP_BY_STEP = ("recurrent", "onnx", "counters")
 """Those that the kernel of layers does not take: a loop, or sums that may leave 16 bits."""
 
 
@@ -353,7 +353,7 @@ def test_other_commands_print_the_keys_of_the_table(command, tmp_path):
     require_keys(command, as_json(*words.format(**places).split(), codes=(0, 1)))
 
 
-@over(("timed", "joined", "binned", "recurrent", "netx"))
+@over(("timed", "joined", "binned", "recurrent", "netx", "counters"))
 def test_watch_decides_as_run(name, tmp_path):
     made = specimen(name)
     lines = []

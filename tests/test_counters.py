@@ -12,7 +12,8 @@ from spikeloom.compiler import compile_network
 from spikeloom.compiler.archive import read_members
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.formats.counters import BLOCK, counting_network, read_counters, write_counters
-from spikeloom.compiler.interpret import channels_last, float_simulation
+from spikeloom.compiler.interpret import channels_last, float_simulation, run_integer
+from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds, linear_rules
@@ -198,3 +199,16 @@ def test_commands_take_a_counting_network(monkeypatch, tmp_path):
 def test_options_of_others_are_refused(words, said):
     code, _, err = run("train", "--data", "synthetic", *words, "-o", "x.pt")
     assert (code, said in err) == (2, True)
+
+
+@pytest.mark.parametrize("rate", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize("plan", PLANS, ids=str)
+def test_no_recording_leaves_the_proven_range(plan, rate):
+    data = counted(made(), plan)
+    counters = counters_of(data, fit(data, CLASSES), made(), CLASSES)
+    integer = compile_network(counting_network(counters)).integer
+    steps = of_length(joined_bins(made(seed=3, rate=rate), plan.bins), counters.clocks.length)
+    membranes = run_integer(integer, channels_last(steps.events, counters.clocks), membranes=True).membranes
+    for proof, found in zip(prove_ranges(integer), membranes, strict=True):
+        assert proof.holds
+        assert np.abs(found).max() <= proof.membrane

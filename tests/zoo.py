@@ -22,13 +22,15 @@ from random_crossbars import random_network as native_network
 from timed_networks import GRAPH, TIMING, written
 
 from spikeloom.compiler.checkpoint import Checkpoint
+from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.dynamics import PLAIN, with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.formats.counters import write_counters
 from spikeloom.compiler.formats.tensors import arrays_of, join
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.truenorth.native_file import write_trained
 from spikeloom.models.networks.checkpoint import save_checkpoint
-from spikeloom.models.recordings.events import joined_bins, load_data
+from spikeloom.models.recordings.events import joined_bins, load_data, of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.base import Machine, machine_for
@@ -74,7 +76,8 @@ class Specimen:
     def recordings(self) -> Recordings:
         """The test split, of bins that the network takes."""
 
-        return joined_bins(load_data(self.data, "test"), self.machine.netlist.bins)
+        netlist = self.machine.netlist
+        return of_length(joined_bins(load_data(self.data, "test"), netlist.bins), netlist.clocks.length)
 
     @property
     def events(self) -> np.ndarray:
@@ -160,6 +163,17 @@ def netx(folder: Path) -> Made:
     return "net.net", TAXELS, "", ""
 
 
+def counting(folder: Path) -> Made:
+    """Counters of two parts of a recording that is shorter than most, and a read-out."""
+    rng = np.random.default_rng(0)
+    counter = np.array([(channel, part, k) for k in (1, 2) for part in (0, 1) for channel in range(2 * TAXELS)])
+    weight = rng.integers(-9, 10, (CLASSES, len(counter)))
+    sizes = {"taxels": TAXELS, "polarities": 2, "classes": CLASSES, "bins": 1, "steps": 10, "parts": 2, "ramp": 8}
+    made = Counters(**sizes, counter=counter, weight=weight, slope=9.0, threshold=150.5)
+    write_counters(folder / "net.pt", made)
+    return "net.pt", TAXELS, "", ""
+
+
 def native(folder: Path) -> Made:
     network = native_network(0, taxels=TAXELS, classes=CLASSES, steps=STEPS)
     write_trained(folder / "net.pt", {"last": network}, graph="ring", edges=np.array([[0, 1], [1, 0]]), training={})
@@ -184,6 +198,7 @@ MAKERS: dict[str, Callable[[Path], Made]] = {
     "fine-tuned": fine_tuned,
     "recurrent": recurrent,
     "onnx": onnx_step,
+    "counters": counting,
     "netx": netx,
     "native": native,
     "in-time": in_time,

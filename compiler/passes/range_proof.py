@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX, MEMBRANE_SHIFT
-from spikeloom.compiler.ir import IntegerNetwork, one_sided
+from spikeloom.compiler.ir import INPUT, IntegerNetwork, one_sided
 from spikeloom.compiler.types import FloatArray, IntArray
 
 
@@ -42,17 +42,35 @@ def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:
 
     The accumulator is bounded by the positive and the negative weights of a neuron taken separately, which covers
     every order of arrival. A membrane is bounded above by its threshold (it is reset when it passes it) plus one
-    step, and below by what the leak lets negative input add up to.
+    step, and below by what the leak lets negative input add up to; its own synapse counts once, since it is reset
+    before. Without a leak that is all that arrives in a recording, where the network says how long one is.
     """
     proofs = []
+    length, unit = network.input.clocks.length or np.inf, 1 << MEMBRANE_SHIFT
+    spikes: dict[int, FloatArray] = {INPUT: np.full(network.input.size, length)}  # in a recording, at most
     for post, population in enumerate(network.populations):
-        into = (projection for projection in network.projections if projection.post == post)
+        into = [projection for projection in network.projections if projection.post == post]
         positive, negative = one_sided(into, population.size)
-        unit = 1 << MEMBRANE_SHIFT
-        kept_u = population.realised_alpha
+        kept_u, kept_v = population.realised_alpha, population.realised_beta
         up, down = settled(positive * unit, kept_u), settled(negative * unit, kept_u)
-        rise = population.realised_beta * population.threshold * unit + up + np.maximum(population.bias, 0)
-        fall = settled(down + np.maximum(-population.bias, 0), population.realised_beta)
+        own, others = np.zeros(population.size), np.zeros(population.size)
+        for p in into:
+            inhibition = -p.effective().minimum(0)
+            inhibition.eliminate_zeros()  # a zero of what has no end is none
+            if p.pre == post and inhibition.nnz == np.count_nonzero(diagonal := inhibition.diagonal()):
+                own += diagonal
+            else:
+                others += inhibition @ spikes.get(p.pre, np.full(inhibition.shape[1], length))
+        rise = kept_v * population.threshold * unit + up + np.maximum(population.bias, 0)
+        sinking = np.maximum(-population.bias, 0)
+        if kept_v < 1:
+            fall = settled(down + sinking, kept_v)
+        else:
+            sinking = np.multiply(sinking, length, out=np.zeros(population.size), where=sinking > 0)
+            fall = settled((own + others) * unit, kept_u) + sinking
+        pause = np.floor((own + population.threshold) * unit / np.maximum(up + np.maximum(population.bias, 0), 1))
+        rests = kept_v == 1 and kept_u == 0
+        spikes[post] = 1 + np.floor((length - 1) / (pause + 1)) if rests else np.full(population.size, length)
         proofs.append(
             RangeProof(
                 layer=population.name,
