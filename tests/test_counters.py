@@ -16,7 +16,7 @@ from spikeloom.compiler.interpret import channels_last, float_simulation, run_in
 from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds, linear_rules
+from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds, held_out, linear_rules
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.studies.counting import decisions_of
 
@@ -162,6 +162,24 @@ def test_rule_is_where_the_loss_is_flat(plan):
         short = np.maximum(1 - sign * rule.sums(data), 0)
         slope = rule.weight.T - 2 * strength * data.spikes[:, rule.used].T @ (sign * short)
         assert np.abs(slope).max() < 1e-8
+
+
+def test_levels_are_told_apart_by_their_boundaries():
+    data, rng = made(samples=90), np.random.default_rng(0)
+    events = np.zeros_like(data.events)
+    events[:, 3, 1, 0] = 1
+    for sample, label in enumerate(data.labels):  # a level more is two channels more, whichever
+        channel = rng.permutation(7)[: 1 + 2 * label]
+        events[sample, channel // 2, channel % 2, 0] = 1
+    plan = Plan(thresholds=(1,), strengths=(0.3,))
+    right = [
+        np.mean(held_out(counted(replace(data, events=events), each), CLASSES)[0.3].argmax(axis=1) == data.labels)
+        for each in (plan, replace(plan, levels=3))
+    ]
+    assert right[0] < 0.9
+    assert right[1] == 1
+    with pytest.raises(OptionError, match="--levels 2: 3 classes"):
+        fit(counted(data, replace(plan, levels=2)), CLASSES)
 
 
 def test_folds_share_out_every_class():

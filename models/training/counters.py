@@ -42,6 +42,9 @@ LEAST = 3
 MOST = 64
 """Thresholds at most."""
 
+THING = 3
+"""How much more a thing weighs than a boundary between its levels."""
+
 NEWTON_STEPS, LEAST_STEP = 100, 1e-6
 """Steps at most, of which a class takes three to ten, and the least part of one that is tried."""
 
@@ -56,6 +59,7 @@ class Plan:
     window: int = 100  # Per cent of the recording that counts
     ramp: int = 32  # Steps of the read-out
     bits: int = 8  # Width of a weight
+    levels: int = 1  # Classes in a row that are levels of one thing, as 0 to 100 % of a container
     strengths: tuple[float, ...] = STRENGTHS
 
     def require_possible(self) -> None:
@@ -140,20 +144,30 @@ def linear_rules(data: Counted, classes: int, strengths: Iterable[float]) -> dic
     """For each strength a support vector machine without bias, one class against the rest.
 
     It looks at the counters that spike now and then. Weights are sums of recordings, of which each class has shares.
+    Where classes are levels, the first of each thing is trained as the thing against the rest, and the others as the
+    boundary below them, on recordings of the thing alone; what a class weighs is the sum of all up to it.
     """
+    levels = data.plan.levels
+    if levels < 1 or classes % levels:
+        raise OptionError(f"--levels {levels}: {classes} classes are no multiple of it; give another")
     used = np.flatnonzero((data.spikes > 0).sum(axis=0) >= LEAST)
     if not len(used):
         raise DataError("counters: none of them spikes; give other --thresholds, or recordings with events")
     spikes = data.spikes[:, used].astype(np.float64)
     alike = spikes @ spikes.T
-    sign = np.where(data.labels[:, None] == np.arange(classes), 1.0, -1.0)
+    label, each = data.labels[:, None], np.arange(classes)
+    here = label // levels == each // levels
+    sign = np.where(here & (label >= each), 1.0, np.where(here | (each % levels == 0), -1.0, 0.0))
     ordered = sorted(strengths)  # so that each starts at what the one before has found
     share = _least_squares(alike, sign, ordered[0])
     found = {}
     for strength in ordered:
-        each = zip(sign.T, share.T, strict=True)
-        share = np.stack([_newton(alike, one, start, strength) for one, start in each], axis=1)
-        found[strength] = Rule(used=used, weight=share.T @ spikes)
+        starts = zip(sign.T, share.T, strict=True)
+        share = np.stack([_newton(alike, one, start, strength) for one, start in starts], axis=1)
+        weight = (share.T @ spikes).reshape(-1, levels, len(used))
+        if levels > 1:
+            weight[:, 0] *= THING
+        found[strength] = Rule(used=used, weight=weight.cumsum(axis=1).reshape(classes, -1))
     return found
 
 
@@ -161,6 +175,11 @@ def _least_squares(alike: FloatArray, sign: FloatArray, strength: float) -> Floa
     """Shares of recordings if all of them pull, as those short of the margin do."""
     ridge = alike + np.eye(len(alike)) / (2 * strength)
     return np.asarray(cho_solve(cho_factor(ridge, overwrite_a=True, check_finite=False), sign, check_finite=False))
+
+
+def _short(sign: FloatArray, sums: FloatArray) -> NDArray[np.bool_]:
+    """Which recordings are short of the margin; those without a sign are not looked at."""
+    return np.asarray((sign * sums < 1) & (sign != 0))
 
 
 def _newton(alike: FloatArray, sign: FloatArray, share: FloatArray, strength: float) -> FloatArray:
@@ -171,11 +190,11 @@ def _newton(alike: FloatArray, sign: FloatArray, share: FloatArray, strength: fl
 
     sums = alike @ share
     for _ in range(NEWTON_STEPS):
-        short = np.flatnonzero(sign * sums < 1)
+        short = np.flatnonzero(_short(sign, sums))
         goal = np.zeros_like(share)
         goal[short] = _least_squares(alike[short[:, None], short], sign[short], strength)
         ahead, step = alike @ goal - sums, 1.0
-        if np.array_equal(np.flatnonzero(sign * (sums + ahead) < 1), short):
+        if np.array_equal(np.flatnonzero(_short(sign, sums + ahead)), short):
             return goal
         here = loss(share, sums)
         while step > LEAST_STEP and loss(share + step * (goal - share), sums + step * ahead) > here:

@@ -93,6 +93,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--parts", type=int, metavar="N", help="equal parts of a recording, counted apart (default: 1)"
     )
     counting.add_argument("--ramp", type=int, metavar="N", help="silent steps of the read-out (default: 32)")
+    counting.add_argument(
+        "--levels", type=int, metavar="N", help="so many classes in a row are levels of one thing (default: 1)"
+    )
     parser.add_argument("--window", metavar="P%%", help="train on the first so many per cent of each recording")
     parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
     parser.add_argument(
@@ -149,7 +152,7 @@ SIZES = ("features", "hops", "hidden", "clocks")
 OVERRIDES = ("current_decay", "membrane_decay", *SIZES, "batch", "decay_epochs", "spike_penalty")
 """Options that change single values of a recipe."""
 
-COUNTERS_ONLY = ("thresholds", "parts", "ramp")
+COUNTERS_ONLY = ("thresholds", "parts", "ramp", "levels")
 NOT_COUNTERS = ("padding", "graph", "edges", "directed", "copies", *OVERRIDES, "epochs", "resume", "keep", "picture")
 
 
