@@ -16,6 +16,7 @@ from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit
+from spikeloom.models.training.record import Held
 from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.numbers import percent
@@ -36,8 +37,8 @@ class CountersRecord:
     plan: Plan
     strength: float  # Of the rule, chosen by cross-validation
     cross_validation: Mapping[str, float]  # Accuracy of each strength on training recordings that it did not see
-    samples: int  # Training recordings
     counters: int
+    validation: Held  # What cross-validation decided rightly, at this strength
     test_correct: int
     test_samples: int
 
@@ -79,8 +80,8 @@ def train_counters(plan: Plan, training: Recordings, test: Recordings, command: 
         plan=plan,
         strength=fitted.strength,
         cross_validation={f"{each:g}": accuracy for each, accuracy in fitted.accuracy.items()},
-        samples=len(training),
         counters=len(made.counter),
+        validation=Held(correct=round(fitted.accuracy[fitted.strength] * len(training)), samples=len(training)),
         test_correct=int(np.sum(decisions_of(made, test) == test.labels)),
         test_samples=len(test),
     )
@@ -92,8 +93,9 @@ def counters_sections(report: CountersReport) -> Iterator[Section]:
     """What was trained, for people."""
     made = report.record
     rows = [[strength, f"{100 * share:.1f} %"] for strength, share in made.cross_validation.items()]
+    chosen = f"strength {made.strength:g}, by cross-validation in {made.validation.samples} recordings"
     lines = [
-        f"{made.counters} counters; strength {made.strength:g}, by cross-validation in {made.samples} recordings",
+        f"{made.counters} counters; {chosen}",
         f"test accuracy: {percent(made.test_correct, made.test_samples)}",
         f"written: {report.file}, sha256 {report.sha256}",
     ]

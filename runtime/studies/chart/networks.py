@@ -10,16 +10,18 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from spikeloom.compiler import Packing, check_packings
-from spikeloom.compiler.archive import arrays_digest, is_netlist
+from spikeloom.compiler.archive import COUNTERS, arrays_digest, is_netlist
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import ONNX
+from spikeloom.compiler.formats.counters import SYSTEM, counting_network, read_counters
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.systems import NO_GRAPH
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import PRETRAINED, shipped
-from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
+from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, network_kind, propagation
 from spikeloom.runtime.machines.base import DEFAULT, trained_for
 from spikeloom.runtime.report.encode import HIDDEN
 from spikeloom.runtime.studies.chart.grid import Grid
@@ -72,6 +74,7 @@ class NetworkFile:
     weights: str
     system: str
     bins: int = 1  # Bins of the recordings that a step joins
+    length: int | None = field(default=None, metadata=HIDDEN)  # Steps that every recording is run, where it says so
     options: tuple[tuple[str, Any], ...] = field(metadata=HIDDEN)  # How it is read: as typed, if they suit it
     sees: str = field(default="", metadata=HIDDEN)  # Hash over what its first layer sees
     taxels: int = field(metadata=HIDDEN)
@@ -148,6 +151,8 @@ def _read(path: str, arguments: argparse.Namespace) -> NetworkFile:
     name = Path(path.removeprefix(PRETRAINED)).stem
     if Path(file).is_file() and is_netlist(file) and trained_for(file) is None:
         raise ModelError(f"{path}: is a netlist, a chart compiles its own; give the checkpoint that it was made from")
+    if network_kind(path) == COUNTERS:
+        return _counting(path, name)
     checkpoint = load_checkpoint(path, arguments)
     typed = repeat.given(arguments, repeat.NETWORK)
     if checkpoint.edges is not None:  # one that knows its graph needs no option; others of the same call may
@@ -171,6 +176,25 @@ def _read(path: str, arguments: argparse.Namespace) -> NetworkFile:
         layers=tuple(checkpoint.neurons),
         training=checkpoint.training or {},
         forms=checkpoint.forms,
+    )
+
+
+def _counting(path: str, name: str) -> NetworkFile:
+    counters, sha256 = read_counters(shipped(path))
+    return NetworkFile(
+        path=path,
+        name=name,
+        graph=NO_GRAPH,
+        sha256=sha256,
+        weights="last",
+        system=SYSTEM,
+        bins=counters.bins,
+        length=counters.clocks.length,
+        options=tuple((option, repeat.USUAL.get(option)) for option in repeat.NETWORK),
+        taxels=counters.taxels,
+        classes=counters.classes,
+        layers=tuple(population.name for population in counting_network(counters).populations),
+        training=counters.training,
     )
 
 

@@ -20,7 +20,7 @@ from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
-from spikeloom.models.recordings.events import joined_bins
+from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part, steps_of
 from spikeloom.runtime.equivalence.reference import votes_so_far
 from spikeloom.runtime.inputs import repeat
@@ -151,10 +151,20 @@ def _decided(network: NetworkFile, data: Data, windows: tuple[int, ...]) -> dict
     """Decisions of the float32 model by window and split; one run each, since what comes later changes nothing."""
     loaded, decided = _loaded(network), {window: dict[str, IntArray]() for window in windows}
     for split, part in _in_steps(data, network).items():
-        votes = votes_so_far(loaded.network, loaded.model, part)
-        for window in windows:
-            decided[window][split] = vote(votes[np.arange(len(part)), steps_of(part.step_counts, window) - 1])
+        if network.length is None:
+            votes = votes_so_far(loaded.network, loaded.model, part)
+            for window in windows:
+                decided[window][split] = vote(votes[np.arange(len(part)), steps_of(part.step_counts, window) - 1])
+        else:
+            for window in windows:
+                votes = votes_so_far(loaded.network, loaded.model, _part(network, part, window))
+                decided[window][split] = vote(votes[:, -1])
     return decided
+
+
+def _part(network: NetworkFile, data: Recordings, window: int) -> Recordings:
+    """As long a part of each recording as a window says, run as long as the network says."""
+    return of_length(first_part(data, window), network.length)
 
 
 # -- the work ----------------------------------------------------------------------------------------------------------
@@ -196,7 +206,7 @@ def _built(work: Measurement, place: Callable[[str], Netlist], layout: str) -> B
     machine, splits = machine_of(netlist), _in_steps(work.data, work.network)
     figures = {
         window: {
-            split: _figures(machine, first_part(splits[split], window), work.data.bin_s, decisions)
+            split: _figures(machine, _part(work.network, splits[split], window), work.data.bin_s, decisions)
             for split, decisions in each.items()
         }
         for window, each in _decided(work.network, work.data, work.windows).items()
@@ -220,7 +230,7 @@ def _rounded(work: Measurement) -> Callable[[str], Netlist]:
             forms=work.network.forms,
             packings=parse_packings(some),
             prune_unused=some.prune_unused,
-            training_events=_in_steps(work.data, work.network)["train"].events,
+            training_events=_part(work.network, _in_steps(work.data, work.network)["train"], WHOLE).events,
         ),
         load_target(some.target),
     )
