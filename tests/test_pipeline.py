@@ -29,6 +29,7 @@ from spikeloom.compiler.passes.prune import compact, disconnect, either, never_f
 from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.pipeline import run
 from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.passes import start
 from spikeloom.compiler.text import text
@@ -53,7 +54,7 @@ def test_the_passes_run_in_order_and_hand_on_what_they_make():
     assert all(proof.holds for proof in done.proofs)
     assert [choice.layer for choice in done.choices] == ["conv1", "fc1", "fc2", "fc3"]
     assert tuple(done.netlist.core_tile) == done.placement.tiles
-    assert (done.core_bound, done.netlist.n_cores) == (1, 1)
+    assert (core_bound(done.held, done.target), done.netlist.n_cores) == (1, 1)
     assert all(use.used <= use.allowed for use in done.uses)
     assert done.netlist.provenance == {"compensated": []}
     assert (done.layout, done.layout.expected) == (done.usual, None)

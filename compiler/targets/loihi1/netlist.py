@@ -142,11 +142,8 @@ class Netlist(netlist_file.Netlist):
 
     def number_in_layer(self) -> IntArray:
         """Place of each compartment among those of its layer; shape (compartments,)."""
-        number = np.empty(self.n_compartments, np.int64)
-        for layer in range(len(self.layers)):
-            ids = self.compartments_of(layer)
-            number[ids] = np.arange(len(ids))
-        return number
+        order = np.lexsort((self.neuron, self.layer))
+        return order.argsort() - np.searchsorted(self.layer[order], self.layer)
 
     def core_of_compartment(self) -> IntArray:
         """Core of each compartment; shape (compartments,)."""
@@ -181,14 +178,10 @@ def one_step_bounds(netlist: Netlist) -> tuple[IntArray, IntArray]:
     No order of arrival and no input can bring a running sum outside ``-negative … positive``: it is reached when
     every positive (negative) synapse is hit at once. Both are magnitudes, (compartments,), in weight units.
     """
-    positive, negative = np.zeros((2, netlist.n_compartments), np.int64)
-    for core in range(netlist.n_cores):
-        _, compartment, weight = netlist.synapses_of(core)
-        first, last = netlist.core_compartments[core : core + 2]
-        for sums, share in ((positive, weight), (negative, -weight)):
-            # float64 sums of integers below 2**53 are exact
-            sums[first:last] = np.bincount(compartment - first, np.maximum(share, 0), last - first)
-    return positive, negative
+    compartment, weight = netlist.synapse_compartment(), netlist.effective_weight()
+    # float64 sums of integers below 2**53 are exact
+    both = [np.bincount(compartment, np.maximum(each, 0), netlist.n_compartments) for each in (weight, -weight)]
+    return both[0].astype(np.int64), both[1].astype(np.int64)
 
 
 class Reach(NamedTuple):

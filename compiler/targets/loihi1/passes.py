@@ -16,7 +16,6 @@ from spikeloom.compiler.pipeline import LATER, Pass, run
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.choose import Layout, lay_out
-from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, require_legal
 from spikeloom.compiler.targets.loihi1.netlist import FILE, Netlist
@@ -59,11 +58,6 @@ class Compilation:
     def placement(self) -> Placement:
         """Tiles and what they cost."""
         return self.layout.placement
-
-    @property
-    def core_bound(self) -> int:
-        """Fewer cores cannot hold it, however it is cut."""
-        return core_bound(self.held, self.target)
 
     @property
     def newest(self) -> Network | IntegerNetwork | Layout | Netlist:

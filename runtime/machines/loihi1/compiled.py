@@ -10,6 +10,7 @@ from spikeloom.compiler.passes.prune import Removal
 from spikeloom.compiler.passes.range_proof import RangeProof
 from spikeloom.compiler.targets.loihi1.layout import choose
 from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation
+from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.passes import Compilation
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice
@@ -66,7 +67,7 @@ def outcome(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> Outcom
         proofs=done.proofs,
         removals=done.removals,
         exactness=done.exactness,
-        core_bound=done.core_bound,
+        core_bound=core_bound(done.held, done.target),
         placement=done.placement,
         layout=LayoutChoice(optimize=done.options.optimize, expected=_layout(done.layout), usual=_layout(done.usual)),
         facts=facts or None,

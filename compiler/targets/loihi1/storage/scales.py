@@ -47,11 +47,8 @@ class FloatLayer:
 
     def peaks(self) -> FloatArray:
         """Magnitude of the largest weight of each neuron; shape (neurons,)."""
-        peak = np.zeros(self.population.size)
-        for projection in self.projections:
-            row = np.repeat(np.arange(self.population.size), np.diff(projection.weight.indptr))
-            np.maximum.at(peak, row, np.abs(projection.weight.data))
-        return peak
+        peaks = [abs(projection.weight).max(axis=1).toarray().ravel() for projection in self.projections]
+        return np.asarray(np.max(peaks, axis=0))
 
 
 def layer_of(network: Network, post: int, calibration: Calibration | None = None) -> FloatLayer:
