@@ -174,6 +174,17 @@ def entry_faults(manifest: Mapping[str, Any], kinds: Mapping[str, Kind]) -> list
     return [f"the manifest has no usable {name}" for name, kind in kinds.items() if not _is(manifest.get(name), kind)]
 
 
+def array_faults(arrays: Mapping[str, Array], axes: Mapping[str, int], floats: Iterable[str] = ()) -> list[str]:
+    """Arrays with other axes than one, or than `axes` says, and those that are no integers, or `floats` no reals."""
+    found = []
+    for name, array in arrays.items():
+        due, kind = axes.get(name, 1), "f" if name in floats else "i"
+        if (array.ndim, array.dtype.kind) != (due, kind):
+            shape = ("list", "table", "block")[due - 1]
+            found.append(f"{name} is no {shape} of {'numbers' if kind == 'f' else 'integers'}")
+    return found
+
+
 def _is(value: Any, kind: Kind) -> bool:
     match kind:
         case type() if kind is float:

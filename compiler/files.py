@@ -27,12 +27,8 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
     Whatever stops the block (an error, a full disk, an interrupt) leaves an existing `path` as it was and no
     half-written file behind. A file that is replaced hands its permissions on; of a link the target is replaced.
-
-    Raises
-    ------
-    OSError
-        If the folder does not exist or cannot be written, or the disk is full; ``filename`` is `path`, unless the
-        block raised it for another file.
+    OSError if the folder does not exist or cannot be written, or the disk is full; its ``filename`` is `path`, unless
+    the block raised it for another file.
     """
     target = Path(path).resolve()
     part = beside(target)

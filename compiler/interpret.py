@@ -177,22 +177,15 @@ def threads() -> ThreadPoolExecutor:
 
 def float_simulation(network: Network, dtype: npt.DTypeLike = np.float64) -> Simulation:
     """The float stage, in the arithmetic of `dtype`."""
-    return Simulation(
-        layers=tuple(
-            float_layer(population, [p for p in network.projections if p.post == post], dtype)
-            for post, population in enumerate(network.populations)
-        )
-    )
+    into = [[p for p in network.projections if p.post == post] for post in range(len(network.populations))]
+    return Simulation(layers=tuple(float_layer(*each, dtype) for each in zip(network.populations, into, strict=True)))
 
 
 def integer_simulation(network: IntegerNetwork, *, saturates: bool = True) -> Simulation:
     """The integer stage; `saturates` as of :func:`integer_layer`."""
-    return Simulation(
-        layers=tuple(
-            integer_layer(population, [p for p in network.projections if p.post == post], saturates=saturates)
-            for post, population in enumerate(network.populations)
-        )
-    )
+    into = [[p for p in network.projections if p.post == post] for post in range(len(network.populations))]
+    layers = zip(network.populations, into, strict=True)
+    return Simulation(layers=tuple(integer_layer(*each, saturates=saturates) for each in layers))
 
 
 def run_float(

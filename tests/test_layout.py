@@ -87,7 +87,7 @@ def test_expectations_are_the_simple_model_of_the_same_spikes(data):
     depth, length = netlist.max_depth, events.shape[1]
     spikes = np.zeros((len(events), length + depth, netlist.n_compartments), bool)
     for layer, late in enumerate(depths(network)):
-        spikes[:, late : late + length, netlist.compartments_of(layer)] = calibration.spikes[layer]
+        spikes[:, late : late + length, netlist.compartments_of(layer)] = calibration.spikes[layer][:]
     latencies = timing.prepare(netlist, target, target.time[0])
     found = timing_oracle.simple(latencies, spikes, np.ones_like(spikes), events.transpose(0, 2, 1).astype(np.uint8))
     expected = layout.expected

@@ -278,7 +278,7 @@ def test_spikes_that_the_decay_alone_moves_are_counted():
     network, calibration = one_layer(rng.normal(0, 0.2, (6, 12)), samples=3, steps=200, beta=0.9999)
     weight = network.projections[0].weight.toarray()
     differ = 0
-    for events, spikes in zip(calibration.events, calibration.spikes[0], strict=True):
+    for events, spikes in zip(calibration.events, calibration.spikes[0][:], strict=True):
         u, s = np.zeros((2, 6))
         for t, current in enumerate(events @ weight.T):
             u = u * (1 - s) + current

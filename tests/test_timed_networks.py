@@ -299,7 +299,7 @@ def test_spikes_are_judged_on_what_the_layer_itself_fired_a_step_before():
     late = calibration.source(0, 0)
     assert_array_equal(late[:, 1:], calibration.spikes[0][:, :-1])
     assert not late[:, 0].any()
-    assert_array_equal(calibration.source(0, 1), calibration.spikes[0])
+    assert_array_equal(calibration.source(0, 1), calibration.spikes[0][:])
     for packing in (Packing(), Packing(planes=2), Packing(groups=4)):
         _, choices = choose_storage(network, LOIHI, packings=(packing,), calibration=calibration)
         assert choices[0].flips < 0.1 * choices[0].spikes

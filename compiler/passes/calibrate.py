@@ -44,10 +44,6 @@ class Spikes:
         """Spikes of some recordings and steps, neurons last."""
         return np.unpackbits(self.bits[rows], axis=-1, count=self.size, bitorder="little").view(np.bool_)
 
-    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
-        """All of them, (samples, steps, neurons)."""
-        return np.asarray(self[:], dtype)
-
     @property
     def total(self) -> int:
         """Spikes of all neurons."""

@@ -20,8 +20,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from spikeloom.compiler import invariants
-from spikeloom.compiler.archive import CLOCKS, Array, Kind, archive_bytes, entry_faults, read_archive, write_archive
+from spikeloom.compiler import archive, invariants
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import FormatError, VerifyError
 from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
@@ -31,10 +30,10 @@ from spikeloom.compiler.types import IntArray
 
 N = TypeVar("N")
 
-COMMON: dict[str, Kind] = {
+COMMON: dict[str, archive.Kind] = {
     "target": str,
     "provenance": dict,
-    "clocks": CLOCKS,
+    "clocks": archive.CLOCKS,
     **dict.fromkeys(("taxels", "polarities", "classes"), (1, 2**31)),
 }
 """Entries of every manifest."""
@@ -90,7 +89,7 @@ class NetlistFile(Generic[N]):
     version: int
     cores: str  # Kind that the target must have
     netlist: type[N]  # A dataclass of arrays and of the entries
-    entries: dict[str, Kind]  # Of the manifest, beside the common ones; ``layers`` among them
+    entries: dict[str, archive.Kind]  # Of the manifest, beside the common ones; ``layers`` among them
     layer: Callable[[Any], Any]  # Makes a layer of its entry
     inconsistencies: Callable[[N], list[str]]  # What in a netlist points nowhere
     floats: frozenset[str] = frozenset()  # Arrays of real numbers
@@ -120,14 +119,14 @@ class NetlistFile(Generic[N]):
             "clocks": manifest["clocks"].to_json(),
             "provenance": dict(manifest["provenance"]),
         }
-        return archive_bytes(manifest, {name: getattr(netlist, name) for name in self.arrays})
+        return archive.archive_bytes(manifest, {name: getattr(netlist, name) for name in self.arrays})
 
     def write(self, netlist: N, path: str | os.PathLike[str]) -> str:
         """Write a netlist, whole or not at all; return the sha256 of the file.
 
         OSError if the file cannot be written; an older file is left as it was.
         """
-        return write_archive(self.content(netlist), path)
+        return archive.write_archive(self.content(netlist), path)
 
     def read(self, path: str | os.PathLike[str]) -> N:
         """Read and check a netlist file.
@@ -136,9 +135,9 @@ class NetlistFile(Generic[N]):
         read.
         """
         path = Path(path)
-        manifest, members = read_archive(path, self.format, self.version, lambda _: self.arrays)
-        faults = entry_faults(manifest, COMMON | self.entries)
-        faults += [fault for name in self.arrays if (fault := self._array_fault(name, members[name]))]
+        manifest, members = archive.read_archive(path, self.format, self.version, lambda _: self.arrays)
+        faults = archive.entry_faults(manifest, COMMON | self.entries)
+        faults += archive.array_faults(members, dict.fromkeys(self.tables, 2), self.floats)
         if faults:
             raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
         if manifest["target"] not in (known := known_targets(self.cores)):
@@ -152,13 +151,7 @@ class NetlistFile(Generic[N]):
             raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
         return netlist
 
-    def _array_fault(self, name: str, array: Array) -> str | None:
-        axes, kind = 1 + (name in self.tables), "f" if name in self.floats else "i"
-        if (array.ndim, array.dtype.kind) == (axes, kind):
-            return None
-        return f"{name} is no {('list', 'table')[axes - 1]} of {'numbers' if kind == 'f' else 'integers'}"
-
-    def _held(self, name: str, array: Array) -> Array:
+    def _held(self, name: str, array: archive.Array) -> archive.Array:
         if name in self.as_stored:
             return frozen(array)
         return read_only_float(array) if name in self.floats else read_only(array)
@@ -191,6 +184,6 @@ def column_faults(
     return found or list(outside)
 
 
-def is_outside(array: Array, low: int, high: int) -> bool:
+def is_outside(array: archive.Array, low: int, high: int) -> bool:
     """Whether an array has values below `low`, or `high` and above."""
     return bool(array.size and (array.min() < low or array.max() >= high))

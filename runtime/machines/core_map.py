@@ -42,11 +42,6 @@ class Way:
     axons: int
     hops: int | None
 
-    @property
-    def sender(self) -> str:
-        """Where they come from."""
-        return "input" if self.source is None else str(self.source)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mesh:

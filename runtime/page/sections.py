@@ -132,7 +132,13 @@ def _cores(found: CoreMap) -> list[Block]:
         for core in found.cores
     ]
     ways = [
-        [way.sender, str(way.to), f"{way.packets:,.0f}", f"{way.axons:,}", "" if way.hops is None else str(way.hops)]
+        [
+            "input" if way.source is None else str(way.source),
+            str(way.to),
+            f"{way.packets:,.0f}",
+            f"{way.axons:,}",
+            "" if way.hops is None else str(way.hops),
+        ]
         for way in sorted(found.traffic, key=lambda way: -way.packets)
     ]
     mesh, tiles, chips = found.mesh, {core.tile for core in found.cores}, {core.chip for core in found.cores}

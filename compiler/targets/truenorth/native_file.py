@@ -21,8 +21,8 @@ import numpy as np
 from spikeloom.compiler.archive import (
     CLOCKS,
     TRAINED,
-    Array,
     archive_bytes,
+    array_faults,
     entry_faults,
     read_archive,
     stated,
@@ -124,7 +124,7 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
     stages: dict[str, dict[str, Any]] = {
         layer: {part: members[f"{chosen}/0/{layer}/{part}"] for part in PARTS} for layer in manifest["layers"]
     }
-    if wrong := _shape_faults(stages):
+    if wrong := [f"{name}: {fault}" for name, parts in stages.items() for fault in array_faults(parts, PARTS)]:
         raise ModelError(f"{path}: {'; '.join(wrong)}; {_AGAIN}")
     network = NativeNetwork(
         **{name: manifest[name] for name in ("taxels", "polarities", "classes", "copies")},
@@ -168,13 +168,3 @@ def _kind_faults(manifest: Mapping[str, Any]) -> list[str]:
     if not found and any(len(edge) != 2 for edge in manifest["graph"]["edges"]):
         found.append("the manifest has no usable graph")
     return found
-
-
-def _shape_faults(stages: Mapping[str, Mapping[str, Array]]) -> list[str]:
-    """Arrays that are not of whole numbers, or have another number of axes."""
-    return [
-        f"{name}: {part} is no array of {PARTS[part]} axes of whole numbers"
-        for name, parts in stages.items()
-        for part, array in parts.items()
-        if array.dtype.kind != "i" or array.ndim != PARTS[part]
-    ]

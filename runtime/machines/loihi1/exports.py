@@ -141,11 +141,7 @@ def _netx(request: Request) -> Export:
 
 
 FORMATS = (
-    Format(
-        name="sanafe",
-        title=f"network and mapping of a netlist for SANA-FE {sanafe.VERSION}, YAML",
-        write=_sanafe,
-    ),
+    Format(name="sanafe", title=f"network and mapping of a netlist for SANA-FE {sanafe.VERSION}, YAML", write=_sanafe),
     Format(
         name="onnx", title="a netlist as an integer ONNX graph, bit for bit the chip", write=_onnx, options=("form",)
     ),
