@@ -191,9 +191,10 @@ def _newton(alike: FloatArray, sign: FloatArray, share: FloatArray, strength: fl
     sums = alike @ share
     for _ in range(NEWTON_STEPS):
         short = np.flatnonzero(_short(sign, sums))
+        pull = alike[short]
         goal = np.zeros_like(share)
-        goal[short] = _least_squares(alike[short[:, None], short], sign[short], strength)
-        ahead, step = alike @ goal - sums, 1.0
+        goal[short] = _least_squares(pull[:, short], sign[short], strength)
+        ahead, step = goal[short] @ pull - sums, 1.0
         if np.array_equal(np.flatnonzero(_short(sign, sums + ahead)), short):
             return goal
         here = loss(share, sums)
