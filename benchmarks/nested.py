@@ -1,0 +1,240 @@
+"""Counting networks and support vector machines in repeated nested cross-validation over all recordings.
+
+    python benchmarks/nested.py DATA OUT.json [--levels 5]        (needs scikit-learn)
+
+Both splits are put together and parted five times five ways. In each training part every plan and strength, kernel and
+constant is tried by cross-validation in five folds; the test part is decided once by what these chose, counting
+networks as they spike. `chosen` is the plan of fewest neurons x steps whose accuracy is not lower than the best one's
+by more than a standard error of the difference, recording by recording; `best` is the best at any price, read out in
+four times the steps. `split` has the same for the split as released; `rules` are single plans, decided by exact sums.
+Intervals (95 %) and differences are bootstrapped over recordings. Parts that were measured before are not again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sklearn.svm import SVC
+
+from spikeloom.compiler.files import write_atomically
+from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.counters import (
+    FOLDS,
+    Counted,
+    Fitted,
+    Plan,
+    counted,
+    counters_of,
+    folds,
+    held_out,
+    linear_rules,
+)
+from spikeloom.runtime.studies.counting import decisions_of
+
+Json = dict[str, Any]
+
+ROUNDS, DRAWS = 5, 10_000
+
+FOUR, EIGHT = (1, 4, 16, 64), (1, 2, 4, 8, 16, 32, 64, 128)
+TWELVE = (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 130)
+
+SMALL = [(bins, parts, events) for bins, parts, events in product((1, 5, 10, 25), (1, 2, 3), (FOUR, EIGHT, TWELVE))]
+LARGE = [(bins, parts, TWELVE) for bins, parts in product((1, 5), (6, 10))]
+STRENGTHS = (0.03, 0.1, 0.3)
+RAMP, LEVELS_RAMP, LONG_RAMP = 32, 64, 128
+
+KERNELS = {"linear SVM": (0.003, 0.01, 0.1), "RBF SVM": (1.0, 3.0, 30.0)}
+SVM_PARTS = (1, 3, 10)
+
+
+def name_of(plan: Plan) -> str:
+    """What tells a plan from the others."""
+    levels = f", levels {plan.levels}" if plan.levels > 1 else ""
+    return f"bins {plan.bins}, parts {plan.parts}, {len(plan.thresholds)} thresholds{levels}"
+
+
+def whole(path: str) -> tuple[Recordings, int]:
+    """Recordings of both splits, and how many are of the training split."""
+    training, test = (load_data(path, split) for split in ("train", "test"))
+    both = replace(
+        training,
+        events=np.concatenate([training.events, test.events]),
+        labels=np.concatenate([training.labels, test.labels]),
+        files=training.files + test.files,
+        split="both",
+    )
+    return both, len(training)
+
+
+def price(data: Counted, classes: int) -> int:
+    """Neurons x steps of a plan, with all counters that would be used."""
+    counters = int(((data.spikes > 0).sum(axis=0) >= 3).sum())
+    gates = len(data.counter) // len(data.plan.thresholds) if data.plan.parts > 1 else 0
+    return (gates + counters + 2 * classes) * (data.steps + data.plan.ramp)
+
+
+def tried(data: Counted, classes: int) -> tuple[float, np.ndarray, float]:
+    """Best strength of a plan on training recordings, which of them it has right, and the lowest largest sum."""
+    sums = held_out(data, classes)
+    right = {strength: each.argmax(axis=1) == data.labels for strength, each in sums.items()}
+    best = max(right, key=lambda strength: right[strength].mean())
+    return best, right[best], float(sums[best].max(axis=1).min())
+
+
+def cheapest(right: Mapping[str, np.ndarray], prices: Mapping[str, int]) -> tuple[str, str]:
+    """The cheapest of those that are not shown to be worse than the best, and the best."""
+    best = max(right, key=lambda name: (right[name].mean(), -prices[name]))
+    behind = {name: right[best].astype(float) - each for name, each in right.items()}
+    able = [name for name, each in behind.items() if each.mean() <= each.std() / np.sqrt(len(each))]
+    return min(able, key=prices.__getitem__), best
+
+
+def measured(data: Recordings, all_counted: Mapping[str, Counted], rows: np.ndarray, held: np.ndarray) -> Json:
+    """All systems, chosen and fitted on some recordings, on the others."""
+    training, test, classes = data.part(rows), data.part(held), int(data.labels.max()) + 1
+    found: Json = {"rules": {}, "systems": {}}
+    trials, prices, rules = {}, {}, {}
+    for name, each in all_counted.items():
+        own = each.part(rows)
+        strength, right, lowest = tried(own, classes)
+        trials[name], prices[name] = right, price(own, classes)
+        rule = linear_rules(own, classes, [strength])[strength]
+        rules[name] = own, Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest)
+        correct = rule.right(each.part(held))
+        found["rules"][name] = {"held_out": float(right.mean()), "right": correct.astype(int).tolist()}
+    for level in sorted({each.plan.levels for each in all_counted.values()}):
+        names = [name for name, each in all_counted.items() if each.plan.levels == level]
+        both = cheapest({name: trials[name] for name in names}, prices)
+        for system, name in zip(("chosen", "best"), both, strict=True):
+            own, fitted = rules[name]
+            if system == "best":
+                own = replace(own, plan=replace(own.plan, ramp=LONG_RAMP))
+            made = counters_of(own, fitted, training, classes)
+            found["systems"][f"{system}, levels" if level > 1 else system] = {
+                "plan": name,
+                "strength": fitted.strength,
+                "counters": len(made.counter),
+                "neuron_steps": price(own, classes),
+                "held_out": float(trials[name].mean()),
+                "right": (decisions_of(made, test) == test.labels).astype(int).tolist(),
+            }
+    found["systems"] |= machines(data, rows, held)
+    return found
+
+
+def machines(data: Recordings, rows: np.ndarray, held: np.ndarray) -> Json:
+    """Support vector machines on log(1 + events) of each channel in parts, chosen by the same folds."""
+    label, found = data.labels[rows], {}
+    fold = folds(label, FOLDS, np.random.default_rng(0))
+    for kernel, constants in KERNELS.items():
+        trials: dict[tuple[int, float], tuple[float, list[int]]] = {}
+        for parts in SVM_PARTS:
+            pieces = np.array_split(data.events, parts, axis=-1)
+            seen = np.log1p(np.stack([each.sum(axis=-1, dtype=float) for each in pieces])).transpose(1, 0, 2, 3)
+            seen = seen.reshape(len(data), -1)
+            seen = seen[:, seen[rows].std(axis=0) > 0]
+            seen = (seen - seen[rows].mean(axis=0)) / seen[rows].std(axis=0)
+            alike = seen @ seen.T / seen.shape[1]
+            if kernel == "linear SVM":
+                alike *= seen.shape[1]
+            else:
+                own = np.diag(alike)
+                alike = np.exp(2 * alike - own[:, None] - own)
+            for constant in constants:
+                right = 0
+                for each in range(FOLDS):
+                    inner, outer = rows[fold != each], rows[fold == each]
+                    machine = SVC(C=constant, kernel="precomputed").fit(alike[np.ix_(inner, inner)], data.labels[inner])
+                    right += int((machine.predict(alike[np.ix_(outer, inner)]) == data.labels[outer]).sum())
+                machine = SVC(C=constant, kernel="precomputed").fit(alike[np.ix_(rows, rows)], label)
+                correct = machine.predict(alike[np.ix_(held, rows)]) == data.labels[held]
+                trials[parts, constant] = right / len(rows), correct.astype(int).tolist()
+        parts, constant = max(trials, key=lambda each: trials[each][0])
+        accuracy, correct = trials[parts, constant]
+        found[kernel] = {"parts": parts, "C": constant, "held_out": accuracy, "right": correct}
+    return found
+
+
+def spread(share: np.ndarray, draws: np.ndarray) -> list[float]:
+    """Mean of a share per recording and its interval over draws of recordings."""
+    means = share[draws].mean(axis=1)
+    return [round(float(each), 5) for each in (share.mean(), *np.quantile(means, (0.025, 0.975)))]
+
+
+def summary(parts: Sequence[Json], tests: Sequence[np.ndarray], samples: int) -> Json:
+    """Accuracy of each system and plan over rounds, and what a system has ahead of each other one."""
+    draws = np.random.default_rng(0).integers(0, samples, (DRAWS, samples))
+    found: Json = {}
+    for kind in ("systems", "rules"):
+        share = {name: np.zeros(samples) for name in parts[0][kind]}
+        for part, test in zip(parts, tests, strict=True):
+            for name, each in part[kind].items():
+                share[name][test] += np.array(each["right"]) / ROUNDS
+        found[kind] = {name: {"accuracy": spread(each, draws)} for name, each in share.items()}
+        if kind == "systems":
+            for name, each in share.items():
+                ahead = {other: spread(each - theirs, draws) for other, theirs in share.items() if other != name}
+                plans: dict[str, int] = {}
+                for part in parts:
+                    plan = part[kind][name].get("plan", "")
+                    plans[plan] = plans.get(plan, 0) + 1
+                found[kind][name] |= {"ahead_of": ahead, "plans": dict(sorted(plans.items(), key=lambda p: -p[1]))}
+    return found
+
+
+def main() -> None:
+    """Measure what is missing, write after each part, report."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("recordings")
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--levels", type=int, default=1, help="classes in a row that are levels of one thing")
+    arguments = parser.parse_args()
+    data, training = whole(arguments.recordings)
+    store = arguments.output.with_suffix(".parts.json")
+    done: Json = json.loads(store.read_text()) if store.exists() else {}
+    plans = [
+        Plan(bins=bins, parts=parts, thresholds=events, strengths=STRENGTHS, levels=levels, ramp=ramp)
+        for levels, ramp in {1: RAMP, arguments.levels: RAMP if arguments.levels == 1 else LEVELS_RAMP}.items()
+        for bins, parts, events in SMALL + LARGE
+    ]
+    all_counted = {name_of(plan): counted(data, plan) for plan in plans}
+    split = {"split": np.arange(len(data)) >= training}
+    for number in range(ROUNDS):
+        fold = folds(data.labels, FOLDS, np.random.default_rng(1000 + number))
+        split |= {f"{number}.{each}": fold == each for each in range(FOLDS)}
+    for name, held in split.items():
+        if name not in done:
+            done[name] = measured(data, all_counted, np.flatnonzero(~held), np.flatnonzero(held))
+            store.write_text(json.dumps(done))
+        rights = {system: sum(each["right"]) for system, each in done[name]["systems"].items()}
+        print(name, f"of {held.sum()}:", rights, flush=True)
+    nested = [name for name in split if name != "split"]
+    found = {"data": Path(arguments.recordings).name, "recordings": len(data), "rounds": ROUNDS, "folds": FOLDS}
+    found |= {"nested": summary([done[name] for name in nested], [split[name] for name in nested], len(data))}
+    own = done["split"]
+    found["split"] = {
+        kind: {
+            name: {key: value for key, value in each.items() if key != "right"}
+            | {"test_correct": sum(each["right"]), "test_samples": len(each["right"])}
+            for name, each in own[kind].items()
+        }
+        for kind in ("systems", "rules")
+    }
+    with write_atomically(arguments.output) as file:
+        file.write(json.dumps(found, indent=1).encode() + b"\n")
+    for name, each in found["nested"]["systems"].items():
+        mean, low, high = (100 * value for value in each["accuracy"])
+        test = found["split"]["systems"][name]
+        print(f"{name:16} {mean:.2f} ({low:.2f} … {high:.2f})   test {test['test_correct']} of {test['test_samples']}")
+
+
+if __name__ == "__main__":
+    main()
