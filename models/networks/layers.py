@@ -179,7 +179,7 @@ class _SpikeLinear(torch.autograd.Function):
     def forward(ctx: Any, spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         rows = spikes.reshape(-1, spikes.shape[-1]).contiguous()
         source, bounds = events_of(rows.numpy())
-        out = bias.repeat(len(rows), 1)
+        out = bias.expand(len(rows), -1).clone(memory_format=torch.contiguous_format)
         gather(source, bounds, weight.detach().contiguous().numpy(), out.numpy())
         ctx.events = source, bounds
         ctx.save_for_backward(weight)
@@ -198,10 +198,11 @@ class _SpikeLinear(torch.autograd.Function):
 
 def times(rows: Tensor, weight: Tensor) -> Tensor:
     """``rows @ weight.t()``, a large one by oneDNN, whose wider registers need half the time for the same sums."""
-    usable = rows.dtype == torch.float32 and torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
-    if weight.numel() < LARGE or not usable:
+    product = getattr(torch.ops.mkldnn, "_linear_pointwise", None)
+    if weight.numel() < LARGE or rows.dtype != torch.float32 or product is None:
         return rows @ weight.t()
-    return torch.nn.functional.linear(rows.to_mkldnn(), weight.detach().to_mkldnn()).to_dense()
+    out: Tensor = product(rows, weight.detach(), None, "none", [], "")
+    return out
 
 
 def time_first(events: npt.NDArray[np.uint8]) -> Tensor:
