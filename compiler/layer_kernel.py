@@ -27,9 +27,6 @@ Function = Callable[..., Any]
 DENORMAL = 1e-30
 """Membranes and currents below this are flushed to zero; beside a threshold they are nothing."""
 
-FIRST = np.int64(0)
-"""A plain 0 is a type of its own to numba, and what is called with it compiled once more."""
-
 GAP = 16
 """Targets this near are joined in one run, with weights of zero in between: a vector costs no more than a weight."""
 
@@ -304,8 +301,8 @@ def run_layer(
                 clear(sums)
             at, now = recording * steps + t, fired[recording % kept, t % last]
             arrive(arriving, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
-            if len(own.run) and t:
-                arrive(arriving, own, before, FIRST, list_fired(fired[recording % kept, (t - 1) % last], before))
+            if len(own.run) and t:  # a plain 0 is a type of its own: all would be compiled once more
+                arrive(arriving, own, before, np.int64(0), list_fired(fired[recording % kept, (t - 1) % last], before))
             if len(registers) == 3:
                 integrate_float(membrane, current, bias, registers[1], registers[2], now)
             else:

@@ -24,7 +24,6 @@ from spikeloom.compiler.interpret import BATCH, channels_last, raster, threads
 from spikeloom.compiler.ir import INPUT, Network, Population, Sparse
 from spikeloom.compiler.layer_kernel import (
     DENORMAL,
-    FIRST,
     Synapses,
     arrive,
     by_source,
@@ -179,6 +178,7 @@ def _run(
 
     It uses `state` (9, neurons) and `listed` (neurons,) int32.
     """
+    start = np.int64(0)  # a plain 0 is a type of its own: all would be compiled once more
     alpha, beta, least, most = constants
     recordings, steps, _ = fired.shape
     c, half, r, doubtful, nothing = state[0], state[1], state[2], state[3], state[4]
@@ -200,12 +200,12 @@ def _run(
             spikes += last - first
             if len(own.run) and t:  # what was uncertain in a step is so in the next
                 found = list_fired(fired[recording, t - 1], listed)
-                arrive(c, own, listed, FIRST, found)
-                arrive(r, own_magnitude, listed, FIRST, found)
+                arrive(c, own, listed, start, found)
+                arrive(r, own_magnitude, listed, start, found)
                 spikes += found
                 found = list_fired(unsure[recording, t - 1], listed)
-                arrive(half, own, listed, FIRST, found)
-                arrive(doubtful, own_magnitude, listed, FIRST, found)
+                arrive(half, own, listed, start, found)
+                arrive(doubtful, own_magnitude, listed, start, found)
                 spikes += found
             added = (roundings + (spikes if per_spike else 0)) * UNIT
             _currents(c, half, r, doubtful, nothing if alpha else bias, SLACK * added / (1 - added))

@@ -136,14 +136,9 @@ def _all(kind: Any, value: int) -> Any:
 def _arrays(context: Any, builder: Any, kind: Any, value: Any) -> dict[str, Any]:
     """Where the arrays of a named tuple begin."""
     return {
-        name: _begin(context, builder, part, builder.extract_value(value, i))
+        name: context.make_array(part)(context, builder, builder.extract_value(value, i)).data
         for i, (name, part) in enumerate(zip(kind.fields, kind.types, strict=True))
     }
-
-
-def _begin(context: Any, builder: Any, kind: Any, array: Any) -> Any:
-    """Where an array begins: one instruction, where numba's own accessor emits a dozen."""
-    return builder.extract_value(array, context.data_model_manager[kind].get_field_position("data"))
 
 
 def _element(builder: Any, array: Any, index: Any) -> Any:
@@ -327,7 +322,7 @@ def _block_step(*, listed: bool, rests: bool, lasts: bool) -> Function:
             table = _arrays(context, builder, tables, values[0])
             own = _arrays(context, builder, scratch, values[5])
             currents = _arrays(context, builder, lasting, values[6]) if lasts else None
-            sources = _begin(context, builder, active, values[1])
+            sources = context.make_array(active)(context, builder, values[1]).data
             (at, end, block), (place, kept_at) = values[2:5], values[7:9]
             if listed:
                 sums, arrived = _sum_listed(builder, table, sources, (at, end), block, marks=rests)
@@ -368,7 +363,7 @@ def _gathered(typing: Any, flags: Any, at: Any) -> Any:
     kind = ir.VectorType(ir.IntType(8), LANES)
 
     def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
-        array = _begin(context, builder, flags, values[0])
+        array = context.make_array(flags)(context, builder, values[0]).data
         found = builder.icmp_unsigned("!=", _vector(builder, array, values[1], kind)[0], _all(kind, 0))
         return builder.bitcast(found, _WORD)
 
@@ -554,16 +549,6 @@ def _copy_membranes(blocks: Blocks, steps: int, kept: AnyArray, out: AnyArray) -
                     place += 1
 
 
-@compiled
-def _clear(scratch: Scratch, lasting: Lasting | None) -> None:
-    for place in range(scratch.idle.size):
-        scratch.idle[place] = 0
-    for position in range(scratch.spikes.size):
-        scratch.spikes[position], scratch.membrane[position], scratch.before[position] = 0, 0, 0
-        if lasting is not None:
-            lasting.current[position] = 0
-
-
 @compiled_and_cached
 def run_recordings(
     blocks: Blocks,
@@ -587,7 +572,12 @@ def run_recordings(
     for r in range(events.shape[0]):
         steps = lengths[r]
         _pack(events[r], steps, scratch.words)
-        _clear(scratch, lasting)
+        for place in range(scratch.idle.size):
+            scratch.idle[place] = 0
+        for position in range(scratch.spikes.size):
+            scratch.spikes[position], scratch.membrane[position], scratch.before[position] = 0, 0, 0
+            if lasting is not None:
+                lasting.current[position] = 0
         _run_stages(blocks, inputs[r], steps, scratch, lasting)
         for position in range(scratch.spikes.size):
             if blocks.compartment[position] >= 0:
