@@ -42,6 +42,3 @@ def run(passes: Iterable[Pass[W]], work: W, after: Callable[[str, W], object] | 
         if after is not None:
             after(step.name, work)
     return work
-
-
-Passes = tuple[Pass[Any], ...]

@@ -83,7 +83,7 @@ def test_provenance_names_everything_that_decided(as_json, place):
 
 
 def test_dumps_go_to_standard_error(spikeloom, tmp_path):
-    words = [word for step in load_target("loihi1").passes for word in ("--dump-after", step.name)]
+    words = [word for step in load_target("loihi1").module.PASSES for word in ("--dump-after", step.name)]
     code, out, err = spikeloom("compile", "net.pt", *words, "-o", tmp_path / "out.loom", "--json")
     assert (code, json.loads(out)["neurons"]) == (0, 51)
     assert err.endswith(text(read_netlist(tmp_path / "out.loom")))

@@ -42,7 +42,7 @@ def test_the_passes_run_in_order_and_hand_on_what_they_make():
     seen = {}
     source = Factored(checkpoint=random_checkpoint(), propagation=ring(5))
     done = compile_network(source, after=lambda name, made: seen.setdefault(name, made.newest))
-    assert list(seen) == [step.name for step in load_target("loihi1").passes]
+    assert list(seen) == [step.name for step in load_target("loihi1").module.PASSES]
     assert [seen[name] for name in ("expand", "quantize", "remove", "emit")] == [
         done.network,
         done.integer,
@@ -77,7 +77,7 @@ def test_the_table_of_passes_in_the_docs():
 def test_a_pass_that_breaks_a_rule_is_named_at_once(name, change):
     passes = [
         replace(step, apply=lambda done, apply=step.apply: change(apply(done))) if step.name == name else step
-        for step in load_target("loihi1").passes
+        for step in load_target("loihi1").module.PASSES
     ]
     work, _ = start(expand(random_checkpoint(), ring(5)), Options(), load_target("loihi1"))
     seen = []

@@ -19,7 +19,7 @@ from typing import Any
 
 from spikeloom.compiler import targets
 from spikeloom.compiler.errors import OptionError, Violation
-from spikeloom.compiler.pipeline import Passes, run
+from spikeloom.compiler.pipeline import run
 from spikeloom.compiler.types import JsonObject
 
 COMPARTMENTS, CROSSBARS = "compartments", "crossbars"
@@ -136,12 +136,6 @@ class Target:
     def module(self) -> Any:
         """Module ``passes`` in the folder of the chip: ``PASSES``, ``Options`` and ``start``."""
         return import_module(f"{targets.__name__}.{self.name}.passes")
-
-    @property
-    def passes(self) -> Passes:
-        """From what is trained to a netlist."""
-        passes: Passes = self.module.PASSES
-        return passes
 
     def compile(self, source: Any, options: Any = None, *, after: Callable[[str, Any], object] | None = None) -> Any:
         """Lower what is trained to a compilation of the chip, with the result as ``netlist``.

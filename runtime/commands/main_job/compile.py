@@ -99,9 +99,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
     chip = load_target(arguments.target)
     if isinstance(arguments.checkpoint, str) and arguments.checkpoint.endswith(NETX):
         return _compile_integers(arguments)
-    if unknown := set(arguments.dump_after) - {step.name for step in chip.passes}:
-        names = ", ".join(step.name for step in chip.passes)
-        raise OptionError(f"--dump-after {', '.join(sorted(unknown))}: no such pass; allowed: {names}")
+    names = [step.name for step in chip.module.PASSES]
+    if unknown := set(arguments.dump_after) - set(names):
+        raise OptionError(f"--dump-after {', '.join(sorted(unknown))}: no such pass; allowed: {', '.join(names)}")
     own = trained_for(arguments.checkpoint) or chip_module(arguments.target, "commands")
     if own is not None:
         return own.compile_network(arguments)  # type: ignore[no-any-return]
