@@ -32,6 +32,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "report": "one self-contained page: verdict, accuracy, cores, taxels, spikes, energy, time, provenance",
     },
     "choose": {
+        "smallest": "the cheapest network that does the job: many are tried, one is chosen, compiled and verified",
         "chart": "accuracy against energy, time and size for a grid of configurations, and which one to deploy",
         "lean": "what of a network its recordings do not need, and a netlist without it",
         "anytime": "how early decisions could be taken, and what that saves",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from spikeloom.runtime.studies import fronts
 from spikeloom.runtime.studies.chart import choices, results
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile
@@ -129,5 +130,5 @@ def made_chart(*budgets: str) -> results.Chart:
         refused=(results.Refused(**refused, storage="8b 3p", why=("core 0 (fc1): 5 used, 4 allowed; fewer planes",)),),
         recommended=choices.recommended(points, networks, BY, bin_s=0.02),
         saving=choices.saving(points, BY),
-        budget=choices.pick(points, choices.parse_budgets(budgets), BY),
+        budget=choices.pick(points, fronts.parse_budgets(budgets), BY),
     )

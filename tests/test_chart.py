@@ -26,6 +26,7 @@ from spikeloom.compiler.targets.truenorth.native_file import write_trained
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import data_digest
+from spikeloom.runtime.studies import fronts
 from spikeloom.runtime.studies.chart import choices
 from spikeloom.runtime.studies.chart import work as chart_work
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
@@ -231,7 +232,7 @@ def test_the_front_is_what_no_other_point_beats(pairs):
         not any(other[0] >= gain and other[1] <= cost and other != (gain, cost) for other in pairs)
         for gain, cost in pairs
     ]
-    assert choices.front(gains, costs) == wanted
+    assert fronts.front(gains, costs) == wanted
 
 
 def test_fronts_are_of_test_accuracy_and_each_cost(points):
@@ -269,7 +270,7 @@ def test_a_point_that_does_not_keep_pace_with_the_sensor_is_not_the_fastest(poin
 def test_choices_do_not_look_at_the_test_split(points):
     blind = [replace(each, test=made_figures(1, 100, 1, 1)) for each in points]
     assert chosen(blind) == chosen(points)
-    assert choices.pick(blind, choices.parse_budgets(["energy=100uJ"]), BY).point == 3
+    assert choices.pick(blind, fronts.parse_budgets(["energy=100uJ"]), BY).point == 3
 
 
 def test_saving_against_eight_bits(points):
@@ -303,8 +304,8 @@ def test_the_usual_mapping_is_the_manual_graph_at_eight_bits_on_whole_recordings
     ],
 )
 def test_a_budget_in_units(words, limit):
-    (budget,) = choices.parse_budgets([words])
-    assert budget == choices.Budget(what=words.partition("=")[0], limit=pytest.approx(limit), words=words)
+    (budget,) = fronts.parse_budgets([words])
+    assert budget == fronts.Budget(what=words.partition("=")[0], limit=pytest.approx(limit), words=words)
 
 
 @pytest.mark.parametrize(
@@ -318,9 +319,9 @@ def test_a_budget_in_units(words, limit):
 )
 def test_a_budget_that_is_none(words):
     with pytest.raises(OptionError, match=f"--budget {words}: .*(write|allowed|give)"):
-        choices.parse_budgets([words])
+        fronts.parse_budgets([words])
     with pytest.raises(OptionError, match="--budget latency=2ms: latency is limited twice; give it once"):
-        choices.parse_budgets(["latency=1ms", "latency=2ms"])
+        fronts.parse_budgets(["latency=1ms", "latency=2ms"])
 
 
 @pytest.mark.parametrize(
@@ -335,13 +336,13 @@ def test_a_budget_that_is_none(words):
     ],
 )
 def test_the_point_that_fits_all_budgets(points, budgets, number, fitting):
-    found = choices.pick(points, choices.parse_budgets(budgets), BY)
+    found = choices.pick(points, fronts.parse_budgets(budgets), BY)
     assert (found.fits, found.point, found.fitting, found.misses) == (True, number, fitting, {})
 
 
 def test_what_is_given_up_beside_the_best(points):
     assert choices.pick(points, (), BY) is None
-    found = choices.pick(points, choices.parse_budgets(["energy=150uJ"]), BY)
+    found = choices.pick(points, fronts.parse_budgets(["energy=150uJ"]), BY)
     assert found.best == 1
     assert found.given_up.expected == pytest.approx(-0.0045)
     assert found.given_up.accuracy == pytest.approx(0.02)
@@ -350,14 +351,14 @@ def test_what_is_given_up_beside_the_best(points):
 
 
 def test_the_nearest_point_of_a_budget_that_nothing_fits(points):
-    found = choices.pick(points, choices.parse_budgets(["energy=20uJ"]), BY)
+    found = choices.pick(points, fronts.parse_budgets(["energy=20uJ"]), BY)
     assert (found.fits, found.fitting, found.point) == (False, 0, 4)
     (miss,) = found.misses.values()
     assert (miss["limit"], miss["found"]) == (pytest.approx(20 * UJ), pytest.approx(40 * UJ))
-    both = choices.pick(points, choices.parse_budgets(["energy=50uJ", "latency=2ms"]), BY)
+    both = choices.pick(points, fronts.parse_budgets(["energy=50uJ", "latency=2ms"]), BY)
     assert (both.point, list(both.misses)) == (3, ["energy"])
     with pytest.raises(OptionError, match=r"--budget latency: .*no time table"):
-        choices.pick(points, choices.parse_budgets(["latency=1ms"]), ChosenBy(energy="one", time=None))
+        choices.pick(points, fronts.parse_budgets(["latency=1ms"]), ChosenBy(energy="one", time=None))
 
 
 TARGET = load_target("loihi1")

@@ -95,10 +95,10 @@ def counted(data: Recordings, plan: Plan, steps: int | None = None) -> Counted:
     events = joined_bins(data, plan.bins).events
     if steps is None:
         steps = max(1, math.ceil(events.shape[-1] * plan.window / 100))
-    if plan.parts > steps:
-        raise OptionError(f"--parts {plan.parts}: a recording has {steps} steps; give fewer")
     flat = events.reshape(len(events), -1, events.shape[-1])[..., :steps]
     length = -(-steps // plan.parts)
+    if (plan.parts - 1) * length >= steps:
+        raise OptionError(f"--parts {plan.parts}: a recording has {steps} steps, the last part none; give fewer")
     rows, kinds = [], []
     for part in range(plan.parts):
         first = part * length
@@ -131,13 +131,21 @@ class Rule:
         """Which recordings it decides rightly; (samples,)."""
         return np.asarray(self.sums(data).argmax(axis=1) == data.labels)
 
-    def sums(self, data: Counted, step: int | None = None) -> FloatArray:
-        """Sums of each class, (samples, classes), in the end or before a step; second spikes count as the first."""
-        spikes = data.spikes[:, self.used]
-        found: FloatArray = (
-            spikes if step is None else np.where(data.at[:, self.used] < step, spikes, 0)
-        ) @ self.weight.T
+    def sums(self, data: Counted) -> FloatArray:
+        """Sums of each class in the end; (samples, classes)."""
+        found: FloatArray = data.spikes[:, self.used] @ self.weight.T
         return found
+
+    def highest(self, data: Counted) -> float:
+        """Largest sum that any class ever has after a step; second spikes count as the first."""
+        highest = -math.inf
+        for at, spikes in zip(data.at[:, self.used], data.spikes[:, self.used], strict=True):
+            order = at.argsort()
+            whole = np.append(np.diff(at[order]) > 0, True)  # where all spikes of a step are in the sum
+            highest = max(highest, float((self.weight * spikes)[:, order].cumsum(axis=1)[:, whole].max()))
+            if at[order[0]] > 0:
+                highest = max(highest, 0.0)  # before the first
+        return highest
 
 
 def linear_rules(data: Counted, classes: int, strengths: Iterable[float]) -> dict[float, Rule]:
@@ -253,7 +261,7 @@ def counters_of(data: Counted, fitted: Fitted, recordings: Recordings, classes: 
     weight = np.rint(fitted.rule.weight / unit)
     kept = weight.any(axis=0)
     rule = Rule(used=fitted.rule.used[kept], weight=weight[:, kept])
-    highest = max(float(rule.sums(data, step).max()) for step in range(1, data.steps + 1))
+    highest = rule.highest(data)
     slope = math.ceil((highest - fitted.lowest / unit) / max(plan.ramp - 2, 1))
     return Counters(
         taxels=recordings.taxels,

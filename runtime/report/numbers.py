@@ -47,7 +47,7 @@ def counted(value: float) -> str:
     return f"{value:.3g}"
 
 
-def wilson(successes: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
+def wilson(successes: float, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
     """Wilson score interval of a proportion, 95 % by default.
 
     References

@@ -14,10 +14,10 @@ from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.machines.base import DEFAULT
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
-from spikeloom.runtime.studies.chart.choices import parse_budgets
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
 from spikeloom.runtime.studies.chart.networks import read_networks, require_grid, require_suited
 from spikeloom.runtime.studies.chart.results import Data
+from spikeloom.runtime.studies.fronts import parse_budgets
 
 NOTES = """\
 Axes of the grid: bits (2-6, 8, or one a layer as in 8+4+4+8), planes (1-3), groups (1-8), prune (0, 1), cores (cores,

@@ -17,8 +17,8 @@ from spikeloom.runtime.report.drawing import COLOURS, GREY, WIDTH, Drawing, scal
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Section, Table, Text
-from spikeloom.runtime.studies.chart.choices import UNITS
 from spikeloom.runtime.studies.chart.results import Axis, Chart, ChosenBy, Point, axes
+from spikeloom.runtime.studies.fronts import UNITS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

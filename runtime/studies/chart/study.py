@@ -11,10 +11,10 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.types import JsonObject
 from spikeloom.runtime.report.encode import decode
 from spikeloom.runtime.studies.chart import choices, work
-from spikeloom.runtime.studies.chart.choices import Budget
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile
 from spikeloom.runtime.studies.chart.results import Chart, ChartedNetwork, ChosenBy, Data, Point, Refused
+from spikeloom.runtime.studies.fronts import Budget
 from spikeloom.runtime.studies.jobs import sweep
 
 STORE = "points.sqlite"

@@ -1,0 +1,94 @@
+"""The command ``smallest``: the cheapest network that does the job, chosen by cross-validation."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from spikeloom.compiler import DEFAULT_TARGET
+from spikeloom.compiler.errors import OptionError
+from spikeloom.runtime.commands.options import add_data
+from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.inputs.files import require_place
+from spikeloom.runtime.report.sections import Outcome
+
+NOTES = """\
+Candidates are counting networks of many sizes. They are cross-validated inside the training split, in three rungs: what
+a cheaper one beats is dropped early. Taken is the cheapest whose accuracy is at most a standard error below the best,
+recording by recording; it is trained on the whole training split, compiled and verified, and read on the test split
+once. Results are kept in the store; the same command goes on from there, other budgets ask it again. The exit code is 1
+if no candidate fits a budget.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe the options of the command."""
+    add_data(parser)
+    parser.add_argument("--taxels", metavar="N", type=int, help="of your sensor, where not all of them send events")
+    parser.add_argument("--target", default=DEFAULT_TARGET, help=f"chip (default: {DEFAULT_TARGET})")
+    parser.add_argument(
+        "--budget",
+        action="append",
+        default=[],
+        metavar="WHAT=LIMIT[,…]",
+        help="of an inference: energy=5uJ, time=5ms, operations=25000, cores=1, accuracy=88; all of them hold",
+    )
+    sweeps = parser.add_argument_group("search")
+    sweeps.add_argument("--store", metavar="FILE", help="what is measured (default: NET.sqlite, beside the netlist)")
+    sweeps.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
+    sweeps.add_argument("--fresh", action="store_true", help="measure anew what an earlier search left")
+    parser.add_argument("-o", "--output", required=True, metavar="NET.loom", help="netlist; NET.pt is the network")
+    parser.epilog = NOTES
+
+
+def run(arguments: argparse.Namespace) -> Outcome:
+    """Run the command; exit code 1 if no candidate fits a budget."""
+    from spikeloom.compiler.targets.base import load_target
+    from spikeloom.models.recordings.evtouch import data_digest
+    from spikeloom.runtime.commands.training.train import both_splits
+    from spikeloom.runtime.studies.chart.results import Data
+    from spikeloom.runtime.studies.fronts import parse_budgets
+    from spikeloom.runtime.studies.smallest.choice import LIMITS
+    from spikeloom.runtime.studies.smallest.sections import sections
+    from spikeloom.runtime.studies.smallest.space import counting
+    from spikeloom.runtime.studies.smallest.study import smallest
+
+    output = Path(arguments.output)
+    network = output.with_suffix(".pt")
+    if network == output:
+        raise OptionError(f"-o {output}: is the name of the network beside the netlist; give NET.loom")
+    store = output.with_suffix(".sqlite") if arguments.store is None else Path(arguments.store)
+    for place, option in ((output, "-o"), (network, "-o"), (store, "--store")):
+        require_place(str(place), option, arguments)
+    budgets = parse_budgets([words for each in arguments.budget for words in each.split(",")], LIMITS)
+    target = load_target(arguments.target)
+    training, test = both_splits(arguments.data, arguments.taxels, arguments.bin)
+    data = Data(
+        path=arguments.data,
+        bin_s=arguments.bin,
+        sha256=data_digest(training, test),
+        train=len(training),
+        test=len(test),
+        steps=training.steps,
+    )
+    found = smallest(
+        counting(training.steps),
+        (training, test),
+        data,
+        target,
+        budgets,
+        store,
+        str(output),
+        taxels=arguments.taxels,
+        command=_command(arguments),
+        jobs=arguments.jobs,
+        fresh=arguments.fresh,
+    )
+    return Outcome(found, sections, 0 if found.choice.fits else 1)
+
+
+def _command(arguments: argparse.Namespace) -> str:
+    """The words that ask for the same search."""
+    words = repeat.words(repeat.given(arguments, ("data", "bin", "taxels", "target", "store")))
+    budgets = [word for budget in arguments.budget for word in ("--budget", budget)]
+    return repeat.command("smallest", *words, *budgets, "-o", arguments.output)

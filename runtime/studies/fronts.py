@@ -1,0 +1,95 @@
+"""Which of many configurations no other one beats, and the words of ``--budget``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+from spikeloom.compiler.errors import OptionError
+
+
+def front(gains: Sequence[float], costs: Sequence[float]) -> list[bool]:
+    """Which points no other one beats: at least as much gain for at most the cost, and better in one of them.
+
+    Examples
+    --------
+    >>> front([0.9, 0.8, 0.7, 0.9], [3.0, 1.0, 2.0, 3.0])
+    [True, True, False, True]
+    """
+    order = sorted(range(len(gains)), key=lambda i: (costs[i], -gains[i]))
+    on = [False] * len(gains)
+    best, best_cost = float("-inf"), float("nan")
+    for i in order:
+        on[i] = gains[i] > best or (gains[i] == best and costs[i] == best_cost)
+        if gains[i] > best:
+            best, best_cost = gains[i], costs[i]
+    return on
+
+
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
+
+UNITS = {
+    "energy": {"J": 1.0, "mJ": 1e-3, "uJ": 1e-6, "µJ": 1e-6, "μJ": 1e-6, "nJ": 1e-9, "pJ": 1e-12},
+    "latency": _SECONDS,
+    "time": _SECONDS,
+    "accuracy": {"": 0.01, "%": 0.01},
+    "operations": {"": 1.0},
+    "cores": {"": 1.0},
+}
+"""What can be limited, and its units; both letters for micro are in use."""
+
+SHOWN = {
+    "energy": "as in 0.1mJ",
+    "latency": "as in 5ms",
+    "time": "as in 5ms",
+    "accuracy": "in per cent, as in 88",
+    "operations": "as in 25000",
+    "cores": "as in 1",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Budget:
+    """One limit of a mean inference, as typed: joules or seconds on the chip at most, or share of right ones at least.
+
+    Of operations and cores their number at most.
+    """
+
+    what: str
+    limit: float
+    words: str
+
+
+def parse_budgets(
+    given: Sequence[str], limits: Collection[str] = ("energy", "latency", "accuracy")
+) -> tuple[Budget, ...]:
+    """Read the words of every ``--budget``; an OptionError says which is none of what has `limits`.
+
+    Examples
+    --------
+    >>> [(each.what, each.limit) for each in parse_budgets(["latency=5ms", "accuracy=88"])]
+    [('latency', 0.005), ('accuracy', 0.88)]
+    """
+    budgets: dict[str, Budget] = {}
+    for words in given:
+        what, equals, value = (part.strip() for part in words.partition("="))
+        if not equals or what not in limits:
+            raise OptionError(
+                f"--budget {words}: is none of {', '.join(limits)}; write for example energy=0.1mJ or accuracy=88"
+            )
+        if what in budgets:
+            raise OptionError(f"--budget {words}: {what} is limited twice; give it once")
+        number = re.fullmatch(r"([0-9]+\.?[0-9]*|\.[0-9]+)(?:e([+-]?[0-9]{1,2}))?\s*([^0-9.\s]*)", value)
+        unit = None if number is None else UNITS[what].get(number[3])
+        if number is None or unit is None:
+            units = ", ".join(u for u in UNITS[what] if u and u.isascii())
+            raise OptionError(
+                f"--budget {words}: {value or 'nothing'} is no {what}; write it {SHOWN[what]}"
+                + (f" ({units})" if units else "")
+            )
+        limit = float(f"{number[1]}e{number[2] or 0}") * unit
+        if limit <= 0 or (what == "accuracy" and limit > 1):
+            raise OptionError(f"--budget {words}: allowed is {'0 to 100' if what == 'accuracy' else 'more than 0'}")
+        budgets[what] = Budget(what=what, limit=limit, words=words)
+    return tuple(budgets.values())

@@ -1,0 +1,118 @@
+"""Who goes on from a rung, and which candidate is taken: the cheapest that is not shown to be worse than the best."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.runtime.studies.fronts import Budget
+from spikeloom.runtime.studies.smallest.results import Choice, Tried
+from spikeloom.runtime.studies.smallest.work import Measured
+
+NEAR = 1e-9
+"""Shares closer than this are equal."""
+
+POINT = 0.01
+"""Accuracy whose price is told."""
+
+LIMITS = ("energy", "time", "operations", "cores", "accuracy")
+"""What ``--budget`` limits."""
+
+
+def accuracy(found: Measured) -> float:
+    """Share of right decisions, over recordings that were decided at all, each with the same weight."""
+    tried = np.array(found.tried)
+    return float((np.array(found.right)[tried > 0] / tried[tried > 0]).mean())
+
+
+def gap(best: Measured, other: Measured) -> tuple[float, float]:
+    """What one has ahead of another, over recordings that both decided, and the standard error of that.
+
+    Examples
+    --------
+    >>> best = Measured(right=(5, 5, 5, 0), tried=(5, 5, 5, 5), setting=0.1)
+    >>> gap(best, Measured(right=(5, 5, 0, 5), tried=(5, 5, 5, 5), setting=0.1))
+    (0.0, 0.408248290463863)
+    """
+    tried = np.array([best.tried, other.tried])
+    both = (tried > 0).all(axis=0)
+    share = (np.array([best.right, other.right]) / np.maximum(tried, 1))[:, both]
+    ahead = share[0] - share[1]
+    error = ahead.std(ddof=1) / np.sqrt(len(ahead)) if len(ahead) > 1 else 0.0
+    return float(ahead.mean()), float(error)
+
+
+def going_on(tried: Iterable[Tried], most: int) -> list[Tried]:
+    """Those that may still be chosen: least behind a cheaper one, and by a fifth of that, behind the best."""
+    able = [each for each in tried if each.costs is not None]
+    top = max((each.accuracy for each in able), default=0.0)
+
+    def lag(each: Tried) -> float:
+        cheaper = max(other.accuracy for other in able if energy(other) <= energy(each))
+        return cheaper - each.accuracy + (top - each.accuracy) / 5
+
+    return sorted(able, key=lambda each: (lag(each), energy(each)))[:most]
+
+
+def energy(tried: Tried, table: str | None = None) -> float:
+    """Joules of a mean inference, by the first table unless another is named; operations where none prices them."""
+    assert tried.costs is not None, "what the chip does not hold has no price"
+    return tried.costs.least if table is None else tried.costs.energy_j[table]
+
+
+def choose(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
+    """The cheapest of the last rung, by each table, that fits the budgets and is not shown to be worse than the best.
+
+    Worse is one whose accuracy is lower by more than a standard error of the difference, recording by recording. Where
+    an accuracy is wanted, all that reach it are good enough. Where no candidate of the last rung fits, earlier ones
+    may.
+    """
+    priced = [each for each in tried if each.costs is not None]
+    if not priced:
+        raise OptionError(f"--target: the chip holds no candidate; the first: {tried[0].refused}")
+    last = max(each.rung for each in priced)
+    pool = [each for each in priced if each.rung == last]
+
+    def fitting(each: Tried) -> bool:
+        return all(excess(each, budget) <= 1 + NEAR for budget in budgets)
+
+    fits = [each for each in pool if fitting(each)] or [each for each in priced if fitting(each)]
+    allowed = fits or [min(pool, key=lambda each: (max(excess(each, b) for b in budgets), energy(each)))]
+    best = min(allowed, key=lambda each: (-each.accuracy, energy(each)))
+    if not any(budget.what == "accuracy" for budget in budgets):
+        allowed = [each for each in allowed if not worse(best, each)]
+    assert best.costs is not None, "all of these are priced"
+    tables = list(best.costs.energy_j)
+    cheapest = {table: min(allowed, key=lambda each: (energy(each, table), -each.accuracy)).number for table in tables}
+    chosen = next(each for each in allowed if each.number == cheapest[tables[0]])
+    above = [each for each in pool if each.accuracy >= chosen.accuracy + POINT - NEAR]
+    return Choice(
+        budgets=tuple(budget.words for budget in budgets),
+        fits=bool(fits),
+        best=best.number,
+        cheapest=cheapest,
+        allowed=tuple(each.number for each in allowed),
+        ahead=min(above, key=energy).number if above else None,
+    )
+
+
+def worse(best: Tried, other: Tried) -> bool:
+    """Whether one is shown to be worse than another."""
+    ahead, error = gap(best.measured, other.measured)
+    return ahead > error + NEAR
+
+
+def excess(tried: Tried, budget: Budget) -> float:
+    """Factor by which a candidate misses a budget; at most 1 where it fits."""
+    costs = tried.costs
+    assert costs is not None, "what the chip does not hold has no price"
+    if budget.what == "accuracy":
+        return budget.limit / tried.accuracy if tried.accuracy else float("inf")
+    if budget.what == "time":
+        if not costs.time_s:
+            raise OptionError(f"--budget {budget.words}: the chip has no time table, nothing is timed; omit it")
+        return next(iter(costs.time_s.values())) / budget.limit
+    found = {"energy": costs.least, "operations": costs.operations, "cores": costs.cores}[budget.what]
+    return found / budget.limit

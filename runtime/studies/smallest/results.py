@@ -1,0 +1,96 @@
+"""What a search for the smallest network comes to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from spikeloom.runtime.equivalence.verdict import Level
+from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL
+from spikeloom.runtime.studies.chart.results import ChosenBy, Data, Share
+from spikeloom.runtime.studies.pruning.results import Costs
+from spikeloom.runtime.studies.smallest.space import Candidate
+from spikeloom.runtime.studies.smallest.work import Measured
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tried:
+    """A candidate as far as it came: its accuracy by cross-validation with the Wilson interval, and its costs.
+
+    `behind` is what the best has ahead of it on the same recordings, with its standard error. It is on the `front` if
+    no other one that came as far is cheaper and as accurate.
+    """
+
+    number: int
+    candidate: Candidate = field(metadata=INLINE)
+    rung: int
+    accuracy: float
+    low: float
+    high: float
+    setting: float
+    costs: Costs | None = field(default=None, metadata=OPTIONAL)
+    refused: str | None = field(default=None, metadata=OPTIONAL)
+    behind: float = 0.0
+    behind_error: float = 0.0
+    front: bool = False
+    measured: Measured = field(metadata=HIDDEN)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """Numbers of candidates: the best that the budgets allow, the cheapest not shown to be worse, by each table.
+
+    If nothing `fits` the budgets, the one that misses by the smallest factor. `ahead` is the cheapest candidate that is
+    a point more accurate.
+    """
+
+    budgets: tuple[str, ...]
+    fits: bool
+    best: int
+    cheapest: Mapping[str, int]
+    allowed: tuple[int, ...]
+    ahead: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Checked:
+    """The choice, trained on the whole training split: its files, and float model beside chip on both splits.
+
+    `different` are spikes in training recordings, `equal` decisions of `training` and `test`; `right` is the chip's on
+    the test split, which nothing else has looked at.
+    """
+
+    network: str
+    network_sha256: str
+    netlist: str
+    netlist_sha256: str
+    different: int
+    levels: tuple[Level, ...]
+    equal: Mapping[str, int]
+    right: Share
+    costs: Costs
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Smallest:
+    """A search, its choice and what that reaches."""
+
+    spikeloom: str
+    command: str
+    target: str
+    data: Data
+    tables: Mapping[str, Mapping[str, str]]
+    chosen_by: ChosenBy
+    tried: tuple[Tried, ...]
+    choice: Choice
+    checked: Checked
+    commands: tuple[str, ...]
+
+    def candidate(self, number: int) -> Tried:
+        """By its number, from 1."""
+        return self.tried[number - 1]
+
+    @property
+    def chosen(self) -> Tried:
+        """The choice by the first table."""
+        return self.candidate(self.choice.cheapest[self.chosen_by.energy])

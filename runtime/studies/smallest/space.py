@@ -1,0 +1,88 @@
+"""What is tried: counting networks of many sizes, a few trained ones, and support vector machines beside them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
+from spikeloom.models.recordings.evtouch import WHOLE
+from spikeloom.models.training.counters import STRENGTHS, Plan
+from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.inputs.compilation import whole_numbers
+
+JOINS = (1, 2, 5, 10, 25)
+PARTS = (1, 2, 5, 10)
+WINDOWS = (100, 50)
+THRESHOLDS = ((1,), (1, 4, 16, 64), (1, 2, 4, 8, 16, 32, 64), (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 130))
+"""Of counting networks."""
+
+RAMP = 16
+"""Steps of the read-out that those which go on are tried with, too: half the usual ones."""
+
+MOST_COUNTERS = {100: 80, 50: 20}
+"""Counters of a channel at most, by window: what is larger gains little and takes minutes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidate:
+    """A system and the options of ``train`` that make it, beside the data; or a baseline and its features."""
+
+    system: str
+    options: Mapping[str, Any]
+
+    json_properties = ("name",)
+
+    @property
+    def name(self) -> str:
+        """For tables."""
+        return " ".join([self.system, *(f"{name}={value}" for name, value in self.options.items())])
+
+    @property
+    def words(self) -> list[str]:
+        """As they are typed after ``train``."""
+        return repeat.words({"system": self.system, **self.options})
+
+    def plan(self, strengths: tuple[float, ...] = STRENGTHS) -> Plan:
+        """Of a counting network."""
+        about = dict(self.options)
+        thresholds = tuple(whole_numbers(about.pop("thresholds"), "--thresholds"))
+        return Plan(thresholds=thresholds, bins=about.pop("join", 1), strengths=strengths, **about)
+
+
+def counting(steps: int) -> Iterator[Candidate]:
+    """Counting networks for recordings of so many bins; options that are usual are left out.
+
+    A counter sees one event a step at most, so thresholds above the steps of a part are omitted.
+
+    Examples
+    --------
+    >>> [each.name for each in counting(2)]
+    ['counters thresholds=1', 'counters thresholds=1,2', 'counters thresholds=1 parts=2']
+    """
+    known: dict[tuple[Any, ...], None] = {}
+    for join, window, parts, thresholds in product(JOINS, WINDOWS, PARTS, THRESHOLDS):
+        seen = math.ceil(math.ceil(steps / join) * window / 100)
+        length = math.ceil(seen / parts)
+        able = tuple(each for each in thresholds if each <= length)
+        whole = (parts - 1) * length < seen and join <= steps // 2  # no part is empty, and time passes
+        closed = window == WHOLE or parts > 1  # gates: nothing else keeps later events from the counters
+        if whole and closed and len(able) * parts <= MOST_COUNTERS[window]:
+            known[join, window, parts, able] = None
+    for join, window, parts, able in known:
+        yield _counters(thresholds=",".join(map(str, able)), parts=parts, window=window, join=join)
+
+
+def _counters(**options: Any) -> Candidate:
+    """Options that are usual are omitted."""
+    usual = {"thresholds": None, "parts": 1, "window": 100, "ramp": 32, "join": 1}
+    given = {name: options.get(name, value) for name, value in usual.items()}
+    return Candidate(system=COUNTING, options={name: each for name, each in given.items() if each != usual[name]})
+
+
+def shorter(candidate: Candidate) -> Candidate:
+    """The same with a shorter read-out."""
+    return _counters(**{**candidate.options, "ramp": RAMP})

@@ -1,0 +1,200 @@
+"""The smallest network for some recordings: candidates by successive halving, a choice, and what that reaches.
+
+On the first rung every candidate is cross-validated once at one strength; what may still be chosen goes on, with more
+strengths, and from there to five rounds. Everything happens on the training split but the last look at the choice.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spikeloom.compiler import __version__, compile_network
+from spikeloom.compiler.targets.base import Target
+from spikeloom.models.recordings.events import joined_bins, of_length
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.equivalence.verify import verify
+from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.inputs.compilation import provenance
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.encode import decode
+from spikeloom.runtime.report.numbers import wilson
+from spikeloom.runtime.studies.chart.results import ChosenBy, Data, share
+from spikeloom.runtime.studies.counting import train_counters
+from spikeloom.runtime.studies.fronts import Budget, front
+from spikeloom.runtime.studies.jobs import sweep
+from spikeloom.runtime.studies.pruning.trials import priced
+from spikeloom.runtime.studies.smallest import choice, work
+from spikeloom.runtime.studies.smallest.results import Checked, Smallest, Tried
+from spikeloom.runtime.studies.smallest.space import Candidate, shorter
+
+KEPT = {1: 24, 2: 12}
+"""Candidates that go on from a rung."""
+
+RUNGS = 3
+
+
+def smallest(
+    candidates: Iterable[Candidate],
+    splits: tuple[Recordings, Recordings],
+    data: Data,
+    target: Target,
+    budgets: Sequence[Budget],
+    store: Path,
+    output: str,
+    *,
+    taxels: int | None,
+    command: str,
+    jobs: int | None = None,
+    fresh: bool = False,
+) -> Smallest:
+    """Search as far as the store does not know, choose, train the choice anew and write network and netlist.
+
+    `splits` are training and test recordings; `command` repeats it.
+    """
+    tried = search(candidates, data, target, store, taxels=taxels, jobs=jobs, fresh=fresh)
+    taken = choice.choose(tried, budgets)
+    tried = [_beside(each, tried[taken.best - 1], tried) for each in tried]
+    by = ChosenBy(energy=next(iter(taken.cheapest)), time=next((table.name for table in target.time), None))
+    chosen = tried[taken.cheapest[by.energy] - 1]
+    checked, commands = train_again(chosen.candidate, splits, data, target, output)
+    return Smallest(
+        spikeloom=__version__,
+        command=command,
+        target=target.name,
+        data=data,
+        tables={
+            "energy": {table.name: table.title for table in target.energy},
+            "time": {table.name: table.title for table in target.time},
+        },
+        chosen_by=by,
+        tried=tuple(tried),
+        choice=taken,
+        checked=checked,
+        commands=commands,
+    )
+
+
+def search(
+    candidates: Iterable[Candidate],
+    data: Data,
+    target: Target,
+    store: Path,
+    *,
+    taxels: int | None,
+    jobs: int | None,
+    fresh: bool,
+) -> list[Tried]:
+    """All candidates, as far as each came."""
+    known: dict[str, Tried] = {}
+    alive = list(candidates)
+    for rung in range(1, RUNGS + 1):
+        before = [known.get(each.name) for each in alive]
+        works = [
+            work.trial(each, rung, None if old is None else old.setting, data, taxels, target.name)
+            for each, old in zip(alive, before, strict=True)
+        ]
+        label = f"rung {rung} of {RUNGS}"
+        found = sweep(works, work.measure, store, jobs=jobs, fresh=fresh and rung == 1, label=label)
+        for candidate, old, each in zip(alive, before, works, strict=True):
+            measured = decode(work.Measured, found[each.key])
+            measured = work.with_costs(measured, None if old is None else old.measured)
+            number = len(known) + 1 if old is None else old.number
+            known[candidate.name] = _tried(number, candidate, rung, measured)
+        if rung < RUNGS:
+            on = [each.candidate for each in choice.going_on((known[c.name] for c in alive), KEPT[rung])]
+            extra = [shorter(each) for each in on] if rung == 1 else []
+            alive = list({each.name: each for each in (*on, *extra)}.values())
+    return list(known.values())
+
+
+def _tried(number: int, candidate: Candidate, rung: int, measured: work.Measured) -> Tried:
+    right, recordings = choice.accuracy(measured), int(np.count_nonzero(measured.tried))
+    low, high = wilson(right * recordings, recordings)
+    return Tried(
+        number=number,
+        candidate=candidate,
+        rung=rung,
+        accuracy=right,
+        low=low,
+        high=high,
+        setting=measured.setting,
+        costs=measured.costs,
+        refused=measured.refused,
+        measured=measured,
+    )
+
+
+def _beside(each: Tried, best: Tried, tried: Sequence[Tried]) -> Tried:
+    """A candidate with what the best has ahead of it, and whether it is on the front of those that came as far."""
+    behind, error = choice.gap(best.measured, each.measured)
+    peers = [other for other in tried if other.rung == each.rung and other.costs is not None]
+    marks = front([other.accuracy for other in peers], [choice.energy(other) for other in peers])
+    on = any(mark and other.number == each.number for mark, other in zip(marks, peers, strict=True))
+    return replace(each, behind=behind, behind_error=error, front=on)
+
+
+# -- the choice --------------------------------------------------------------------------------------------------------
+
+
+def train_again(
+    candidate: Candidate, splits: tuple[Recordings, Recordings], data: Data, target: Target, output: str
+) -> tuple[Checked, tuple[str, ...]]:
+    """Train a candidate on the whole training split, compile and verify it, then read the test split; the commands."""
+    training, test = splits
+    network = str(Path(output).with_suffix(".pt"))
+    words = repeat.words({"data": Path(data.path).name, "bin": data.bin_s})
+    command = repeat.command("train", *words, *candidate.words)
+    made = train_counters(candidate.plan(), training, test, command, network)
+    progress("compiling")
+    loaded = load_network(network, _arguments(target.name))
+    netlist, sha256 = _compiled(loaded, target, output)
+    train, held = (of_length(joined_bins(each, netlist.bins), netlist.clocks.length) for each in (training, test))
+    progress("verifying")
+    of = {"train": train, "test": held}
+    verdicts = {
+        split: verify(netlist, loaded.model, each.events, each.labels, each.files, lengths=each.lengths)
+        for split, each in of.items()
+    }
+    seen = verdicts["train"]
+    _, costs = priced(netlist, work.some(train))
+    right = int(np.count_nonzero(verdicts["test"].chip_predictions == held.labels))
+    checked = Checked(
+        network=network,
+        network_sha256=made.sha256,
+        netlist=output,
+        netlist_sha256=sha256,
+        different=sum(each.different for each in seen.spikes.values()),
+        levels=seen.levels,
+        equal={split: int(np.sum(v.float_predictions == v.chip_predictions)) for split, v in verdicts.items()},
+        right=share(right, len(held)),
+        costs=costs,
+    )
+    read = repeat.words({"data": data.path, "bin": data.bin_s})
+    return checked, (
+        repeat.command("train", *repeat.words({"data": data.path, "bin": data.bin_s}), *candidate.words, "-o", network),
+        repeat.command("compile", network, "-o", output),
+        repeat.command("verify", output, "--checkpoint", network, *read),
+        repeat.command("estimate", output, *read),
+    )
+
+
+def _arguments(target: str) -> argparse.Namespace:
+    """What the command ``compile`` would have parsed."""
+    names = (*repeat.NETWORK, *repeat.ROUNDING, *repeat.PLACING, "polarities", "polarities_first", "dt", "convention")
+    return argparse.Namespace(**{name: repeat.USUAL.get(name) for name in names}, target=target)
+
+
+def _compiled(loaded: LoadedNetwork, target: Target, output: str) -> tuple[Any, str]:
+    """The netlist that ``compile`` makes of a network, and the hash of its file."""
+    from spikeloom.compiler import write_netlist
+
+    options: Any = target.module.Options(provenance=provenance(_arguments(target.name), loaded, calibrated=False))
+    netlist = compile_network(loaded.model, options, target=target.name).netlist
+    return netlist, write_netlist(netlist, output)

@@ -1,0 +1,167 @@
+"""One candidate by cross-validation inside the training split, and what it costs; work that crosses process borders."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from spikeloom.compiler import __version__, compile_network
+from spikeloom.compiler.counters import Counters
+from spikeloom.compiler.errors import CapacityError, DataError, ModelError
+from spikeloom.compiler.formats.counters import counting_network
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
+from spikeloom.models.recordings.events import joined_bins, of_length
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.counters import (
+    FOLDS,
+    STRENGTHS,
+    Counted,
+    Fitted,
+    counted,
+    counters_of,
+    folds,
+    linear_rules,
+)
+from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.studies.chart.results import Data
+from spikeloom.runtime.studies.jobs import Job, content_key
+from spikeloom.runtime.studies.pruning.results import Costs
+from spikeloom.runtime.studies.pruning.trials import priced
+from spikeloom.runtime.studies.smallest.space import Candidate
+
+FORMAT = 1
+"""Of what is measured; goes up when a figure means something else."""
+
+PRICED = 48
+"""Training recordings that a candidate is priced on, evenly spaced."""
+
+ROUNDS = 5
+"""Of cross-validation on the last rung."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial(Job):
+    """A candidate on a rung, on the training split; the last one takes the `setting` that the one before has chosen."""
+
+    candidate: Candidate
+    rung: int  # From 1
+    setting: float | None
+    data: Data
+    taxels: int | None
+    target: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measured:
+    """How often each training recording was decided, and rightly; the costs of a mean inference, where it is priced."""
+
+    right: tuple[int, ...]
+    tried: tuple[int, ...]
+    setting: float  # Strength of the rule
+    costs: Costs | None = None
+    refused: str | None = None  # Why the chip does not hold it
+
+
+def trial(candidate: Candidate, rung: int, setting: float | None, data: Data, taxels: int | None, target: str) -> Trial:
+    """Work whose key is of everything that decides the result."""
+    about = {"format": FORMAT, "spikeloom": __version__, "data": data.sha256, "bin_s": data.bin_s, "target": target}
+    about |= {"system": candidate.system, "options": dict(candidate.options), "rung": rung, "setting": setting}
+    return Trial(
+        key=content_key(about),
+        label=candidate.name,
+        candidate=candidate,
+        rung=rung,
+        setting=setting,
+        data=data,
+        taxels=taxels,
+        target=target,
+    )
+
+
+def measure(work: Trial) -> JsonObject:
+    """Do one piece of work; the JSON of a :class:`Measured`."""
+    found: JsonObject = encode(_counting(work, _training(work.data, work.taxels)))
+    return found
+
+
+@lru_cache(maxsize=1)
+def _training(data: Data, taxels: int | None) -> Recordings:
+    return recordings(data.path, "train", classes=None, taxels=taxels, bin_s=data.bin_s, labels_for="training")
+
+
+def some(data: Recordings) -> Recordings:
+    """The recordings that are priced."""
+    return data.part(np.unique(np.linspace(0, len(data) - 1, PRICED).astype(np.int64)))
+
+
+def _counting(work: Trial, training: Recordings) -> Measured:
+    """A counting network: its strength, its decisions, its costs."""
+    plan = work.candidate.plan({1: STRENGTHS[2:3], 2: STRENGTHS}.get(work.rung, (work.setting or 0.0,)))
+    classes, data = int(training.labels.max()) + 1, counted(training, plan)
+    right = np.zeros(len(training), np.int64)
+    last = work.rung == 3
+    for seed in range(1, ROUNDS + 1) if last else (0,):
+        decided, strength, lowest = cross_validated(data, classes, training, seed)
+        right += decided == training.labels
+    costs, refused = None, None
+    if not last:
+        rule = linear_rules(data, classes, [strength])[strength]
+        made = counters_of(data, Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest), training, classes)
+        costs, refused = costs_of(made, training, work.target)
+    rounds = (ROUNDS if last else 1,) * len(training)
+    return Measured(right=tuple(right.tolist()), tried=rounds, setting=strength, costs=costs, refused=refused)
+
+
+def cross_validated(data: Counted, classes: int, sensor: Recordings, seed: int) -> tuple[IntArray, float, float]:
+    """Class of each recording by a network that did not see it, the strength of all of them, and the least winning sum.
+
+    The strength is chosen as ``train`` chooses it; `sensor` has the shape of the recordings.
+    """
+    fold = folds(data.labels, FOLDS, np.random.default_rng(seed))
+    rules = [linear_rules(data.part(fold != held), classes, data.plan.strengths) for held in range(FOLDS)]
+    sums = {strength: np.zeros((len(fold), classes)) for strength in sorted(data.plan.strengths)}
+    for strength, held in ((strength, held) for strength in sums for held in range(FOLDS)):
+        sums[strength][fold == held] = rules[held][strength].sums(data.part(fold == held))
+    best = max(sums, key=lambda strength: np.mean(sums[strength].argmax(axis=1) == data.labels))
+    top, decided = sums[best].max(axis=1), np.zeros(len(fold), np.int64)
+    for held in range(FOLDS):
+        lowest = float(top[fold != held].min())
+        fitted = Fitted(rule=rules[held][best], strength=best, accuracy={}, lowest=lowest)
+        made = counters_of(data.part(fold != held), fitted, sensor, classes)
+        decided[fold == held] = decisions(made, data.part(fold == held))
+    return decided, best, float(top.min())
+
+
+def decisions(made: Counters, data: Counted) -> IntArray:
+    """Class of each recording as the spikes of the network decide: the first sum over the ramp, of several the lowest.
+
+    That is exact but for a sum that exceeds all training sums before the recording ends.
+    """
+    place: Mapping[tuple[int, ...], int] = {tuple(each): index for index, each in enumerate(data.counter.tolist())}
+    spikes = data.spikes[:, [place[tuple(each)] for each in made.counter.tolist()]]
+    sums: FloatArray = spikes.astype(np.float64) @ made.weight.T
+    crossing = np.floor((made.threshold - made.slope * made.steps - sums) / made.slope) + 1
+    found: IntArray = np.where(crossing > made.ramp, np.inf, crossing).argmin(axis=1)
+    return found
+
+
+def costs_of(made: Counters, training: Recordings, target: str) -> tuple[Costs | None, str | None]:
+    """What an inference of a counting network costs on the chip, or why the chip does not hold it."""
+    options: Any = load_target(target).module.Options()
+    try:
+        netlist = compile_network(counting_network(made), options, target=target).netlist
+    except (CapacityError, ModelError, DataError) as error:
+        return None, str(error).splitlines()[0]
+    steps = of_length(joined_bins(some(training), made.bins), made.clocks.length)
+    return priced(netlist, steps)[1], None
+
+
+def with_costs(found: Measured, before: Measured | None) -> Measured:
+    """What is measured on the last rung with the costs that the one before knows."""
+    return found if before is None or found.costs else replace(found, costs=before.costs, refused=before.refused)

@@ -1,0 +1,174 @@
+"""The command ``smallest``: what goes on, what is chosen, and that the choice is what the other commands make of it."""
+
+import shlex
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from commands import as_json, refusal, run
+from numpy.testing import assert_array_equal
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.models.recordings.grasps import synthetic_split
+from spikeloom.models.training.counters import Plan, counted, counters_of, fit
+from spikeloom.runtime.studies.counting import decisions_of
+from spikeloom.runtime.studies.fronts import parse_budgets
+from spikeloom.runtime.studies.pruning.results import Costs
+from spikeloom.runtime.studies.smallest import choice, space, work
+from spikeloom.runtime.studies.smallest.results import Tried
+from spikeloom.runtime.studies.smallest.space import Candidate
+
+RECORDINGS = 40
+UJ = 1e-6
+
+
+def tried(number, right, joules, rung=3, other=None, cores=1, order=0):
+    """A candidate that is right in the first recordings, or in others where the `order` is another."""
+    decided = np.roll(np.arange(RECORDINGS) < right, order)
+    costs = Costs(
+        operations=1e9 * joules,
+        energy_j={"one": joules, "two": joules if other is None else other},
+        time_s={"clock": 100 * joules},
+        cores=cores,
+        neurons=1,
+        synapses=1,
+    )
+    measured = work.Measured(right=tuple(5 * decided), tried=(5,) * RECORDINGS, setting=0.1, costs=costs)
+    return Tried(
+        number=number,
+        candidate=Candidate(system="counters", options={"thresholds": str(number)}),
+        rung=rung,
+        accuracy=right / RECORDINGS,
+        low=0.0,
+        high=1.0,
+        setting=0.1,
+        costs=costs,
+        measured=measured,
+    )
+
+
+POOL = (
+    tried(1, 36, 40 * UJ, cores=2),
+    tried(2, 35, 10 * UJ, other=9 * UJ),  # 1 of 40 behind: as much as the error, not more
+    tried(3, 35, 11 * UJ, other=8 * UJ),
+    tried(4, 32, 2 * UJ),
+    tried(5, 36, 1 * UJ, rung=2),  # it was dropped
+)
+
+
+def budgets(*words):
+    return parse_budgets(words, choice.LIMITS)
+
+
+def test_the_cheapest_that_is_not_shown_to_be_worse():
+    found = choice.choose(POOL, ())
+    assert (found.best, found.cheapest, found.allowed, found.fits) == (1, {"one": 2, "two": 3}, (1, 2, 3), True)
+    assert found.ahead == 1
+    ahead, error = choice.gap(POOL[0].measured, POOL[3].measured)
+    wrong = np.repeat([1.0, 0.0], [4, 36])
+    assert (ahead, error) == (pytest.approx(0.1), pytest.approx(wrong.std(ddof=1) / np.sqrt(40)))
+    shifted = tried(6, 32, UJ, order=8)  # as good as number 4, wrong elsewhere: less is known of the difference
+    assert not choice.worse(tried(1, 33, UJ), shifted)
+    assert choice.choose([POOL[0], POOL[3]], ()).cheapest["one"] == 1
+
+
+def test_the_difference_is_of_recordings_that_both_decided():
+    fold = work.Measured(right=(1, 0, 0, 0), tried=(1, 1, 0, 0), setting=0.1)
+    assert choice.accuracy(fold) == 0.5
+    ahead, error = choice.gap(work.Measured(right=(5, 3, 0, 0), tried=(5,) * 4, setting=0.1), fold)
+    assert (ahead, error) == (pytest.approx(0.3), pytest.approx(0.3))
+
+
+@pytest.mark.parametrize(
+    ("words", "chosen", "fits"),
+    [
+        (["energy=5uJ"], 4, True),
+        (["accuracy=80"], 4, True),
+        (["accuracy=81", "cores=1"], 2, True),
+        (["time=1.05ms"], 2, True),
+        (["operations=1500"], 5, True),  # none of the last rung fits
+        (["energy=1nJ"], 4, False),  # nothing fits, the nearest of the last rung
+    ],
+)
+def test_budgets(words, chosen, fits):
+    found = choice.choose(POOL, budgets(*words))
+    assert (found.cheapest["one"], found.fits, found.budgets) == (chosen, fits, tuple(words))
+
+
+def test_budgets_that_are_none():
+    for words in ("energy=5", "latency=5ms", "cores=none", "operations=0"):
+        with pytest.raises(OptionError, match="--budget"):
+            budgets(words)
+    timeless = replace(POOL[0], costs=replace(POOL[0].costs, time_s={}))
+    with pytest.raises(OptionError, match="no time table"):
+        choice.choose([timeless], budgets("time=5ms"))
+    with pytest.raises(OptionError, match="holds no candidate; the first: too large"):
+        choice.choose([replace(POOL[0], costs=None, refused="too large")], ())
+
+
+def test_who_goes_on():
+    assert [each.number for each in choice.going_on(POOL[:4], 4)] == [1, 2, 3, 4]
+    dominated = tried(6, 20, 20 * UJ)
+    assert dominated not in choice.going_on([*POOL, dominated], 5)
+    assert choice.going_on([replace(dominated, costs=None)], 5) == []
+
+
+@pytest.mark.parametrize(
+    "plan", [Plan(parts=2), Plan(bins=5, ramp=8), Plan(thresholds=(1, 2), parts=5, window=50)], ids=str
+)
+def test_decisions_are_those_of_the_spiking_network(plan):
+    training, test = (synthetic_split(split, limit=72) for split in ("train", "test"))
+    data = counted(training, plan)
+    made = counters_of(data, fit(data, 6), training, 6)
+    for each in (training, test):
+        assert_array_equal(work.decisions(made, counted(each, plan, data.steps)), decisions_of(made, each))
+
+
+def test_candidates_can_all_be_trained():
+    every = list(space.counting(250))
+    assert 60 <= len(every) == len({each.name for each in every}) <= 140
+    for each in every:
+        each.plan().require_possible()
+    assert space.shorter(every[0]).words[-2:] == ["--ramp", str(space.RAMP)]
+
+
+@pytest.fixture
+def few(monkeypatch, tmp_path):
+    """A small space, in a folder of its own."""
+    for name, values in {"JOINS": (5, 10), "PARTS": (1,), "THRESHOLDS": ((1,), (1, 4)), "WINDOWS": (100,)}.items():
+        monkeypatch.setattr(space, name, values)
+    monkeypatch.setattr(work, "ROUNDS", 2)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_command(few, monkeypatch):
+    words = ["smallest", "--data", "synthetic", "--jobs", "1", "-o", "a.loom"]
+    found = as_json(*words)
+    names = [each["name"] for each in found["tried"]]
+    assert "counters thresholds=1 join=5" in names
+    assert "counters thresholds=1 ramp=16 join=5" in names
+    chosen = found["tried"][found["choice"]["cheapest"]["davies2018"] - 1]
+    best = found["tried"][found["choice"]["best"] - 1]
+    assert best["behind"] == 0
+    assert chosen["rung"] == 3
+    assert chosen["costs"]["energy_j"]["davies2018"] <= best["costs"]["energy_j"]["davies2018"]
+    assert chosen["behind"] <= chosen["behind_error"]
+    assert found["checked"]["equal"] == {"train": 360, "test": 144}
+    assert found["checked"]["different"] == 0
+
+    # once more from the store alone, and the same by hand
+    files = {name: (few / name).read_bytes() for name in ("a.pt", "a.loom")}
+    monkeypatch.setattr(work, "measure", lambda _: pytest.fail("it is known"))
+    assert as_json(*words) == found
+    for command in found["commands"][:2]:
+        assert run(*shlex.split(command)[1:])[0] == 0
+    assert files == {name: (few / name).read_bytes() for name in files}
+    assert as_json(*words, "--budget", "accuracy=100,energy=1nJ", codes=(1,))["choice"]["fits"] is False
+    assert "no candidate fits" in run(*words, "--budget", "energy=1nJ")[1]
+
+
+@pytest.mark.usefixtures("few")
+def test_files_that_would_be_lost():
+    for output in ("a.pt", "missing/a.loom"):
+        assert f"-o {output}" in refusal("smallest", "--data", "synthetic", "-o", output)
