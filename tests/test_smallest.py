@@ -114,7 +114,7 @@ def test_who_goes_on():
 
 
 @pytest.mark.parametrize(
-    "plan", [Plan(parts=2), Plan(bins=5, ramp=8), Plan(thresholds=(1, 2), parts=5, window=50)], ids=str
+    "plan", [Plan(parts=2, ramp=5), Plan(bins=5, ramp=8), Plan(thresholds=(1, 2), parts=5, window=50)], ids=str
 )
 def test_decisions_are_those_of_the_spiking_network(plan):
     training, test = (synthetic_split(split, limit=72) for split in ("train", "test"))

@@ -78,7 +78,7 @@ def counting(steps: int) -> Iterator[Candidate]:
 
 def _counters(**options: Any) -> Candidate:
     """Options that are usual are omitted."""
-    usual = {"thresholds": None, "parts": 1, "window": 100, "ramp": 32, "join": 1}
+    usual = {"thresholds": None, "parts": 1, "ramp": 32, "levels": 1, "window": 100, "join": 1}
     given = {name: options.get(name, value) for name, value in usual.items()}
     return Candidate(system=COUNTING, options={name: each for name, each in given.items() if each != usual[name]})
 
