@@ -65,8 +65,8 @@ def clocks_over(channels: int, steps: int) -> Clocks:
 
     Examples
     --------
-    >>> clocks_over(8, 250)
-    Clocks(channels=8, steps=32)
+    >>> clocks_over(8, 250).steps
+    32
     """
     return Clocks(channels=channels, steps=-(-steps // channels)) if channels else NO_CLOCKS
 

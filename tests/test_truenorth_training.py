@@ -178,7 +178,7 @@ def with_first(name, change):
         (lambda path: restated(path, towers=2, graph=1), "no usable graph; the manifest has no usable towers"),
         (lambda path: restated(path, graph={"name": "ring", "edges": [[0, 9]]}), "joins taxels outside 0..3"),
         (lambda path: written(path, with_first("level", lambda k: k * 4)), "conv1: levels beyond 3"),
-        (lambda path: written(path, with_first("leak", lambda v: v[None])), "leak is no array of 1 axes"),
+        (lambda path: written(path, with_first("leak", lambda v: v[None])), "leak is no list of integers"),
     ],
 )
 def test_files_that_are_refused(tmp_path, change, said):

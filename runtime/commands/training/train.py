@@ -148,7 +148,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     return Outcome(TrainingReport(runs=records, protocols=summary(records)), training_sections)
 
 
-SIZES = ("features", "hops", "hidden", "clocks")
+SIZES = ("clocks", "features", "hops", "hidden")
 OVERRIDES = ("current_decay", "membrane_decay", *SIZES, "batch", "decay_epochs", "spike_penalty")
 """Options that change single values of a recipe."""
 
