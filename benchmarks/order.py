@@ -4,7 +4,7 @@
 
 The released code takes recordings in the order in which the folder lists them, the same in every epoch: which one that
 is depends on the machine. Tried are ``fixed``, one order drawn for all epochs, and ``listed``, by file name. Accuracies
-are of the best epoch on test (the paper's protocol) and of the last.
+are of the best epoch on test and of the last.
 """
 
 from __future__ import annotations

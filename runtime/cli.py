@@ -43,7 +43,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "yardsticks": "NeuroBench's metrics of a checkpoint, and arithmetic energy on a processor",
     },
     "training": {
-        "train": "train a network by the released protocol, reported by the paper's and a clean one",
+        "train": "train networks by the released recipe; last, best and clean epoch reported",
         "finetune": "train a network further on the very integers of the chip, down to ternary weights",
         "join": "put several trained networks side by side in one, whose votes add up",
     },

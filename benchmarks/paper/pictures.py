@@ -13,7 +13,7 @@ from PIL import Image
 from spreads import Line
 
 SERIES = {
-    "best": ("best epoch on test (the paper's protocol)", "C0", "o"),
+    "best": ("best epoch on test", "C0", "o"),
     "last": ("last epoch", "C1", "s"),
     "clean": ("clean epoch, chosen on validation", "C2", "^"),
     "chip": ("last epoch on the chip, 8 bits", "C3", "D"),

@@ -9,20 +9,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from cells import PUBLISHED, RUNS, SAME_AS, Cell, Row
-from scipy.stats import f_oneway, spearmanr
+from cells import PUBLISHED, RUNS, Cell, Row
+from scipy.stats import f_oneway, kendalltau, spearmanr
+from scipy.stats import t as student
 
 from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, TACTILESGNET
 from spikeloom.runtime.report.numbers import of_mean
 
 PROTOCOLS = {
-    "best": "best epoch on test (paper's protocol)",
+    "best": "best epoch on test",
     "last": "last epoch",
     "clean": "clean epoch, chosen on validation",
 }
 READINGS = {**PROTOCOLS, "chip": "on the chip, last epoch"}
 MARGIN = 2.0
-"""Combined standard errors within which the paper's mean counts as reproduced."""
+"""Combined standard errors beyond which the paper's mean and ours are said to differ; within, neither is shown."""
+
+EQUAL = 2.0
+"""Points that two means may differ by and be called equal; both one-sided tests, at 5 % each, must say so."""
 
 NAMES = {TACTILESGNET: "TactileSGNet", GRID_CNN: "grid-based CNN", MLP: "MLP", GCN: "GCN"}
 
@@ -58,6 +62,25 @@ class Spread:
 
 
 @dataclass(frozen=True, slots=True)
+class Comparison:
+    """Our mean less the paper's, the combined standard error, and its degrees of freedom."""
+
+    difference: float
+    error: float
+    freedom: float
+
+    @property
+    def within(self) -> bool:
+        """Whether no difference is shown."""
+        return abs(self.difference) <= MARGIN * self.error
+
+    @property
+    def equal(self) -> bool:
+        """Whether the means are shown to be within ``EQUAL`` points."""
+        return abs(self.difference) + float(student.ppf(0.95, self.freedom)) * self.error < EQUAL
+
+
+@dataclass(frozen=True, slots=True)
 class Line:
     """A row of a table with its cells, by seed; `table` says what the row is called."""
 
@@ -70,11 +93,11 @@ class Line:
         """What tables call it."""
         form, system = self.row.form, self.row.system
         if self.table == "graphs":
-            return f"{form}, {SAME_AS[form]}" if form in SAME_AS else form
+            return form
         return NAMES[system] + (f", {form} graph" if system in GRAPH_SYSTEMS else "")
 
     @property
-    def paper(self) -> tuple[float, float | None] | None:
+    def paper(self) -> tuple[float, float] | None:
         """Published mean and standard deviation."""
         return PUBLISHED.get((self.row.data, self.row.system, self.row.form))
 
@@ -120,12 +143,16 @@ class Line:
         """Decisions that change without the quiet neurons, over all seeds."""
         return sum(self.samples - chip["without_quiet"]["equal_to_chip"] for chip in self.chips)
 
-    def comparison(self) -> tuple[float, float] | None:
-        """Our best-epoch mean less the paper's, and the combined standard error; None where that is not known."""
-        ours = self.accuracy("best")
-        if self.paper is None or self.paper[1] is None or ours.std is None:
+    def comparison(self, reading: str) -> Comparison | None:
+        """Our mean less the paper's; None where that is not known."""
+        ours = self.accuracy(reading)
+        if self.paper is None or ours.std is None:
             return None
-        return ours.mean - self.paper[0], math.sqrt(ours.std**2 / len(ours.values) + self.paper[1] ** 2 / RUNS)
+        parts = [(ours.std**2 / len(ours.values), len(ours.values)), (self.paper[1] ** 2 / RUNS, RUNS)]
+        total = sum(part for part, _ in parts)
+        # Welch's degrees of freedom
+        freedom = total**2 / sum(part**2 / (runs - 1) for part, runs in parts)
+        return Comparison(ours.mean - self.paper[0], math.sqrt(total), freedom)
 
 
 def lines_of(table: str, rows: Mapping[Row, int], cells: Mapping[str, Cell]) -> list[Line]:
@@ -169,11 +196,13 @@ def variance(groups: Sequence[Sequence[float]]) -> Variance | None:
     )
 
 
-def rank_correlation(values: Sequence[float], others: Sequence[float]) -> tuple[float, float] | None:
-    """Spearman's rho and its p; None where one of them does not vary or there are fewer than four pairs."""
+def rank_correlation(
+    values: Sequence[float], others: Sequence[float], *, kendall: bool = False
+) -> tuple[float, float] | None:
+    """Spearman's rho or Kendall's tau, and its p; None where one does not vary or there are fewer than four pairs."""
     # means of equal sums are the same rank, although 300 / 3 and 200 / 2 may differ in their last digit
     values, others = ([round(value, 9) for value in each] for each in (values, others))
     if len(values) < 4 or len(set(values)) == 1 or len(set(others)) == 1:
         return None
-    rho, p = spearmanr(values, others)
+    rho, p = (kendalltau if kendall else spearmanr)(values, others)
     return float(rho), float(p)

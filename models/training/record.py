@@ -1,4 +1,4 @@
-"""What a training leaves behind in its checkpoint: how to repeat it, and what it reached by both protocols."""
+"""What a training leaves behind in its checkpoint: how to repeat it, and what it reached at three epochs."""
 
 from __future__ import annotations
 

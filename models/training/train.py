@@ -8,10 +8,10 @@ to machine. Here each epoch shuffles them anew, from the seed.
 Everything runs on one thread: at one recording per step a second thread gains little, and so a seed gives the same
 weights whatever the number of cores.
 
-There are two ways to report a training, always side by side. *Paper protocol*: accuracy of the epoch that did best on
-the test split, the maximum over epochs, as the published figures are made. *Clean protocol*: a first training leaves a
-fifth of the training split out and says which epoch does best on it; a second one, on the whole training split, is read
-on the test split at that epoch only.
+A training is reported at three epochs, side by side. *Last*: nothing is chosen. *Best epoch on test*: the maximum
+over epochs, chosen on the test split. *Clean*: a first training leaves a fifth of the training split out and says which
+epoch does best on it; a second one, on the whole training split, is read on the test split at that epoch only. Which
+epoch the published figures [1]_ are of their text does not say.
 
 References
 ----------
@@ -246,12 +246,12 @@ def _require_suited(recordings: Recordings, architecture: Sizes) -> None:
         )
 
 
-# -- both protocols ----------------------------------------------------------------------------------------------------
+# -- last, best and clean epoch ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reported:
-    """A training and what both protocols say of it."""
+    """A training and what it reached at its last, best and clean epoch."""
 
     trained: Trained  # On the whole training split; ``kept`` holds the weights of the clean epoch
     validation: Trained  # The training that chose the clean epoch; its "test" figures are those of the left-out part
@@ -269,7 +269,7 @@ def validation_split(training: Recordings) -> tuple[Recordings, Recordings]:
         members = np.flatnonzero(training.labels == label)
         if len(members) < 2:
             raise DataError(
-                f"{training.source}: class {label} has one training recording, the clean protocol needs 2 of each; "
+                f"{training.source}: class {label} has one training recording, the clean epoch needs 2 of each; "
                 "record more or drop the class"
             )
         held[draw.permutation(members)[: max(1, int(len(members) * VALIDATION_SHARE))]] = True

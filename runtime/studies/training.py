@@ -28,8 +28,8 @@ from spikeloom.runtime.studies.jobs import ProcessDied, ended_by_signal, only_on
 
 TITLES = {
     "last": "last epoch",
-    "best": "paper protocol: best on test",
-    "clean": "clean protocol: epoch chosen on validation",
+    "best": "best epoch on test",
+    "clean": "clean epoch, chosen on validation",
 }
 """What the epochs of ``WEIGHTS`` are called where people read of them."""
 
@@ -56,7 +56,7 @@ class Accuracies:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingReport:
-    """All seeds, and their accuracies by protocol."""
+    """All seeds, and their accuracies by epoch (JSON calls these protocols)."""
 
     runs: Sequence[Finished]
     protocols: Mapping[str, Accuracies]
@@ -103,7 +103,7 @@ def state_of(job: Job) -> tuple[Path, Path]:
 
 
 def run_job(job: Job) -> Finished:
-    """Train one seed by both protocols and write its checkpoint."""
+    """Train one seed, read at its last, best and clean epoch, and write its checkpoint."""
     from spikeloom.models.training.record import training_record
     from spikeloom.models.training.train import train_both
 
@@ -263,13 +263,13 @@ def _side_by_side(jobs: Sequence[Job], waiting: Sequence[int], results: dict[int
 
 
 def reached(record: TrainingRecord, which: str) -> Reached:
-    """What the epoch of a protocol reached."""
+    """What one of the epochs of ``WEIGHTS`` reached."""
     found: Reached = getattr(record, which)
     return found
 
 
 def summary(records: Sequence[TrainingRecord]) -> dict[str, Accuracies]:
-    """Accuracies over seeds by protocol."""
+    """Accuracies over seeds by epoch."""
     result: dict[str, Accuracies] = {}
     for protocol in WEIGHTS:
         values = [reached(record, protocol).accuracy for record in records]
@@ -279,7 +279,7 @@ def summary(records: Sequence[TrainingRecord]) -> dict[str, Accuracies]:
 
 
 def training_sections(result: TrainingReport) -> Iterable[Section]:
-    """Every seed by every protocol, then the means."""
+    """Every seed at every epoch of ``WEIGHTS``, then the means."""
     total = result.runs[0].test_samples
     rows = []
     for run in result.runs:
@@ -295,8 +295,8 @@ def training_sections(result: TrainingReport) -> Iterable[Section]:
     lines = []
     if several:
         means = (f"{100 * s.mean:.2f} % ± {100 * (s.std or 0.0):.2f}" for s in result.protocols.values())
-        last, paper, clean = means
-        lines.append(f"  mean of {len(result.runs)} seeds: last {last}, paper {paper}, clean {clean}")
+        last, best, clean = means
+        lines.append(f"  mean of {len(result.runs)} seeds: last {last}, best on test {best}, clean {clean}")
     files = ", ".join(run.file for run in result.runs)
     lines += textwrap.wrap(f"written: {files}", WIDTH, initial_indent="  ", subsequent_indent="    ")
     yield Section(
@@ -326,7 +326,7 @@ def picture(records: Sequence[Finished]) -> Drawing:
     loss = (records[0].recipe or {}).get("loss", MSE)
     measured = "squared error of spike rates" if loss == MSE else loss
     left.set(xlabel="epoch", ylabel=measured, title="loss: training solid, test dashed")
-    right.set(xlabel="epoch", ylabel="test accuracy (%)", title="accuracy; circle: epoch of the clean protocol")
+    right.set(xlabel="epoch", ylabel="test accuracy (%)", title="accuracy; circle: clean epoch")
     right.legend(loc="lower right")
     for axes in (left, right):
         axes.locator_params(axis="x", integer=True)

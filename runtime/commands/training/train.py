@@ -1,4 +1,4 @@
-"""The command ``train``: one system, any number of seeds, reported by both protocols."""
+"""The command ``train``: one system, any number of seeds, reported at three epochs."""
 
 from __future__ import annotations
 
