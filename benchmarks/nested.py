@@ -5,9 +5,9 @@
 Both splits are put together and parted five times five ways. In each training part every plan and strength, kernel and
 constant is tried by cross-validation in five folds; the test part is decided once by what these chose, counting
 networks as they spike. `chosen` is the plan of fewest neurons x steps whose accuracy is not lower than the best one's
-by more than a standard error of the difference, recording by recording; `best` is the best at any price, read out in
-four times the steps. `split` has the same for the split as released; `rules` are single plans, decided by exact sums.
-Intervals (95 %) and differences are bootstrapped over recordings. Parts that were measured before are not again.
+by more than a standard error of the difference, recording by recording; `best` is the best at any price, its ramp too.
+`split` has the same for the split as released; `rules` are single plans, decided by exact sums. Intervals (95 %) and
+differences are bootstrapped over recordings. Parts that were measured before are not again.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ TWELVE = (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 130)
 SMALL = [(bins, parts, events) for bins, parts, events in product((1, 5, 10, 25), (1, 2, 3), (FOUR, EIGHT, TWELVE))]
 LARGE = [(bins, parts, TWELVE) for bins, parts in product((1, 5), (6, 10))]
 STRENGTHS = (0.03, 0.1, 0.3)
-RAMP, LEVELS_RAMP, LONG_RAMP = 32, 64, 128
+RAMP, LEVELS_RAMP, LONG_RAMP = 32, 64, 256
 
 KERNELS = {"linear SVM": (0.003, 0.01, 0.1), "RBF SVM": (1.0, 3.0, 30.0)}
 SVM_PARTS = (1, 3, 10)

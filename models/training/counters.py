@@ -255,14 +255,15 @@ def fit(data: Counted, classes: int) -> Fitted:
 def counters_of(data: Counted, fitted: Fitted, recordings: Recordings, classes: int) -> Counters:
     """The network of a rule in whole weights; counters whose weights are all zero are left out.
 
-    Its ramp leads from the largest sum that the training recordings ever reach down to the lowest that may win.
+    Half of its ramp leads from the largest sum that the training recordings ever reach down to the lowest that may win.
+    The other half is for lower ones: noise lowers all sums.
     """
     plan, unit = data.plan, float(np.abs(fitted.rule.weight).max()) / ((1 << (data.plan.bits - 1)) - 1)
     weight = np.rint(fitted.rule.weight / unit)
     kept = weight.any(axis=0)
     rule = Rule(used=fitted.rule.used[kept], weight=weight[:, kept])
     highest = rule.highest(data)
-    slope = math.ceil((highest - fitted.lowest / unit) / max(plan.ramp - 2, 1))
+    slope = math.ceil((highest - fitted.lowest / unit) / max(plan.ramp // 2 - 2, 1))
     return Counters(
         taxels=recordings.taxels,
         polarities=recordings.events.shape[2],
