@@ -61,7 +61,7 @@ compile:
     placement? proofs? removals?
 compile, crossbars:
     axons classes cores crossing_points drain_ticks feeds layers limits max_crossing_points_of_an_axon neurons
-    provenance sha256 target taxels tick_clocks ticks_per_step wires clocks?
+    provenance sha256 target taxels tick_clocks ticks_per_step wires bins? clocks?
 data:
     bin_s dead duration_s events found hot labels one_sided rate recordings rules source split steps taxels
     unlabelled
@@ -92,7 +92,7 @@ inspect netlist:
     synapses_stored target taxels tiles bins? clocks?
 inspect netlist, crossbars:
     axons classes cores crossing_points drain_ticks feeds layers limits max_crossing_points_of_an_axon neurons
-    provenance sha256 target taxels tick_clocks ticks_per_step wires clocks?
+    provenance sha256 target taxels tick_clocks ticks_per_step wires bins? clocks?
 join:
     classes command file graph layers sha256 system towers
 lean:
@@ -109,7 +109,7 @@ verify:
     accuracy breakdowns certificate decision_agreement engine engine_different first_divergence ladder levels missed
     not_compared quantised_different same_checkpoint samples spec_equals_engine spec_samples spikes weights
 verify, crossbars:
-    E0 E1 correct exact membranes_saturated samples target spec_steps? sums?
+    E0 E1 correct exact membranes_saturated samples target E3? spec_steps? sums?
 watch bin:
     bins counts decision grasp kind margin time_s
 watch end:
@@ -280,6 +280,8 @@ def test_verify_holds_every_network_to_its_file(name):
         require_keys("verify, crossbars", found)
         assert found["E0"]["differences"] == 0
         assert found["exact"]
+        if "E3" in found:
+            assert found["E3"] == {"decisions_equal": found["samples"], "votes_different": 0}
         return
     require_keys("verify", found)
     assert found["spec_equals_engine"] is found["same_checkpoint"] is True

@@ -93,7 +93,7 @@ def test_numpy_alone_reads_it_and_a_reader_of_other_files_names_it(path):
         ({"manifest": {"bin_ticks": 0}}, "the manifest has no usable bin_ticks"),
         ({"manifest": {"clocks": {"channels": 0}}}, "the manifest has no usable clocks"),
         ({"manifest": {"target": "loihi1"}}, "is for 'loihi1', this program knows truenorth"),
-        ({"manifest": {"version": 2}}, "has format version 2, this program reads 1"),
+        ({"manifest": {"version": 3}}, "has format version 3, this program reads 2"),
         (
             {"axon_synapses": np.array([0, 2, 2], np.int8), "synapse_neuron": np.array([1, 1], np.int8)},
             "synapse_neuron does not rise along an axon",

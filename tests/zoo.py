@@ -174,6 +174,11 @@ def counting(folder: Path) -> Made:
     return "net.pt", TAXELS, "", ""
 
 
+def counting_crossbars(folder: Path) -> Made:
+    """The same for the other kind of cores."""
+    return *counting(folder)[:3], "--target truenorth"
+
+
 def native(folder: Path) -> Made:
     network = native_network(0, taxels=TAXELS, classes=CLASSES, steps=STEPS)
     write_trained(folder / "net.pt", {"last": network}, graph="ring", edges=np.array([[0, 1], [1, 0]]), training={})
@@ -201,9 +206,10 @@ MAKERS: dict[str, Callable[[Path], Made]] = {
     "counters": counting,
     "netx": netx,
     "native": native,
+    "counters-crossbars": counting_crossbars,
     "in-time": in_time,
 }
-CROSSBARS = ("native", "in-time")
+CROSSBARS = ("native", "in-time", "counters-crossbars")
 INTEGERS = (*CROSSBARS, "netx")
 """Those without a float network that compiles for the chip of the others."""
 LAYERED = tuple(name for name in MAKERS if name not in CROSSBARS)

@@ -8,6 +8,8 @@ References
 ----------
 .. [1] R.-E. Fan et al., "LIBLINEAR: A Library for Large Linear Classification", JMLR 9, 2008: L2-loss SVC.
 .. [2] O. Chapelle, "Training a Support Vector Machine in the Primal", Neural Computation 19, 2007.
+.. [3] E. Frantar et al., "GPTQ: Accurate Post-Training Quantization for Generative Pre-trained Transformers",
+   ICLR 2023.
 """
 
 from __future__ import annotations
@@ -48,6 +50,12 @@ THING = 3
 NEWTON_STEPS, LEAST_STEP = 100, 1e-6
 """Steps at most, of which a class takes three to ten, and the least part of one that is tried."""
 
+BITS = range(2, 9)
+"""Widths of a weight."""
+
+RIDGE = 0.03
+"""What is added to how often counters spike together, in terms of how often one spikes, where weights are rounded."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
@@ -71,6 +79,8 @@ class Plan:
         if not 1 <= len(set(self.thresholds)) == len(self.thresholds) <= MOST or min(self.thresholds) < 1:
             words = ",".join(map(str, self.thresholds))
             raise OptionError(f"--thresholds {words}: give up to {MOST} different numbers from 1, as in 1,4,16,64")
+        if self.bits not in BITS:
+            raise OptionError(f"--weight-bits {self.bits}: allowed are {BITS[0]} to {BITS[-1]}; choose another")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -252,14 +262,35 @@ def fit(data: Counted, classes: int) -> Fitted:
     return Fitted(rule=rule, strength=best, accuracy=accuracy, lowest=float(sums[best].max(axis=1).min()))
 
 
+def rounded(weight: FloatArray, spikes: FloatArray, most: int) -> FloatArray:
+    """Whole weights (classes, counters) of at most a magnitude, whose sums over spikes (samples, counters) stay.
+
+    One counter after the other is rounded, those that spike most first, and the weights of those to come make up for
+    what its rounding does to the sums [3]_.
+    """
+    alike = spikes.T @ spikes
+    order = np.argsort(-np.diag(alike), kind="stable")
+    alike += RIDGE * np.diag(alike).mean() * np.eye(len(alike))
+    pull = np.linalg.cholesky(np.linalg.inv(alike[order[:, None], order])).T
+    left, whole = weight[:, order], np.zeros_like(weight)
+    for n, place in enumerate(order):
+        whole[:, place] = np.clip(np.rint(left[:, n]), -most, most)
+        missing = (left[:, n] - whole[:, place]) / pull[n, n]
+        left[:, n + 1 :] -= np.outer(missing, pull[n, n + 1 :])
+    return whole
+
+
 def counters_of(data: Counted, fitted: Fitted, recordings: Recordings, classes: int) -> Counters:
     """The network of a rule in whole weights; counters whose weights are all zero are left out.
 
     Half of its ramp leads from the largest sum that the training recordings ever reach down to the lowest that may win.
     The other half is for lower ones: noise lowers all sums.
     """
-    plan, unit = data.plan, float(np.abs(fitted.rule.weight).max()) / ((1 << (data.plan.bits - 1)) - 1)
+    plan, most = data.plan, (1 << (data.plan.bits - 1)) - 1
+    unit = float(np.abs(fitted.rule.weight).max()) / most
     weight = np.rint(fitted.rule.weight / unit)
+    if plan.bits < BITS[-1]:  # as few levels as these need to make up for each other
+        weight = rounded(fitted.rule.weight / unit, data.spikes[:, fitted.rule.used].astype(np.float64), most)
     kept = weight.any(axis=0)
     rule = Rule(used=fitted.rule.used[kept], weight=weight[:, kept])
     highest = rule.highest(data)

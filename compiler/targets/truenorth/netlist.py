@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
+from spikeloom.compiler.dynamics import MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.targets import netlist_file
 from spikeloom.compiler.targets.base import CROSSBARS
 from spikeloom.compiler.targets.netlist_file import NetlistFile, column_faults, part_of
@@ -117,6 +117,7 @@ class CrossbarNetlist(netlist_file.Netlist):
     clock_phase: IntArray
     provenance: Mapping[str, Any]
     clocks: Clocks = NO_CLOCKS
+    bins: int = 1
 
     @property
     def n_cores(self) -> int:
@@ -239,10 +240,10 @@ def inconsistencies(netlist: CrossbarNetlist) -> list[str]:
 
 FILE = NetlistFile(
     format="spikeloom-crossbars",
-    version=1,
+    version=2,
     cores=CROSSBARS,
     netlist=CrossbarNetlist,
-    entries={"layers": [str], "bin_ticks": (1, MOST_TICKS)},
+    entries={"layers": [str], "bin_ticks": (1, MOST_TICKS), "bins": (1, MOST_STEPS)},
     layer=str,
     inconsistencies=inconsistencies,
     tables=frozenset({"weight"}),

@@ -1,6 +1,6 @@
 """The passes of this chip in their order: a trained network at the top, a netlist that obeys every rule at the end.
 
-There are two ways in. A network that was trained for the chip is whole numbers already and starts at `place`. A float
+Networks that were trained for the chip and counting networks are whole numbers already and start at `place`. A float
 network without memory (``--in-time``) is written out, and its weights become levels.
 """
 
@@ -10,22 +10,27 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import CapacityError, ModelError, OptionError
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes import expand
 from spikeloom.compiler.pipeline import LATER, Pass
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.codebook import COPIES, LevelNetwork, in_levels
+from spikeloom.compiler.targets.truenorth.counting import lower_counters
 from spikeloom.compiler.targets.truenorth.in_time import lower_in_time
 from spikeloom.compiler.targets.truenorth.legalize import needs, require_legal
 from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork, lower
 from spikeloom.compiler.targets.truenorth.netlist import FILE, CrossbarNetlist
 
 WAYS = (
-    f"two ways lead to the chip: --in-time N, N of {', '.join(map(str, COPIES))}, for networks that forget within a "
-    f"step; or training for it, spikeloom train --system {SYSTEM}"
+    f"three ways lead to the chip: --in-time N, N of {', '.join(map(str, COPIES))}, for networks that forget within a "
+    f"step; training for it, spikeloom train --system {SYSTEM}; or counting, --system counters --weight-bits 5"
 )
 FORGET = "give --beta 0 where the file does not say, or train it with --membrane-decay LAYER=0 for every layer"
+
+Source = NativeNetwork | Counters | expand.Factored | Network
+"""What can be compiled; the first two are whole numbers already."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +45,7 @@ class Options:
 class Compilation:
     """What one compilation was given and has made so far; each field is filled in by the pass of its name."""
 
-    source: NativeNetwork | expand.Factored | Network
+    source: Source
     options: Options
     target: Target
     network: Network = LATER
@@ -59,7 +64,7 @@ class Compilation:
 
 def _expand(done: Compilation) -> Compilation:
     source = done.source
-    assert not isinstance(source, NativeNetwork), "whole numbers start behind the passes of float networks"
+    assert not isinstance(source, NativeNetwork | Counters), "whole numbers start behind the passes of float networks"
     network = source if isinstance(source, Network) else expand.expand(source.checkpoint, source.propagation)
     if done.options.in_time is None:
         error = CapacityError(needs(network, done.target))
@@ -83,6 +88,8 @@ def _place(done: Compilation) -> Compilation:
     provenance = done.options.provenance
     if isinstance(done.source, NativeNetwork):
         return replace(done, netlist=lower(done.source, done.target, provenance=provenance))
+    if isinstance(done.source, Counters):
+        return replace(done, netlist=lower_counters(done.source, done.target, provenance=provenance))
     return replace(done, netlist=lower_in_time(done.levels, done.target, provenance=provenance))
 
 
@@ -120,14 +127,12 @@ PASSES = (
 )
 
 
-def start(
-    source: NativeNetwork | expand.Factored | Network, options: Options, target: Target
-) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
+def start(source: Source, options: Options, target: Target) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
     """What the passes begin with, and which of them are due; OptionError if whole numbers are to be rounded again."""
-    native = isinstance(source, NativeNetwork)
-    if native and options.in_time is not None:
-        raise OptionError(f"--in-time {options.in_time}: the network was trained for the chip; omit it")
+    whole = isinstance(source, NativeNetwork | Counters)
+    if whole and options.in_time is not None:
+        raise OptionError(f"--in-time {options.in_time}: the network is whole numbers already; omit it")
     if options.in_time not in (None, *COPIES):
         raise OptionError(f"--in-time {options.in_time}: allowed are {', '.join(map(str, COPIES))} axons an input")
     work = Compilation(source=source, options=options, target=target)
-    return work, PASSES[2:] if native else PASSES
+    return work, PASSES[2:] if whole else PASSES

@@ -96,6 +96,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     counting.add_argument(
         "--levels", type=int, metavar="N", help="so many classes in a row are levels of one thing (default: 1)"
     )
+    counting.add_argument(
+        "--weight-bits", type=int, metavar="N", help="of a weight, 2 to 8 (default: 8; truenorth holds up to 5)"
+    )
     parser.add_argument("--window", metavar="P%%", help="train on the first so many per cent of each recording")
     parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
     parser.add_argument(
@@ -152,7 +155,7 @@ SIZES = ("clocks", "features", "hops", "hidden")
 OVERRIDES = ("current_decay", "membrane_decay", *SIZES, "batch", "decay_epochs", "spike_penalty")
 """Options that change single values of a recipe."""
 
-COUNTERS_ONLY = ("thresholds", "parts", "ramp", "levels")
+COUNTERS_ONLY = ("thresholds", "parts", "ramp", "levels", "weight_bits")
 NOT_COUNTERS = ("padding", "graph", "edges", "directed", "copies", *OVERRIDES, "epochs", "resume", "keep", "picture")
 
 
@@ -174,6 +177,8 @@ def _count(arguments: argparse.Namespace) -> Outcome:
         typed += ["--join", str(arguments.join)]
     if "thresholds" in asked:
         asked["thresholds"] = tuple(whole_numbers(asked["thresholds"], "--thresholds"))
+    if "weight_bits" in asked:
+        asked["bits"] = asked.pop("weight_bits")
     plan = Plan(bins=arguments.join, **asked)
     plan.require_possible()
     taxels = None if arguments.taxels is None else len(sensor_places(arguments.taxels))

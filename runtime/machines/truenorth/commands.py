@@ -1,4 +1,4 @@
-"""What TrueNorth does in its own way: networks that were trained for it, and history-free ones (``--in-time``)."""
+"""What TrueNorth does in its own way: networks trained for it, counting ones, and history-free ones (``--in-time``)."""
 
 from __future__ import annotations
 
@@ -13,34 +13,39 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler import __version__
+from spikeloom.compiler.archive import COUNTERS
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.interpret import vote
+from spikeloom.compiler.formats.counters import read_counters
+from spikeloom.compiler.interpret import channels_last, float_simulation, vote
 from spikeloom.compiler.ir import Network
-from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.codebook import LevelNetwork, PartialSums, in_levels, run_levels
+from spikeloom.compiler.targets.truenorth.counting import Plan, planned, run_counters
 from spikeloom.compiler.targets.truenorth.in_time import first_spikes
 from spikeloom.compiler.targets.truenorth.native import NativeNetwork
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
-from spikeloom.compiler.targets.truenorth.passes import Compilation, Options
+from spikeloom.compiler.targets.truenorth.passes import Compilation, Options, Source
 from spikeloom.compiler.text import text
-from spikeloom.compiler.types import BoolArray, JsonObject
+from spikeloom.compiler.types import BoolArray, IntArray, JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.files import shipped
-from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.network import NETWORKS, LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
 from spikeloom.runtime.machines.truenorth.description import describe, describe_trained
 from spikeloom.runtime.machines.truenorth.machine import load, machine_of
-from spikeloom.runtime.machines.votes import class_counts
+from spikeloom.runtime.machines.votes import class_counts, readout_counts
 from spikeloom.runtime.report.console import Progress, progress
 from spikeloom.runtime.report.encode import OPTIONAL, key
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 
 TITLE = "TrueNorth"
+
+COUNTING = NETWORKS[COUNTERS].lower()
+"""What a netlist says of the format that it was compiled from, if that was a counting network."""
 
 VERIFY = ("original", "min_agreement", "require", "engine")
 """Options of ``verify`` where chip and model may differ."""
@@ -73,13 +78,14 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
     if arguments.target != chip.name:
         raise OptionError(f"--target {arguments.target}: {path} was trained for {TITLE}; give --target {chip.name}")
     refuse(arguments, ("calibrate", *ROUNDING, *PLACING), f"is not for {chip.name}")
-    source: NativeNetwork | Factored | Network
+    source: Source
     if trained:
         network = read(path, arguments)
         source, origin = network.network, provenance(network)
     else:
         loaded = load_network(path, arguments)
-        source, origin = loaded.model, {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256}
+        source = read_counters(shipped(path))[0] if loaded.format == COUNTING else loaded.model
+        origin = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256}
         origin |= loaded.origin(arguments.run) | {"in_time": arguments.in_time}
     progress("compiling")
 
@@ -142,9 +148,20 @@ class AgainstModel:
         return sum(layer.differences for layer in self.layers)
 
 
+@dataclass(frozen=True, slots=True)
+class AgainstNetwork:
+    """Decisions that are those of the network of the file, as other chips have it, and votes that differ."""
+
+    decisions_equal: int
+    votes_different: int
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """Chip against definition (E0) and model (E1); `spec_steps` confines the former to the first data steps of each."""
+    """Chip against definition (E0), model (E1) and, for a counting network, the network of the file (E3).
+
+    `spec_steps` confines the first to the first data steps of each recording.
+    """
 
     target: str
     samples: int
@@ -154,6 +171,7 @@ class Verdict:
     correct: int
     spec_steps: int | None = field(default=None, metadata=OPTIONAL)
     sums: tuple[PartialSums, ...] | None = field(default=None, metadata=OPTIONAL)
+    network: AgainstNetwork | None = field(default=None, metadata={**OPTIONAL, **key("E3")})
     json_properties = ("exact",)
 
     @property
@@ -169,9 +187,10 @@ def compare(
     data: Recordings,
     *,
     spec_samples: int,
-    spec_steps: int | None,
+    spec_steps: int | None = None,
+    network: Network | None = None,
 ) -> Verdict:
-    """Run the chip and the model on recordings, and count every spike that differs.
+    """Run the chip and the model on recordings, and count every spike that differs, and votes of a float network.
 
     `first` is the tick in which a layer spikes for the first data step. The specification runs on the first
     recordings, too, and there on the first steps, where `spec_steps` says so.
@@ -179,6 +198,7 @@ def compare(
     machine, layers = machine_of(netlist), list(netlist.layers)
     spikes, differences = dict.fromkeys(first, 0), dict.fromkeys(first, 0)
     votes, overflows, wrong = np.zeros((len(data), netlist.classes), np.int64), 0, 0
+    theirs = np.zeros_like(votes)
     sums: tuple[PartialSums, ...] = ()
     count = Progress(len(data))
     for index in range(len(data)):
@@ -197,7 +217,9 @@ def compare(
             differences[name] += int(np.count_nonzero(on_chip != due))
         overflows += int(trace.counts.overflows.sum())
         votes[index] = class_counts(netlist, trace.counts.votes)[0]
+        theirs[index] = 0 if network is None else _votes(network, events)
         wrong += machine.check(events[..., :spec_steps]) if index < spec_samples else 0
+    same, moved = np.count_nonzero(vote(votes) == vote(theirs)), np.abs(votes - theirs).sum()
     return Verdict(
         target=netlist.target,
         samples=len(data),
@@ -207,7 +229,14 @@ def compare(
         correct=int(np.count_nonzero(vote(votes) == data.labels)),
         spec_steps=spec_steps,
         sums=sums or None,
+        network=None if network is None else AgainstNetwork(int(same), int(moved)),
     )
+
+
+def _votes(network: Network, events: npt.NDArray[np.uint8]) -> IntArray:
+    """Votes (1, classes) of a float network in a recording (1, taxels, polarities, steps)."""
+    done = float_simulation(network).run(channels_last(events, network.input.clocks))
+    return readout_counts(network.readout, network.classes, done.spikes[network.readout.population])
 
 
 def sections(found: Verdict) -> list[Section]:
@@ -231,6 +260,11 @@ def sections(found: Verdict) -> list[Section]:
         each_sum = zip(found.sums, shares, strict=True)
         sums = [[each.layer, f"{each.partial:,}", share, str(each.largest)] for each, share in each_sum]
         blocks.append(Table(["layer", "partial sums", "saturated", "largest"], sums))
+    if found.network is not None:
+        same, moved = found.network.decisions_equal, found.network.votes_different
+        blocks.append(
+            Text(f"E3 network of the file: {same} of {found.samples} decisions equal; votes moved: {moved:,}")
+        )
     return [Section("Verdict", [*blocks, Text(accuracy)])]
 
 
@@ -244,13 +278,15 @@ def verify(arguments: argparse.Namespace) -> Outcome:
     refuse(arguments, VERIFY, f"a network for {TITLE} has one model, whose every spike must be the chip's")
     machine = load(arguments.netlist)
     netlist, made = machine.netlist, machine.netlist.provenance
-    copies: int = made.get("in_time", 0)
-    network = load_network(arguments.checkpoint, arguments) if copies else read(arguments.checkpoint, arguments)
+    copies, counting, path = int(made.get("in_time") or 0), made.get("format") == COUNTING, arguments.checkpoint
+    network = load_network(path, arguments) if copies or counting else read(path, arguments)
     if made.get("checkpoint_sha256") != network.sha256:
-        raise OptionError(
-            f"--checkpoint {arguments.checkpoint}: {arguments.netlist} was compiled from another file; give that one"
-        )
-    if isinstance(network, LoadedNetwork):
+        raise OptionError(f"--checkpoint {path}: {arguments.netlist} was compiled from another file; give that one")
+    compared: Network | None = None
+    if isinstance(network, LoadedNetwork) and counting:
+        plan, compared = planned(read_counters(shipped(path))[0], machine.target), network.network
+        model, first = _counting_model(plan), plan.first
+    elif isinstance(network, LoadedNetwork):
         levels = in_levels(network.network, copies, machine.target)
         model, first = _level_model(levels), first_spikes(levels)
     elif made.get("weights") != network.weights:
@@ -261,12 +297,17 @@ def verify(arguments: argparse.Namespace) -> Outcome:
         model, first = _trained_model(network.network), {s.name: n for n, s in enumerate(network.network.stages)}
     data = netlist_recordings(arguments, netlist, labels_for="verify")
     steps = SPEC_STEPS if copies else None
-    verdict = compare(netlist, model, first, data, spec_samples=arguments.spec_samples, spec_steps=steps)
+    checked = arguments.spec_samples
+    verdict = compare(netlist, model, first, data, spec_samples=checked, spec_steps=steps, network=compared)
     return Outcome(verdict, sections, 0 if verdict.exact else 1)
 
 
 def _level_model(levels: LevelNetwork) -> Model:
     return lambda events: run_levels(levels, events.reshape(-1, events.shape[-1]))
+
+
+def _counting_model(plan: Plan) -> Model:
+    return lambda events: (run_counters(plan, events), ())
 
 
 def _trained_model(network: NativeNetwork) -> Model:

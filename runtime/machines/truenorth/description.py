@@ -48,6 +48,7 @@ class Description:
     taxels: int
     classes: int
     clocks: Clocks | None = field(metadata=OPTIONAL)
+    bins: int | None = field(metadata=OPTIONAL)
     ticks_per_step: int
     drain_ticks: int
     neurons: int
@@ -98,6 +99,7 @@ def describe(netlist: CrossbarNetlist, sha256: str) -> Outcome:
         taxels=netlist.taxels,
         classes=netlist.classes,
         clocks=netlist.clocks if netlist.clocks.channels else None,
+        bins=netlist.bins if netlist.bins > 1 else None,
         ticks_per_step=netlist.bin_ticks,
         drain_ticks=netlist.drain,
         neurons=netlist.n_neurons,

@@ -1,0 +1,240 @@
+"""Place a counting network on crossbar cores: the integers of its file, a tick to a data step.
+
+What a core cannot hold are sums over hundreds of counters, so these are made in two steps, by numbers of spikes:
+
+============  ==========================================================================================================
+``gates``     where a recording has several parts: spike when their channel and the clock of their part do
+``counters``  add up events; a spike sets them to ``-BLOCK``, the one synapse onto itself that other chips need
+``sums``      two of each class for some of the counters, for weights above zero and for those below; a counter is led
+              to axons of the types 1, 2, 4 and 8. They spike as long as they hold one or more, and give one away
+``votes``     add these spikes up, those for weights below zero with -1; the leak is the ramp. They are not reset
+============  ==========================================================================================================
+
+A neuron has one target, so there is a counter for each axon that it reaches, all alike. Cores are filled with sums and
+votes first; counters and gates go where neurons and axons are left.
+
+Sums spike later than they would on other chips, at most as many ticks as the largest can hold: so many ticks later the
+votes count, and the ramp starts so much lower. The votes are those of other chips, spike for spike, unless a sum
+crosses the threshold before the data end, or counters spike a second time shortly before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import floor
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.counters import BLOCK, Counters
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, Place, history_free, place_cores
+from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_LINEAR, RESET_NONE, CrossbarNetlist
+from spikeloom.compiler.types import BoolArray, IntArray
+
+MAGNITUDES = tuple(1 << kind for kind in range(AXON_TYPES))
+"""Weights of the axon types of a core of sums."""
+
+LARGEST = sum(MAGNITUDES)
+
+CHANNELS = 32
+"""Axons that a core of sums leaves to channels, so that counters can use its other neurons."""
+
+FLOOR = (1 << 18) - 1
+"""Lowest membrane of a vote, as a magnitude; the register of negative thresholds holds no more."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Plan:
+    """How the sums of a counting network are divided among cores."""
+
+    counters: Counters
+    groups: tuple[slice, ...]  # Counters whose sums are made together
+    # (groups, 2 * classes, counters) int64; of each class the weights above zero, and the magnitudes of those below
+    magnitude: IntArray
+
+    @property
+    def first(self) -> dict[str, int]:
+        """Tick in which each layer spikes for the first data step."""
+        gated = int(self.counters.parts > 1)
+        most = int(self.magnitude.sum(axis=2).max(initial=1))
+        first = {"gates": 0} if gated else {}
+        return first | {"counters": gated, "sums": gated + 1, "votes": gated + 1 + max(most, 1)}
+
+
+def planned(counters: Counters, chip: Target) -> Plan:
+    """Divide the counters of a network into groups whose sums fit a core; ModelError if the chip cannot hold it."""
+    most = int(np.abs(counters.weight).max())
+    if most > LARGEST:
+        bits = LARGEST.bit_length() + 1
+        raise ModelError(f"weights of up to {most}, {LARGEST} allowed; train it with --weight-bits {bits} or fewer")
+    if counters.slope != int(counters.slope):
+        raise ModelError(f"a ramp of {counters.slope:g} a step, whole numbers are allowed; train it again")
+    signed = np.stack([counters.weight, -counters.weight], axis=1).clip(min=0)
+    signed = signed.reshape(2 * counters.classes, -1)
+    axons = (signed[None] & np.array(MAGNITUDES)[:, None, None]).any(axis=1).sum(axis=0)
+    room = chip.limit("core.axons") - CHANNELS
+    bounds = [0]
+    for end in range(1, len(axons) + 1):
+        if axons[bounds[-1] : end].sum() > room:
+            bounds.append(end - 1)
+    groups = tuple(slice(*each) for each in zip(bounds, [*bounds[1:], len(axons)], strict=True))
+    magnitude = np.zeros((len(groups), *signed.shape), np.int64)
+    for number, group in enumerate(groups):
+        magnitude[number, :, group] = signed[:, group]
+    return Plan(counters=counters, groups=groups, magnitude=magnitude)
+
+
+def lower_counters(counters: Counters, chip: Target, *, provenance: Mapping[str, Any] | None = None) -> CrossbarNetlist:
+    """Place a counting network; ModelError if its weights are beyond the chip, CapacityError if its cores are."""
+    plan = planned(counters, chip)
+    placing = _Placing(chip=chip)
+    reached = _sums(placing, plan, _votes(placing, plan))
+    channels, source = counters.taxels * counters.polarities, _sources(counters)
+    for n in np.argsort(source, kind="stable").tolist():
+        made = Neuron(threshold=int(counters.counter[n, 2]), reset=-BLOCK, negative_threshold=BLOCK)
+        for end in reached[n]:
+            placing.add(made, "counters", n, end, (int(source[n]),))
+    if counters.parts > 1:
+        for gate, *end in placing.connect():
+            part, channel = divmod(gate, channels)
+            placing.add(history_free((1,), 2), "gates", gate, (end[0], end[1]), (channel, channels + part))
+    for channel, core, line in placing.connect():
+        placing.draft.feed(channel, core, line)
+    place_cores(placing.draft, chip, "train it with fewer thresholds, or --weight-bits")
+    return placing.draft.netlist(
+        taxels=counters.taxels,
+        polarities=counters.polarities,
+        classes=counters.classes,
+        bins=counters.bins,
+        clocks=counters.clocks,
+        target=chip.name,
+        provenance=provenance,
+    )
+
+
+def _sources(counters: Counters) -> IntArray:
+    """Channel that each counter receives, or its gate; (counters,)."""
+    channel, part, _ = counters.counter.T
+    found: IntArray = part * (counters.taxels * counters.polarities) + channel
+    return found
+
+
+def _least(counters: Counters) -> int:
+    """Membrane at which a vote spikes: the first whole number above the threshold."""
+    return floor(counters.threshold) + 1
+
+
+def _votes(placing: _Placing, plan: Plan) -> dict[Place, Place]:
+    """Add the votes; returns the axon that each sum reaches, by its group and its place in the group."""
+    draft, counters, ends = placing.draft, plan.counters, dict[Place, Place]()
+    used, first, slope = plan.magnitude.sum(axis=2) > 0, plan.first["votes"], int(counters.slope)
+    core = placing.core()
+    for label in range(counters.classes):
+        own = np.argwhere(used[:, 2 * label : 2 * label + 2]).tolist()
+        if len(draft.cores[core].axons) + len(own) > placing.chip.limit("core.axons"):
+            core = placing.core()
+        vote = Neuron(
+            weights=(1, -1),
+            leak=slope,
+            threshold=_least(counters),
+            reset_mode=RESET_NONE,
+            negative_threshold=FLOOR,
+            negative_saturates=True,
+            initial=-slope * first,
+        )
+        number = draft.neuron(core, vote, layer="votes", number=label)
+        draft.vote((core, number), label, first=first)
+        for group, sign in own:
+            ends[group, 2 * label + sign] = core, draft.axon(core, sign, [number])
+    return ends
+
+
+def _sums(placing: _Placing, plan: Plan, ends: Mapping[Place, Place]) -> list[list[Place]]:
+    """Add the sums, which reach the axons `ends`; returns the axons that each counter reaches."""
+    draft, reached = placing.draft, [list[Place]() for _ in plan.counters.counter]
+    for number, group in enumerate(plan.groups):
+        core, rows = placing.core(), sorted(row for each, row in ends if each == number)
+        for row in rows:
+            held = Neuron(weights=MAGNITUDES, reset_mode=RESET_LINEAR)
+            added = draft.neuron(core, held, layer="sums", number=number * plan.magnitude.shape[1] + row)
+            draft.wire((core, added), *ends[number, row])
+        points = plan.magnitude[number, rows, group].T[:, :, None] & np.array(MAGNITUDES)
+        for n, line in draft.inputs(core, points):
+            reached[group.start + n].append((core, line))
+    return reached
+
+
+@dataclass(slots=True, kw_only=True)
+class _Placing:
+    """Cores as they are filled; `awaited` are neurons of each core by the source whose axon they still wait for."""
+
+    chip: Target
+    draft: Draft = field(default_factory=Draft)
+    awaited: list[dict[int, list[int]]] = field(default_factory=list)
+
+    def core(self) -> int:
+        """Add a core."""
+        self.awaited.append({})
+        return self.draft.core()
+
+    def add(self, made: Neuron, layer: str, number: int, end: Place, sources: tuple[int, ...]) -> None:
+        """Add a neuron that reaches an axon, on the first core with room for it and for the axons of its sources."""
+        fits = (core for core in range(len(self.draft.cores)) if self._has_room(core, sources))
+        core = next(fits, None)
+        core = self.core() if core is None else core
+        added = self.draft.neuron(core, made, layer=layer, number=number)
+        self.draft.wire((core, added), *end)
+        for source in sources:
+            self.awaited[core].setdefault(source, []).append(added)
+
+    def _has_room(self, core: int, sources: tuple[int, ...]) -> bool:
+        made, awaited = self.draft.cores[core], self.awaited[core]
+        axons = len(made.axons) + len(awaited.keys() | set(sources))
+        return len(made.neurons) < self.chip.limit("core.neurons") and axons <= self.chip.limit("core.axons")
+
+    def connect(self) -> list[tuple[int, int, int]]:
+        """Add the axons that neurons wait for; returns source, core and line of each."""
+        found = [
+            (source, core, self.draft.axon(core, 0, neurons))
+            for core, awaited in enumerate(self.awaited)
+            for source, neurons in awaited.items()
+        ]
+        self.awaited = [{} for _ in self.awaited]
+        return found
+
+
+def run_counters(plan: Plan, events: npt.NDArray[np.uint8]) -> dict[str, BoolArray]:
+    """Spikes (steps, neurons) of each layer for one recording (taxels, polarities, steps), in whole numbers.
+
+    Step s of a layer is the tick ``s`` after its first, see :attr:`Plan.first`.
+    """
+    counters, first, steps = plan.counters, plan.first, events.shape[-1]
+    active = with_clocks(events[None], counters.clocks)[0].T > 0
+    channels, spikes = counters.taxels * counters.polarities, dict[str, BoolArray]()
+    source = active[:, :channels]
+    if counters.parts > 1:
+        source = (active[:, channels:, None] & source[:, None]).reshape(steps, -1)
+        spikes["gates"] = source
+    seen, count = source[:, _sources(counters)], counters.counter[:, 2]
+    over = np.cumsum(seen, axis=0) - count
+    spikes["counters"] = seen & (over >= 0) & (over % (count + BLOCK) == 0)
+
+    late = first["votes"] - first["sums"]
+    arriving = np.zeros((steps + late, plan.magnitude.shape[0] * plan.magnitude.shape[1]), np.int64)
+    arriving[:steps] = spikes["counters"].astype(np.int64) @ plan.magnitude.reshape(arriving.shape[1], -1).T
+    sent, held = np.zeros(arriving.shape, np.bool_), np.zeros(arriving.shape[1], np.int64)
+    for tick, more in enumerate(arriving):
+        held += more
+        sent[tick] = held > 0
+        held -= sent[tick]
+    spikes["sums"] = sent[:steps]
+    above, below = np.moveaxis(sent.reshape(steps + late, -1, counters.classes, 2).sum(axis=1), -1, 0)
+    sums = np.cumsum(above - below, axis=0)[late - 1 : -1]
+    ramp = int(counters.slope) * np.arange(1, steps + 1)[:, None]
+    spikes["votes"] = sums + ramp >= _least(counters)
+    return spikes

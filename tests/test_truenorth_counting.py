@@ -1,0 +1,131 @@
+"""Counting networks on crossbar cores: every spike is the model's, and the votes are the file's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from commands import as_json, run
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_crossbars import CHIP, both, with_limit
+
+from spikeloom.compiler.counters import BLOCK, Counters
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.errors import CapacityError, ModelError, OptionError
+from spikeloom.compiler.formats.counters import counting_network, write_counters
+from spikeloom.compiler.interpret import channels_last, float_simulation
+from spikeloom.compiler.targets.truenorth.counting import LARGEST, planned, run_counters
+from spikeloom.models.training.counters import rounded
+from spikeloom.runtime.machines.votes import class_counts
+
+
+def random_counters(seed, *, taxels=3, parts=1, classes=3, thresholds=(1, 3), most=LARGEST, steps=20, ramp=12):
+    """Some counters of a sensor, whose sums of the data never reach the threshold."""
+    rng = np.random.default_rng(seed)
+    kinds = [(channel, part, k) for k in thresholds for part in range(parts) for channel in range(2 * taxels)]
+    counter = np.array(kinds)[rng.random(len(kinds)) < 0.8][::-1]
+    weight = rng.integers(-most, most + 1, (classes, len(counter))) * (rng.random((classes, len(counter))) < 0.7)
+    slope = int(rng.integers(1, 9))
+    highest = int(weight.clip(min=0).sum(axis=1).max())
+    sizes = {"taxels": taxels, "polarities": 2, "classes": classes, "bins": 1, "steps": steps}
+    threshold = highest + slope * steps + 0.5
+    return Counters(
+        **sizes, parts=parts, ramp=ramp, counter=counter, weight=weight, slope=float(slope), threshold=threshold
+    )
+
+
+def random_events(seed, counters, rate=0.3):
+    """A recording (taxels, polarities, steps) that is silent in the ramp."""
+    shape = counters.taxels, counters.polarities, counters.clocks.length
+    events = (np.random.default_rng(seed).random(shape) < rate).astype(np.uint8)
+    events[..., counters.steps :] = 0
+    return events
+
+
+def assert_exact(counters, events, chip=CHIP):
+    """Specification, engine and model agree in every spike, and votes with the network in the file; gives the votes."""
+    netlist, plan = CHIP.compile(counters).netlist, planned(counters, chip)
+    trace, steps = both(netlist, with_clocks(events[None], counters.clocks)[0]), events.shape[-1]
+    assert trace.counts.overflows.sum() == 0
+    model = run_counters(plan, events)
+    for name, first in plan.first.items():
+        chosen = np.flatnonzero(netlist.layer == netlist.layers.index(name))
+        on_chip = trace.spikes[first : first + steps][:, chosen]
+        np.testing.assert_array_equal(on_chip, model[name][:, netlist.neuron[chosen]], name)
+    votes = class_counts(netlist, trace.counts.votes[None])[0]
+    np.testing.assert_array_equal(votes, model["votes"].sum(axis=0))
+    network = counting_network(counters)
+    spikes = float_simulation(network).run(channels_last(events[None], counters.clocks)).spikes
+    np.testing.assert_array_equal(votes, spikes[-1][0].sum(axis=0))
+    return votes
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(0, 2**31),
+    st.sampled_from([1, 2, 3]),
+    st.integers(1, 5),
+    st.sampled_from([1, 3, LARGEST]),
+    st.sampled_from([0.1, 0.5, 1.0]),
+)
+def test_every_spike_is_the_models_and_the_votes_are_the_files(seed, parts, classes, most, rate):
+    counters = random_counters(seed, parts=parts, classes=classes, most=most)
+    assert_exact(counters, random_events(seed, counters, rate))
+
+
+def test_sums_of_several_cores_come_together():
+    counters = random_counters(1, taxels=40, classes=12, thresholds=(1, 3, 7), steps=30, ramp=400)
+    netlist = CHIP.compile(counters).netlist
+    groups = len(planned(counters, CHIP).groups)
+    assert 2 * groups * 12 == np.count_nonzero(netlist.layer == netlist.layers.index("sums")) > 24
+    assert netlist.n_cores < groups + 4, "counters use what sums and votes leave"
+    assert assert_exact(counters, random_events(2, counters)).max() > 0
+
+
+def test_counters_spike_again_as_on_other_chips():
+    counters = random_counters(0, taxels=1, thresholds=(3,), steps=400, ramp=20)
+    events = np.zeros((1, 2, 420), np.uint8)
+    events[..., :400] = 1
+    spikes = run_counters(planned(counters, CHIP), events)["counters"]
+    assert np.flatnonzero(spikes[:, 0]).tolist() == [2 + again * (3 + BLOCK) for again in range(4)]
+    assert_exact(replace(counters, weight=np.abs(counters.weight) % 2, threshold=3000.5), events)
+
+
+def test_what_the_chip_cannot_hold_is_refused(tmp_path):
+    counters = random_counters(0, most=127)
+    with pytest.raises(ModelError, match=r"weights of up to \d+, 15 allowed; train it with --weight-bits 5 or fewer"):
+        CHIP.compile(counters)
+    counters = random_counters(0)
+    with pytest.raises(ModelError, match=r"a ramp of 0\.5 a step"):
+        CHIP.compile(replace(counters, slope=0.5))
+    with pytest.raises(CapacityError, match=r"chip: 2 used, 1 allowed .*--weight-bits"):
+        with_limit("chip.cores", 1).compile(counters)
+    with pytest.raises(OptionError, match="--in-time 3: the network is whole numbers already"):
+        CHIP.compile(counters, CHIP.module.Options(in_time=3))
+    write_counters(tmp_path / "c.pt", random_counters(0, most=127))
+    code, _, err = run("compile", tmp_path / "c.pt", "--target", "truenorth", "-o", tmp_path / "c.loom")
+    assert (code, "c.pt: weights of up to" in err) == (2, True)
+    code, _, err = run("train", "--data", "synthetic", "--system", "counters", "--weight-bits", "9", "-o", "x.pt")
+    assert (code, "--weight-bits 9: allowed are 2 to 8" in err) == (2, True)
+
+
+def test_rounded_weights_keep_the_sums():
+    rng = np.random.default_rng(0)
+    spikes = (rng.random((200, 40)) < rng.random(40)).astype(float)
+    weight = rng.normal(0, 2, (5, 40))
+    whole = rounded(weight, spikes, 7)
+    assert set(np.unique(whole)) <= set(range(-7, 8))
+    errors = [np.abs(spikes @ (each - weight).T).mean() for each in (whole, np.rint(weight).clip(-7, 7))]
+    assert errors[0] < 0.8 * errors[1]
+
+
+def test_objects_on_the_chip(objects_zip, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = "--data", objects_zip, "--system", "counters", "--weight-bits", "4"
+    record = as_json("train", *words, "-o", "o.pt")["record"]
+    made = as_json("compile", "o.pt", "--target", "truenorth", "-o", "o.loom")
+    assert made["cores"] <= 8
+    found = as_json("verify", "o.loom", "--checkpoint", "o.pt", "--data", objects_zip)
+    assert found["exact"]
+    assert found["E3"] == {"decisions_equal": 144, "votes_different": 0}
+    assert found["correct"] == record["test_correct"]
