@@ -378,7 +378,6 @@ NETWORKS = {
     "objects": {"planes": "2", "scale_groups": "4"},
     "containers": {"weight_bits": "8,4,4,8", "chips": 2},
     "objects-200ms": {"weight_bits": "3"},
-    "containers-100ms": {"chips": 4},
     "objects-truenorth": {"target": "truenorth"},
     "containers-truenorth": {"target": "truenorth"},
 }
