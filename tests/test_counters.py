@@ -116,6 +116,7 @@ def test_file_and_back(tmp_path):
         (lambda c: replace(c, counter=np.add(c.counter, (0, 3, 0))), "do not exist"),
         (lambda c: replace(c, counter=c.counter * 0), "do not exist"),
         (lambda c: replace(c, taxels=0), "no usable taxels"),
+        (lambda c: replace(c, taxels=2**20), "more than 1,048,576 channels"),
         (lambda c: replace(c, threshold=-1.0), "no usable threshold"),
     ],
 )

@@ -38,7 +38,8 @@ SYSTEM = "counters"
 
 SIZES = ("taxels", "polarities", "classes", "bins", "steps", "parts", "ramp")
 CONSTANTS = ("slope", "threshold")
-LARGEST = {"bins": MOST_STEPS, "steps": MOST_STEPS, "ramp": MOST_STEPS, "parts": MOST_CLOCKS}
+MOST = 2**20
+LARGEST = {"parts": MOST_CLOCKS}
 
 _AGAIN = "copy or train it again"
 
@@ -93,7 +94,7 @@ def read_counters(path: str | os.PathLike[str]) -> tuple[Counters, str]:
     except FormatError as error:
         said = str(error).rpartition("; ")[0].replace("netlist", "network")  # without the remedy, which is a netlist's
         raise ModelError(f"{said}; {_AGAIN}") from error
-    kinds = {name: (0 if name == "ramp" else 1, LARGEST.get(name, 2**20)) for name in SIZES}
+    kinds = {name: (0 if name == "ramp" else 1, LARGEST.get(name, MOST)) for name in SIZES}
     wrong = entry_faults(manifest, kinds | dict.fromkeys(CONSTANTS, float) | {"training": dict})
     if not wrong:
         wrong = _array_faults(manifest, members["counter"], members["weight"])
@@ -109,6 +110,8 @@ def read_counters(path: str | os.PathLike[str]) -> tuple[Counters, str]:
 
 def _array_faults(sizes: Mapping[str, Any], counter: Array, weight: Array) -> list[str]:
     """What in the arrays does not suit the sizes, or each other."""
+    if sizes["taxels"] * sizes["polarities"] * sizes["parts"] > MOST:
+        return [f"more than {MOST:,} channels of parts"]
     if (counter.dtype.kind, weight.dtype.kind) != ("i", "i") or counter.shape[1:] != (3,) or not len(counter):
         return ["counter is no table of whole numbers"]
     if weight.shape != (sizes["classes"], len(counter)) or np.abs(weight.astype(np.int64)).max() > BLOCK:
