@@ -44,9 +44,6 @@ LARGEST = sum(MAGNITUDES)
 CHANNELS = 32
 """Axons that a core of sums leaves to channels, so that counters can use its other neurons."""
 
-FLOOR = (1 << 18) - 1
-"""Lowest membrane of a vote, as a magnitude; the register of negative thresholds holds no more."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Plan:
@@ -133,7 +130,7 @@ def _votes(placing: _Placing, plan: Plan) -> dict[Place, Place]:
     """Add the votes; returns the axon that each sum reaches, by its group and its place in the group."""
     draft, counters, ends = placing.draft, plan.counters, dict[Place, Place]()
     used, first, slope = plan.magnitude.sum(axis=2) > 0, plan.first["votes"], int(counters.slope)
-    core = placing.core()
+    core, lowest = placing.core(), (1 << placing.chip.limit("neuron.threshold_bits")) - 1
     for label in range(counters.classes):
         own = np.argwhere(used[:, 2 * label : 2 * label + 2]).tolist()
         if len(draft.cores[core].axons) + len(own) > placing.chip.limit("core.axons"):
@@ -143,7 +140,7 @@ def _votes(placing: _Placing, plan: Plan) -> dict[Place, Place]:
             leak=slope,
             threshold=_least(counters),
             reset_mode=RESET_NONE,
-            negative_threshold=FLOOR,
+            negative_threshold=lowest,
             negative_saturates=True,
             initial=-slope * first,
         )

@@ -124,6 +124,7 @@ def sections(found: Description) -> list[Section]:
     head = (
         f"{found.target}: {found.neurons:,} neurons, {found.axons:,} axons, {found.crossing_points:,} crossing points, "
         f"{found.cores:,} cores; {ticks} tick{'s' * (ticks > 1)} a data step, {found.drain_ticks} more to drain"
+        + (f"; a step joins {found.bins} bins" if found.bins else "")
     )
     layers = [
         [layer.name, f"{layer.neurons:,}", f"{layer.distinct:,}", f"{layer.max_fan_in:,}", f"{layer.cores:,}"]
