@@ -12,7 +12,7 @@ class Work(Protocol):
 
     @property
     def newest(self) -> Any:
-        """What the last pass made that changed anything, which :func:`text.text` prints."""
+        """What the last pass made that changed anything, which :func:`formats.text.text` prints."""
 
     def verify(self) -> None:
         """Check every rule of that; VerifyError if a pass broke one."""

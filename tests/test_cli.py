@@ -21,10 +21,10 @@ from random_netlists import Axon, Neuron, build, large_netlist
 from spikeloom.__main__ import main as start
 from spikeloom.compiler import __version__, lift
 from spikeloom.compiler.fixedpoint import read_only
+from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.targets.base import EVENTS, load_target
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
-from spikeloom.compiler.text import text
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.runtime import cli

@@ -18,10 +18,10 @@ from zoo import CROSSBARS, FLOAT, LAYERED, MAKERS, over, specified, specimen
 import spikeloom
 from spikeloom.compiler import lift
 from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes, read_netlist
 from spikeloom.compiler.targets.truenorth.netlist import crossbar_bytes
-from spikeloom.compiler.text import text
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.inputs.network import load_network

@@ -25,10 +25,10 @@ from scipy import sparse
 import spikeloom.runtime.studies.stress.pair
 from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.errors import VerifyError
+from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent
-from spikeloom.compiler.text import text
 from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.studies.stress.pair import Inputs, Pair, evaluate, float_layers

@@ -22,6 +22,7 @@ from random_networks import (
 
 from spikeloom.compiler import Options, compile_network, invariants
 from spikeloom.compiler.errors import VerifyError
+from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import INPUT, depths, fan_in
 from spikeloom.compiler.passes.expand import Factored, expand, hop_powers, synapses
@@ -32,7 +33,6 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.passes import start
-from spikeloom.compiler.text import text
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.runtime.equivalence.verify import verify
 

@@ -17,11 +17,11 @@ from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import NETX, NIR, ONNX
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
 from spikeloom.compiler.targets.netlist_file import Netlist
-from spikeloom.compiler.text import text
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.graphs import CHOICES, NEUTOUCH, Graph
 from spikeloom.models.sensors import read_layout, sensor_graph

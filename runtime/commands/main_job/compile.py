@@ -21,8 +21,8 @@ from spikeloom.compiler import (
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
+from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.text import text
 from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_bin_option, add_network, group
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance

@@ -17,6 +17,7 @@ from spikeloom.compiler.archive import COUNTERS
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.counters import read_counters
+from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.interpret import channels_last, float_simulation, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.targets.base import load_target
@@ -27,7 +28,6 @@ from spikeloom.compiler.targets.truenorth.native import NativeNetwork
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Compilation, Options, Source
-from spikeloom.compiler.text import text
 from spikeloom.compiler.types import BoolArray, IntArray, JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.files import shipped
