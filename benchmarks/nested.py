@@ -1,13 +1,14 @@
 """Counting networks and support vector machines in repeated nested cross-validation over all recordings.
 
-    python benchmarks/nested.py DATA OUT.json [--levels 5]        (needs scikit-learn)
+    python benchmarks/nested.py DATA OUT.json [--levels 5] [--ramp 64] [--again 5]        (needs scikit-learn)
 
 Both splits are put together and parted five times five ways. In each training part every plan and strength, kernel and
-constant is tried by cross-validation in five folds; the test part is decided once by what these chose, counting
-networks as they spike. `chosen` is the plan of fewest neurons x steps whose accuracy is not lower than the best one's
-by more than a standard error of the difference, recording by recording; `best` is the best at any price, its ramp too.
-`split` has the same for the split as released; `rules` are single plans, decided by exact sums. Intervals (95 %) and
-differences are bootstrapped over recordings. Parts that were measured before are not again.
+constant is tried by cross-validation in five folds, plans within two standard errors of the best `--again` times;
+the test part is decided once by what these chose, counting networks as they spike. `chosen` is the plan of fewest
+neurons x steps whose accuracy is not lower than the best one's by more than a standard error of the difference,
+recording by recording; `best` is the best at any price, its ramp too. `split` has the same for the split as released;
+`rules` are single plans, decided by exact sums. Intervals (95 %) and differences are bootstrapped over recordings.
+Parts that were measured before are not again.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ TWELVE = (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 130)
 SMALL = [(bins, parts, events) for bins, parts, events in product((1, 5, 10, 25), (1, 2, 3), (FOUR, EIGHT, TWELVE))]
 LARGE = [(bins, parts, TWELVE) for bins, parts in product((1, 5), (6, 10))]
 STRENGTHS = (0.03, 0.1, 0.3)
-RAMP, LEVELS_RAMP, LONG_RAMP = 32, 64, 256
+LONG_RAMP = 256
 
 KERNELS = {"linear SVM": (0.003, 0.01, 0.1), "RBF SVM": (1.0, 3.0, 30.0)}
 SVM_PARTS = (1, 3, 10)
@@ -81,49 +82,55 @@ def price(data: Counted, classes: int) -> int:
     return (gates + counters + 2 * classes) * (data.steps + data.plan.ramp)
 
 
-def tried(data: Counted, classes: int) -> tuple[float, np.ndarray, float]:
-    """Best strength of a plan on training recordings, which of them it has right, and the lowest largest sum."""
-    sums = held_out(data, classes)
-    right = {strength: each.argmax(axis=1) == data.labels for strength, each in sums.items()}
+def tried(data: Counted, classes: int, seeds: Sequence[int] = (0,)) -> tuple[float, np.ndarray, float]:
+    """Best strength of a plan on training recordings, how often each is right, and the lowest largest sum."""
+    sums = [held_out(data, classes, seed=seed) for seed in seeds]
+    right = {name: np.mean([each[name].argmax(axis=1) == data.labels for each in sums], axis=0) for name in sums[0]}
     best = max(right, key=lambda strength: right[strength].mean())
-    return best, right[best], float(sums[best].max(axis=1).min())
+    return best, right[best], min(float(each[best].max(axis=1).min()) for each in sums)
 
 
-def cheapest(right: Mapping[str, np.ndarray], prices: Mapping[str, int]) -> tuple[str, str]:
-    """The cheapest of those that are not shown to be worse than the best, and the best."""
-    best = max(right, key=lambda name: (right[name].mean(), -prices[name]))
-    behind = {name: right[best].astype(float) - each for name, each in right.items()}
-    able = [name for name, each in behind.items() if each.mean() <= each.std() / np.sqrt(len(each))]
-    return min(able, key=prices.__getitem__), best
+def able(right: Mapping[str, np.ndarray], errors: float = 1.0) -> list[str]:
+    """Plans that are not worse than the best one by more than so many standard errors of the difference."""
+    best = max(right, key=lambda name: right[name].mean())
+    behind = {name: right[best] - each for name, each in right.items()}
+    return [name for name, each in behind.items() if each.mean() <= errors * each.std() / np.sqrt(len(each))]
 
 
-def measured(data: Recordings, all_counted: Mapping[str, Counted], rows: np.ndarray, held: np.ndarray) -> Json:
+def measured(
+    data: Recordings, all_counted: Mapping[str, Counted], rows: np.ndarray, held: np.ndarray, again: int = 1
+) -> Json:
     """All systems, chosen and fitted on some recordings, on the others."""
     training, test, classes = data.part(rows), data.part(held), int(data.labels.max()) + 1
     found: Json = {"rules": {}, "systems": {}}
-    trials, prices, rules = {}, {}, {}
+    once, trials, own_of = {}, {}, {}
     for name, each in all_counted.items():
         own = each.part(rows)
-        strength, right, lowest = tried(own, classes)
-        trials[name], prices[name] = right, price(own, classes)
+        once[name] = strength, trials[name], _ = tried(own, classes)
         rule = linear_rules(own, classes, [strength])[strength]
-        rules[name] = own, Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest)
+        own_of[name] = own
         correct = rule.right(each.part(held))
-        found["rules"][name] = {"held_out": float(right.mean()), "right": correct.astype(int).tolist()}
-    for level in sorted({each.plan.levels for each in all_counted.values()}):
-        names = [name for name, each in all_counted.items() if each.plan.levels == level]
-        both = cheapest({name: trials[name] for name in names}, prices)
-        for system, name in zip(("chosen", "best"), both, strict=True):
-            own, fitted = rules[name]
+        found["rules"][name] = {"held_out": float(trials[name].mean()), "right": correct.astype(int).tolist()}
+    prices = {name: price(own, classes) for name, own in own_of.items()}
+    for levels in sorted({each.plan.levels for each in all_counted.values()}):
+        names = able({name: trials[name] for name in trials if all_counted[name].plan.levels == levels}, 2.0)
+        tried_again = {name: tried(own_of[name], classes, range(again)) if again > 1 else once[name] for name in names}
+        right = {name: each[1] for name, each in tried_again.items()}
+        chosen = min(able(right), key=prices.__getitem__)
+        best = max(right, key=lambda name: right[name].mean())
+        for system, name in (("chosen", chosen), ("best", best)):
+            own, (strength, _, lowest) = own_of[name], tried_again[name]
             if system == "best":
                 own = replace(own, plan=replace(own.plan, ramp=LONG_RAMP))
+            rule = linear_rules(own, classes, [strength])[strength]
+            fitted = Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest)
             made = counters_of(own, fitted, training, classes)
-            found["systems"][f"{system}, levels" if level > 1 else system] = {
+            found["systems"][f"{system}, levels" if levels > 1 else system] = {
                 "plan": name,
-                "strength": fitted.strength,
+                "strength": strength,
                 "counters": len(made.counter),
                 "neuron_steps": price(own, classes),
-                "held_out": float(trials[name].mean()),
+                "held_out": float(right[name].mean()),
                 "right": (decisions_of(made, test) == test.labels).astype(int).tolist(),
             }
     found["systems"] |= machines(data, rows, held)
@@ -196,13 +203,15 @@ def main() -> None:
     parser.add_argument("recordings")
     parser.add_argument("output", type=Path)
     parser.add_argument("--levels", type=int, default=1, help="classes in a row that are levels of one thing")
+    parser.add_argument("--again", type=int, default=1, help="cross-validations of plans near the best one")
+    parser.add_argument("--ramp", type=int, default=32, help="steps of the read-out (best at any price: 256)")
     arguments = parser.parse_args()
     data, training = whole(arguments.recordings)
     store = arguments.output.with_suffix(".parts.json")
     done: Json = json.loads(store.read_text()) if store.exists() else {}
     plans = [
-        Plan(bins=bins, parts=parts, thresholds=events, strengths=STRENGTHS, levels=levels, ramp=ramp)
-        for levels, ramp in {1: RAMP, arguments.levels: RAMP if arguments.levels == 1 else LEVELS_RAMP}.items()
+        Plan(bins=bins, parts=parts, thresholds=events, strengths=STRENGTHS, levels=levels, ramp=arguments.ramp)
+        for levels in sorted({1, arguments.levels})
         for bins, parts, events in SMALL + LARGE
     ]
     all_counted = {name_of(plan): counted(data, plan) for plan in plans}
@@ -212,7 +221,7 @@ def main() -> None:
         split |= {f"{number}.{each}": fold == each for each in range(FOLDS)}
     for name, held in split.items():
         if name not in done:
-            done[name] = measured(data, all_counted, np.flatnonzero(~held), np.flatnonzero(held))
+            done[name] = measured(data, all_counted, np.flatnonzero(~held), np.flatnonzero(held), arguments.again)
             store.write_text(json.dumps(done))
         rights = {system: sum(each["right"]) for system, each in done[name]["systems"].items()}
         print(name, f"of {held.sum()}:", rights, flush=True)

@@ -171,8 +171,8 @@ def linear_rules(data: Counted, classes: int, strengths: Iterable[float]) -> dic
     used = np.flatnonzero((data.spikes > 0).sum(axis=0) >= LEAST)
     if not len(used):
         raise DataError("counters: none of them spikes; give other --thresholds, or recordings with events")
-    spikes = data.spikes[:, used].astype(np.float64)
-    alike = spikes @ spikes.T
+    spikes = data.spikes[:, used].astype(np.float32)  # whole numbers: what they have in common is exact
+    alike = (spikes @ spikes.T).astype(np.float64)
     label, each = data.labels[:, None], np.arange(classes)
     here = label // levels == each // levels
     sign = np.where(here & (label >= each), 1.0, np.where(here | (each % levels == 0), -1.0, 0.0))
