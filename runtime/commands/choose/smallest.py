@@ -7,6 +7,7 @@ from pathlib import Path
 
 from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.files import write_atomically
 from spikeloom.runtime.commands.options import add_data
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import require_place
@@ -37,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     sweeps.add_argument("--store", metavar="FILE", help="what is measured (default: NET.sqlite, beside the netlist)")
     sweeps.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
     sweeps.add_argument("--fresh", action="store_true", help="measure anew what an earlier search left")
+    parser.add_argument("--html", metavar="PAGE.html", help="write a page, too")
     parser.add_argument("-o", "--output", required=True, metavar="NET.loom", help="netlist; NET.pt is the network")
     parser.epilog = NOTES
 
@@ -49,7 +51,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     from spikeloom.runtime.studies.chart.results import Data
     from spikeloom.runtime.studies.fronts import parse_budgets
     from spikeloom.runtime.studies.smallest.choice import LIMITS
-    from spikeloom.runtime.studies.smallest.sections import sections
+    from spikeloom.runtime.studies.smallest.sections import page, sections
     from spikeloom.runtime.studies.smallest.space import counting
     from spikeloom.runtime.studies.smallest.study import smallest
 
@@ -60,6 +62,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     store = output.with_suffix(".sqlite") if arguments.store is None else Path(arguments.store)
     for place, option in ((output, "-o"), (network, "-o"), (store, "--store")):
         require_place(str(place), option, arguments)
+    require_place(arguments.html, "--html", arguments)
     budgets = parse_budgets([words for each in arguments.budget for words in each.split(",")], LIMITS)
     target = load_target(arguments.target)
     training, test = both_splits(arguments.data, arguments.taxels, arguments.bin)
@@ -84,6 +87,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
         jobs=arguments.jobs,
         fresh=arguments.fresh,
     )
+    if arguments.html is not None:
+        with write_atomically(arguments.html) as file:
+            file.write(page(found).encode())
     return Outcome(found, sections, 0 if found.choice.fits else 1)
 
 

@@ -44,7 +44,11 @@ def gap(best: Measured, other: Measured) -> tuple[float, float]:
     return float(ahead.mean()), float(error)
 
 
-def going_on(tried: Iterable[Tried], most: int) -> list[Tried]:
+KEPT = {1: 24, 2: 12}
+"""Candidates that go on from a rung."""
+
+
+def going_on(tried: Iterable[Tried], rung: int) -> list[Tried]:
     """Those that may still be chosen: least behind a cheaper one, and by a fifth of that, behind the best."""
     able = [each for each in tried if each.costs is not None]
     top = max((each.accuracy for each in able), default=0.0)
@@ -53,7 +57,7 @@ def going_on(tried: Iterable[Tried], most: int) -> list[Tried]:
         cheaper = max(other.accuracy for other in able if energy(other) <= energy(each))
         return cheaper - each.accuracy + (top - each.accuracy) / 5
 
-    return sorted(able, key=lambda each: (lag(each), energy(each)))[:most]
+    return sorted(able, key=lambda each: (lag(each), energy(each)))[: KEPT[rung]]
 
 
 def energy(tried: Tried, table: str | None = None) -> float:

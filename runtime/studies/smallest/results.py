@@ -9,6 +9,7 @@ from spikeloom.runtime.equivalence.verdict import Level
 from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL
 from spikeloom.runtime.studies.chart.results import ChosenBy, Data, Share
 from spikeloom.runtime.studies.pruning.results import Costs
+from spikeloom.runtime.studies.smallest.baselines import Processor
 from spikeloom.runtime.studies.smallest.space import Candidate
 from spikeloom.runtime.studies.smallest.work import Measured
 
@@ -30,6 +31,7 @@ class Tried:
     setting: float
     costs: Costs | None = field(default=None, metadata=OPTIONAL)
     refused: str | None = field(default=None, metadata=OPTIONAL)
+    processor: Processor | None = field(default=None, metadata=OPTIONAL)
     behind: float = 0.0
     behind_error: float = 0.0
     front: bool = False
@@ -82,6 +84,7 @@ class Smallest:
     tables: Mapping[str, Mapping[str, str]]
     chosen_by: ChosenBy
     tried: tuple[Tried, ...]
+    baselines: tuple[Tried, ...]
     choice: Choice
     checked: Checked
     commands: tuple[str, ...]

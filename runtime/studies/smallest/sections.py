@@ -1,55 +1,62 @@
-"""A search for people: the choice and why, what is on the front, what was dropped, and the commands that repeat it."""
+"""A search for people: the choice and why, the front, what was dropped, baselines, and the commands that repeat it."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import TYPE_CHECKING
 
 from spikeloom.models.recordings.counts import number
+from spikeloom.runtime.report import html
+from spikeloom.runtime.report.drawing import COLOURS, GREY, MARKERS, Drawing, scale, sheet, styled
 from spikeloom.runtime.report.numbers import percent, si
-from spikeloom.runtime.report.sections import Code, Section, Table, Text
-from spikeloom.runtime.studies.smallest.choice import energy
+from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Section, Table, Text
+from spikeloom.runtime.studies.smallest import baselines
+from spikeloom.runtime.studies.smallest.choice import energy, worse
 from spikeloom.runtime.studies.smallest.results import Smallest, Tried
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MEANINGS = (
+    "Accuracy is that of cross-validation inside the training split, lines are 95 % intervals (Wilson). Large marks "
+    "came to the last rung (five rounds of five parts), small ones were dropped before. The dashed line is the front: "
+    "no other candidate of the last rung is as accurate for less. The ring is the choice. Horizontal bars are support "
+    "vector machines on event counts: on a small processor they take between their arithmetic and memory accesses, and "
+    "those with an instruction for every operation."
+)
 
 
 def sections(result: Smallest) -> Iterator[Section]:
     """All of a search."""
-    yield Section("The choice", [Text(_why(result)), *map(Text, _beside(result))])
-    last = [each for each in result.tried if each.rung == max(each.rung for each in result.tried)]
-    yield Section("Candidates", [_table(result, last, "Candidates of the last rung"), Text(_dropped(result.tried))])
+    last = max(each.rung for each in result.tried)
+    tried = sorted((each for each in result.tried if each.rung == last), key=energy)
+    beside = [each for each in result.baselines if each.rung == last]
+    yield Section("The choice", [Facts(_facts(result)), Text("\n".join([*_why(result), *_needless(result)]))])
+    figure = Figure("front", partial(picture, result), "Accuracy over energy and time of a mean inference.")
+    yield Section("Accuracy against cost", [figure, Details("What is drawn", [Text(MEANINGS)], unfolded=True)])
+    yield Section(
+        "Candidates",
+        [
+            _table(result, [*tried, *beside], "Candidates of the last rung, cheapest first, then baselines"),
+            Text("\n".join(_dropped(result))),
+            Details("All that was dropped", [_table(result, _others(result), "Candidates of earlier rungs", 0)]),
+        ],
+    )
     yield Section("On the chip", [Text(_checked(result))])
-    yield Section("Again", [Code([result.command, *result.commands])])
+    yield Section(
+        "Again", [Code([result.command, *result.commands]), Details("Where figures are from", _sources(result))]
+    )
 
 
-def _costs(each: Tried) -> list[str]:
-    costs = each.costs
-    assert costs is not None, "only what is priced is shown"
-    times = [si(seconds, "s") for seconds in costs.time_s.values()]
-    joules = [si(joules, "J") for joules in costs.energy_j.values()]
-    return [*joules, *times, f"{costs.operations:,.0f}", str(costs.cores)]
+def page(result: Smallest) -> str:
+    """The same as one HTML file."""
+    name = result.data.path.rstrip("/").rsplit("/", 1)[-1]
+    return html.page(f"The smallest network for {name}", "Point at a mark to read its figures.", sections(result))
 
 
-def _why(result: Smallest) -> str:
-    """The choice, how good it is expected to be, and what it was held against."""
-    chosen, best, choice = result.chosen, result.candidate(result.choice.best), result.choice
-    data = result.data
-    lines = [
-        f"{len(result.tried)} candidates, by cross-validation in {data.train} training recordings; the test split is "
-        "looked at in the end",
-    ]
-    if choice.budgets:
-        fit = "" if choice.fits else ": no candidate fits; the nearest is taken"
-        lines.append(f"budget: {' and '.join(choice.budgets)}{fit}")
-    share = f"{100 * chosen.accuracy:.1f} % (95 % interval {100 * chosen.low:.1f} … {100 * chosen.high:.1f})"
-    lines.append(f"take #{chosen.number} {chosen.candidate.name}: {share}, {_joules(chosen)}")
-    if chosen.number == best.number:
-        lines.append("  the best, and none that is cheaper is as good")
-    else:
-        lines.append(
-            f"  the best, #{best.number} {best.candidate.name}, has {100 * best.accuracy:.1f} % for {_joules(best)}; "
-            f"it is {100 * chosen.behind:.1f} ± {100 * chosen.behind_error:.1f} points ahead, recording by recording"
-        )
-    return "\n".join(lines)
+# -- the choice --------------------------------------------------------------------------------------------------------
 
 
 def _joules(each: Tried) -> str:
@@ -57,71 +64,230 @@ def _joules(each: Tried) -> str:
     return ", ".join(f"{si(joules, 'J')} ({table})" for table, joules in each.costs.energy_j.items())
 
 
-def _beside(result: Smallest) -> Iterator[str]:
-    """Where another table disagrees, and what the next point of accuracy costs."""
-    chosen = result.chosen
-    for table, index in result.choice.cheapest.items():
+def _share(each: Tried) -> str:
+    return f"{100 * each.accuracy:.1f} %"
+
+
+def _facts(result: Smallest) -> dict[str, tuple[str, str]]:
+    chosen, costs, right = result.chosen, result.checked.costs, result.checked.right
+    test = f"{right.correct} of {result.data.test}; 95 % interval {100 * right.low:.1f} … {100 * right.high:.1f}"
+    facts = {
+        "choice": (f"#{chosen.number}", chosen.candidate.name),
+        "cross-validation": (_share(chosen), f"95 % interval {100 * chosen.low:.1f} … {100 * chosen.high:.1f}"),
+        "test split, looked at once": (f"{100 * right.accuracy:.1f} %", test),
+        "energy": (si(costs.least, "J"), f"{costs.operations:,.0f} synaptic operations, {number(costs.cores, 'core')}"),
+    }
+    if (table := result.chosen_by.time) is not None:
+        facts["time"] = si(costs.time_s[table], "s"), table
+    return facts
+
+
+def _why(result: Smallest) -> Iterator[str]:
+    """The choice, what it was held against, where tables disagree, and what the next point of accuracy costs."""
+    chosen, best, choice = result.chosen, result.candidate(result.choice.best), result.choice
+    yield (
+        f"{len(result.tried)} candidates by cross-validation in {result.data.train} training recordings; the test "
+        "split is looked at once, in the end"
+    )
+    if choice.budgets:
+        yield f"budget: {' and '.join(choice.budgets)}{'' if choice.fits else ': nothing fits, the nearest is taken'}"
+    interval = f"95 % interval {100 * chosen.low:.1f} … {100 * chosen.high:.1f}"
+    yield f"take #{chosen.number} {chosen.candidate.name}: {_share(chosen)} ({interval}), {_joules(chosen)}"
+    if chosen.number == best.number:
+        yield "  the best of them, and nothing cheaper is as good"
+    else:
+        yield (
+            f"  the best, #{best.number} {best.candidate.name}, has {_share(best)} for {_joules(best)}; recording by "
+            f"recording it is {_behind(chosen)} points ahead"
+        )
+    for table, index in choice.cheapest.items():
         if index != chosen.number:
             other = result.candidate(index)
             yield f"  by the table {table} it would be #{index} {other.candidate.name}, {_joules(other)}"
-    if result.choice.ahead is None:
-        yield "  no candidate is a point better"
+    if choice.ahead is None:
+        yield "  no candidate is a point more accurate"
     else:
-        ahead = result.candidate(result.choice.ahead)
-        times = energy(ahead) / energy(chosen)
-        yield (
-            f"  a point more, {100 * ahead.accuracy:.1f} %, costs {times:.1f} times the energy: "
-            f"#{ahead.number} {ahead.candidate.name}"
-        )
+        ahead = result.candidate(choice.ahead)
+        times = f"{energy(ahead) / energy(chosen):.1f} times the energy"
+        yield f"  a point more costs {times}: #{ahead.number} {ahead.candidate.name}, {_share(ahead)}, {_joules(ahead)}"
 
 
-def _table(result: Smallest, tried: Sequence[Tried], caption: str) -> Table:
-    tables = [f"energy ({name})" for name in result.choice.cheapest]
-    times = [f"time ({name})" for name in result.tables["time"]]
-    head = ["#", "candidate", "accuracy %", "interval", "behind the best", *tables, *times, "operations", "cores", ""]
+def _behind(each: Tried) -> str:
+    return f"{100 * each.behind:.1f} ± {100 * each.behind_error:.1f}"
+
+
+def _needless(result: Smallest) -> Iterator[str]:
+    """Whether a processor does the job as well: the best of the baselines, and the cheapest that is no worse."""
+    last = [each for each in result.baselines if each.processor and each.rung == max(e.rung for e in result.baselines)]
+    if not last:
+        yield baselines.MISSING
+        return
+    chosen = result.chosen
+    enough = [each for each in last if not worse(chosen, each)]
+    each = min(enough or last, key=lambda each: each.processor.most_j if each.processor and enough else -each.accuracy)
+    assert each.processor is not None, "these are priced"
+    costs = each.processor
+    words = f"{each.candidate.name}, {_share(each)}, {si(costs.least_j, 'J')} … {si(costs.most_j, 'J')} on a processor"
+    if not enough:
+        yield f"without spikes: the best is {words}; that is shown to be worse"
+    elif costs.most_j < energy(chosen):
+        yield f"no spiking network is needed here: {words}, is not shown to be worse, and takes less in any case"
+    elif costs.least_j < energy(chosen):
+        yield f"without spikes: {words}, is not shown to be worse; whether it takes less depends on the processor"
+    else:
+        yield f"without spikes: {words}, is not shown to be worse, but takes more"
+
+
+# -- tables ------------------------------------------------------------------------------------------------------------
+
+
+def _table(result: Smallest, tried: Sequence[Tried], caption: str, most: int | None = None) -> Table:
+    """Candidates by the first tables of energy and time; of baselines what a processor takes at least and at most."""
+    by = result.chosen_by
+    head = ["#", "candidate", "accuracy %", "interval", "behind the best", f"energy ({by.energy})"]
+    head += [] if by.time is None else [f"time ({by.time})"]
     rows = []
-    for each in sorted(tried, key=lambda each: each.costs.least if each.costs else 0.0):
-        marks = [
-            *(["front"] if each.front else []),
-            *(["best"] if each.number == result.choice.best else []),
-            *(["choice"] if each.number == result.chosen.number else []),
+    for each in tried:
+        marks = {
+            "choice": each is result.chosen,
+            "best": each is result.candidate(result.choice.best),
+            "front": each.front,
+        }
+        row = [
+            " ".join(
+                [f"#{each.number}" if each.processor is None else "–", *(name for name, on in marks.items() if on)]
+            ),
+            each.candidate.name,
+            f"{100 * each.accuracy:.1f}",
+            f"{100 * each.low:.1f} … {100 * each.high:.1f}",
+            _behind(each),
         ]
-        rows.append(
-            [
-                f"#{each.number}",
-                each.candidate.name,
-                f"{100 * each.accuracy:.1f}",
-                f"{100 * each.low:.1f} … {100 * each.high:.1f}",
-                f"{100 * each.behind:.1f} ± {100 * each.behind_error:.1f}",
-                *_costs(each),
-                ", ".join(marks),
-            ]
-        )
-    return Table(head, rows, caption)
+        timed = by.time is not None
+        if (costs := each.costs) is not None:
+            row += [si(energy(each), "J"), *([si(costs.time_s[str(by.time)], "s")] if timed else [])]
+            row += [f"{costs.operations:,.0f}", str(costs.cores)]
+        elif (plain := each.processor) is not None:
+            row += [f"{si(plain.least_j, 'J')} … {si(plain.most_j, 'J')}", *(["–"] if timed else [])]
+            row += [f"{plain.events + plain.products:,.0f}", "processor"]
+        else:
+            row += ["–"] * (3 + timed)
+        rows.append(row)
+    return Table([*head, "operations", "cores"], rows, caption, most=most)
 
 
-def _dropped(tried: Sequence[Tried]) -> str:
-    """How many stayed behind, by rung."""
-    last = max(each.rung for each in tried)
-    counts = Counter((each.rung, each.candidate.system) for each in tried if each.rung < last)
-    lines = [f"dropped on rung {rung}: {count} of {system}" for (rung, system), count in sorted(counts.items())]
-    refused = [each for each in tried if each.refused]
+def _others(result: Smallest) -> list[Tried]:
+    last = max(each.rung for each in result.tried)
+    left = [each for each in (*result.tried, *result.baselines) if each.rung < last]
+    return sorted(left, key=lambda each: (-each.rung, -each.accuracy))
+
+
+def _dropped(result: Smallest) -> Iterator[str]:
+    """How many stayed behind on each rung, and what the chip does not hold."""
+    counts = Counter((each.rung, each.candidate.system) for each in _others(result))
+    for rung in sorted({rung for rung, _ in counts}):
+        words = ", ".join(f"{count} {system}" for (at, system), count in sorted(counts.items()) if at == rung)
+        yield f"dropped after rung {rung}, since a cheaper one is ahead: {words}"
+    refused = [each for each in result.tried if each.refused]
     if refused:
-        lines.append(f"{number(len(refused), 'candidate')} the chip does not hold; the first: {refused[0].refused}")
-    return "\n".join(lines)
+        first = f"{refused[0].candidate.name}: {refused[0].refused}"
+        yield f"the chip does not hold {number(len(refused), 'candidate')}; the first is {first}"
 
 
 def _checked(result: Smallest) -> str:
     """What the choice reaches, trained on all of the training split."""
     checked, data = result.checked, result.data
-    equal = (
-        f"{checked.equal['train']} of {data.train} training and {checked.equal['test']} of {data.test} test decisions"
-    )
+    equal = f"{checked.equal['train']} of {data.train} in training and {checked.equal['test']} of {data.test} on test"
     return "\n".join(
         [
             f"chip accuracy on the test split: {percent(checked.right.correct, data.test)}",
-            f"float model and chip: {checked.different:,} spikes differ in training; equal are {equal}",
+            f"float model and chip: {checked.different:,} spikes differ in training; decisions equal: {equal}",
             f"written: {checked.network}, sha256 {checked.network_sha256}",
             f"written: {checked.netlist}, sha256 {checked.netlist_sha256}",
         ]
+    )
+
+
+def _sources(result: Smallest) -> list[Block]:
+    titles = [[f"{kind}, {name}", title] for kind, tables in result.tables.items() for name, title in tables.items()]
+    titles += [["processor", baselines.SOURCE], ["recordings", f"{result.data.path}, sha256 {result.data.sha256}"]]
+    return [Table(["", "source"], titles, "Tables of prices and times, and recordings", words=True)]
+
+
+# -- the figure --------------------------------------------------------------------------------------------------------
+
+
+@styled
+def picture(result: Smallest) -> Drawing:
+    """Accuracy over energy and, where the chip has a time table, over time."""
+    by = result.chosen_by
+    drawing = sheet("Accuracy of candidates over energy and time", 4.6)
+    panels = drawing.figure.subplots(1, 1 if by.time is None else 2, squeeze=False, sharey=True)[0]
+    _panel(drawing, panels[0], result, "J")
+    panels[0].set(xlabel=f"energy of a mean inference ({by.energy})", ylabel="accuracy by cross-validation (%)")
+    if by.time is not None:
+        _panel(drawing, panels[1], result, "s")
+        panels[1].set_xlabel(f"time of a mean inference on the chip ({by.time})")
+    handles, names = panels[0].get_legend_handles_labels()
+    drawing.figure.legend(handles, names, loc="outside lower center", ncols=5, fontsize=8)
+    return drawing
+
+
+def _panel(drawing: Drawing, panel: Axes, result: Smallest, unit: str) -> None:
+    """One cost: joules, with the baselines, or seconds."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    def cost(each: Tried) -> float:
+        assert each.costs is not None, "only what is priced is drawn"
+        return energy(each) if unit == "J" else each.costs.time_s[str(result.chosen_by.time)]
+
+    last = max(each.rung for each in result.tried)
+    priced = [each for each in result.tried if each.costs is not None]
+    for index, system in enumerate(dict.fromkeys(each.candidate.system for each in priced)):
+        own = [each for each in priced if each.candidate.system == system]
+        colour, marker = COLOURS[index], MARKERS[index]
+        for members, size, alpha in (
+            ([each for each in own if each.rung < last], 9, 0.35),
+            ([each for each in own if each.rung == last], 34, 1.0),
+        ):
+            x, y = [cost(each) for each in members], [100 * each.accuracy for each in members]
+            name = system if alpha == 1.0 else f"{system}, dropped"
+            panel.scatter(x, y, s=size, marker=marker, color=colour, alpha=alpha, linewidths=0, label=name, zorder=3)
+        for each in own:
+            if each.rung == last:
+                ends = [100 * each.low, 100 * each.high]
+                panel.plot([cost(each)] * 2, ends, color=colour, alpha=0.5, lw=1.0, zorder=2)
+    front = sorted((cost(each), 100 * each.accuracy) for each in priced if each.rung == last and each.front)
+    panel.step(*zip(*front, strict=True), where="post", color=GREY, lw=1.0, ls=(0, (5, 2)), label="front", zorder=1)
+    chosen = result.chosen
+    at = cost(chosen), 100 * chosen.accuracy
+    panel.plot(*at, "o", ms=13, mfc="none", mec=COLOURS[4], mew=1.8, ls="none", label="choice", zorder=5)
+    drawing.tips += [(panel, cost(each), 100 * each.accuracy, _tip(each)) for each in sorted(priced, key=cost)]
+    if unit == "J":
+        _processors(drawing, panel, result)
+    panel.set_xscale("log")
+    panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if unit == "s" else (1,)))
+    panel.xaxis.set_minor_formatter(NullFormatter())
+    scale(panel.xaxis, unit)
+    panel.grid(True)
+
+
+def _processors(drawing: Drawing, panel: Axes, result: Smallest) -> None:
+    """Baselines of the last rung, between what they take on a processor at least and at most."""
+    last = max((each.rung for each in result.baselines), default=0)
+    for index, each in enumerate(each for each in result.baselines if each.rung == last):
+        if (costs := each.processor) is not None:
+            x, y, colour = [costs.least_j, costs.most_j], 100 * each.accuracy, COLOURS[2 + index % 2]
+            panel.plot(x, [y, y], color=colour, lw=3.0, alpha=0.8, label=each.candidate.system, zorder=4)
+            drawing.tips += [(panel, joules, y, _tip(each)) for joules in x]
+
+
+def _tip(each: Tried) -> str:
+    share = f"{_share(each)} ({100 * each.low:.1f} … {100 * each.high:.1f})"
+    if each.processor is not None:
+        return f"{each.candidate.name}: {share}, {si(each.processor.least_j, 'J')} … {si(each.processor.most_j, 'J')}"
+    assert each.costs is not None, "only what is priced is drawn"
+    times = [f"{si(seconds, 's')} ({name})" for name, seconds in each.costs.time_s.items()]
+    size = f"{each.costs.operations:,.0f} synaptic operations, {number(each.costs.cores, 'core')}"
+    return (
+        f"#{each.number} {each.candidate.name}: {share}, {', '.join([_joules(each), *times, size])}, rung {each.rung}"
     )

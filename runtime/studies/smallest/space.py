@@ -39,7 +39,9 @@ class Candidate:
     @property
     def name(self) -> str:
         """For tables."""
-        return " ".join([self.system, *(f"{name}={value}" for name, value in self.options.items())])
+        options = dict(self.options)
+        thresholds = [str(options.pop("thresholds"))] if "thresholds" in options else []
+        return " ".join([self.system, *thresholds, *(f"{name}={value}" for name, value in options.items())])
 
     @property
     def words(self) -> list[str]:
@@ -61,7 +63,7 @@ def counting(steps: int) -> Iterator[Candidate]:
     Examples
     --------
     >>> [each.name for each in counting(2)]
-    ['counters thresholds=1', 'counters thresholds=1,2', 'counters thresholds=1 parts=2']
+    ['counters 1', 'counters 1,2', 'counters 1 parts=2']
     """
     known: dict[tuple[Any, ...], None] = {}
     for join, window, parts, thresholds in product(JOINS, WINDOWS, PARTS, THRESHOLDS):

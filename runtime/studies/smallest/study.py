@@ -7,7 +7,7 @@ strengths, and from there to five rounds. Everything happens on the training spl
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler import __version__, compile_network
+from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.targets.base import Target
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
@@ -31,11 +32,9 @@ from spikeloom.runtime.studies.fronts import Budget, front
 from spikeloom.runtime.studies.jobs import sweep
 from spikeloom.runtime.studies.pruning.trials import priced
 from spikeloom.runtime.studies.smallest import choice, work
+from spikeloom.runtime.studies.smallest.baselines import baselines
 from spikeloom.runtime.studies.smallest.results import Checked, Smallest, Tried
 from spikeloom.runtime.studies.smallest.space import Candidate, shorter
-
-KEPT = {1: 24, 2: 12}
-"""Candidates that go on from a rung."""
 
 RUNGS = 3
 
@@ -58,9 +57,12 @@ def smallest(
 
     `splits` are training and test recordings; `command` repeats it.
     """
-    tried = search(candidates, data, target, store, taxels=taxels, jobs=jobs, fresh=fresh)
+    about: dict[str, Any] = {"taxels": taxels, "jobs": jobs}
+    beside = search(baselines(), most_accurate, data, target, store, fresh=fresh, **about)
+    tried = search(candidates, choice.going_on, data, target, store, fresh=False, **about)
     taken = choice.choose(tried, budgets)
-    tried = [_beside(each, tried[taken.best - 1], tried) for each in tried]
+    best = tried[taken.best - 1]
+    tried = [_beside(each, best, tried) for each in tried]
     by = ChosenBy(energy=next(iter(taken.cheapest)), time=next((table.name for table in target.time), None))
     chosen = tried[taken.cheapest[by.energy] - 1]
     checked, commands = train_again(chosen.candidate, splits, data, target, output)
@@ -75,6 +77,7 @@ def smallest(
         },
         chosen_by=by,
         tried=tuple(tried),
+        baselines=tuple(_beside(each, best, ()) for each in beside),
         choice=taken,
         checked=checked,
         commands=commands,
@@ -83,6 +86,7 @@ def smallest(
 
 def search(
     candidates: Iterable[Candidate],
+    going_on: Callable[[Sequence[Tried], int], Sequence[Tried]],
     data: Data,
     target: Target,
     store: Path,
@@ -91,7 +95,7 @@ def search(
     jobs: int | None,
     fresh: bool,
 ) -> list[Tried]:
-    """All candidates, as far as each came."""
+    """All candidates, as far as each came; `going_on` chooses those that go on from a rung."""
     known: dict[str, Tried] = {}
     alive = list(candidates)
     for rung in range(1, RUNGS + 1):
@@ -108,10 +112,17 @@ def search(
             number = len(known) + 1 if old is None else old.number
             known[candidate.name] = _tried(number, candidate, rung, measured)
         if rung < RUNGS:
-            on = [each.candidate for each in choice.going_on((known[c.name] for c in alive), KEPT[rung])]
-            extra = [shorter(each) for each in on] if rung == 1 else []
+            on = [each.candidate for each in going_on([known[c.name] for c in alive], rung)]
+            extra = [shorter(each) for each in on if each.system == COUNTING] if rung == 1 else []
             alive = list({each.name: each for each in (*on, *extra)}.values())
     return list(known.values())
+
+
+def most_accurate(tried: Sequence[Tried], rung: int) -> list[Tried]:
+    """Baselines that go on from a rung: three of each kind, then one."""
+    ordered = sorted(tried, key=lambda each: -each.accuracy)
+    kinds = dict.fromkeys(each.candidate.system for each in tried)
+    return [each for kind in kinds for each in [e for e in ordered if e.candidate.system == kind][: {1: 3, 2: 1}[rung]]]
 
 
 def _tried(number: int, candidate: Candidate, rung: int, measured: work.Measured) -> Tried:
@@ -127,6 +138,7 @@ def _tried(number: int, candidate: Candidate, rung: int, measured: work.Measured
         setting=measured.setting,
         costs=measured.costs,
         refused=measured.refused,
+        processor=measured.processor,
         measured=measured,
     )
 

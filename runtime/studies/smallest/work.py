@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,8 @@ from spikeloom.runtime.studies.chart.results import Data
 from spikeloom.runtime.studies.jobs import Job, content_key
 from spikeloom.runtime.studies.pruning.results import Costs
 from spikeloom.runtime.studies.pruning.trials import priced
+from spikeloom.runtime.studies.smallest import baselines
+from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF, Processor
 from spikeloom.runtime.studies.smallest.space import Candidate
 
 FORMAT = 1
@@ -66,6 +69,7 @@ class Measured:
     setting: float  # Strength of the rule
     costs: Costs | None = None
     refused: str | None = None  # Why the chip does not hold it
+    processor: Processor | None = None  # Costs of a baseline
 
 
 def trial(candidate: Candidate, rung: int, setting: float | None, data: Data, taxels: int | None, target: str) -> Trial:
@@ -86,7 +90,8 @@ def trial(candidate: Candidate, rung: int, setting: float | None, data: Data, ta
 
 def measure(work: Trial) -> JsonObject:
     """Do one piece of work; the JSON of a :class:`Measured`."""
-    found: JsonObject = encode(_counting(work, _training(work.data, work.taxels)))
+    kinds = {LINEAR: _baseline, RBF: _baseline}
+    found: JsonObject = encode(kinds.get(work.candidate.system, _counting)(work, _training(work.data, work.taxels)))
     return found
 
 
@@ -116,6 +121,24 @@ def _counting(work: Trial, training: Recordings) -> Measured:
         costs, refused = costs_of(made, training, work.target)
     rounds = (ROUNDS if last else 1,) * len(training)
     return Measured(right=tuple(right.tolist()), tried=rounds, setting=strength, costs=costs, refused=refused)
+
+
+def _baseline(work: Trial, training: Recordings) -> Measured:
+    """A support vector machine: its constant, its decisions, its costs."""
+    system, last = work.candidate.system, work.rung == 3
+    tried = {1: baselines.STRENGTHS[system][:1], 2: sorted(baselines.STRENGTHS[system])}.get(work.rung, (work.setting,))
+    seen, labels = baselines.features(training, work.candidate), training.labels
+    right = {strength: np.zeros(len(training), np.int64) for strength in tried if strength is not None}
+    for strength, seed in product(right, range(1, ROUNDS + 1) if last else (0,)):
+        fold = folds(labels, FOLDS, np.random.default_rng(seed))
+        right[strength] += baselines.decided(system, strength, seen, labels, fold) == labels
+    best = max(right, key=lambda strength: right[strength].sum())
+    return Measured(
+        right=tuple(right[best].tolist()),
+        tried=(ROUNDS if last else 1,) * len(training),
+        setting=best,
+        processor=baselines.processor(system, best, training, work.candidate),
+    )
 
 
 def cross_validated(data: Counted, classes: int, sensor: Recordings, seed: int) -> tuple[IntArray, float, float]:
