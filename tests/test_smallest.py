@@ -130,7 +130,7 @@ def test_candidates_can_all_be_trained():
     assert 60 <= len(every) == len({each.name for each in every}) <= 140
     for each in every:
         each.plan().require_possible()
-    assert space.shorter(every[0]).words[-2:] == ["--ramp", str(space.RAMP)]
+    assert [each.words[-2:] for each in space.variants(every[0])] == [["--ramp", "16"], ["--ramp", "64"]]
 
 
 @pytest.fixture

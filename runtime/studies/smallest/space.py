@@ -20,8 +20,8 @@ WINDOWS = (100, 50)
 THRESHOLDS = ((1,), (1, 4, 16, 64), (1, 2, 4, 8, 16, 32, 64), (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 130))
 """Of counting networks."""
 
-RAMP = 16
-"""Steps of the read-out that those which go on are tried with, too: half the usual ones."""
+RAMPS = (16, 64)
+"""Steps of the read-out that those which go on are tried with, too: half and twice the usual ones."""
 
 MOST_COUNTERS = {100: 80, 50: 20}
 """Counters of a channel at most, by window: what is larger gains little and takes minutes."""
@@ -85,6 +85,7 @@ def _counters(**options: Any) -> Candidate:
     return Candidate(system=COUNTING, options={name: each for name, each in given.items() if each != usual[name]})
 
 
-def shorter(candidate: Candidate) -> Candidate:
-    """The same with a shorter read-out."""
-    return _counters(**{**candidate.options, "ramp": RAMP})
+def variants(candidate: Candidate) -> list[Candidate]:
+    """The same with other lengths of the read-out, where it has one."""
+    known = candidate.options if candidate.system == COUNTING else {}
+    return [_counters(**{**known, "ramp": ramp}) for ramp in RAMPS if known]

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler import __version__, compile_network
-from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.targets.base import Target
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
@@ -34,7 +33,7 @@ from spikeloom.runtime.studies.pruning.trials import priced
 from spikeloom.runtime.studies.smallest import choice, work
 from spikeloom.runtime.studies.smallest.baselines import baselines
 from spikeloom.runtime.studies.smallest.results import Checked, Smallest, Tried
-from spikeloom.runtime.studies.smallest.space import Candidate, shorter
+from spikeloom.runtime.studies.smallest.space import Candidate, variants
 
 RUNGS = 3
 
@@ -113,7 +112,7 @@ def search(
             known[candidate.name] = _tried(number, candidate, rung, measured)
         if rung < RUNGS:
             on = [each.candidate for each in going_on([known[c.name] for c in alive], rung)]
-            extra = [shorter(each) for each in on if each.system == COUNTING] if rung == 1 else []
+            extra = [other for each in on for other in variants(each)] if rung == 1 else []
             alive = list({each.name: each for each in (*on, *extra)}.values())
     return list(known.values())
 
