@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,7 +29,7 @@ from spikeloom.runtime.studies.anytime import exits
 STEPS = 60
 
 WORDS = ("anytime", "net.loom", "--data", "data")
-ALL = (*WORDS, "--checkpoint", "net.pt", "--calibrate", "data")
+ALL = (*WORDS, "--calibrate", "data")
 
 
 def made(seed, samples):
@@ -87,14 +86,11 @@ def test_all_figures_of_a_stopped_chip(report, place, monkeypatch):
     proof = report["rules"][0]
     assert proof["differ"] == proof["gained"] == proof["lost"] == 0
     assert proof["samples"]["decisions"] == report["decisions"]
-    assert_allclose(
-        proof["mean"]["energy_j"]["sanafe"], (1 - proof["saved"]["energy_j"]["sanafe"]) * joule["sanafe"].mean()
-    )
-    assert report["rules"][report["savings"]["identical"]]["differ"] == 0
-    assert report["rules"][report["savings"]["one_lost"]]["correct"] >= report["full"]["correct"] - 1
+    saved = np.mean(proof["samples"]["saved_energy_j"]["sanafe"])
+    assert_allclose(proof["mean"]["energy_j"]["sanafe"], joule["sanafe"].mean() - saved)
 
 
-def test_windows_are_those_of_shortened_recordings(report, as_json):
+def test_windows_are_those_of_shortened_recordings(report):
     netlist, data = read_netlist("net.loom"), load_data("data", "test")
     assert [window["percent"] for window in report["windows"]] == list(range(5, 101, 5))
     for window in report["windows"]:
@@ -103,10 +99,6 @@ def test_windows_are_those_of_shortened_recordings(report, as_json):
         flat = with_clocks(data.events[..., :steps], netlist.clocks)
         decided = predictions(netlist, engine.simulate(netlist, flat).counts.spikes)
         assert window["chip"]["correct"] == np.count_nonzero(decided == data.labels)
-    recordings_folder(Path("short"), test=made(2, 12)[..., : STEPS // 2])
-    cut = as_json("verify", "net.loom", "--checkpoint", "net.pt", "--data", "short", codes=(0, 1))
-    assert report["windows"][9]["float"]["correct"] == round(cut["accuracy"]["float"] * len(data))
-    assert report["windows"][9]["chip"]["correct"] == round(cut["accuracy"]["chip"] * len(data))
 
 
 def test_recordings_of_different_length_end_on_their_own(place, monkeypatch):
@@ -134,7 +126,6 @@ def test_recordings_of_different_length_end_on_their_own(place, monkeypatch):
     [
         (["--differ", "0.1"], "--differ 0.1: |add --calibrate"),
         (["--calibrate", "data", "--differ", "1"], "--differ 1: |from 0 to below 1"),
-        (["--graph", "manual"], "--graph manual: |--checkpoint|not given"),
     ],
 )
 def test_mistakes(refusal, words, said):

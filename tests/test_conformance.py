@@ -51,7 +51,7 @@ def float_side(made):
 
 LISTS = """
 anytime:
-    bins chip_steps decisions files full labelled labels least_interval rules samples savings source split windows
+    bins chip_steps decisions files full labelled labels least_interval rules samples source split windows
 chart:
     budget chosen_by command data expected format grid networks points recommended refused saving
     spikeloom tables target
@@ -325,7 +325,7 @@ def test_explain_prints_the_keys_of_the_table(name):
 
 COMMANDS = {
     "report": ("timed", "report {net} --checkpoint {file} --data {data} -o {out}/page.html"),
-    "anytime": ("timed", "anytime {net} --checkpoint {file} --data {data}"),
+    "anytime": ("timed", "anytime {net} --data {data}"),
     "lean": ("joined-timed", "lean {file} --data {data} -o {out}/lean.loom"),
     "stress": ("recurrent", "stress {net} --checkpoint {file} --dt 0.02 --data {data} --seeds 1 --only taxels_dead"),
     "chart": ("binned", "chart {file} --data {data} --grid bits=8 --jobs 1 -o {out}/chart"),

@@ -23,12 +23,10 @@ def add_netlist(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("netlist", metavar="NET.loom", help="compiled network")
 
 
-def add_netlist_and_model(
-    parser: argparse.ArgumentParser, what: str = "its float model", *, required: bool = True
-) -> None:
+def add_netlist_and_model(parser: argparse.ArgumentParser) -> None:
     """Add a netlist, the float network beside it as ``--checkpoint``, and how that is read."""
     add_netlist(parser)
-    group(parser, "network").add_argument("--checkpoint", metavar=NETWORK_FILES, required=required, help=what)
+    group(parser, "network").add_argument("--checkpoint", metavar=NETWORK_FILES, required=True, help="its float model")
     add_network(parser)
 
 

@@ -6,13 +6,10 @@ import argparse
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import write_atomically
-from spikeloom.compiler.types import FloatArray, IntArray
-from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.options import add_netlist_and_model, add_recordings
+from spikeloom.compiler.types import FloatArray
+from spikeloom.runtime.commands.options import add_netlist, add_recordings
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
-from spikeloom.runtime.inputs.repeat import NETWORK, refuse
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import write_json
@@ -36,7 +33,7 @@ DIFFER = 0.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
-    add_netlist_and_model(parser, "float model to show beside the chip", required=False)
+    add_netlist(parser)
     add_recordings(parser)
     parser.add_argument("--calibrate", metavar="PATH", help="recordings whose train split says when a vote is sure")
     parser.add_argument(
@@ -45,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X",
         help=f"share of calibration races that may end otherwise (default: {DIFFER:g})",
     )
-    parser.add_argument("--picture", metavar="OUT.png", help="draw accuracy against the window, and savings")
+    parser.add_argument("--picture", metavar="OUT.png", help="draw accuracy by window, and when recordings stop")
     parser.add_argument("-o", "--output", metavar="OUT.json", help="write the result with figures of every recording")
     parser.epilog = NOTES
 
@@ -58,17 +55,14 @@ def run(arguments: argparse.Namespace) -> Outcome:
     machine = integer_machine_for(arguments.netlist)
     data = load_recordings(arguments, machine.netlist)
     machine.require_sensor(data.events)
-    lengths = data.step_counts
-    floats = _float_votes(arguments, machine, data)
     points = _races(arguments, machine)
     progress("running")
-    ran = machine.cumulative(data.events, lengths)
+    ran = machine.cumulative(data.events, data.step_counts)
     result = study(
         machine,
         data,
         ran,
         () if points is None else [exits.calibrate(points, share) for share in sorted(allowed)],
-        model_votes=floats,
         calibrated_on=arguments.calibrate,
         chosen=None if points is None else sorted(allowed).index(allowed[0]) + 1,
     )
@@ -99,15 +93,3 @@ def _races(arguments: argparse.Namespace, machine: IntegerMachine) -> FloatArray
     progress("calibrating")
     lengths = training.step_counts
     return exits.turning_points(exits.races(machine.cumulative(training.events, lengths).votes, lengths))
-
-
-def _float_votes(arguments: argparse.Namespace, machine: IntegerMachine, data: Recordings) -> IntArray | None:
-    """Votes of the float model so far after each step, (samples, steps, classes), if a checkpoint was given."""
-    if arguments.checkpoint is None:
-        refuse(arguments, (*NETWORK, "dt", "convention"), "is for --checkpoint, which is not given; add it")
-        return None
-    from spikeloom.runtime.equivalence.reference import require_match, votes_so_far
-
-    loaded = load_network(arguments.checkpoint, arguments, machine.netlist)
-    require_match(machine.netlist, loaded.model)
-    return votes_so_far(loaded.network, loaded.model, data)
