@@ -25,6 +25,8 @@ from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 
 NOT_PRICED = (
     "injection of input events and clocks, read-out of votes (no public figure per event)",
+    "initial membranes, which every neuron takes before each recording (no public figure)",
+    "work off the chip: binning of the sensor's events, joining of bins, making of clocks",
     "spikes and hops by themselves (both prices are per synaptic event and hold them at the measured workload)",
 )
 """Said with every estimate."""

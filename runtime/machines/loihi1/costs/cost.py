@@ -40,8 +40,10 @@ OPTIONAL = frozenset({"spike"})
 """Events that a table may leave out because it prices them elsewhere (Davies: in the active neuron update)."""
 
 NOT_PRICED = (
-    "injection of input events into the mesh (no public figure per event)",
+    "injection of input events and clocks into the mesh (no public figure per event)",
     "reset of each compartment at the start of its layer's window (one register write each; no public figure)",
+    "read-out of votes (no public figure)",
+    "work off the chip: binning of the sensor's events, joining of bins, making of clocks",
 )
 """What no table covers; always listed, never counted as zero."""
 
