@@ -14,6 +14,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from made import made
 from sklearn.model_selection import StratifiedKFold, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
@@ -58,7 +59,8 @@ def main() -> None:
             found.append(row)
             print(f"{words:20} {kernel:8} {across:16.1%}   {right} of {len(test)} ({right / len(test):.1%})")
     if arguments.output:
-        rows = {"data": Path(arguments.recordings).name, "test_samples": len(test), "machines": found}
+        rows = made(training, test) | {"data": Path(arguments.recordings).name}
+        rows |= {"test_samples": len(test), "machines": found}
         arguments.output.write_text(json.dumps(rows, indent=1) + "\n")
 
 

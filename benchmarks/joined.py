@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from made import made
 from paper.measured import float_decisions
 
 from spikeloom.compiler import Options, compile_network
@@ -48,7 +49,7 @@ def main() -> None:
     parser.add_argument("--float-only", action="store_true", help="leave the chip away")
     arguments = parser.parse_args()
     training, test = (load_data(arguments.recordings, split) for split in ("train", "test"))
-    found: Json = {"data": Path(arguments.recordings).name, "test_samples": len(test)}
+    found: Json = made(training, test) | {"data": Path(arguments.recordings).name, "test_samples": len(test)}
     for weights in arguments.weights or WEIGHTS:
         members = [read_checkpoint(path, weights=weights) for path in arguments.members]
         of_weights: Json = {"1": _summary([_decided(member, test) for member in members])}

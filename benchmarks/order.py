@@ -19,6 +19,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from made import made
 
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, MLP
 from spikeloom.models.graphs import NEUTOUCH
@@ -52,7 +53,8 @@ def main() -> None:
     parser.add_argument("--orders", nargs="+", choices=ORDERS, default=ORDERS)
     asked = parser.parse_args()
     training, test = both_splits(asked.recordings, len(NEUTOUCH), BIN_S)
-    found: dict[str, Any] = {"data": Path(asked.recordings).name, "system": asked.system, "epochs": asked.epochs}
+    found: dict[str, Any] = made(training, test) | {"data": Path(asked.recordings).name}
+    found |= {"system": asked.system, "epochs": asked.epochs}
     for kind in asked.orders:
         runs = []
         for seed in range(asked.seeds):

@@ -19,6 +19,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 from joined import measured
+from made import made
 
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.recordings.events import load_data
@@ -39,7 +40,8 @@ def main() -> None:
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
     training, test = (load_data(arguments.recordings, split) for split in ("train", "test"))
-    found: Json = {"data": Path(arguments.recordings).name, "test_samples": len(test), "variants": {}}
+    found: Json = made(training, test) | {"data": Path(arguments.recordings).name}
+    found |= {"test_samples": len(test), "variants": {}}
     for variant in arguments.variants:
         name, _, files = variant.rpartition("=")
         paths = sorted(glob(files))  # noqa: PTH207, the pattern may be absolute

@@ -129,7 +129,7 @@ def cells(module):
 
 def test_stored_tables_are_those_of_the_stored_cells(module, cells):
     written = module("tables").files(cells, drawn=False)
-    assert sorted(written) == ["graphs.csv", "graphs.md", "methods.csv", "methods.md"]
+    assert sorted(written) == ["graphs.csv", "graphs.md", "methods.csv", "methods.md", "statistics.json"]
     for name, content in written.items():
         assert content == (module("cells").RESULTS / name).read_bytes()
 

@@ -2,14 +2,15 @@
 
 import csv
 import io
+import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from cells import EPOCHS, RESULTS, RUNS, SAME_AS, Cell, planned, read_cells
+from cells import DATA, EPOCHS, RESULTS, RUNS, SAME_AS, Cell, planned, read_cells
 from pictures import pictures
 from spreads import EQUAL, MARGIN, PROTOCOLS, READINGS, Line, Spread, lines_of, rank_correlation, variance
 
@@ -39,11 +40,19 @@ def main() -> None:
 def files(cells: Mapping[str, Cell], *, drawn: bool = True) -> dict[str, bytes]:
     """Content of every file by name."""
     found: dict[str, bytes] = {}
+    summed: dict[str, Any] = {
+        "command": "python benchmarks/paper/tables.py",
+        "data_sha256": {
+            data: sorted({cell["data_sha256"] for cell in cells.values() if cell["data"] == data}) for data in DATA
+        },
+    }
     for table in EPOCHS:
         lines = lines_of(table, planned(table), cells)
         found[f"{table}.csv"] = _csv(_twice(lines), planned(table)).encode()
         found[f"{table}.md"] = _markdown(table, lines, cells).encode()
         found |= pictures(table, lines) if drawn else {}
+        summed[table] = {data: _statistics([line for line in lines if line.row.data == data]) for data in DATA}
+    found["statistics.json"] = (json.dumps(summed, indent=1, allow_nan=False) + "\n").encode()
     return found
 
 
@@ -112,8 +121,9 @@ def _markdown(table: str, lines: Sequence[Line], cells: Mapping[str, Cell]) -> s
         of_data = [line for line in lines if line.row.data == data]
         samples = of_data[0].samples
         parts.append(f"## {data} ({samples} test recordings, one is {100 / samples:.2f})")
-        parts += [_marked(_accuracies(_twice(of_data))), _marked(_agreement(_twice(of_data)))]
-        parts += [_marked(_noise(table, of_data)), _marked(_chip(of_data)), _marked(_quiet(of_data))]
+        statistics = _statistics(of_data)
+        parts += [_marked(_accuracies(_twice(of_data))), _marked(_agreement(statistics))]
+        parts += [_marked(_noise(table, statistics)), _marked(_chip(of_data)), _marked(_quiet(of_data))]
     if table == "graphs":
         parts.append(
             "`knn:K` and `mst:SIGMA` are without the repeated edges of the released code, with which the paper's "
@@ -160,46 +170,56 @@ def _against(line: Line, reading: str) -> str:
     return f"{found.difference:+.2f}, {verdict}{', equal' if found.equal else ''}"
 
 
-def _agreement(lines: Sequence[Line]) -> Table:
-    """How the rows of a data set go with the paper's, by each epoch; too few rows have no p."""
-    lines = [line for line in lines if line.paper is not None]
+def _statistics(lines: Sequence[Line]) -> dict[str, Any]:
+    """By epoch: how the rows of a data set go with the paper's, and whether they differ by more than seeds do."""
+    found: dict[str, Any] = {}
+    several = [line for line in _twice(lines) if line.paper is not None]
+    papers = [line.paper[0] for line in several if line.paper]
+    for reading in READINGS:
+        spread = variance([line.accuracy(reading).values for line in lines])
+        costs = [line.mean("first_layer_operations") for line in lines]
+        ranks = {"operations": rank_correlation([line.accuracy(reading).mean for line in lines], costs)}
+        found[reading] = {"variance": spread and asdict(spread)}
+        if reading in PROTOCOLS:
+            against = [each for line in several if (each := line.comparison(reading))]
+            ours = [line.accuracy(reading).mean for line in several]
+            ranks["spearman"] = rank_correlation(ours, papers)
+            ranks["kendall"] = rank_correlation(ours, papers, kendall=True)
+            found[reading] |= {"rows": len(against)}
+            found[reading]["difference"] = fmean(each.difference for each in against) if against else None
+            found[reading] |= {key: sum(getattr(each, key) for each in against) for key in ("within", "equal")}
+        found[reading] |= {key: rank and dict(zip(("rank", "p"), rank, strict=True)) for key, rank in ranks.items()}
+    return found
+
+
+def _agreement(statistics: Mapping[str, Any]) -> Table:
+    """How the rows of a data set go with the paper's; of few rows a rank correlation has no p."""
     rows = []
     for reading, title in PROTOCOLS.items():
-        ours, papers = [line.accuracy(reading).mean for line in lines], [line.paper[0] for line in lines if line.paper]
-        found = [comparison for line in lines if (comparison := line.comparison(reading))]
+        each = statistics[reading]
         cells = []
-        for kendall in (False, True):
-            rank = rank_correlation(ours, papers, kendall=kendall)
-            cells += ["—"] * 2 if rank is None else [f"{rank[0]:+.2f}", _chance(rank[1]) if len(lines) > 5 else "—"]
-        cells.append(f"{fmean(each.difference for each in found):+.2f}")
-        for flags in ([each.within for each in found], [each.equal for each in found]):
-            cells.append(f"{sum(flags)} of {len(flags)}")
-        rows.append([title, *cells])
+        for rank in (each["spearman"], each["kendall"]):
+            cells.append("—" if rank is None else f"{rank['rank']:+.2f}")
+            cells.append("—" if rank is None or each["rows"] < 6 else _chance(rank["p"]))
+        difference = "—" if each["difference"] is None else f"{each['difference']:+.2f}"
+        counts = (f"{each[key]} of {each['rows']}" for key in ("within", "equal"))
+        rows.append([title, *cells, difference, *counts])
     head = ["with the paper's rows", "Spearman", "p", "Kendall", "p", "mean difference"]
     return Table([*head, f"within {MARGIN:g} standard errors", f"equal within {EQUAL:g} points"], rows)
 
 
-def _noise(table: str, lines: Sequence[Line]) -> Table:
-    """Whether rows differ by more than seeds do, and with what they cost."""
+def _noise(table: str, statistics: Mapping[str, Any]) -> Table:
+    """Whether rows differ by more than their seeds do, and with what they cost."""
     head = ["differences", f"{table} with two seeds or more", "deviation of their means", "by seeds alone", "F", "p"]
     head += ["rank correlation with first-layer operations", "p"] if table == "graphs" else []
     rows = []
     for reading, title in READINGS.items():
-        spreads = [line.accuracy(reading) for line in lines]
-        found = variance([spread.values for spread in spreads])
-        if found is None:
-            cells = ["—"] * 5
-        else:
-            cells = [
-                str(found.rows),
-                f"{found.between:.2f}",
-                f"{found.expected:.2f}",
-                f"{found.f:.2f}",
-                _chance(found.p),
-            ]
-        costs = [line.mean("first_layer_operations") for line in lines]
-        rank = rank_correlation([spread.mean for spread in spreads], costs)
-        cells += ["—"] * 2 if rank is None else [f"{rank[0]:+.2f}", _chance(rank[1])]
+        found, rank = statistics[reading]["variance"], statistics[reading]["operations"]
+        cells = ["—"] * 5
+        if found is not None:
+            means = (f"{found[key]:.2f}" for key in ("between", "expected", "f"))
+            cells = [str(found["rows"]), *means, _chance(found["p"])]
+        cells += ["—"] * 2 if rank is None else [f"{rank['rank']:+.2f}", _chance(rank["p"])]
         rows.append([title, *cells][: len(head)])
     return Table(head, rows)
 

@@ -33,8 +33,9 @@ def _lines(result: Anytime) -> list[str]:
     rule = result.rules[result.chosen].stop
     assert rule.bound is not None, "a chosen rule is calibrated"
     return [
-        f"calibrated on {rule.races} races for second place of {result.calibrated_on}, split train; of others at most "
-        f"{100 * rule.bound:.1f} % end otherwise at an allowed {_allowed(rule)} (95 % confidence)",
+        f"calibrated on {rule.races} races for second place of {result.calibrated_on}, split train, which the network "
+        f"may have been trained on: at an allowed {_allowed(rule)} at most {100 * rule.bound:.1f} % of such races end "
+        "otherwise (95 % confidence), of decisions more may",
         f"{live} {math.ceil(1e4 * rule.factor) / 1e4:g}",  # a larger one is as safe
     ]
 

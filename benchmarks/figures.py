@@ -1,0 +1,168 @@
+"""Figures of commands that the docs quote, stored: what ``benchmarks/claims.toml`` binds texts to.
+
+    python benchmarks/figures.py FOLDER [STUDY...]
+
+FOLDER holds ``Ev-Objects.zip`` and ``Ev-Containers.zip``, the released ``objects_manual.t7`` and, for the chart of
+Containers, ``containers-knn1.pt`` (docs/chart.md has its command). Each study is a file in benchmarks/results, with the
+commands, the hash of the recordings and the state of the code that made it.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import spikeloom
+from spikeloom.compiler.files import write_atomically
+from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.evtouch import data_digest
+
+Json = dict[str, Any]
+
+RESULTS = Path(__file__).parent / "results"
+OBJECTS, CONTAINERS, MANUAL = "Ev-Objects.zip", "Ev-Containers.zip", "objects_manual.t7"
+SHIPPED = {  # Row: network with its options, recordings, options of `compile`
+    "objects_manual": (f"{MANUAL} --graph manual", OBJECTS, ""),
+    "objects_manual, spike-exact": (f"{MANUAL} --graph manual", OBJECTS, "--spike-exact"),
+    "objects": ("pretrained:objects", OBJECTS, ""),
+    "objects-200ms": ("pretrained:objects-200ms", OBJECTS, ""),
+    "objects-200ms, spike-exact": ("pretrained:objects-200ms", OBJECTS, "--spike-exact"),
+    "containers": ("pretrained:containers", CONTAINERS, ""),
+    "containers-100ms": ("pretrained:containers-100ms", CONTAINERS, ""),
+    "grasps": ("pretrained:grasps", "synthetic", ""),
+}
+LAYOUTS = ("", *(f"--cores-for {each}" for each in ("fc1=4", "fc1=6", "fc1=8", "conv1=6,fc1=6,fc2=3")))
+CHARTS = {
+    OBJECTS: ("pretrained:objects", "bits=3,4,8,window=10%,20%,100%,cores=cores/latency"),
+    CONTAINERS: ("pretrained:containers containers-knn1.pt", "bits=2,4,8,window=25-100%,cores=cores/latency"),
+}
+POINT = ("number", "network", "storage", "cores", "window", "n_cores", "test")
+
+
+class Session:
+    """Commands that run in one folder, beside links to what they read."""
+
+    def __init__(self, sources: Path, folder: Path) -> None:
+        self.folder = folder
+        self.commands: list[str] = []
+        for file in sources.resolve().iterdir():
+            (folder / file.name).symlink_to(file)
+
+    def run(self, words: str, output: str = "") -> Json:
+        """What a command says in JSON, or writes."""
+        self.commands.append(f"spikeloom {words}")
+        run = [sys.executable, "-m", "spikeloom", *words.split(), "--json"]
+        done = subprocess.run(run, cwd=self.folder, stdout=subprocess.PIPE, text=True, check=False)
+        if done.returncode not in (0, 1):
+            raise SystemExit(f"spikeloom {words}: exit code {done.returncode}")
+        found: Json = json.loads((self.folder / output).read_text() if output else done.stdout)
+        return found
+
+    def costs(self, data: str, options: str = "") -> Json:
+        """Means of ``estimate`` for ``net.loom``."""
+        found = self.run(f"estimate net.loom --data {data} {options}".rstrip())
+        time = found["time"][-1]
+        return {
+            "chip_steps": found["chip_steps"],
+            "cores": len(found["cores"]),
+            "synaptic_operations": found["per_inference"]["synaptic_operations"],
+            "energy_j": found["per_inference"]["energy_j"],
+            "static_real_time_j": found["static"][0]["real_time_j"],
+            "time": {
+                "model": time["model"],
+                "inference_s": time["inference_s"]["mean"],
+                "step_s": time["step_s"]["mean"],
+            },
+        }
+
+
+def shipped(session: Session) -> Json:
+    """Decisions, spikes and costs at 8 bits."""
+    found = {}
+    for name, (network, data, options) in SHIPPED.items():
+        session.run(f"compile {network} --calibrate {data} {options} -o net.loom".replace("  ", " "))
+        verdict = session.run(f"verify net.loom --checkpoint {network} --data {data}")
+        right = {side: round(share * verdict["samples"]) for side, share in verdict["accuracy"].items()}
+        found[name] = {
+            "test_samples": verdict["samples"],
+            **right,
+            "equal": round(verdict["decision_agreement"] * verdict["samples"]),
+            "certified": verdict["certificate"]["decisions"],
+            "spikes": {name: {key: n[key] for key in ("float", "different")} for name, n in verdict["spikes"].items()},
+            **session.costs(data),
+        }
+    return found
+
+
+def layouts(session: Session) -> Json:
+    """What more cores cost and bring, message by message."""
+    found = {}
+    for options in (*LAYOUTS, "--optimize latency"):
+        session.run(f"compile {MANUAL} --graph manual --calibrate {OBJECTS} {options} -o net.loom".replace("  ", " "))
+        found[options or "default"] = session.costs(OBJECTS, "--detail cycle")
+    return found
+
+
+def chart(session: Session, data: str) -> Json:
+    """Points of a grid, and what was chosen."""
+    networks, grid = CHARTS[data]
+    found = session.run(f"chart {networks} --data {data} --grid {grid} -o chart", "chart/chart.json")
+    points = {str(point["number"]): {key: point[key] for key in POINT} for point in found["points"]}
+    return {"points": points, "recommended": found["recommended"], "saving": found["saving"]}
+
+
+def anytime(session: Session, data: str) -> Json:
+    """Windows and rules."""
+    network = f"{MANUAL} --graph manual" if data == OBJECTS else "pretrained:containers"
+    session.run(f"compile {network} --calibrate {data} -o net.loom")
+    found = session.run(f"anytime net.loom --data {data} --calibrate {data} -o anytime.json", "anytime.json")
+    windows = {str(each["percent"]): each["chip"]["correct"] for each in found["windows"]}
+    rules = {str(each["allowed"]): {key: each[key] for key in each if key != "samples"} for each in found["rules"]}
+    for rule in rules.values():
+        rule["steps_saved"] = 1 - rule["mean"]["chip_steps"] / found["full"]["chip_steps"]
+    return {"full": found["full"], "windows": windows, "rules": rules}
+
+
+STUDIES = {
+    "shipped": shipped,
+    "layouts": layouts,
+    "chart-objects": lambda session: chart(session, OBJECTS),
+    "chart-containers": lambda session: chart(session, CONTAINERS),
+    "anytime-objects": lambda session: anytime(session, OBJECTS),
+    "anytime-containers": lambda session: anytime(session, CONTAINERS),
+}
+
+
+def main() -> None:
+    """Make the studies that are named, or all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("studies", nargs="*", metavar="STUDY", help=", ".join(STUDIES))
+    arguments = parser.parse_args()
+    code = subprocess.run(["git", "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True, check=True)
+    for name in arguments.studies or STUDIES:
+        with tempfile.TemporaryDirectory() as folder:
+            session = Session(arguments.folder, Path(folder))
+            figures = STUDIES[name](session)
+            read = [data for data in (OBJECTS, CONTAINERS) if any(data in words for words in session.commands)]
+            hashes = {
+                data: data_digest(*(load_data(arguments.folder / data, each) for each in ("train", "test")))
+                for data in read
+            }
+        found = {
+            "command": f"python benchmarks/figures.py FOLDER {name}",
+            "commands": session.commands,
+            "spikeloom": f"{spikeloom.compiler.__version__} ({code.stdout.strip()})",
+            "data_sha256": hashes,
+            "figures": figures,
+        }
+        with write_atomically(RESULTS / f"{name}.json") as file:
+            file.write((json.dumps(found, indent=1) + "\n").encode())
+        print(RESULTS / f"{name}.json")
+
+
+if __name__ == "__main__":
+    main()
