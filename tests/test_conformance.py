@@ -23,6 +23,7 @@ from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes, read_netlist
 from spikeloom.compiler.targets.truenorth.netlist import crossbar_bytes
 from spikeloom.models.networks.reference import float_spikes
+from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.machines.base import machine_for
@@ -378,6 +379,8 @@ NETWORKS = {
     "objects": {"planes": "2", "scale_groups": "4"},
     "containers": {"weight_bits": "8,4,4,8", "chips": 2},
     "objects-200ms": {"weight_bits": "3"},
+    "objects-counters": {},
+    "containers-counters": {},
     "objects-truenorth": {"target": "truenorth"},
     "containers-truenorth": {"target": "truenorth"},
 }
@@ -401,7 +404,8 @@ def test_integers_votes_and_costs_are_as_recorded(name, golden):
     netlist = machine_for(net.path).netlist
     arrays = {each.name: getattr(netlist, each.name) for each in fields(netlist)}
     found = {key: digest(value) for key, value in arrays.items() if isinstance(value, np.ndarray)}
-    done, price = machine_for(net.path).price(grasps().events[:12], bin_s=0.02)
+    events = of_length(grasps(), netlist.clocks.length).events[:12]
+    done, price = machine_for(net.path).price(events, bin_s=0.02)
     found["votes"] = done.votes.tolist()
     found["costs"] = encode([price.synaptic_operations, price.energy_j, price.time_s])
     golden(f"{name}.json", json.dumps(found, indent=1) + "\n")
