@@ -97,7 +97,7 @@ inspect netlist, crossbars:
 join:
     classes command file graph layers sha256 system towers
 lean:
-    differ layers output overflowing rows samples source split taken taxels
+    differ layers output rows samples source split taken taxels
 report:
     cores costs decisions netlist output provenance recording taxels verify
 run:

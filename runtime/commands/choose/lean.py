@@ -22,8 +22,8 @@ from spikeloom.runtime.studies.pruning.study import study
 
 NOTES = """\
 Everything is chosen on the training split and reported on --split: how many decisions change, what is right,
-operations, energy and time. What -o writes is, of neurons, taxels and hops alone or together, what takes least energy
-on the training split.
+operations, energy and time. What -o writes is what takes least energy on the training split, without neurons, without
+taxels or without hops.
 """
 
 DIFFER = 0.01
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X",
         help=f"share of training decisions that the netlist may change (default: {DIFFER:g})",
     )
-    parser.add_argument("-o", "--output", metavar="OUT.loom", help="write the netlist without what may go together")
+    parser.add_argument("-o", "--output", metavar="OUT.loom", help="write the netlist without what may go")
     parser.add_argument("--report", metavar="OUT.json", help="write the result")
     parser.epilog = NOTES
 

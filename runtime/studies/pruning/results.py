@@ -69,19 +69,18 @@ class LayerUse:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaxelUse:
-    """Training events of a taxel, and decisions that change without it."""
+    """Training events of a taxel, and training decisions that change without it."""
 
     events: int
     training_differ: int
-    test_differ: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lean:
-    """What a network can do without.
+    """What a network can do without; the first row is the whole one.
 
     `samples` counts recordings of ``training`` and ``test``. `taken` is the row of least energy in training among those
-    that change few enough decisions; `overflowing` were not tried, since a register could overflow.
+    that change few enough decisions.
     """
 
     taken: int
@@ -89,7 +88,6 @@ class Lean:
     layers: tuple[LayerUse, ...]
     taxels: tuple[TaxelUse, ...]
     rows: tuple[Row, ...]
-    overflowing: tuple[str, ...]
     source: str
     split: str
     differ: float
@@ -104,7 +102,6 @@ def sections(result: Lean) -> list[Section]:
     trained, tested = result.samples["training"], result.samples["test"]
     whole, taken = result.rows[0], result.rows[result.taken]
     layers = [[e.name, *(f"{n:,}" for n in (e.neurons, e.on_chip, e.never_fired))] for e in result.layers]
-    lines = [f"without {name}: not tried, what is left could leave a register" for name in result.overflowing]
     last = [f"least energy in training: {taken.name}", *_removed(taken.removed)]
     return [
         Section(
@@ -120,7 +117,7 @@ def sections(result: Lean) -> list[Section]:
             "Use",
             [Table(["layer", "neurons", "on chip", "never fired in training"], layers), Text(_taxels(result.taxels))],
         ),
-        Section("Without", [_rows(result), Text("\n".join(lines))]),
+        Section("Without", [_rows(result)]),
         Section(
             "Taken",
             [Text("\n".join(last + ([] if result.output is None else [f"written without them: {result.output}"])))],
@@ -150,10 +147,9 @@ def _rows(result: Lean) -> Table:
     head += [word for name in whole.energy_j for word in (name, "saved")]
     head += [*(f"time, {name}" for name in whole.time_s), "neurons", "cores"]
     body = []
-    for index, row in enumerate(result.rows):
+    for row in result.rows:
         costs = row.costs
-        cells = ["nothing" if index == 0 else row.name]
-        cells += [f"{row.training.differ} of {trained}", f"{row.test.differ} of {tested}"]
+        cells = [row.name, f"{row.training.differ} of {trained}", f"{row.test.differ} of {tested}"]
         cells += [str(row.test.right), f"{costs.operations:,.0f}", _saved(costs.operations, whole.operations)]
         for name, joules in costs.energy_j.items():
             cells += [si(joules, "J"), _saved(joules, whole.energy_j[name])]
@@ -167,8 +163,7 @@ def _saved(left: float, whole: float) -> str:
 
 
 def _removed(gone: Removed) -> list[str]:
-    """What went together."""
+    """What went, of each kind."""
     neurons = [f"{name} {count:,}" for name, count in (gone.neurons or {}).items()]
-    parts = {"hops": map(str, gone.hops or ()), "taxels": map(str, gone.taxels or ()), "neurons": neurons}
-    words = {what: ", ".join(names) for what, names in parts.items()}
-    return [f"{what} that went: {names}" for what, names in words.items() if names]
+    parts = {"hops": gone.hops, "taxels": gone.taxels, "neurons": neurons}
+    return [f"{what} that went: {', '.join(map(str, names))}" for what, names in parts.items() if names]

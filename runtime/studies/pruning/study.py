@@ -1,32 +1,26 @@
-"""The study: neurons, taxels and hops are taken from a network, alone and together, and it is measured again."""
+"""The study: neurons, taxels or hops are taken from a network, and it is measured again."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spikeloom.compiler import Compilation, Netlist, Options, compile_network
+from spikeloom.compiler import Netlist, Options, compile_network
 from spikeloom.compiler.systems import TACTILESGNET
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
+from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.report.console import progress
-from spikeloom.runtime.studies.pruning.results import (
-    Changed,
-    LayerUse,
-    Lean,
-    Removed,
-    Row,
-    TaxelUse,
-)
+from spikeloom.runtime.studies.pruning.results import Changed, LayerUse, Lean, Removed, Row, TaxelUse
 from spikeloom.runtime.studies.pruning.trials import (
-    Trial,
     changed_alone,
     decisions,
+    laid_out,
     priced,
-    spikes_of,
+    spared_neurons,
+    spared_taxels,
     without_hops,
     without_taxels,
 )
@@ -42,145 +36,72 @@ def study(
     progress("compiling")
     forms = None if loaded.checkpoint is None else loaded.checkpoint.forms
     compilation = compile_network(loaded.network, Options(forms=forms, training_events=training.events))
-    whole = _Whole(loaded, compilation, training, test, int(differ * len(training) + 1e-9))
-    left = list(whole.everything())
-    kept = [each for each in left if each.offered and each.row.training.differ <= whole.loose.allowed]
-    taken = min(kept, key=lambda each: priced(each.netlist, training)[1].least)
+    whole, allowed = compilation.netlist, int(differ * len(training) + 1e-9)
+    spikes: IntArray = machine_of(whole).run(training.events, lengths=training.lengths).counts.sum(axis=0)
+    wanted, wanted_test = decisions(whole, training), decisions(whole, test)
+    alone = changed_alone(whole, training, wanted)
+
+    def fits(netlist: Netlist) -> bool:
+        return bool(np.count_nonzero(decisions(netlist, training) != wanted) <= allowed)
+
+    def tried() -> Iterator[tuple[str, Removed, Netlist]]:
+        yield "nothing", Removed(), whole
+        neurons = spared_neurons(whole, spikes, fits)
+        yield "neurons", Removed(neurons=_by_layer(whole, neurons)), laid_out(compilation, neurons)
+        taxels = spared_taxels(whole, training, alone, fits)
+        deaf = without_taxels(compilation, taxels)
+        yield "taxels", Removed(taxels=tuple(sorted(taxels.tolist()))), laid_out(deaf)
+        for hops in _hops(loaded):
+            name = f"hop {hops[0]}" if len(hops) == 1 else f"hops {hops[0]} to {hops[-1]}"
+            if (fewer := without_hops(compilation, loaded, hops)) is not None:
+                yield name, Removed(hops=hops), laid_out(fewer)
+
+    rows, spent, netlists = [], [], []
+    for name, removed, netlist in tried():
+        progress(f"without {name}")
+        trained, training_costs = priced(netlist, training)
+        tested, costs = priced(netlist, test)
+        changed = _changed(wanted, trained, training.labels)
+        changed_test = _changed(wanted_test, tested, test.labels)
+        rows.append(Row(name=name, removed=removed, training=changed, test=changed_test, costs=costs))
+        spent.append(training_costs.least if changed.differ <= allowed else np.inf)
+        netlists.append(netlist)
+    taken = int(np.argmin(spent))
+    events = training.events.sum(axis=(0, 2, 3), dtype=np.int64)
     return Lean(
-        taken=left.index(taken),
+        taken=taken,
         samples={"training": len(training), "test": len(test)},
-        layers=whole.layers(),
-        taxels=whole.taxels(),
-        rows=tuple(each.row for each in left),
-        overflowing=tuple(whole.overflowing),
+        layers=tuple(_use(whole, layer, spikes) for layer in range(len(whole.layers))),
+        taxels=tuple(
+            TaxelUse(events=sent, training_differ=differing)
+            for sent, differing in zip(events.tolist(), alone.tolist(), strict=True)
+        ),
+        rows=tuple(rows),
         source=test.source,
         split=test.split,
         differ=differ,
         output=output,
-    ), taken.netlist
+    ), netlists[taken]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Left:
-    """What is left of a network; it may be written if it is offered."""
+def _hops(loaded: LoadedNetwork) -> list[tuple[int, ...]]:
+    """Every hop alone and all from one on, of a network that has several."""
+    checkpoint = loaded.checkpoint
+    if checkpoint is None or checkpoint.system != TACTILESGNET or len(checkpoint.hops) < 2:
+        return []
+    every = tuple(range(len(checkpoint.hops)))
+    return [*((hop,) for hop in every), *(every[first:] for first in every[1:-1])]
 
-    row: Row
-    netlist: Netlist
-    offered: bool
 
-
-class _Whole:
-    """A compiled network on both splits, from which parts are taken."""
-
-    def __init__(
-        self, loaded: LoadedNetwork, compilation: Compilation, training: Recordings, test: Recordings, allowed: int
-    ) -> None:
-        self.loaded, self.compilation, self.netlist = loaded, compilation, compilation.netlist
-        self.training, self.test = training, test
-        self.spikes = spikes_of(self.netlist, training)
-        self.wanted, self.wanted_test = decisions(self.netlist, training), decisions(self.netlist, test)
-        self.strict = Trial(
-            compilation=compilation, integer=compilation.integer, training=training, wanted=self.wanted, allowed=0
-        )
-        self.loose = replace(self.strict, allowed=allowed)
-        self.trials = (self.strict, self.loose) if allowed else (self.strict,)
-        self.overflowing: list[str] = []
-        self.changed = changed_alone(self.netlist, training, self.wanted)
-        self.changed_test = changed_alone(self.netlist, test, self.wanted_test)
-
-    def everything(self) -> Iterator[_Left]:
-        """All that is tried."""
-        yield self._left("everything", Removed(), self.netlist)
-        progress("neurons")
-        yield from self._neurons()
-        progress("taxels")
-        for trial in self.trials:
-            spared = trial.spare_taxels(self.netlist, self.changed)
-            deaf = replace(trial, integer=without_taxels(trial.integer, self.netlist, spared)).built()
-            yield self._left(f"taxels, {_allowed(trial)}", Removed(taxels=_numbers(spared)), deaf, offered=True)
-        cheapest: tuple[float, tuple[int, ...]] = np.inf, ()
-        for hops, left in self._hops():
-            yield left
-            if left.row.training.differ <= self.loose.allowed:
-                cheapest = min(cheapest, (left.row.costs.operations, hops))
-        progress("all of it together")
-        yield self._together(cheapest[1])
-
-    def _left(self, name: str, removed: Removed, netlist: Netlist, *, offered: bool = False) -> _Left:
-        """Measure what is left."""
-        tested, costs = priced(netlist, self.test)
-        row = Row(
-            name=name,
-            removed=removed,
-            training=_changed(self.wanted, decisions(netlist, self.training), self.training.labels),
-            test=_changed(self.wanted_test, tested, self.test.labels),
-            costs=costs,
-        )
-        return _Left(row, netlist, offered)
-
-    def _neurons(self) -> Iterator[_Left]:
-        netlist = self.netlist
-        never = np.flatnonzero((self.spikes == 0) & (netlist.readout_class < 0))
-        removed = Removed(neurons=_by_layer(netlist, never))
-        yield self._left("neurons that never fired in training", removed, self.strict.built(never, netlist))
-        for trial in self.trials:
-            spared = trial.spare_neurons(netlist, self.spikes)
-            removed = Removed(neurons=_by_layer(netlist, spared))
-            yield self._left(f"neurons, {_allowed(trial)}", removed, trial.built(spared, netlist), offered=True)
-
-    def _hops(self) -> Iterator[tuple[tuple[int, ...], _Left]]:
-        """Every hop alone and all from one on."""
-        checkpoint, adjacency = self.loaded.checkpoint, self.loaded.adjacency
-        if checkpoint is None or adjacency is None or checkpoint.system != TACTILESGNET or len(checkpoint.hops) < 2:
-            return
-        count = len(checkpoint.hops)
-        for hops in [(hop,) for hop in range(count)] + [tuple(range(hop, count)) for hop in range(1, count - 1)]:
-            progress(f"without hops {', '.join(map(str, hops))}")
-            integer = without_hops(self.compilation, checkpoint, adjacency, hops)
-            name = f"hop {hops[0]}" if len(hops) == 1 else f"hops {hops[0]} to {hops[-1]}"
-            if integer is None:
-                self.overflowing.append(name)
-            else:
-                built = replace(self.strict, integer=integer).built()
-                yield hops, self._left(name, Removed(hops=hops), built, offered=True)
-
-    def _together(self, hops: tuple[int, ...]) -> _Left:
-        """Hops, then taxels, then neurons, as long as no more training decisions change than may."""
-        trial, checkpoint, adjacency = self.loose, self.loaded.checkpoint, self.loaded.adjacency
-        if hops and checkpoint is not None and adjacency is not None:
-            fewer = without_hops(self.compilation, checkpoint, adjacency, hops)
-            assert fewer is not None, "it was tried before"
-            trial = replace(trial, integer=fewer)
-        built = trial.built()
-        taxels = trial.spare_taxels(built, self.changed)
-        trial = replace(trial, integer=without_taxels(trial.integer, built, taxels))
-        built = trial.built()
-        spared = trial.spare_neurons(built, spikes_of(built, self.training))
-        removed = Removed(hops=hops or None, taxels=_numbers(taxels), neurons=_by_layer(built, spared))
-        return self._left(f"together, {_allowed(trial)}", removed, trial.built(spared, built), offered=True)
-
-    def layers(self) -> tuple[LayerUse, ...]:
-        """Neurons of each layer by what they do."""
-        held = [self.netlist.compartments_of(index) for index in range(len(self.netlist.layers))]
-        return tuple(
-            LayerUse(
-                name=layer.name,
-                neurons=layer.neurons,
-                on_chip=len(ids),
-                never_fired=int(np.count_nonzero(self.spikes[ids] == 0)),
-            )
-            for layer, ids in zip(self.netlist.layers, held, strict=True)
-        )
-
-    def taxels(self) -> tuple[TaxelUse, ...]:
-        """Events of each taxel and what its absence changes."""
-        events = self.training.events.sum(axis=(0, 2, 3), dtype=np.int64)
-        return tuple(
-            TaxelUse(events=count, training_differ=here, test_differ=there)
-            for count, here, there in zip(
-                events.tolist(), self.changed.tolist(), self.changed_test.tolist(), strict=True
-            )
-        )
+def _use(netlist: Netlist, layer: int, spikes: IntArray) -> LayerUse:
+    """Neurons of a layer by what they do."""
+    ids = netlist.compartments_of(layer)
+    return LayerUse(
+        name=netlist.layers[layer].name,
+        neurons=netlist.layers[layer].neurons,
+        on_chip=len(ids),
+        never_fired=int(np.count_nonzero(spikes[ids] == 0)),
+    )
 
 
 def _changed(whole: IntArray, less: IntArray, labels: IntArray) -> Changed:
@@ -191,14 +112,6 @@ def _changed(whole: IntArray, less: IntArray, labels: IntArray) -> Changed:
         gained=int(np.count_nonzero(~before & after)),
         lost=int(np.count_nonzero(before & ~after)),
     )
-
-
-def _allowed(trial: Trial) -> str:
-    return "no training decision changed" if not trial.allowed else f"{trial.allowed} training decisions may change"
-
-
-def _numbers(ids: IntArray) -> tuple[int, ...]:
-    return tuple(sorted(ids.tolist()))
 
 
 def _by_layer(netlist: Netlist, gone: IntArray) -> dict[str, int]:

@@ -8,27 +8,21 @@ largest that changes no more training decisions than allowed. Nothing is chosen 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from spikeloom.compiler import Compilation, Netlist, layer_of, rounded, without
-from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
-from spikeloom.compiler.ir import Form, IntegerNetwork
+from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import without_channels
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.studies.pruning.results import Costs
-
-
-def spikes_of(netlist: Netlist, of: Recordings) -> IntArray:
-    """Spikes of each compartment in all recordings; (compartments,)."""
-    spikes: IntArray = machine_of(netlist).run(of.events, lengths=of.lengths).counts.sum(axis=0)
-    return spikes
 
 
 def decisions(netlist: Netlist, of: Recordings) -> IntArray:
@@ -49,11 +43,36 @@ def priced(netlist: Netlist, of: Recordings) -> tuple[IntArray, Costs]:
     )
 
 
-def silenced(netlist: Netlist, sources: BoolArray) -> Netlist:
+def silenced(netlist: Netlist, sources: IntArray) -> Netlist:
     """The netlist with synapses of weight zero from some sources: input channels, then compartments."""
-    away = np.repeat(sources[netlist.axon_source], np.diff(netlist.axon_synapses))
+    silent = np.zeros(netlist.n_inputs + netlist.n_compartments, np.bool_)
+    silent[sources] = True
+    away = np.repeat(silent[netlist.axon_source], np.diff(netlist.axon_synapses))
     weight = np.where(away, 0, netlist.synapse_weight).astype(netlist.synapse_weight.dtype)
     return replace(netlist, synapse_weight=weight)
+
+
+def channels_of(netlist: Netlist, taxels: IntArray) -> IntArray:
+    """Input channels of some taxels; shape (taxels, polarities)."""
+    channels: IntArray = taxels[:, None] * netlist.polarities + np.arange(netlist.polarities)
+    return channels
+
+
+def spared_neurons(netlist: Netlist, spikes: IntArray, fits: Callable[[Netlist], bool]) -> IntArray:
+    """Compartments that may go together so that the rest `fits`; at least those that never spiked."""
+    share = effects(netlist, spikes)
+    order = np.argsort(share, kind="stable")
+    order = order[np.isfinite(share[order])]
+    sources, never = netlist.n_inputs + order, int(np.count_nonzero(share == 0))
+    return order[: most_spared(len(order), never, lambda count: fits(silenced(netlist, sources[:count])))]
+
+
+def spared_taxels(netlist: Netlist, training: Recordings, alone: IntArray, fits: Callable[[Netlist], bool]) -> IntArray:
+    """Taxels that may go together; those first without which, `alone`, fewest decisions change."""
+    events = training.events.sum(axis=(0, 2, 3), dtype=np.int64)
+    order = np.lexsort((events, alone))
+    sources, silent = channels_of(netlist, order), int(np.count_nonzero(events == 0))
+    return order[: most_spared(len(order), silent, lambda count: fits(silenced(netlist, sources[:count])))]
 
 
 def effects(netlist: Netlist, spikes: IntArray) -> FloatArray:
@@ -72,88 +91,43 @@ def effects(netlist: Netlist, spikes: IntArray) -> FloatArray:
     return share
 
 
-def most_spared(order: IntArray, least: int, fits: Callable[[IntArray], bool]) -> IntArray:
-    """Bisect for a longest beginning of `order` that fits; one shorter than `least` is not tried.
+def most_spared(parts: int, least: int, fits: Callable[[int], bool]) -> int:
+    """Bisect for a largest number of parts that fits; fewer than `least` are not tried.
 
     Examples
     --------
-    >>> most_spared(np.array([4, 2, 7, 1]), 1, lambda parts: len(parts) <= 3).tolist()
-    [4, 2, 7]
+    >>> most_spared(4, 1, lambda count: count <= 3)
+    3
     """
-    low, high = least, len(order)
+    low, high = least, parts
     while low < high:
         middle = (low + high + 1) // 2
-        if fits(order[:middle]):
+        if fits(middle):
             low = middle
         else:
             high = middle - 1
-    return order[:low]
+    return low
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Trial:
-    """A compiled network, what is left of it, and training recordings.
-
-    At most so many of the `wanted` decisions (samples,) are `allowed` to change on them.
-    """
-
-    compilation: Compilation
-    integer: IntegerNetwork
-    training: Recordings
-    wanted: IntArray
-    allowed: int
-
-    def differ(self, netlist: Netlist) -> int:
-        """Training decisions that a netlist changes."""
-        return int(np.count_nonzero(decisions(netlist, self.training) != self.wanted))
-
-    def built(self, unused: IntArray | None = None, of: Netlist | None = None) -> Netlist:
-        """Lay out what is left, without some compartments of a netlist `of` it."""
-        masks = tuple(np.zeros(population.size, np.bool_) for population in self.integer.populations)
-        if unused is not None and of is not None:
-            for layer, mask in enumerate(masks):
-                mask[of.neuron[unused[of.layer[unused] == layer]]] = True
-                held = of.neuron[of.compartments_of(layer)]
-                if len(held) and mask[held].all():
-                    mask[held[0]] = False  # a layer keeps one neuron
-        return without(replace(self.compilation, integer=self.integer), masks)
-
-    def spare_neurons(self, netlist: Netlist, spikes: IntArray) -> IntArray:
-        """Compartments that may go together, those that never spiked first; at least these."""
-        share = effects(netlist, spikes)
-        order = np.argsort(share, kind="stable")
-        order = order[np.isfinite(share[order])]
-        never = int(np.count_nonzero(share == 0))
-
-        def fits(gone: IntArray) -> bool:
-            sources = np.zeros(netlist.n_inputs + netlist.n_compartments, np.bool_)
-            sources[netlist.n_inputs + gone] = True
-            return self.differ(silenced(netlist, sources)) <= self.allowed
-
-        return most_spared(order, never, fits)
-
-    def spare_taxels(self, netlist: Netlist, alone: IntArray) -> IntArray:
-        """Taxels that may go together; those first without which, `alone`, fewest decisions change."""
-        events = self.training.events.sum(axis=(0, 2, 3), dtype=np.int64)
-        order = np.lexsort((events, alone))
-        return most_spared(
-            order,
-            int(np.count_nonzero(events == 0)) if np.all(alone[events == 0] == 0) else 0,
-            lambda gone: self.differ(silenced(netlist, sources_of(netlist, gone))) <= self.allowed,
-        )
+def without_taxels(compilation: Compilation, taxels: IntArray) -> Compilation:
+    """Without the synapses from some taxels."""
+    deaf = np.zeros(compilation.netlist.n_inputs, np.bool_)
+    deaf[channels_of(compilation.netlist, taxels)] = True
+    return replace(compilation, integer=without_channels(compilation.integer, deaf))
 
 
-def sources_of(netlist: Netlist, taxels: IntArray) -> BoolArray:
-    """Channels of some taxels among the sources; shape (n_inputs + compartments,)."""
-    found = np.zeros(netlist.n_inputs + netlist.n_compartments, np.bool_)
-    channels = np.asarray(taxels)[:, None] * netlist.polarities + np.arange(netlist.polarities)
-    found[channels.ravel()] = True
-    return found
-
-
-def without_taxels(integer: IntegerNetwork, netlist: Netlist, taxels: IntArray) -> IntegerNetwork:
-    """The integer network without the synapses from some taxels."""
-    return without_channels(integer, sources_of(netlist, taxels)[: netlist.n_inputs])
+def laid_out(compilation: Compilation, unused: IntArray | None = None) -> Netlist:
+    """Lay out what is left, without some compartments of the netlist; a layer keeps one neuron."""
+    netlist = compilation.netlist
+    gone = np.zeros(netlist.n_compartments, np.bool_)
+    gone[[] if unused is None else unused] = True
+    masks = tuple(np.zeros(population.size, np.bool_) for population in compilation.integer.populations)
+    for layer, mask in enumerate(masks):
+        ids = netlist.compartments_of(layer)
+        mask[netlist.neuron[ids]] = gone[ids]
+        if len(ids) and gone[ids].all():
+            mask[netlist.neuron[ids[0]]] = False
+    return without(compilation, masks)
 
 
 def changed_alone(netlist: Netlist, of: Recordings, wanted: IntArray) -> IntArray:
@@ -169,13 +143,14 @@ def changed_alone(netlist: Netlist, of: Recordings, wanted: IntArray) -> IntArra
     return changed
 
 
-def without_hops(
-    compilation: Compilation, checkpoint: Checkpoint, adjacency: FloatArray, hops: tuple[int, ...]
-) -> IntegerNetwork | None:
-    """The integer network with a first layer that lacks some hops, rounded to the storage that it has; others as is.
+def without_hops(compilation: Compilation, loaded: LoadedNetwork, hops: tuple[int, ...]) -> Compilation | None:
+    """A first layer that lacks some hops, rounded to the storage that it has; others as they are.
 
     Neurons that were left out stay out. None where a register cannot hold what is left.
     """
+    checkpoint, adjacency = loaded.checkpoint, loaded.adjacency
+    assert checkpoint is not None, "only a checkpoint has hops"
+    assert adjacency is not None, "and a graph"
     fewer = checkpoint.hops.copy()
     fewer[list(hops)] = 0
     integer, network = compilation.integer, expand(replace(checkpoint, hops=fewer), adjacency)
@@ -188,4 +163,5 @@ def without_hops(
     layer = rounded(layer_of(network, 0), form)
     if layer is None or layer.reached > ONE_STEP_SUM_MAX:
         return None
-    return replace(integer, projections=(*layer.projections, *(p for p in integer.projections if p.post != 0)))
+    others = (p for p in integer.projections if p.post != 0)
+    return replace(compilation, integer=replace(integer, projections=(*layer.projections, *others)))
