@@ -45,7 +45,7 @@ NUMERIC = {
     "models/networks": "layers lif quantised reference",
     "models/truenorth": "neurons",
     "runtime/studies": "yardsticks",
-    "runtime/equivalence": "certain_spikes certificates reference rounding verdict verify",
+    "runtime/equivalence": "certificates reference rounding verdict verify",
     "runtime/machines": "votes",
     "runtime/machines/loihi1": "block_kernel blocks engine kernel spec timing timing_kernel",
     "runtime/machines/loihi1/costs": "cost cumulative",

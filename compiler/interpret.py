@@ -104,7 +104,7 @@ def float_layer(
     Without `loops` what it receives from itself comes from outside, too, as from other populations.
     """
     registers = tuple(np.array([population.alpha, population.beta, population.theta], dtype))
-    pres, synapses = _synapses([(p, p.weight) for p in projections], dtype, loops=loops)
+    pres, synapses = synapses_of([(p, p.weight) for p in projections], dtype, loops=loops)
     return Layer(pres=pres, size=population.size, fixed=(*synapses, population.bias.astype(dtype), registers))
 
 
@@ -127,14 +127,14 @@ def integer_layer(
     # 32 bits are as exact, and twice as fast, where membranes have limits and no current outlasts its step
     dtype = np.int32 if saturates and not keep_u and largest < 2**31 else np.int64
     limit = MEMBRANE_MAX if saturates else 2**62
-    pres, synapses = _synapses(weights, dtype, loops=loops)
+    pres, synapses = synapses_of(weights, dtype, loops=loops)
     threshold = (population.threshold << MEMBRANE_SHIFT).astype(dtype)
     registers = threshold, *(dtype(value) for value in (keep_u, keep_v, limit))
     return Layer(pres=pres, size=population.size, fixed=(*synapses, population.bias.astype(dtype), registers))
 
 
-def _synapses(
-    weights: Sequence[tuple[Any, Sparse]], dtype: npt.DTypeLike, *, loops: bool
+def synapses_of(
+    weights: Sequence[tuple[Any, Sparse]], dtype: npt.DTypeLike, *, loops: bool = True
 ) -> tuple[tuple[int, ...], tuple[Synapses, Synapses]]:
     """Presynaptic populations; weights from these, and from the population itself, all planes together."""
     from spikeloom.compiler.layer_kernel import by_source, no_synapses

@@ -12,8 +12,7 @@ from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.interpret import channels_last, run_float, vote
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.models.networks.reference import float_spikes
-from spikeloom.runtime.equivalence.certain_spikes import SPARE, Certainty, _layers, _step
-from spikeloom.runtime.equivalence.certificates import Certifier
+from spikeloom.runtime.equivalence.certificates import SPARE, Certainty, Certifier, _layers, _step
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
@@ -35,7 +34,7 @@ def on_chip(netlist, recordings):
 
 def certified(model, integer, recordings, chip, decisions):
     """All recordings at once."""
-    certifier = Certifier(model, integer)
+    certifier = Certifier(model, integer, [slice(None)] * len(chip))
     certifier.add(recordings, chip, decisions)
     return certifier.certificate()
 

@@ -286,10 +286,9 @@ def test_description():
     grid[:, 2, 1] = 0
     grid[1, :, :, 5:] = 0  # the second recording has 5 steps
     found = describe(made(grid, labels=np.array([3, -1]), lengths=np.array([10, 5])), 0.1)
-    lasts = found.duration_s
-    assert (lasts.shortest, lasts.median, lasts.longest) == (0.5, 0.75, 1.0)
+    assert found.duration_s == {"shortest": 0.5, "median": 0.75, "longest": 1.0}
     assert (found.recordings, found.events, found.labels, found.unlabelled) == (2, 15, {3: 1}, 1)
-    rates = [[taxel.falling, taxel.rising] for taxel in found.rate.taxels]
+    rates = [[*taxel.values()] for taxel in found.rate.taxels]
     assert rates == [[2, 2], [0, 0], [2, 0], [2, 2], [0, 0]]  # 3 events in 1.5 s
     assert (found.dead, found.one_sided, found.hot) == ((1, 4), (2,), ())
 

@@ -19,7 +19,7 @@ from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_fo
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence.explanation.causes import explain
-from spikeloom.runtime.equivalence.explanation.replay import (
+from spikeloom.runtime.equivalence.explanation.results import (
     BETA,
     BIAS,
     LEFT_OUT,

@@ -29,7 +29,7 @@ from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.models.networks.reference import float_spikes
-from spikeloom.runtime.equivalence.certain_spikes import Certainty
+from spikeloom.runtime.equivalence.certificates import Certainty
 from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.integer import integer_machine_of

@@ -6,7 +6,7 @@ in which the two differ are ill-posed, decided by the rounding of a sum and not 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -88,7 +88,6 @@ def verify(
     beside = machine.beside(engine_name)
     tuned = isinstance(source, Factored) and source.checkpoint.forms is not None
     origin = network if original is None else float_network(source)
-    weights = check_rounding(machine, origin, fine_tuned=tuned)
     kept, checked = machine.compared(), min(spec_samples, len(events))
     begin("specification", 0)
     equal = machine.check(events[:checked], lengths=lengths) == 0
@@ -97,7 +96,8 @@ def verify(
     fine_tuned_spikes = _fine_tuned(source) if tuned else None
     certifier = Certifier(model, integer, kept)
     neurons = [np.arange(each.size)[keep] for each, keep in zip(integer.populations, kept, strict=True)]
-    tally = _Tally([len(each) for each in neurons])
+    fired = [np.zeros((2, len(each)), np.int64) for each in neurons]  # spikes of float model and chip
+    different = {stage: np.zeros(len(names), np.int64) for stage in LADDER}
     float_votes, chip_votes = np.zeros((2, len(events), network.classes), np.int64)
     quantised_different, divergence = 0 if tuned else None, None
     for rows in machine.parts(len(events), events.shape[3]):
@@ -118,11 +118,13 @@ def verify(
             begin("fine-tuned model", first)
             quantised_different += int(_differences(compared(fine_tuned_spikes(part)), chip).sum())
 
-        tally.add(reference, chip)
+        different[LADDER[-1]] += _differences(reference, chip)
+        for total, *sides in zip(fired, reference, chip, strict=True):
+            total += [side.sum(axis=(0, 1)) for side in sides]
         for stage, ready in ladder.items():
             begin(f"ladder: {'proven' if ready is None else stage}", first)
             lower = chip if ready is None else compared(ready.run(channels).spikes)
-            tally.different[stage] += _differences(reference, lower)
+            different[stage] += _differences(reference, lower)
             if stage == LADDER[0] and divergence is None:
                 begin("first divergence", first)
                 divergence = _first_divergence(machine, model, reference, chip, lower, part, files[rows])
@@ -138,47 +140,35 @@ def verify(
         chip_predictions=vote(chip_votes),
         float_counts=float_votes,
         chip_counts=chip_votes,
-        spikes=dict(zip(names, tally.spikes(), strict=True)),
+        spikes={
+            name: LayerSpikes(float=int(ours.sum()), chip=int(theirs.sum()), different=int(moved), ill_posed=int(posed))
+            for name, (ours, theirs), moved, posed in zip(
+                names, fired, different[LADDER[-1]], different[LADDER[0]], strict=True
+            )
+        },
         spec_samples=checked,
         spec_equals_engine=equal and not engine_different,
-        weights=weights,
+        weights=check_rounding(machine, origin, fine_tuned=tuned),
         first_divergence=divergence,
         ladder=tuple(
             Rung(stage=stage, different=dict(zip(names, counts.tolist(), strict=True)))
-            for stage, counts in tally.different.items()
+            for stage, counts in different.items()
         ),
         quantised_different=quantised_different,
-        breakdowns=breakdowns(names, tally.float, tally.chip, neurons, (float_votes, chip_votes), files),
+        breakdowns=breakdowns(
+            names,
+            [ours for ours, _ in fired],
+            [theirs for _, theirs in fired],
+            neurons,
+            (float_votes, chip_votes),
+            files,
+        ),
         not_compared={name: int(out.sum()) for name, out in zip(names, machine.unread, strict=True) if out.any()},
         certificate=certifier.certificate(),
         engine=engine_name,
         engine_different=engine_different,
         required={} if required is None else required,
     )
-
-
-class _Tally:
-    """Spikes of each neuron of the layers, of float model and chip, and entries of each layer that differ, by rung."""
-
-    def __init__(self, sizes: Sequence[int]) -> None:
-        self.float, self.chip = ([np.zeros(size, np.int64) for size in sizes] for _ in range(2))
-        self.different = {stage: np.zeros(len(sizes), np.int64) for stage in LADDER}
-
-    def add(self, reference: Layers, chip: Layers) -> None:
-        """Count some recordings."""
-        self.different[LADDER[-1]] += _differences(reference, chip)
-        for total, layers in ((self.float, reference), (self.chip, chip)):
-            for index, each in enumerate(layers):
-                total[index] += each.sum(axis=(0, 1))
-
-    def spikes(self) -> Iterator[LayerSpikes]:
-        """The same, layer by layer."""
-        for ours, theirs, different, ill_posed in zip(
-            self.float, self.chip, self.different[LADDER[-1]], self.different[LADDER[0]], strict=True
-        ):
-            yield LayerSpikes(
-                float=int(ours.sum()), chip=int(theirs.sum()), different=int(different), ill_posed=int(ill_posed)
-            )
 
 
 def _fine_tuned(source: Factored | Network) -> Callable[[npt.NDArray[np.uint8]], list[BoolArray]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,27 +34,12 @@ RULES = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Duration:
-    """Of recordings, in seconds."""
-
-    shortest: float
-    median: float
-    longest: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Rate:
-    """Events per second by polarity."""
+    """Events per second of the sensor and of each taxel by polarity, over the time that was recorded."""
 
     falling: float
     rising: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SensorRate(Rate):
-    """Events per second by polarity, of the sensor and of each taxel, over the time that was recorded."""
-
-    taxels: tuple[Rate, ...]
+    taxels: Sequence[Mapping[str, float]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -67,12 +52,12 @@ class Described:
     taxels: int
     bin_s: float
     steps: int
-    duration_s: Duration
+    duration_s: Mapping[str, float]
     events: int  # Those that share taxel, polarity and bin count once
     found: EventCounts | None
     labels: Mapping[int, int]
     unlabelled: int
-    rate: SensorRate
+    rate: Rate
     dead: tuple[int, ...]
     one_sided: tuple[int, ...]
     hot: tuple[int, ...]
@@ -144,7 +129,7 @@ def _fetch(arguments: Arguments) -> Outcome:
     return Outcome(fetch_data(arguments.name, url=arguments.url), _fetch_sections)
 
 
-def _fetch_sections(result: Fetched) -> Iterable[Section]:
+def _fetch_sections(result: Fetched) -> Iterator[Section]:
     state = "fetched" if result.new else "already there"
     yield Section(
         "Fetched",
@@ -172,7 +157,7 @@ def describe(recordings: Recordings, bin_s: float) -> Described:
     rate = per_taxel / (lengths.sum() * bin_s)
     falling, rising = (float(rate[:, polarity].sum()) for polarity in (0, 1))
     labels = dict(zip(*(found.tolist() for found in np.unique(recordings.labels, return_counts=True)), strict=True))
-    shortest, median, longest = (float(of(lengths) * bin_s) for of in (np.min, np.median, np.max))
+    ends = {"shortest": lengths.min(), "median": np.median(lengths), "longest": lengths.max()}
     return Described(
         source=recordings.source,
         split=recordings.split,
@@ -180,15 +165,15 @@ def describe(recordings: Recordings, bin_s: float) -> Described:
         taxels=recordings.taxels,
         bin_s=bin_s,
         steps=recordings.steps,
-        duration_s=Duration(shortest=shortest, median=median, longest=longest),
+        duration_s={name: float(steps * bin_s) for name, steps in ends.items()},
         events=int(total.sum()),
         found=recordings.counts,
         unlabelled=labels.pop(UNLABELLED, 0),
         labels=labels,
-        rate=SensorRate(
+        rate=Rate(
             falling=falling,
             rising=rising,
-            taxels=tuple(Rate(falling=low, rising=high) for low, high in rate.tolist()),
+            taxels=[{"falling": low, "rising": high} for low, high in rate.tolist()],
         ),
         dead=tuple(np.flatnonzero(~alive).tolist()),
         one_sided=tuple(np.flatnonzero((per_taxel > 0).sum(axis=1) == 1).tolist()),
@@ -197,10 +182,10 @@ def describe(recordings: Recordings, bin_s: float) -> Described:
     )
 
 
-def described_sections(result: Described) -> Iterable[Section]:
+def described_sections(result: Described) -> Iterator[Section]:
     """Statistics for people."""
     duration, rate, labels = result.duration_s, result.rate, result.labels
-    short, middle, long = (f"{seconds:g}" for seconds in (duration.shortest, duration.median, duration.longest))
+    short, middle, long = (f"{seconds:g}" for seconds in duration.values())
     lasts = f"{long} s" if short == long else f"{short} … {long} s (median {middle} s)"
     each = sorted(set(labels.values()))
     spread = number(each[0], "recording") if len(each) == 1 else f"{each[0]} … {each[-1]} recordings" if each else ""
@@ -212,7 +197,8 @@ def described_sections(result: Described) -> Iterable[Section]:
         f"  events: {result.events:,} after binning; {rate.falling:.1f} falling and {rate.rising:.1f} rising "
         "per second",
     ]
-    lines += [] if result.found is None else [f"  found: {result.found}"]
+    if result.found is not None:
+        lines.append(f"  found: {result.found}")
     broken = {"dead": result.dead, "one-sided": result.one_sided, "hot": result.hot}
     for kind, taxels in broken.items():
         lines.append(f"  {kind} taxels: {', '.join(map(str, taxels)) or 'none'} ({result.rules[kind]})")
@@ -220,7 +206,7 @@ def described_sections(result: Described) -> Iterable[Section]:
     rows = []
     for taxel, one in enumerate(rate.taxels):
         looks = ", ".join(kind for kind, taxels in broken.items() if taxel in taxels)
-        rows.append([str(taxel), f"{one.falling:.2f}", f"{one.rising:.2f}", looks])
+        rows.append([str(taxel), *(f"{each:.2f}" for each in one.values()), looks])
     yield Section("Taxels", [Table(["taxel", "falling/s", "rising/s", "looks"], rows)])
 
 
@@ -256,7 +242,7 @@ def _convert(arguments: Arguments) -> Outcome:
     return Outcome(result, _convert_sections)
 
 
-def _convert_sections(result: Converted) -> Iterable[Section]:
+def _convert_sections(result: Converted) -> Iterator[Section]:
     lines = [f"{result.output}: {number(result.taxels, 'taxel')}, {number(result.steps, 'bin')}"]
     for split, made in result.splits.items():
         lines.append(f"  {split}: {number(made.recordings, 'recording')}")

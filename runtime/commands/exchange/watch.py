@@ -48,49 +48,6 @@ EDGE = Decimal("1e-9")
 """Share of a bin by which a time may miss an edge and yet count as on it; the same as where recordings are read."""
 
 
-@dataclass(kw_only=True, eq=False)
-class Display:
-    """Where the running decision appears: lines, or objects as JSON, on stdout."""
-
-    bin_s: Decimal
-    as_json: bool
-    shown: int | None = None  # Decision that was printed last
-
-    def bin(self, grasp: int, step: Step) -> None:
-        """Show what is decided after a bin, if it is something else than before."""
-        if self.as_json:
-            self._write(self._result("bin", grasp, step.index + 1, step))
-        elif step.counts.any() and step.decision != self.shown:
-            self.shown = step.decision
-            elapsed = f"{self.bin_s * (step.index + 1):f} s"
-            self._write(f"{elapsed:>10}  {_standing(step)}")
-
-    def grasp(self, grasp: int, bins: int, last: Step, *, early: bool | None = None) -> None:
-        """Show what a grasp came to; and whether it ended before its length, where it may."""
-        self.shown = None
-        if self.as_json:
-            self._write(self._result("grasp", grasp, bins, last) | ({} if early is None else {"early": early}))
-        else:
-            seconds = f"{self.bin_s * bins:f}"
-            sure = ", sure" if early else ""
-            self._write(f"grasp {grasp}: {_standing(last)}{sure}, after {number(bins, 'bin')} ({seconds} s)")
-
-    def _result(self, kind: str, grasp: int, bins: int, step: Step) -> JsonObject:
-        return {
-            "kind": kind,
-            "grasp": grasp,
-            "bins": bins,
-            "time_s": float(self.bin_s * bins),
-            "decision": step.decision,
-            "margin": step.margin,
-            "counts": step.counts.tolist(),
-        }
-
-    def _write(self, line: str | JsonObject) -> None:
-        sys.stdout.write(f"{line if isinstance(line, str) else json.dumps(line)}\n")
-        sys.stdout.flush()
-
-
 @dataclass(slots=True, kw_only=True)
 class Summary:
     """All grasps together; `early` counts those that ended before their length, where they may."""
@@ -111,7 +68,7 @@ class Watch:
 
     stream: Stream  # At rest
     lines: EventLines
-    display: Display
+    as_json: bool  # Whether decisions are printed as objects, or as lines for people
     bin_s: Decimal  # Length of a bin
     bins: int | None  # Length of every grasp in bins; without it the last event or the wall clock ends it
     from_first: bool  # Whether the bins of a grasp begin at its first event instead of at time 0
@@ -123,6 +80,7 @@ class Watch:
     epoch: float = 0.0  # Wall clock at the origin
     decided: bool = False
     last: tuple[Step, ...] = ()
+    shown: int | None = None  # Decision that was printed last
     found: Summary = field(default_factory=Summary)
 
     def run(self) -> None:
@@ -183,7 +141,12 @@ class Watch:
         step = self.stream.step(self.column)
         self.last = (step,)
         self.column[:] = 0
-        self.display.bin(self.found.grasps + 1, step)
+        line = ""
+        if step.counts.any() and step.decision != self.shown:
+            self.shown = step.decision
+            elapsed = f"{self.bin_s * (step.index + 1):f} s"
+            line = f"{elapsed:>10}  {_standing(step)}"
+        self._show(line, "bin", self.found.grasps + 1, step.index + 1, step)
         if step.index + 1 == self.bins:
             self._decide()
         elif self.may_end is not None and self.may_end(step.index, step.counts):
@@ -207,7 +170,20 @@ class Watch:
         self.found.bins += bins
         if self.found.early is not None:
             self.found.early += early
-        self.display.grasp(self.found.grasps, bins, last, early=None if self.may_end is None else early)
+        self.shown = None
+        after = f"after {number(bins, 'bin')} ({self.bin_s * bins:f} s)"
+        line = f"grasp {self.found.grasps}: {_standing(last)}{', sure' if early else ''}, {after}"
+        self._show(line, "grasp", self.found.grasps, bins, last, {} if self.may_end is None else {"early": early})
+
+    def _show(self, line: str, kind: str, grasp: int, bins: int, step: Step, more: JsonObject | None = None) -> None:
+        """Print a line, if there is one, or what it says as an object."""
+        if self.as_json:
+            found = {"kind": kind, "grasp": grasp, "bins": bins, "time_s": float(self.bin_s * bins)}
+            found |= {"decision": step.decision, "margin": step.margin, "counts": step.counts.tolist()}
+            line = json.dumps(found | (more or {}))
+        if line:
+            sys.stdout.write(f"{line}\n")
+            sys.stdout.flush()
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
@@ -242,7 +218,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         session = Watch(
             stream=stream,
             lines=EventLines(file, name, netlist.taxels),
-            display=Display(bin_s=bin_s, as_json=arguments.json),
+            as_json=arguments.json,
             column=np.zeros(netlist.taxels * netlist.polarities, np.uint8),
             bin_s=bin_s,
             bins=arguments.bins or netlist.clocks.length,

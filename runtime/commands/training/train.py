@@ -243,6 +243,7 @@ def _recipe(arguments: argparse.Namespace) -> Recipe:
     """The recipe that was named, with the values that were given beside it."""
     recipe = _named_recipe(arguments)
     whole = repeat.given(arguments, ("clocks", "features", "hops", "batch", "decay_epochs"))
+    whole["penalty"] = arguments.spike_penalty
     if arguments.hidden is not None:
         whole["hidden"] = tuple(whole_numbers(arguments.hidden, "--hidden"))
     recipe = replace(recipe, **{name: value for name, value in whole.items() if value is not None})
@@ -251,12 +252,10 @@ def _recipe(arguments: argparse.Namespace) -> Recipe:
             f"--decay-epochs {arguments.decay_epochs}: the recipe {recipe.name} lowers its learning rate all along; "
             "omit it"
         )
-    if arguments.spike_penalty is not None:
-        recipe = replace(recipe, penalty=arguments.spike_penalty)
-    if arguments.current_decay is not None:
-        recipe = replace(recipe, alphas=decays_asked(arguments.current_decay, "--current-decay", recipe.layers))
-    if arguments.membrane_decay is not None:
-        recipe = replace(recipe, betas=decays_asked(arguments.membrane_decay, "--membrane-decay", recipe.layers))
+    for decays, option in (("alphas", "current_decay"), ("betas", "membrane_decay")):
+        if (words := getattr(arguments, option)) is not None:
+            asked: Any = decays_asked(words, f"--{option.replace('_', '-')}", recipe.layers)
+            recipe = replace(recipe, **{decays: asked})
     if arguments.hops is not None and arguments.system not in (None, TACTILESGNET):
         raise OptionError(f"--hops {arguments.hops}: {TITLES[arguments.system]} has no hops to choose; omit it")
     check_recipe(recipe)
@@ -267,17 +266,9 @@ def _named_recipe(arguments: argparse.Namespace) -> Recipe:
     """What was named, or the only one of a system that has its own."""
     from spikeloom.models.training.kinds import kind_of
 
-    usual = {
-        "recipe": RELEASED.name,
-        "current_decay": None,
-        "membrane_decay": None,
-        "join": 1,
-        "spike_penalty": None,
-        "copies": None,
-        "hidden": None,
-        "hops": None,
-    }
-    given = {name: getattr(arguments, name) for name, value in usual.items() if getattr(arguments, name) != value}
+    names = ("recipe", "current_decay", "membrane_decay", "join", "spike_penalty", "copies", "hidden", "hops")
+    usual = {"recipe": RELEASED.name, "join": 1}
+    given = {name: value for name, value in repeat.given(arguments, names).items() if value != usual.get(name)}
     options = {f"--{name.replace('_', '-')}": value for name, value in given.items()}
     return kind_of(arguments.system or TACTILESGNET).recipe_for(arguments.recipe, options)
 

@@ -1,47 +1,56 @@
 """Name the cause of every root: which deviation, if it alone were gone, would give the float model's spike.
 
 A root's neuron remembers the steps since its last common reset, in which it got the same spikes in the float model
-and on the chip. It is run again over these steps, from rest, with one deviation taken away at a time. The cause is, in
-this order,
+and on the chip. It is run again over these steps, from rest, with one deviation taken away at a time. There it fires
+where both did, which resets a membrane but no current; at any other step but the last it does not, or the replay says
+that it would. The cause is, in this order,
 
 1. a tie, where the float model's membrane is at its threshold up to the rounding of float64;
 2. of the deviations without which the spike is the float model's, the one that moved the membrane most;
 3. what moved the membrane most.
+
+A netlist is entitled to round weights, biases, decays and membranes, and to the limits of its registers; whether what
+it stores is the rounding of its checkpoint at all is for :mod:`equivalence.rounding` to say.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
+from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, reach, step_units
 from spikeloom.compiler.interpret import Activity, run_float, step_late
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
 from spikeloom.compiler.passes.expand import Factored
-from spikeloom.compiler.types import BoolArray, FloatArray
-from spikeloom.runtime.equivalence.explanation.replay import (
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.runtime.equivalence.explanation.results import (
+    BETA,
+    BIAS,
     LEFT_OUT,
+    SATURATION,
     TIE,
-    UNCLIPPED,
+    TRUNCATION,
     UNKNOWN,
-    UNROUNDED,
     WEIGHTS,
-    run_variants,
-    sources_into,
-    variants_of,
-    weights_into,
+    Explanation,
+    LayerRoots,
+    RootCause,
+    remedy,
 )
-from spikeloom.runtime.equivalence.explanation.results import Explanation, LayerRoots, RootCause, remedy
 from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots, sources_of
 from spikeloom.runtime.equivalence.reference import taxel_and_feature
-from spikeloom.runtime.equivalence.rounding import Rounding
+from spikeloom.runtime.equivalence.rounding import SLACK, Rounding, summed
 from spikeloom.runtime.machines.base import EventArray
 from spikeloom.runtime.machines.integer import IntegerMachine
 
 UNDECIDED = 256 * float(np.finfo(np.float64).eps)
 """Distance to threshold, as a share of all that the neuron adds up, that the order of a sum decides."""
+
+STORED, UNROUNDED, UNCLIPPED = range(3)
+"""Weights of a replay: as stored, as the checkpoint has them, as stored but for those that the range cuts off."""
 
 
 def observe(machine: IntegerMachine, events: EventArray) -> Activity:
@@ -208,3 +217,111 @@ def _name_causes(
             )
         )
     return found
+
+
+# -- replay ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Variant:
+    """A replay: the stored neurons without the deviation `cause`.
+
+    Weights are STORED, UNROUNDED or UNCLIPPED; bias (neurons,) and the membrane's limit are in membrane units; `keep_u`
+    and `keep_v` are what a step keeps of current and membrane, rounded toward zero if `rounds`.
+    """
+
+    cause: str
+    weights: int
+    bias: FloatArray
+    keep_u: float
+    keep_v: float
+    limit: float = float(MEMBRANE_MAX)
+    rounds: bool = True
+
+
+def sources_into(network: Network, integer: IntegerNetwork, post: int) -> tuple[int, ...]:
+    """Presynaptic populations of a population on either side, the input first."""
+    return tuple(sorted({p.pre for stage in (network, integer) for p in stage.projections if p.post == post}))
+
+
+def weights_into(network: Network, integer: IntegerNetwork, post: int, rows: IntArray) -> FloatArray:
+    """Weights in membrane units into neurons of a population, (3, neurons, sources), by ``Variant.weights``."""
+    pres, scale = sources_into(network, integer, post), integer.populations[post].scale[rows]
+    real, stored = (
+        np.concatenate([summed(stage, pre, post)[rows].toarray() for pre in pres], axis=1)
+        for stage in (network, integer)
+    )
+    real *= scale[:, None]
+    planes = {(p.bits, p.exponent) for p in integer.projections if p.post == post}
+    bits, exponents = min(b for b, _ in planes), tuple(sorted({e for _, e in planes}))
+    clipped = np.abs(real) > reach(bits, exponents) * step_units(bits, exponents) * SLACK
+    return np.stack([stored, real, np.where(clipped, real, stored)]) * (1 << MEMBRANE_SHIFT)
+
+
+def variants_of(
+    network: Network, integer: IntegerNetwork, post: int, rows: IntArray, *, compensated: bool
+) -> list[Variant]:
+    """What to run for neurons of a population: the netlist as it is, then without each deviation."""
+    wanted, chip, one = network.populations[post], integer.populations[post], 1 << DECAY_BITS
+    exact = wanted.bias[rows] * chip.scale[rows] * (1 << MEMBRANE_SHIFT)
+    netlist = Variant(
+        cause=UNKNOWN,
+        weights=STORED,
+        bias=chip.bias[rows].astype(np.float64),
+        keep_u=(one - chip.decay_u - 1) / one,
+        keep_v=(one - chip.decay_v) / one,
+    )
+    # where a rounding compensates, biases make up for weights: both go together
+    with_weights, alone = (exact, netlist.bias) if compensated else (netlist.bias, exact)
+    return [
+        netlist,
+        replace(netlist, cause=WEIGHTS, weights=UNCLIPPED),
+        replace(netlist, cause=WEIGHTS, weights=UNROUNDED, bias=with_weights),
+        replace(netlist, cause=BIAS, bias=alone),
+        replace(netlist, cause=BETA, keep_u=wanted.alpha, keep_v=wanted.beta),
+        replace(netlist, cause=SATURATION, limit=np.inf),
+        replace(netlist, cause=TRUNCATION, rounds=False),  # last, see run_variants
+    ]
+
+
+def run_variants(
+    variants: list[Variant],
+    threshold: FloatArray,
+    inflows: FloatArray,
+    begins: IntArray,
+    steps: IntArray,
+    fired: BoolArray,
+) -> tuple[FloatArray, BoolArray]:
+    """Run neurons from rest over what they remember, from step `begins` to `steps`; the longest come first.
+
+    Of the variants the last one, and only it, does not round. `inflows` (3, steps, neurons) are shifted synaptic sums
+    by ``Variant.weights``; float model and chip both `fired` (steps, neurons). Gives (variants, neurons): membrane
+    minus threshold in the last step, and whether the neuron fired before it, where it should not.
+    """
+
+    def column(values: list[float]) -> FloatArray:
+        return np.array(values, np.float64)[:, None]
+
+    bias = np.stack([v.bias for v in variants])
+    keep_u, keep_v = column([v.keep_u for v in variants]), column([v.keep_v for v in variants])
+    limit, which = column([v.limit for v in variants]), [v.weights for v in variants]
+    length = steps - begins + 1
+    place = np.arange(len(length))
+    u, v = np.zeros(bias.shape), np.zeros(bias.shape)
+    margins, early = np.zeros(bias.shape), np.zeros(bias.shape, np.bool_)
+    running = len(length)
+    for k in range(int(length[0])):
+        u, v = keep_u * u[:, :running], keep_v * v[:, :running]
+        for state in (u, v):
+            np.trunc(state[:-1], out=state[:-1])
+        u += inflows[:, begins[:running] + k, place[:running]][which]
+        v += u
+        v += bias[:, :running]
+        np.clip(v, -limit, limit, out=v)
+        left = int(np.count_nonzero(length > k + 1))
+        margins[:, left:running] = v[:, left:] - threshold[left:running]
+        both = fired[begins[:left] + k, place[:left]]
+        early[:, :left] |= (v[:, :left] > threshold[:left]) & ~both
+        v[:, :left] *= ~both
+        running = left
+    return margins, early

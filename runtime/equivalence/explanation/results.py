@@ -7,17 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from textwrap import wrap
 
-from spikeloom.runtime.equivalence.explanation.replay import (
-    BETA,
-    BIAS,
-    LEFT_OUT,
-    SATURATION,
-    TIE,
-    TRUNCATION,
-    WEIGHTS,
-)
 from spikeloom.runtime.report.encode import HIDDEN, INLINE
 from spikeloom.runtime.report.sections import Section, Table, Text
+
+WEIGHTS, BIAS, BETA = "weight rounding", "bias rounding", "realised beta"
+TRUNCATION, SATURATION, TIE = "round toward zero", "saturation or overflow", "tie (> or >=)"
+LEFT_OUT, UNKNOWN = "neuron left out", "not known"
 
 _BOUND = ", as far as the accumulator lets it"
 
