@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS
-from spikeloom.compiler.errors import FormatError
+from spikeloom.compiler.errors import FormatError, ModelError
 from spikeloom.compiler.files import write_atomically
 
 Array = np.ndarray[Any, Any]
@@ -37,6 +37,8 @@ FORMATS = {
     COUNTERS: "a counting network, not yet compiled",
 }
 """What a manifest may say that an archive is."""
+
+AGAIN = "copy or train it again"
 
 SIZE_LIMIT = 2**32
 """Bytes that a netlist file may have, 4 GiB: some hundred times the synapses of a whole chip."""
@@ -155,10 +157,12 @@ def is_netlist(path: str | os.PathLike[str]) -> bool:
     return str(path).endswith(".loom") or stated(Path(path), "format") not in (None, COUNTERS)
 
 
-Kind = type | tuple[int, int] | dict[str, Any] | list[Any]
+Kind = type | tuple[int, int] | frozenset[str] | dict[str, Any] | list[Any]
 """What an entry of a manifest must be: of a type (``float``: from 0, finite), a whole number within bounds (both
-allowed), an object of exactly these entries (``NAME?`` may be missing), or a list of such things, ``[kind, ...]`` of at
-least one."""
+allowed), one of some words, an object of exactly these entries (``NAME?`` may be missing), or a list of such things,
+``[kind, ...]`` of at least one, ``[kind, 2]`` of two."""
+
+GRAPH: Kind = {"name": str, "edges": [[(0, 2**31), 2]]}
 
 CLOCKS: Kind = {"channels": (0, MOST_CLOCKS), "steps": (1, MOST_STEPS), "length?": (1, MOST_STEPS)}
 
@@ -187,18 +191,22 @@ def array_faults(arrays: Mapping[str, Array], axes: Mapping[str, int], floats: I
 
 def _is(value: Any, kind: Kind) -> bool:
     match kind:
-        case type() if kind is float:
-            return type(value) in (int, float) and 0 <= value < math.inf
         case type():
-            return isinstance(value, kind)
+            return (
+                isinstance(value, kind) if kind is not float else type(value) in (int, float) and 0 <= value < math.inf
+            )
         case tuple():
             return type(value) is int and kind[0] <= value <= kind[1]
+        case frozenset():
+            return isinstance(value, str) and value in kind
         case dict():
             known = {name.removesuffix("?"): name for name in kind}
             if not isinstance(value, dict) or not {name for name in kind if name in known} <= set(value) <= set(known):
                 return False
             return all(_is(each, kind[known[name]]) for name, each in value.items())
-    return isinstance(value, list) and len(value) >= len(kind) - 1 and all(_is(one, kind[0]) for one in value)
+    size = len(value) if isinstance(value, list) else -1
+    fits = size == kind[1] if kind[1:] == [2] else size >= len(kind) - 1
+    return fits and all(_is(one, kind[0]) for one in value)
 
 
 def read_archive(
@@ -236,3 +244,29 @@ def read_archive(
     if digest({"manifest": text, **{name: members[name] for name in expected}}) != written:
         raise FormatError(f"{path}: its content does not match its hash, so it was altered; compile it again")
     return manifest, members
+
+
+def read_trained_archive(
+    path: Path,
+    wanted: str,
+    version: int,
+    kinds: Mapping[str, Kind],
+    names: Callable[[Mapping[str, Any]], Iterable[str]],
+) -> tuple[dict[str, Any], dict[str, Array]]:
+    """The same of a network that is not compiled, whose entries are of these kinds; ModelError instead."""
+
+    def checked(manifest: Mapping[str, Any]) -> Iterable[str]:
+        require_none(path, entry_faults(manifest, kinds))
+        return names(manifest)
+
+    try:
+        return read_archive(path, wanted, version, checked)
+    except FormatError as error:
+        said = str(error).rpartition("; ")[0].replace("netlist", "network")  # without the remedy, which is a netlist's
+        raise ModelError(f"{said}; {AGAIN}") from error
+
+
+def require_none(path: Path, faults: Iterable[str]) -> None:
+    """Refuse a network that is not compiled for what is wrong in its file."""
+    if faults := list(faults):
+        raise ModelError(f"{path}: {'; '.join(faults)}; {AGAIN}")

@@ -34,11 +34,16 @@ class Pass(Generic[W]):
     apply: Callable[[W], W]  # Makes new work of what it is given, which stays as it is
 
 
+def step(does: str, *, keeps: str) -> Callable[[Callable[[W], W]], Pass[W]]:
+    """Make a function the pass of its name; `does` and `keeps` as of :class:`Pass`."""
+    return lambda apply: Pass(name=apply.__name__.strip("_"), does=does, keeps=keeps, apply=apply)
+
+
 def run(passes: Iterable[Pass[W]], work: W, after: Callable[[str, W], object] | None = None) -> W:
     """Apply passes in order and verify what each one made; `after` gets the name of each and its work."""
-    for step in passes:
-        work = step.apply(work)
+    for each in passes:
+        work = each.apply(work)
         work.verify()
         if after is not None:
-            after(step.name, work)
+            after(each.name, work)
     return work

@@ -47,7 +47,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.archive import Kind, arrays_digest, entry_faults, read_npy, stored_members
+from spikeloom.compiler.archive import AGAIN, GRAPH, Kind, arrays_digest, entry_faults, read_npy, stored_members
 from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, constant_faults, layers_of
 from spikeloom.compiler.dynamics import MOST_STEPS, PLAIN, Dynamics, dynamics_from_json
 from spikeloom.compiler.errors import ModelError, OptionError
@@ -62,10 +62,10 @@ FORMAT = "spikeloom-checkpoint"
 VERSION = 6
 
 ENTRIES: dict[str, Kind] = {
-    "architecture": str,
+    "architecture": frozenset(SYSTEMS),
     **dict.fromkeys(("taxels", "classes"), (1, 2**31)),
     **dict.fromkeys(("beta", "theta"), float),
-    "graph": {"name": str, "edges": [[(0, 2**31)]]},
+    "graph": GRAPH,
     "weights": [str, ...],
     "training": dict,
 }
@@ -75,8 +75,6 @@ MORE: dict[str, Kind] = {
     "forms": [{"layer": str, "bits": (2, 8), "exponents": [(-1, 7), ...], "threshold": [(1, THRESHOLD_MANTISSA_MAX)]}],
 }
 """What a manifest may leave out."""
-
-_AGAIN = "copy or train it again"
 
 
 def read_checkpoint(
@@ -152,7 +150,7 @@ def _read_own(content: bytes, members: dict[str, bytes], weights: str | None) ->
     """Check a file of our own format, and take one set of weights from its members."""
     manifest, arrays = _signed_content(members)
     if faults := _manifest_faults(manifest):
-        raise ModelError(f"{'; '.join(faults)}; {_AGAIN}")
+        raise ModelError(f"{'; '.join(faults)}; {AGAIN}")
     sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
     weights = sets[0] if weights is None else weights
     if weights not in sets:
@@ -175,7 +173,7 @@ def _read_own(content: bytes, members: dict[str, bytes], weights: str | None) ->
     if edges.size and edges.max() >= manifest["taxels"]:
         faults.append(f"the graph joins taxels outside 0..{manifest['taxels'] - 1}")
     if faults:
-        raise ModelError(f"{'; '.join(faults)}; {_AGAIN}")
+        raise ModelError(f"{'; '.join(faults)}; {AGAIN}")
     found = Checkpoint(
         **layers_of(chosen),
         beta=float(manifest["beta"]),
@@ -211,7 +209,7 @@ def _signed_content(members: Mapping[str, bytes]) -> tuple[dict[str, Any], Array
     if type(version) is not int or not 1 <= version <= VERSION:
         raise ModelError(f"has format version {version!r}, this program reads up to {VERSION}; update spikeloom")
     if content_digest(manifest, arrays) != manifest.get("sha256"):
-        raise ModelError(f"its content does not match its hash, so it was altered; {_AGAIN}")
+        raise ModelError(f"its content does not match its hash, so it was altered; {AGAIN}")
     return manifest, arrays
 
 
@@ -220,13 +218,8 @@ def _manifest_faults(manifest: Mapping[str, Any]) -> list[str]:
     kinds = ENTRIES | {name: kind for name, kind in MORE.items() if name in manifest}
     if faults := entry_faults(manifest, kinds):
         return faults
-    fine = {
-        "architecture": manifest["architecture"] in SYSTEMS,
-        "weights": not set(WEIGHTS).isdisjoint(manifest["weights"]),
-        "graph": all(len(edge) == 2 for edge in manifest["graph"]["edges"]),
-    }
-    faults = [f"the manifest has no usable {name}" for name, good in fine.items() if not good]
-    return faults + constant_faults(manifest["beta"], manifest["theta"])
+    unknown = set(WEIGHTS).isdisjoint(manifest["weights"])
+    return ["the manifest has no usable weights"] * unknown + constant_faults(manifest["beta"], manifest["theta"])
 
 
 def _forms(entries: list[dict[str, Any]], checkpoint: Checkpoint) -> tuple[Form, ...]:
@@ -234,7 +227,7 @@ def _forms(entries: list[dict[str, Any]], checkpoint: Checkpoint) -> tuple[Form,
     fits = [(entry["layer"], len(entry["threshold"])) for entry in entries] == [*checkpoint.neurons.items()]
     gaps = [(entry["bits"], b - a) for entry in entries for a, b in pairwise(entry["exponents"])]
     if not fits or not all(0 < gap <= plane_distance(bits) for bits, gap in gaps):
-        raise ModelError(f"the manifest has no usable forms; {_AGAIN}")
+        raise ModelError(f"the manifest has no usable forms; {AGAIN}")
     return tuple(
         Form(bits=entry["bits"], exponents=tuple(entry["exponents"]), threshold=read_only(entry["threshold"]))
         for entry in entries

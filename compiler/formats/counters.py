@@ -22,10 +22,17 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from spikeloom.compiler.archive import COUNTERS, Array, archive_bytes, entry_faults, read_archive, write_archive
+from spikeloom.compiler.archive import (
+    COUNTERS,
+    Array,
+    Kind,
+    archive_bytes,
+    read_trained_archive,
+    require_none,
+    write_archive,
+)
 from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS
-from spikeloom.compiler.errors import FormatError, ModelError
 from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble
@@ -39,9 +46,13 @@ SYSTEM = "counters"
 SIZES = ("taxels", "polarities", "classes", "bins", "steps", "parts", "ramp")
 CONSTANTS = ("slope", "threshold")
 MOST = 2**20
-LARGEST = {"parts": MOST_CLOCKS}
-
-_AGAIN = "copy or train it again"
+KINDS: dict[str, Kind] = {
+    **dict.fromkeys(SIZES, (1, MOST)),
+    "parts": (1, MOST_CLOCKS),
+    "ramp": (0, MOST),
+    **dict.fromkeys(CONSTANTS, float),
+    "training": dict,
+}
 
 
 def counting_network(counters: Counters) -> Network:
@@ -89,17 +100,8 @@ def write_counters(path: str | os.PathLike[str], counters: Counters) -> str:
 def read_counters(path: str | os.PathLike[str]) -> tuple[Counters, str]:
     """Read and check a file; also its sha256. ModelError if it is damaged, altered, newer or inconsistent."""
     path = Path(path)
-    try:
-        manifest, members = read_archive(path, COUNTERS, VERSION, lambda _: ("counter", "weight"))
-    except FormatError as error:
-        said = str(error).rpartition("; ")[0].replace("netlist", "network")  # without the remedy, which is a netlist's
-        raise ModelError(f"{said}; {_AGAIN}") from error
-    kinds = {name: (0 if name == "ramp" else 1, LARGEST.get(name, MOST)) for name in SIZES}
-    wrong = entry_faults(manifest, kinds | dict.fromkeys(CONSTANTS, float) | {"training": dict})
-    if not wrong:
-        wrong = _array_faults(manifest, members["counter"], members["weight"])
-    if wrong:
-        raise ModelError(f"{path}: {'; '.join(wrong)}; {_AGAIN}")
+    manifest, members = read_trained_archive(path, COUNTERS, VERSION, KINDS, lambda _: ("counter", "weight"))
+    require_none(path, _array_faults(manifest, members["counter"], members["weight"]))
     counters = Counters(
         **{name: manifest[name] for name in (*SIZES, *CONSTANTS, "training")},
         counter=read_only(members["counter"]),

@@ -12,7 +12,7 @@ from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.passes.prune import Masks, Removal
 from spikeloom.compiler.passes.range_proof import RangeProof, prove_ranges
-from spikeloom.compiler.pipeline import LATER, Pass, run
+from spikeloom.compiler.pipeline import LATER, Pass, run, step
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.choose import Layout, lay_out
@@ -38,6 +38,7 @@ class Compilation:
     rates: tuple[FloatArray, ...] | None = None
     connected: Network = LATER  # The same network without the weights of neurons that do nothing (`disconnect`)
     quiet: Masks = ()  # Neurons that never fired in training and are to go for it, although some input makes them fire
+    gone: Masks = ()  # Neurons that are to go in any case, see :func:`without`
     integer: IntegerNetwork = LATER  # In the integers of the chip (`quantize`)
     choices: tuple[Choice, ...] = ()  # Scale of each layer and why
     exactness: tuple[Exactness, ...] = ()  # What is in the way of equal spikes, where these were asked for; else empty
@@ -70,6 +71,10 @@ class Compilation:
         FILE.verify(self.newest)
 
 
+@step(
+    "writes the graph convolution out as synapses, W = sum over hops k of A^k x W_k, in float64",
+    keeps="every spike, up to the rounding of a differently ordered sum",
+)
 def _expand(done: Compilation) -> Compilation:
     assert not isinstance(done.source, IntegerNetwork), "integers start behind the passes of float networks"
     source = done.source
@@ -77,6 +82,7 @@ def _expand(done: Compilation) -> Compilation:
     return replace(done, network=network)
 
 
+@step("runs the float network on training recordings, where there are any", keeps="the network")
 def _calibrate(done: Compilation) -> Compilation:
     options = done.options
     if options.training_events is None:
@@ -89,6 +95,11 @@ def _calibrate(done: Compilation) -> Compilation:
     return replace(done, calibration=found, rates=found.rates)
 
 
+@step(
+    "zeroes the weights of neurons that no input can make fire; with --prune-unused also of those that never "
+    "fired in training",
+    keeps="every spike on any input; with --prune-unused on any input on which these stay silent",
+)
 def _disconnect(done: Compilation) -> Compilation:
     quiet = prune.none_of(done.network)
     if done.options.keep_all or done.options.forms is not None:
@@ -100,6 +111,10 @@ def _disconnect(done: Compilation) -> Compilation:
     return replace(done, connected=prune.disconnect(done.network, gone), quiet=quiet)
 
 
+@step(
+    "chooses the scales of each layer and rounds weights, biases, thresholds and decays to registers",
+    keeps="the decisions, as well as the width allows; every training spike where --spike-exact succeeds",
+)
 def _quantize(done: Compilation) -> Compilation:
     options, network, target = done.options, done.connected, done.target
     packings = options.packings or (Packing(),)
@@ -115,20 +130,30 @@ def _quantize(done: Compilation) -> Compilation:
     return replace(done, integer=integer, choices=choices, connected=LATER)  # large, and no pass needs it again
 
 
+@step("bounds every register by the weights alone", keeps="the network")
 def _prove(done: Compilation) -> Compilation:
     return replace(done, proofs=prove_ranges(done.integer))
 
 
-def _remove(done: Compilation, gone: Masks | None = None) -> Compilation:
+@step(
+    "takes out the neurons that no input can make fire and those whose spikes reach no neuron",
+    keeps="every spike of the neurons that are left, on any input",
+)
+def _remove(done: Compilation) -> Compilation:
     integer, network = done.integer, done.network
     none = prune.none_of(integer)
     silent, unread = (none, none) if done.options.keep_all else prune.removable(integer)
-    silent = prune.either(silent, gone or none)
+    silent = prune.either(silent, done.gone or none)
     removals = () if network is LATER else prune.removals(network, silent, unread, done.quiet)
     held, identity = prune.compact(integer, prune.either(silent, unread))
     return replace(done, held=held, identity=identity, silent=silent, unread=unread, removals=removals)
 
 
+@step(
+    "cuts the layers over as few cores as every limit allows and puts the cores on tiles with the fewest "
+    "spike-hops, or as --optimize asks",
+    keeps="every spike: where a neuron sits has no influence on any",
+)
 def _place(done: Compilation) -> Compilation:
     options = done.options
     rates = done.rates and tuple(rate[ids] for rate, ids in zip(done.rates, done.identity, strict=True))
@@ -145,6 +170,7 @@ def _place(done: Compilation) -> Compilation:
     return replace(done, layout=layout, usual=usual)
 
 
+@step("writes cores, axons and synapse lists down as a netlist", keeps="every synapse that is not zero, stored once")
 def _emit(done: Compilation) -> Compilation:
     provenance = dict(done.options.provenance)
     if done.choices:
@@ -162,71 +188,18 @@ def _emit(done: Compilation) -> Compilation:
     return replace(done, netlist=made)
 
 
+@step("measures every limit again on the netlist and refuses one that breaks any", keeps="the netlist")
 def _legalize(done: Compilation) -> Compilation:
     return replace(done, uses=require_legal(done.netlist, done.target))
 
 
-FLOATS = (
-    Pass(
-        name="expand",
-        does="writes the graph convolution out as synapses, W = sum over hops k of A^k x W_k, in float64",
-        keeps="every spike, up to the rounding of a differently ordered sum",
-        apply=_expand,
-    ),
-    Pass(
-        name="calibrate",
-        does="runs the float network on training recordings, where there are any",
-        keeps="the network",
-        apply=_calibrate,
-    ),
-    Pass(
-        name="disconnect",
-        does="zeroes the weights of neurons that no input can make fire; with --prune-unused also of those that never "
-        "fired in training",
-        keeps="every spike on any input; with --prune-unused on any input on which these stay silent",
-        apply=_disconnect,
-    ),
-    Pass(
-        name="quantize",
-        does="chooses the scales of each layer and rounds weights, biases, thresholds and decays to registers",
-        keeps="the decisions, as well as the width allows; every training spike where --spike-exact succeeds",
-        apply=_quantize,
-    ),
-)
+FLOATS = (_expand, _calibrate, _disconnect, _quantize)
 """From floats to integers."""
 
-INTEGERS = (
-    Pass(name="prove", does="bounds every register by the weights alone", keeps="the network", apply=_prove),
-    Pass(
-        name="remove",
-        does="takes out the neurons that no input can make fire and those whose spikes reach no neuron",
-        keeps="every spike of the neurons that are left, on any input",
-        apply=_remove,
-    ),
-)
+INTEGERS = (_prove, _remove)
 """On integers, where they are no matter from."""
 
-LAYOUT = (
-    Pass(
-        name="place",
-        does="cuts the layers over as few cores as every limit allows and puts the cores on tiles with the fewest "
-        "spike-hops, or as --optimize asks",
-        keeps="every spike: where a neuron sits has no influence on any",
-        apply=_place,
-    ),
-    Pass(
-        name="emit",
-        does="writes cores, axons and synapse lists down as a netlist",
-        keeps="every synapse that is not zero, stored once",
-        apply=_emit,
-    ),
-    Pass(
-        name="legalize",
-        does="measures every limit again on the netlist and refuses one that breaks any",
-        keeps="the netlist",
-        apply=_legalize,
-    ),
-)
+LAYOUT = (_place, _emit, _legalize)
 """From integers to a netlist."""
 
 STORAGE = (*FLOATS, *INTEGERS)
@@ -266,5 +239,5 @@ def without(done: Compilation, gone: Masks, *, rates: tuple[FloatArray, ...] | N
     spike is as before. Each population must keep a neuron; `rates` are spikes per step of all, for the placement.
     """
     options = Options(provenance=done.netlist.provenance)
-    removed = _remove(replace(done, options=options, calibration=None, rates=rates), gone)
-    return lay_out_again(removed, options).netlist
+    work = replace(done, options=options, calibration=None, rates=rates, gone=gone)
+    return lay_out_again(_remove.apply(work), options).netlist

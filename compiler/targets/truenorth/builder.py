@@ -135,6 +135,17 @@ class Draft:
         """Let the spikes of a neuron count for a class, from tick `first` on."""
         self.votes.append((*source, label, first))
 
+    def placed(self, network: Any, chip: Target, remedy: str, **facts: Any) -> CrossbarNetlist:
+        """What was drafted for a network, its cores line by line in a square; CapacityError if there are too many."""
+        count = len(self.cores)
+        if count > chip.limit("chip.cores"):
+            raise CapacityError((chip.exceeded("chip", "chip.cores", count, remedy),))
+        side = max(int(np.ceil(np.sqrt(count))), -(-count // chip.limit("mesh.height")))
+        for number, core in enumerate(self.cores):
+            core.y, core.x = divmod(number, side)
+        sensor = {name: getattr(network, name) for name in ("taxels", "polarities", "classes")}
+        return self.netlist(**sensor, target=chip.name, **facts)
+
     def netlist(
         self,
         *,
@@ -190,13 +201,3 @@ class Draft:
             provenance=dict(provenance or {}),
             clocks=clocks,
         )
-
-
-def place_cores(draft: Draft, chip: Target, remedy: str) -> None:
-    """Give cores their places, line by line in a square as they were made; CapacityError if there are too many."""
-    count = len(draft.cores)
-    if count > chip.limit("chip.cores"):
-        raise CapacityError((chip.exceeded("chip", "chip.cores", count, remedy),))
-    side = max(int(np.ceil(np.sqrt(count))), -(-count // chip.limit("mesh.height")))
-    for number, core in enumerate(draft.cores):
-        core.y, core.x = divmod(number, side)

@@ -20,8 +20,9 @@ crosses the threshold before the data end, or counters spike a second time short
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from math import floor
 from typing import Any
 
@@ -32,7 +33,7 @@ from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, Place, history_free, place_cores
+from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, Place, history_free
 from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_LINEAR, RESET_NONE, CrossbarNetlist
 from spikeloom.compiler.types import BoolArray, IntArray
 
@@ -40,6 +41,9 @@ MAGNITUDES = tuple(1 << kind for kind in range(AXON_TYPES))
 """Weights of the axon types of a core of sums."""
 
 LARGEST = sum(MAGNITUDES)
+
+Wanted = tuple[Neuron, int, Place, tuple[int, ...]]
+"""A neuron, its number in the layer, the axon that it reaches, and its sources."""
 
 CHANNELS = 32
 """Axons that a core of sums leaves to channels, so that counters can use its other neurons."""
@@ -89,29 +93,24 @@ def planned(counters: Counters, chip: Target) -> Plan:
 def lower_counters(counters: Counters, chip: Target, *, provenance: Mapping[str, Any] | None = None) -> CrossbarNetlist:
     """Place a counting network; ModelError if its weights are beyond the chip, CapacityError if its cores are."""
     plan = planned(counters, chip)
-    placing = _Placing(chip=chip)
-    reached = _sums(placing, plan, _votes(placing, plan))
+    draft = Draft()
+    reached = _sums(draft, plan, _votes(draft, plan, chip))
     channels, source = counters.taxels * counters.polarities, _sources(counters)
+    wanted = list[Wanted]()
     for n in np.argsort(source, kind="stable").tolist():
         made = Neuron(threshold=int(counters.counter[n, 2]), reset=-BLOCK, negative_threshold=BLOCK)
-        for end in reached[n]:
-            placing.add(made, "counters", n, end, (int(source[n]),))
+        wanted += [(made, n, end, (int(source[n]),)) for end in reached[n]]
+    fed = _filled(draft, chip, "counters", wanted)
     if counters.parts > 1:
-        for gate, *end in placing.connect():
-            part, channel = divmod(gate, channels)
-            placing.add(history_free((1,), 2), "gates", gate, (end[0], end[1]), (channel, channels + part))
-    for channel, core, line in placing.connect():
-        placing.draft.feed(channel, core, line)
-    place_cores(placing.draft, chip, "train it with fewer thresholds, or --weight-bits")
-    return placing.draft.netlist(
-        taxels=counters.taxels,
-        polarities=counters.polarities,
-        classes=counters.classes,
-        bins=counters.bins,
-        clocks=counters.clocks,
-        target=chip.name,
-        provenance=provenance,
-    )
+        gated = [(*divmod(gate, channels), gate, end) for gate, end in fed]
+        gate = history_free((1,), 2)
+        wanted = [(gate, number, end, (channel, channels + part)) for part, channel, number, end in gated]
+        fed = _filled(draft, chip, "gates", wanted)
+    for channel, end in fed:
+        draft.feed(channel, *end)
+    remedy = "train it with fewer thresholds, or --weight-bits"
+    facts = {"bins": counters.bins, "clocks": counters.clocks, "provenance": provenance}
+    return draft.placed(counters, chip, remedy, **facts)
 
 
 def _sources(counters: Counters) -> IntArray:
@@ -126,15 +125,15 @@ def _least(counters: Counters) -> int:
     return floor(counters.threshold) + 1
 
 
-def _votes(placing: _Placing, plan: Plan) -> dict[Place, Place]:
+def _votes(draft: Draft, plan: Plan, chip: Target) -> dict[Place, Place]:
     """Add the votes; returns the axon that each sum reaches, by its group and its place in the group."""
-    draft, counters, ends = placing.draft, plan.counters, dict[Place, Place]()
+    counters, ends = plan.counters, dict[Place, Place]()
     used, first, slope = plan.magnitude.sum(axis=2) > 0, plan.first["votes"], int(counters.slope)
-    core, lowest = placing.core(), (1 << placing.chip.limit("neuron.threshold_bits")) - 1
+    core, lowest = draft.core(), (1 << chip.limit("neuron.threshold_bits")) - 1
     for label in range(counters.classes):
         own = np.argwhere(used[:, 2 * label : 2 * label + 2]).tolist()
-        if len(draft.cores[core].axons) + len(own) > placing.chip.limit("core.axons"):
-            core = placing.core()
+        if len(draft.cores[core].axons) + len(own) > chip.limit("core.axons"):
+            core = draft.core()
         vote = Neuron(
             weights=(1, -1),
             leak=slope,
@@ -151,11 +150,11 @@ def _votes(placing: _Placing, plan: Plan) -> dict[Place, Place]:
     return ends
 
 
-def _sums(placing: _Placing, plan: Plan, ends: Mapping[Place, Place]) -> list[list[Place]]:
+def _sums(draft: Draft, plan: Plan, ends: Mapping[Place, Place]) -> list[list[Place]]:
     """Add the sums, which reach the axons `ends`; returns the axons that each counter reaches."""
-    draft, reached = placing.draft, [list[Place]() for _ in plan.counters.counter]
+    reached = [list[Place]() for _ in plan.counters.counter]
     for number, group in enumerate(plan.groups):
-        core, rows = placing.core(), sorted(row for each, row in ends if each == number)
+        core, rows = draft.core(), sorted(row for each, row in ends if each == number)
         for row in rows:
             held = Neuron(weights=MAGNITUDES, reset_mode=RESET_LINEAR)
             added = draft.neuron(core, held, layer="sums", number=number * plan.magnitude.shape[1] + row)
@@ -166,43 +165,28 @@ def _sums(placing: _Placing, plan: Plan, ends: Mapping[Place, Place]) -> list[li
     return reached
 
 
-@dataclass(slots=True, kw_only=True)
-class _Placing:
-    """Cores as they are filled; `awaited` are neurons of each core by the source whose axon they still wait for."""
+def _filled(draft: Draft, chip: Target, layer: str, wanted: Iterable[Wanted]) -> list[tuple[int, Place]]:
+    """Add neurons; gives each source and an axon that waits for it.
 
-    chip: Target
-    draft: Draft = field(default_factory=Draft)
-    awaited: list[dict[int, list[int]]] = field(default_factory=list)
-
-    def core(self) -> int:
-        """Add a core."""
-        self.awaited.append({})
-        return self.draft.core()
-
-    def add(self, made: Neuron, layer: str, number: int, end: Place, sources: tuple[int, ...]) -> None:
-        """Add a neuron that reaches an axon, on the first core with room for it and for the axons of its sources."""
-        fits = (core for core in range(len(self.draft.cores)) if self._has_room(core, sources))
-        core = next(fits, None)
-        core = self.core() if core is None else core
-        added = self.draft.neuron(core, made, layer=layer, number=number)
-        self.draft.wire((core, added), *end)
+    A neuron is on the first core with room for it and for an axon of each of its sources.
+    """
+    neurons, axons = chip.limit("core.neurons"), chip.limit("core.axons")
+    awaited = defaultdict[int, dict[int, list[int]]](dict)  # neurons of each core by the source that they wait for
+    for made, number, end, sources in wanted:
+        for core, held in enumerate(draft.cores):
+            if len(held.neurons) < neurons and len(held.axons) + len(awaited[core].keys() | set(sources)) <= axons:
+                break
+        else:
+            core = draft.core()
+        added = draft.neuron(core, made, layer=layer, number=number)
+        draft.wire((core, added), *end)
         for source in sources:
-            self.awaited[core].setdefault(source, []).append(added)
-
-    def _has_room(self, core: int, sources: tuple[int, ...]) -> bool:
-        made, awaited = self.draft.cores[core], self.awaited[core]
-        axons = len(made.axons) + len(awaited.keys() | set(sources))
-        return len(made.neurons) < self.chip.limit("core.neurons") and axons <= self.chip.limit("core.axons")
-
-    def connect(self) -> list[tuple[int, int, int]]:
-        """Add the axons that neurons wait for; returns source, core and line of each."""
-        found = [
-            (source, core, self.draft.axon(core, 0, neurons))
-            for core, awaited in enumerate(self.awaited)
-            for source, neurons in awaited.items()
-        ]
-        self.awaited = [{} for _ in self.awaited]
-        return found
+            awaited[core].setdefault(source, []).append(added)
+    return [
+        (source, (core, draft.axon(core, 0, joined)))
+        for core in range(len(draft.cores))
+        for source, joined in awaited[core].items()
+    ]
 
 
 def run_counters(plan: Plan, events: npt.NDArray[np.uint8]) -> dict[str, BoolArray]:

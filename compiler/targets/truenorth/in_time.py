@@ -34,7 +34,6 @@ from spikeloom.compiler.targets.truenorth.builder import (
     Place,
     crossing_points,
     history_free,
-    place_cores,
 )
 from spikeloom.compiler.targets.truenorth.codebook import BIN_TICKS, EMPTYING, MOST, WEIGHTS, Layer, LevelNetwork
 from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_LINEAR, RESET_TO, CrossbarNetlist
@@ -58,21 +57,13 @@ def lower_in_time(
     ends: list[list[Place]] | None = None
     for depth, layer in reversed(list(enumerate(network.layers))):
         inputs: list[list[Place]] = [[] for _ in range(layer.level.shape[1])]
-        add = placing.split if layer.is_split else placing.whole
-        add(depth, layer, ends, inputs)
+        (placing.split if layer.is_split else placing.whole)(depth, layer, ends, inputs)
         ends = inputs
     for channel, places in enumerate(ends or []):
         for core, line in places:
             placing.draft.feed(channel, core, line)
-    place_cores(placing.draft, chip, "use fewer axons an input, or train with fewer features")
-    return placing.draft.netlist(
-        taxels=network.taxels,
-        polarities=network.polarities,
-        classes=network.classes,
-        bin_ticks=BIN_TICKS,
-        target=chip.name,
-        provenance=provenance,
-    )
+    remedy = "use fewer axons an input, or train with fewer features"
+    return placing.draft.placed(network, chip, remedy, bin_ticks=BIN_TICKS, provenance=provenance)
 
 
 def _starts(network: LevelNetwork) -> list[int]:

@@ -32,7 +32,7 @@ import numpy as np
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, Place, crossing_points, place_cores
+from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, Place, crossing_points
 from spikeloom.compiler.targets.truenorth.netlist import RESET_TO, CrossbarNetlist
 from spikeloom.compiler.types import IntArray
 
@@ -166,15 +166,8 @@ def lower(network: NativeNetwork, chip: Target, *, provenance: Mapping[str, Any]
     draft, ends = Draft(), None
     for depth in range(len(network.stages) - 1, -1, -1):
         ends = _place(draft, network, depth, ends, chip.limit("core.neurons"))
-    place_cores(draft, chip, "train with fewer features or copies")
-    return draft.netlist(
-        taxels=network.taxels,
-        polarities=network.polarities,
-        classes=network.classes,
-        clocks=network.clocks,
-        target=chip.name,
-        provenance=provenance,
-    )
+    remedy = "train with fewer features or copies"
+    return draft.placed(network, chip, remedy, clocks=network.clocks, provenance=provenance)
 
 
 def _place(

@@ -20,17 +20,19 @@ import numpy as np
 
 from spikeloom.compiler.archive import (
     CLOCKS,
+    GRAPH,
     TRAINED,
+    Kind,
     archive_bytes,
     array_faults,
-    entry_faults,
-    read_archive,
+    read_trained_archive,
+    require_none,
     stated,
     write_archive,
 )
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.dynamics import Clocks
-from spikeloom.compiler.errors import FormatError, ModelError
+from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.truenorth.native import NativeNetwork, Stage, faults
@@ -41,7 +43,15 @@ VERSION = 1
 PARTS = {"inputs": 2, "level": 3, "threshold": 1, "floor": 1, "leak": 1}
 """Arrays of a stage, in file order, and their axes."""
 
-_AGAIN = "copy or train it again"
+KINDS: dict[str, Kind] = {
+    "layers": [str, ...],
+    "clocks": CLOCKS,
+    "weights": [frozenset(WEIGHTS), ...],
+    "graph": GRAPH,
+    "towers": (1, 1),
+    "training": dict,
+    **dict.fromkeys(("taxels", "polarities", "classes", "copies"), (1, 2**20)),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,16 +117,10 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
     path = Path(path)
 
     def names(manifest: Mapping[str, Any]) -> Iterable[str]:
-        if wrong := _kind_faults(manifest):
-            raise ModelError(f"{path}: {'; '.join(wrong)}; {_AGAIN}")
         members = product(manifest["weights"], manifest["layers"], PARTS)
         return [f"{which}/0/{layer}/{part}" for which, layer, part in members]
 
-    try:
-        manifest, members = read_archive(path, FORMAT, VERSION, names)
-    except FormatError as error:
-        said = str(error).rpartition("; ")[0].replace("netlist", "network")  # without the remedy, which is a netlist's
-        raise ModelError(f"{said}; {_AGAIN}") from error
+    manifest, members = read_trained_archive(path, FORMAT, VERSION, KINDS, names)
     sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
     chosen = sets[0] if weights is None else weights
     if chosen not in sets:
@@ -124,8 +128,7 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
     stages: dict[str, dict[str, Any]] = {
         layer: {part: members[f"{chosen}/0/{layer}/{part}"] for part in PARTS} for layer in manifest["layers"]
     }
-    if wrong := [f"{name}: {fault}" for name, parts in stages.items() for fault in array_faults(parts, PARTS)]:
-        raise ModelError(f"{path}: {'; '.join(wrong)}; {_AGAIN}")
+    require_none(path, (f"{name}: {fault}" for name, parts in stages.items() for fault in array_faults(parts, PARTS)))
     network = NativeNetwork(
         **{name: manifest[name] for name in ("taxels", "polarities", "classes", "copies")},
         clocks=Clocks(**manifest["clocks"]),
@@ -136,10 +139,9 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
     )
     wrong = faults(network)
     edges = np.array(manifest["graph"]["edges"], np.int64).reshape(-1, 2)
-    if edges.size and (edges.min() < 0 or edges.max() >= network.taxels):
+    if edges.max(initial=0) >= network.taxels:
         wrong.append(f"the graph joins taxels outside 0..{network.taxels - 1}")
-    if wrong:
-        raise ModelError(f"{path}: {'; '.join(wrong)}; {_AGAIN}")
+    require_none(path, wrong)
     return Trained(
         network=network,
         weights=chosen,
@@ -149,22 +151,3 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
         training=manifest["training"],
         sha256=sha256_of(path),
     )
-
-
-def _kind_faults(manifest: Mapping[str, Any]) -> list[str]:
-    """What in the manifest is missing or of another kind."""
-    kinds = {
-        "layers": [str, ...],
-        "clocks": CLOCKS,
-        "weights": [str, ...],
-        "graph": {"name": str, "edges": [[(-(2**31), 2**31)]]},
-        "towers": (1, 1),
-        "training": dict,
-        **dict.fromkeys(("taxels", "polarities", "classes", "copies"), (1, 2**20)),
-    }
-    found = entry_faults(manifest, kinds)
-    if not found and not set(manifest["weights"]) <= set(WEIGHTS):
-        found.append("the manifest has no usable weights")
-    if not found and any(len(edge) != 2 for edge in manifest["graph"]["edges"]):
-        found.append("the manifest has no usable graph")
-    return found

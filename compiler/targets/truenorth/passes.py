@@ -14,7 +14,7 @@ from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import CapacityError, ModelError, OptionError
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes import expand
-from spikeloom.compiler.pipeline import LATER, Pass
+from spikeloom.compiler.pipeline import LATER, Pass, step
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.codebook import COPIES, LevelNetwork, in_levels
 from spikeloom.compiler.targets.truenorth.counting import lower_counters
@@ -62,6 +62,10 @@ class Compilation:
         FILE.verify(self.newest)
 
 
+@step(
+    "writes the graph convolution out as synapses, in float64; refuses what no layout could hold",
+    keeps="every spike, up to the rounding of a differently ordered sum",
+)
 def _expand(done: Compilation) -> Compilation:
     source = done.source
     assert not isinstance(source, NativeNetwork | Counters), "whole numbers start behind the passes of float networks"
@@ -75,6 +79,10 @@ def _expand(done: Compilation) -> Compilation:
     return replace(done, network=network)
 
 
+@step(
+    "rounds the weights of each neuron to a few levels of a step of its own",
+    keeps="the decisions, as well as the levels allow",
+)
 def _levels(done: Compilation) -> Compilation:
     copies = done.options.in_time
     assert copies is not None, "refused by the pass before"
@@ -84,6 +92,11 @@ def _levels(done: Compilation) -> Compilation:
         raise ModelError(f"{error}; {FORGET}") from error
 
 
+@step(
+    "puts neurons on cores, inputs on axons of the types that make their levels, and copies or relays where "
+    "a spike has several targets",
+    keeps="every spike; partial sums that travel in time saturate at 19",
+)
 def _place(done: Compilation) -> Compilation:
     provenance = done.options.provenance
     if isinstance(done.source, NativeNetwork):
@@ -93,38 +106,13 @@ def _place(done: Compilation) -> Compilation:
     return replace(done, netlist=lower_in_time(done.levels, done.target, provenance=provenance))
 
 
+@step("holds the netlist against every rule and refuses one that breaks any", keeps="the netlist")
 def _legalize(done: Compilation) -> Compilation:
     require_legal(done.netlist, done.target)
     return done
 
 
-PASSES = (
-    Pass(
-        name="expand",
-        does="writes the graph convolution out as synapses, in float64; refuses what no layout could hold",
-        keeps="every spike, up to the rounding of a differently ordered sum",
-        apply=_expand,
-    ),
-    Pass(
-        name="levels",
-        does="rounds the weights of each neuron to a few levels of a step of its own",
-        keeps="the decisions, as well as the levels allow",
-        apply=_levels,
-    ),
-    Pass(
-        name="place",
-        does="puts neurons on cores, inputs on axons of the types that make their levels, and copies or relays where "
-        "a spike has several targets",
-        keeps="every spike; partial sums that travel in time saturate at 19",
-        apply=_place,
-    ),
-    Pass(
-        name="legalize",
-        does="holds the netlist against every rule and refuses one that breaks any",
-        keeps="the netlist",
-        apply=_legalize,
-    ),
-)
+PASSES = (_expand, _levels, _place, _legalize)
 
 
 def start(source: Source, options: Options, target: Target) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
