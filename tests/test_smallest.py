@@ -14,7 +14,7 @@ from spikeloom.models.training.counters import Plan, counted, counters_of, fit
 from spikeloom.runtime.studies.counting import decisions_of
 from spikeloom.runtime.studies.fronts import parse_budgets
 from spikeloom.runtime.studies.pruning.results import Costs
-from spikeloom.runtime.studies.smallest import choice, space, work
+from spikeloom.runtime.studies.smallest import baselines, choice, space, work
 from spikeloom.runtime.studies.smallest.results import Tried
 from spikeloom.runtime.studies.smallest.space import Candidate
 
@@ -138,6 +138,8 @@ def few(monkeypatch, tmp_path):
     """A small space, in a folder of its own."""
     for name, values in {"JOINS": (5, 10), "PARTS": (1,), "THRESHOLDS": ((1,), (1, 4)), "WINDOWS": (100,)}.items():
         monkeypatch.setattr(space, name, values)
+    monkeypatch.setattr(space, "NETWORKS", ())
+    monkeypatch.setattr(baselines, "PARTS", (1,))
     monkeypatch.setattr(work, "ROUNDS", 2)
     monkeypatch.chdir(tmp_path)
     return tmp_path

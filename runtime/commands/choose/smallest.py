@@ -5,27 +5,48 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import numpy as np
+
 from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import write_atomically
-from spikeloom.runtime.commands.options import add_data
+from spikeloom.compiler.systems import MLP, SYSTEMS
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.models.graphs import NEUTOUCH
+from spikeloom.models.recordings.evtouch import data_digest
+from spikeloom.models.systems import taxels_alone
+from spikeloom.runtime.commands.options import add_data, add_graph_options
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import require_place
+from spikeloom.runtime.inputs.network import load_graph, sensor_places
 from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.studies.chart.results import Data
+from spikeloom.runtime.studies.fronts import parse_budgets
+from spikeloom.runtime.studies.smallest.choice import LIMITS
+from spikeloom.runtime.studies.smallest.space import counting, networks
+from spikeloom.runtime.studies.smallest.trained import Sensor
+
+SENSOR = ("graph", "taxels", "edges", "directed")
+
+GRAPH = "manual"
+"""Of the built-in sensor, unless another is named."""
+
+LEVELS = "so many classes in a row are levels of one thing, for counting networks (default: 1)"
 
 NOTES = """\
-Candidates are counting networks of many sizes. They are cross-validated inside the training split, in three rungs: what
-a cheaper one beats is dropped early. Taken is the cheapest whose accuracy is at most a standard error below the best,
-recording by recording; it is trained on the whole training split, compiled and verified, and read on the test split
-once. Results are kept in the store; the same command goes on from there, other budgets ask it again. The exit code is 1
-if no candidate fits a budget.
+Candidates are counting networks of many sizes and a few that are trained by gradients. They are cross-validated inside
+the training split, in three rungs: what a cheaper one beats is dropped early. Taken is the cheapest whose accuracy is
+at most a standard error below the best, recording by recording; it is trained on the whole training split, compiled and
+verified, and read on the test split once. Results are kept in the store; the same command goes on from there, other
+budgets ask it again. The exit code is 1 if no candidate fits a budget.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
     add_data(parser)
-    parser.add_argument("--taxels", metavar="N", type=int, help="of your sensor, where not all of them send events")
+    add_graph_options(parser, f"of the built-in sensor (default: {GRAPH})")
+    parser.add_argument("--levels", type=int, metavar="N", help=LEVELS)
     parser.add_argument("--target", default=DEFAULT_TARGET, help=f"chip (default: {DEFAULT_TARGET})")
     parser.add_argument(
         "--budget",
@@ -45,14 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; exit code 1 if no candidate fits a budget."""
-    from spikeloom.compiler.targets.base import load_target
-    from spikeloom.models.recordings.evtouch import data_digest
     from spikeloom.runtime.commands.training.train import both_splits
-    from spikeloom.runtime.studies.chart.results import Data
-    from spikeloom.runtime.studies.fronts import parse_budgets
-    from spikeloom.runtime.studies.smallest.choice import LIMITS
     from spikeloom.runtime.studies.smallest.sections import page, sections
-    from spikeloom.runtime.studies.smallest.space import counting
     from spikeloom.runtime.studies.smallest.study import smallest
 
     output = Path(arguments.output)
@@ -65,7 +80,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_place(arguments.html, "--html", arguments)
     budgets = parse_budgets([words for each in arguments.budget for words in each.split(",")], LIMITS)
     target = load_target(arguments.target)
-    training, test = both_splits(arguments.data, arguments.taxels, arguments.bin)
+    taxels = None if arguments.taxels is None else len(sensor_places(arguments.taxels))
+    training, test = both_splits(arguments.data, taxels, arguments.bin)
+    sensor = _sensor(arguments, training.taxels)
     data = Data(
         path=arguments.data,
         bin_s=arguments.bin,
@@ -74,15 +91,16 @@ def run(arguments: argparse.Namespace) -> Outcome:
         test=len(test),
         steps=training.steps,
     )
+    systems = SYSTEMS if len(sensor.graph.edges) else (MLP,)
     found = smallest(
-        counting(training.steps),
+        [*counting(training.steps, arguments.levels or 1), *networks(training.steps, systems)],
         (training, test),
         data,
         target,
         budgets,
         store,
         str(output),
-        taxels=arguments.taxels,
+        sensor=sensor,
         command=_command(arguments),
         jobs=arguments.jobs,
         fresh=arguments.fresh,
@@ -93,8 +111,17 @@ def run(arguments: argparse.Namespace) -> Outcome:
     return Outcome(found, sections, 0 if found.choice.fits else 1)
 
 
+def _sensor(arguments: argparse.Namespace, taxels: int) -> Sensor:
+    """The sensor that the options name, or the built-in one with its usual graph, if it has as many taxels."""
+    options = repeat.given(arguments, SENSOR)
+    if taxels == len(NEUTOUCH) and not any(options.values()):
+        options["graph"] = GRAPH
+    graph = load_graph(argparse.Namespace(**options)) or taxels_alone(np.arange(float(taxels))[:, None])
+    return Sensor(graph=graph, options=options)
+
+
 def _command(arguments: argparse.Namespace) -> str:
     """The words that ask for the same search."""
-    words = repeat.words(repeat.given(arguments, ("data", "bin", "taxels", "target", "store")))
+    words = repeat.words(repeat.given(arguments, ("data", "bin", *SENSOR, "levels", "target", "store")))
     budgets = [word for budget in arguments.budget for word in ("--budget", budget)]
     return repeat.command("smallest", *words, *budgets, "-o", arguments.output)

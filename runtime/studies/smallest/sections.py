@@ -16,6 +16,9 @@ from spikeloom.runtime.studies.smallest import baselines
 from spikeloom.runtime.studies.smallest.choice import energy, worse
 from spikeloom.runtime.studies.smallest.results import Smallest, Tried
 
+LOWER = 12
+"""Points below the last rung's intervals that are drawn."""
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -33,7 +36,7 @@ def sections(result: Smallest) -> Iterator[Section]:
     last = max(each.rung for each in result.tried)
     tried = sorted((each for each in result.tried if each.rung == last), key=energy)
     beside = [each for each in result.baselines if each.rung == last]
-    yield Section("The choice", [Facts(_facts(result)), Text("\n".join([*_why(result), *_needless(result)]))])
+    yield Section("The choice", [Facts(_facts(result)), *map(Text, [*_why(result), *_needless(result)])])
     figure = Figure("front", partial(picture, result), "Accuracy over energy and time of a mean inference.")
     yield Section("Accuracy against cost", [figure, Details("What is drawn", [Text(MEANINGS)], unfolded=True)])
     yield Section(
@@ -94,22 +97,22 @@ def _why(result: Smallest) -> Iterator[str]:
     interval = f"95 % interval {100 * chosen.low:.1f} … {100 * chosen.high:.1f}"
     yield f"take #{chosen.number} {chosen.candidate.name}: {_share(chosen)} ({interval}), {_joules(chosen)}"
     if chosen.number == best.number:
-        yield "  the best of them, and nothing cheaper is as good"
+        yield "it is the best of them, and nothing cheaper is as good"
     else:
         yield (
-            f"  the best, #{best.number} {best.candidate.name}, has {_share(best)} for {_joules(best)}; recording by "
+            f"the best, #{best.number} {best.candidate.name}, has {_share(best)} for {_joules(best)}; recording by "
             f"recording it is {_behind(chosen)} points ahead"
         )
     for table, index in choice.cheapest.items():
         if index != chosen.number:
             other = result.candidate(index)
-            yield f"  by the table {table} it would be #{index} {other.candidate.name}, {_joules(other)}"
+            yield f"by the table {table} it would be #{index} {other.candidate.name}, {_joules(other)}"
     if choice.ahead is None:
-        yield "  no candidate is a point more accurate"
+        yield "no candidate is a point more accurate"
     else:
         ahead = result.candidate(choice.ahead)
         times = f"{energy(ahead) / energy(chosen):.1f} times the energy"
-        yield f"  a point more costs {times}: #{ahead.number} {ahead.candidate.name}, {_share(ahead)}, {_joules(ahead)}"
+        yield f"a point more costs {times}: #{ahead.number} {ahead.candidate.name}, {_share(ahead)}, {_joules(ahead)}"
 
 
 def _behind(each: Tried) -> str:
@@ -264,6 +267,8 @@ def _panel(drawing: Drawing, panel: Axes, result: Smallest, unit: str) -> None:
     drawing.tips += [(panel, cost(each), 100 * each.accuracy, _tip(each)) for each in sorted(priced, key=cost)]
     if unit == "J":
         _processors(drawing, panel, result)
+    shown = [each for each in (*result.tried, *result.baselines) if each.rung == last]
+    panel.set_ylim(100 * min(each.low for each in shown) - LOWER, min(100, 100 * max(each.high for each in shown) + 2))
     panel.set_xscale("log")
     panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if unit == "s" else (1,)))
     panel.xaxis.set_minor_formatter(NullFormatter())

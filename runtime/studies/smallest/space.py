@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
+from spikeloom.compiler.systems import MLP, TACTILESGNET
 from spikeloom.models.recordings.evtouch import WHOLE
 from spikeloom.models.training.counters import STRENGTHS, Plan
 from spikeloom.runtime.inputs import repeat
@@ -25,6 +26,17 @@ RAMPS = (16, 64)
 
 MOST_COUNTERS = {100: 80, 50: 20}
 """Counters of a channel at most, by window: what is larger gains little and takes minutes."""
+
+
+NETWORKS = (
+    (TACTILESGNET, 10, 16, "64,64"),
+    (TACTILESGNET, 10, 32, "128,256"),
+    (MLP, 10, 16, "64,64"),
+)
+"""System, join, features and neurons of the dense layers of those that are trained by gradients."""
+
+EPOCHS = 15
+"""Of these."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +67,7 @@ class Candidate:
         return Plan(thresholds=thresholds, bins=about.pop("join", 1), strengths=strengths, **about)
 
 
-def counting(steps: int) -> Iterator[Candidate]:
+def counting(steps: int, levels: int = 1) -> Iterator[Candidate]:
     """Counting networks for recordings of so many bins; options that are usual are left out.
 
     A counter sees one event a step at most, so thresholds above the steps of a part are omitted.
@@ -75,7 +87,15 @@ def counting(steps: int) -> Iterator[Candidate]:
         if whole and closed and len(able) * parts <= MOST_COUNTERS[window]:
             known[join, window, parts, able] = None
     for join, window, parts, able in known:
-        yield _counters(thresholds=",".join(map(str, able)), parts=parts, window=window, join=join)
+        yield _counters(thresholds=",".join(map(str, able)), parts=parts, levels=levels, window=window, join=join)
+
+
+def networks(steps: int, systems: Collection[str]) -> Iterator[Candidate]:
+    """Networks of some systems that are trained by gradients, for recordings of so many bins."""
+    for system, join, features, hidden in NETWORKS:
+        if system in systems and join <= steps // 2:
+            options = {"recipe": "timed", "join": join, "features": features, "hidden": hidden, "epochs": EPOCHS}
+            yield Candidate(system=system, options=options)
 
 
 def _counters(**options: Any) -> Candidate:

@@ -6,7 +6,6 @@ strengths, and from there to five rounds. Everything happens on the training spl
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import __version__, compile_network
+from spikeloom.compiler import __version__, write_netlist
+from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.targets.base import Target
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs import repeat
-from spikeloom.runtime.inputs.compilation import provenance
-from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import decode
 from spikeloom.runtime.report.numbers import wilson
@@ -34,6 +33,8 @@ from spikeloom.runtime.studies.smallest import choice, work
 from spikeloom.runtime.studies.smallest.baselines import baselines
 from spikeloom.runtime.studies.smallest.results import Checked, Smallest, Tried
 from spikeloom.runtime.studies.smallest.space import Candidate, variants
+from spikeloom.runtime.studies.smallest.trained import Sensor, arguments, compiled, plan_of
+from spikeloom.runtime.studies.training import Job, run_job
 
 RUNGS = 3
 
@@ -47,7 +48,7 @@ def smallest(
     store: Path,
     output: str,
     *,
-    taxels: int | None,
+    sensor: Sensor,
     command: str,
     jobs: int | None = None,
     fresh: bool = False,
@@ -56,7 +57,7 @@ def smallest(
 
     `splits` are training and test recordings; `command` repeats it.
     """
-    about: dict[str, Any] = {"taxels": taxels, "jobs": jobs}
+    about: dict[str, Any] = {"sensor": sensor, "jobs": jobs}
     beside = search(baselines(), most_accurate, data, target, store, fresh=fresh, **about)
     tried = search(candidates, choice.going_on, data, target, store, fresh=False, **about)
     taken = choice.choose(tried, budgets)
@@ -64,7 +65,7 @@ def smallest(
     tried = [_beside(each, best, tried) for each in tried]
     by = ChosenBy(energy=next(iter(taken.cheapest)), time=next((table.name for table in target.time), None))
     chosen = tried[taken.cheapest[by.energy] - 1]
-    checked, commands = train_again(chosen.candidate, splits, data, target, output)
+    checked, commands = train_again(chosen.candidate, sensor, splits, data, target, output)
     return Smallest(
         spikeloom=__version__,
         command=command,
@@ -90,7 +91,7 @@ def search(
     target: Target,
     store: Path,
     *,
-    taxels: int | None,
+    sensor: Sensor,
     jobs: int | None,
     fresh: bool,
 ) -> list[Tried]:
@@ -100,7 +101,7 @@ def search(
     for rung in range(1, RUNGS + 1):
         before = [known.get(each.name) for each in alive]
         works = [
-            work.trial(each, rung, None if old is None else old.setting, data, taxels, target.name)
+            work.trial(each, rung, None if old is None else old.setting, data, sensor, target.name)
             for each, old in zip(alive, before, strict=True)
         ]
         label = f"rung {rung} of {RUNGS}"
@@ -155,17 +156,39 @@ def _beside(each: Tried, best: Tried, tried: Sequence[Tried]) -> Tried:
 
 
 def train_again(
-    candidate: Candidate, splits: tuple[Recordings, Recordings], data: Data, target: Target, output: str
+    candidate: Candidate,
+    sensor: Sensor,
+    splits: tuple[Recordings, Recordings],
+    data: Data,
+    target: Target,
+    output: str,
 ) -> tuple[Checked, tuple[str, ...]]:
     """Train a candidate on the whole training split, compile and verify it, then read the test split; the commands."""
     training, test = splits
-    network = str(Path(output).with_suffix(".pt"))
-    words = repeat.words({"data": Path(data.path).name, "bin": data.bin_s})
-    command = repeat.command("train", *words, *candidate.words)
-    made = train_counters(candidate.plan(), training, test, command, network)
+    network, counts = str(Path(output).with_suffix(".pt")), candidate.system == COUNTING
+    typed = [*repeat.words({"bin": data.bin_s, **sensor.options_of(candidate.system)}), *candidate.words]
+    typed += [] if counts else ["--keep", "last"]
+    command = repeat.command("train", "--data", Path(data.path).name, *typed)
+    if counts:
+        sha256 = train_counters(candidate.plan(), training, test, command, network).sha256
+    else:
+        job = Job(
+            plan=plan_of(candidate, sensor, training),
+            training=training,
+            test=test,
+            epochs=candidate.options["epochs"],
+            seed=0,
+            resume=False,
+            output=Path(network),
+            keep=("last",),
+            command=command,
+            position=0,
+        )
+        sha256 = run_job(job).sha256
     progress("compiling")
-    loaded = load_network(network, _arguments(target.name))
-    netlist, sha256 = _compiled(loaded, target, output)
+    loaded = load_network(network, arguments(target))
+    netlist = compiled(loaded, target, None if counts else joined_bins(training, loaded.network.input.bins))
+    netlist_sha256 = write_netlist(netlist, output)
     train, held = (of_length(joined_bins(each, netlist.bins), netlist.clocks.length) for each in (training, test))
     progress("verifying")
     of = {"train": train, "test": held}
@@ -178,9 +201,9 @@ def train_again(
     right = int(np.count_nonzero(verdicts["test"].chip_predictions == held.labels))
     checked = Checked(
         network=network,
-        network_sha256=made.sha256,
+        network_sha256=sha256,
         netlist=output,
-        netlist_sha256=sha256,
+        netlist_sha256=netlist_sha256,
         different=sum(each.different for each in seen.spikes.values()),
         levels=seen.levels,
         equal={split: int(np.sum(v.float_predictions == v.chip_predictions)) for split, v in verdicts.items()},
@@ -189,23 +212,8 @@ def train_again(
     )
     read = repeat.words({"data": data.path, "bin": data.bin_s})
     return checked, (
-        repeat.command("train", *repeat.words({"data": data.path, "bin": data.bin_s}), *candidate.words, "-o", network),
-        repeat.command("compile", network, "-o", output),
+        repeat.command("train", "--data", data.path, *typed, "-o", network),
+        repeat.command("compile", network, *([] if counts else ["--calibrate", data.path]), "-o", output),
         repeat.command("verify", output, "--checkpoint", network, *read),
         repeat.command("estimate", output, *read),
     )
-
-
-def _arguments(target: str) -> argparse.Namespace:
-    """What the command ``compile`` would have parsed."""
-    names = (*repeat.NETWORK, *repeat.ROUNDING, *repeat.PLACING, "polarities", "polarities_first", "dt", "convention")
-    return argparse.Namespace(**{name: repeat.USUAL.get(name) for name in names}, target=target)
-
-
-def _compiled(loaded: LoadedNetwork, target: Target, output: str) -> tuple[Any, str]:
-    """The netlist that ``compile`` makes of a network, and the hash of its file."""
-    from spikeloom.compiler import write_netlist
-
-    options: Any = target.module.Options(provenance=provenance(_arguments(target.name), loaded, calibrated=False))
-    netlist = compile_network(loaded.model, options, target=target.name).netlist
-    return netlist, write_netlist(netlist, output)

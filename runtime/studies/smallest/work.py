@@ -11,9 +11,12 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler import __version__, compile_network
+from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import CapacityError, DataError, ModelError
+from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.formats.counters import counting_network
+from spikeloom.compiler.systems import SYSTEMS
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.recordings.events import joined_bins, of_length
@@ -33,10 +36,12 @@ from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.studies.chart.results import Data
 from spikeloom.runtime.studies.jobs import Job, content_key
 from spikeloom.runtime.studies.pruning.results import Costs
+from spikeloom.runtime.studies.pruning.trials import decisions as decisions_on_chip
 from spikeloom.runtime.studies.pruning.trials import priced
 from spikeloom.runtime.studies.smallest import baselines
 from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF, Processor
 from spikeloom.runtime.studies.smallest.space import Candidate
+from spikeloom.runtime.studies.smallest.trained import Sensor, plan_of, without
 
 FORMAT = 1
 """Of what is measured; goes up when a figure means something else."""
@@ -56,7 +61,7 @@ class Trial(Job):
     rung: int  # From 1
     setting: float | None
     data: Data
-    taxels: int | None
+    sensor: Sensor
     target: str
 
 
@@ -72,10 +77,13 @@ class Measured:
     processor: Processor | None = None  # Costs of a baseline
 
 
-def trial(candidate: Candidate, rung: int, setting: float | None, data: Data, taxels: int | None, target: str) -> Trial:
+def trial(candidate: Candidate, rung: int, setting: float | None, data: Data, sensor: Sensor, target: str) -> Trial:
     """Work whose key is of everything that decides the result."""
     about = {"format": FORMAT, "spikeloom": __version__, "data": data.sha256, "bin_s": data.bin_s, "target": target}
     about |= {"system": candidate.system, "options": dict(candidate.options), "rung": rung, "setting": setting}
+    if candidate.system in SYSTEMS:
+        graph = sensor.graph
+        about["graph"] = arrays_digest({"edges": graph.edges, "coordinates": graph.coordinates})
     return Trial(
         key=content_key(about),
         label=candidate.name,
@@ -83,20 +91,21 @@ def trial(candidate: Candidate, rung: int, setting: float | None, data: Data, ta
         rung=rung,
         setting=setting,
         data=data,
-        taxels=taxels,
+        sensor=sensor,
         target=target,
     )
 
 
 def measure(work: Trial) -> JsonObject:
     """Do one piece of work; the JSON of a :class:`Measured`."""
-    kinds = {LINEAR: _baseline, RBF: _baseline}
-    found: JsonObject = encode(kinds.get(work.candidate.system, _counting)(work, _training(work.data, work.taxels)))
+    kinds = {COUNTING: _counting, LINEAR: _baseline, RBF: _baseline}
+    training = _training(work.data, len(work.sensor.graph.coordinates))
+    found: JsonObject = encode(kinds.get(work.candidate.system, _network)(work, training))
     return found
 
 
 @lru_cache(maxsize=1)
-def _training(data: Data, taxels: int | None) -> Recordings:
+def _training(data: Data, taxels: int) -> Recordings:
     return recordings(data.path, "train", classes=None, taxels=taxels, bin_s=data.bin_s, labels_for="training")
 
 
@@ -121,6 +130,24 @@ def _counting(work: Trial, training: Recordings) -> Measured:
         costs, refused = costs_of(made, training, work.target)
     rounds = (ROUNDS if last else 1,) * len(training)
     return Measured(right=tuple(right.tolist()), tried=rounds, setting=strength, costs=costs, refused=refused)
+
+
+def _network(work: Trial, training: Recordings) -> Measured:
+    """A network that is trained by gradients: decisions on one part, on the last rung on all; costs of the first."""
+    plan, target = plan_of(work.candidate, work.sensor, training), load_target(work.target)
+    epochs = work.candidate.options["epochs"] // (2 if work.rung == 1 else 1)
+    fold = folds(training.labels, FOLDS, np.random.default_rng(0))
+    right, tried, costs = *np.zeros((2, len(training)), np.int64), None
+    steps = joined_bins(training, plan.bins)
+    for part in range(FOLDS if work.rung == 3 else 1):
+        held = fold == part
+        try:
+            netlist = without(plan, training, held, epochs, target)
+        except (CapacityError, ModelError) as error:
+            return Measured(right=(), tried=(), setting=epochs, refused=str(error).splitlines()[0])
+        costs = costs or priced(netlist, some(steps))[1]
+        right[held], tried[held] = decisions_on_chip(netlist, steps.part(held)) == training.labels[held], 1
+    return Measured(right=tuple(right.tolist()), tried=tuple(tried.tolist()), setting=epochs, costs=costs)
 
 
 def _baseline(work: Trial, training: Recordings) -> Measured:
