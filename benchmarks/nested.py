@@ -1,6 +1,6 @@
 """Counting networks and support vector machines in repeated nested cross-validation over all recordings.
 
-    python benchmarks/nested.py DATA OUT.json [--levels 5] [--ramp 64] [--again 5]        (needs scikit-learn)
+    python benchmarks/nested.py DATA OUT.json [--levels 5] [--ramp 32] [--again 1]        (needs scikit-learn)
 
 Both splits are put together and parted five times five ways. In each training part every plan and strength, kernel and
 constant is tried by cross-validation in five folds, plans within two standard errors of the best `--again` times;
@@ -117,7 +117,7 @@ def measured(
         tried_again = {name: tried(own_of[name], classes, range(again)) if again > 1 else once[name] for name in names}
         right = {name: each[1] for name, each in tried_again.items()}
         chosen = min(able(right), key=prices.__getitem__)
-        best = max(right, key=lambda name: right[name].mean())
+        best = max(right, key=lambda name: (right[name].mean(), -prices[name]))
         for system, name in (("chosen", chosen), ("best", best)):
             own, (strength, _, lowest) = own_of[name], tried_again[name]
             if system == "best":
@@ -204,13 +204,20 @@ def main() -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("--levels", type=int, default=1, help="classes in a row that are levels of one thing")
     parser.add_argument("--again", type=int, default=1, help="cross-validations of plans near the best one")
-    parser.add_argument("--ramp", type=int, default=32, help="steps of the read-out (best at any price: 256)")
+    parser.add_argument("--ramp", type=int, default=32, help="steps of the read-out; twice for levels")
     arguments = parser.parse_args()
     data, training = whole(arguments.recordings)
     store = arguments.output.with_suffix(".parts.json")
     done: Json = json.loads(store.read_text()) if store.exists() else {}
     plans = [
-        Plan(bins=bins, parts=parts, thresholds=events, strengths=STRENGTHS, levels=levels, ramp=arguments.ramp)
+        Plan(
+            bins=bins,
+            parts=parts,
+            thresholds=events,
+            strengths=STRENGTHS,
+            levels=levels,
+            ramp=arguments.ramp * min(levels, 2),
+        )
         for levels in sorted({1, arguments.levels})
         for bins, parts, events in SMALL + LARGE
     ]
