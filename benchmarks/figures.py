@@ -107,11 +107,11 @@ def layouts(session: Session) -> Json:
 
 
 def chart(session: Session, data: str) -> Json:
-    """Points of a grid, and what was chosen."""
+    """Points of a grid, and the one that was chosen."""
     networks, grid = CHARTS[data]
     found = session.run(f"chart {networks} --data {data} --grid {grid} -o chart", "chart/chart.json")
     points = {str(point["number"]): {key: point[key] for key in POINT} for point in found["points"]}
-    return {"points": points, "recommended": found["recommended"], "saving": found["saving"]}
+    return {"points": points, "taken": found["budget"]["point"]}
 
 
 def anytime(session: Session, data: str) -> Json:

@@ -1,19 +1,17 @@
-"""The command ``chart`` on small networks; grids as written, and fronts, choices and budgets on made-up points."""
+"""The command ``chart`` on small networks; grids as written, and fronts, the choice and budgets on made-up points."""
 
-import csv
 import hashlib
 import json
 import re
 import shlex
 import shutil
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_chart import BY, made_figures, made_network, made_point
+from made_chart import BY, made_figures, made_network, made_point, stored
 from made_files import CLASSES, events, own_file, recordings_folder, ring, weights
 from random_crossbars import random_network
 from zoo import STORAGE, tuned
@@ -27,10 +25,9 @@ from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import data_digest
 from spikeloom.runtime.studies import fronts
-from spikeloom.runtime.studies.chart import choices
+from spikeloom.runtime.studies.chart import results, study
 from spikeloom.runtime.studies.chart import work as chart_work
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
-from spikeloom.runtime.studies.chart.results import ChosenBy
 
 GRID = "bits=4,8,window=50-100%:50,cores=cores/fc1:2"
 VIOLATION = Violation(owner="core 0", rule="loihi1.core.axons_in", used=5, allowed=4, remedy="use fewer inputs")
@@ -82,11 +79,11 @@ def test_every_point_of_the_grid_is_there(made, place):
     assert made["refused"] == []
     assert (made["data"]["train"], made["data"]["test"], made["data"]["steps"]) == (16, 8, 24)
     (network,) = made["networks"]
-    assert network["validation"] == network["expected"] == 0.75
+    assert network["validation"] == 0.75
+    whole = made["points"][1]["train"]["float"]["accuracy"]
     decided = {}
     for point in made["points"]:
-        kept = point["train"]["accuracy"] / network["float_training"]
-        assert point["expected"] == pytest.approx(0.75 * kept)
+        assert point["expected"] == pytest.approx(0.75 * point["train"]["accuracy"] / whole)
         assert point["test"]["low"] <= point["test"]["accuracy"] <= point["test"]["high"]
         figures = [point[split][key] for split in ("train", "test") for key in ("correct", "equal")]
         assert decided.setdefault((str(point["bits"]), point["window"]), figures) == figures, "layouts decide alike"
@@ -95,13 +92,6 @@ def test_every_point_of_the_grid_is_there(made, place):
     assert (place / "out" / "chart.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert (place / "out" / "chart.svg").read_text("utf-8").startswith("<?xml")
     assert (place / "out" / "chart.html").read_text("utf-8").startswith("<!DOCTYPE html>")
-    with (place / "out" / "chart.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    for row, point in zip(rows, made["points"], strict=True):
-        assert row["bits"] == str(point["bits"][0])
-        assert float(row["test_energy_j_davies2018"]) == point["test"]["energy_j"]["davies2018"]
-        assert float(row["train_time_s_sanafe"]) == point["train"]["time_s"]["sanafe"]
-        assert [row["compile"], row["run"]] == point["commands"]
 
 
 @pytest.mark.parametrize("number", [4, 7])
@@ -150,7 +140,6 @@ def test_one_more_width_measures_nothing_else(made, again, spikeloom, monkeypatc
     assert [point["test"] for point in points if point["bits"] != [6]] == [point["test"] for point in made["points"]]
 
 
-# -- choices -----------------------------------------------------------------------------------------------------------
 def test_what_the_chip_refuses_is_listed(as_json, refusal, place, monkeypatch):
     refused, to_integers = {4}, chart_work.to_integers
 
@@ -200,16 +189,10 @@ def test_a_mistake_is_named(refusal, place, words, told):
     assert not (place / "bad").exists()
 
 
-UJ = 1e-6
-
-
-def point(number, train, test, energy, time, *, step=20e-6, bits=4, **about):
+def point(number, train, test, energy, time, *, bits=4, **about):
     """Right of 400 training and of 100 test recordings, µJ and ms of both splits."""
-    figures = {
-        "train": made_figures(train, 400, energy, time, step=step),
-        "test": made_figures(test, 100, energy, time, step=step),
-    }
-    return made_point(number, bits=(bits,), n_cores=4, **figures, **about)
+    figures = {"train": made_figures(train, 400, energy, time), "test": made_figures(test, 100, energy, time)}
+    return made_point(number, stored=stored(bits), **figures, **about)
 
 
 @pytest.fixture
@@ -218,13 +201,13 @@ def points():
         point(1, 400, 88, 200, 4.0, bits=8),
         point(2, 398, 90, 120, 3.0),
         point(3, 396, 70, 60, 2.0, bits=3),
-        point(4, 395, 89, 40, 2.5, bits=2),
+        point(4, 394, 89, 40, 2.5, bits=2),
         point(5, 400, 60, 300, 1.0, cores="latency"),
     ]
-    return choices.with_fronts(choices.with_expectations(made, [made_network()])[0], BY)
+    return study.with_fronts(study.with_expectations(made, [made_network()]), BY)
 
 
-# -- fronts and expectations -------------------------------------------------------------------------------------------
+# -- fronts and the choice ---------------------------------------------------------------------------------------------
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), max_size=12))
 def test_the_front_is_what_no_other_point_beats(pairs):
     gains, costs = [float(gain) for gain, _ in pairs], [float(cost) for _, cost in pairs]
@@ -238,58 +221,53 @@ def test_the_front_is_what_no_other_point_beats(pairs):
 def test_fronts_are_of_test_accuracy_and_each_cost(points):
     assert [each.front["energy"] for each in points] == [False, True, False, True, False]
     assert [each.front["latency"] for each in points] == [False, True, True, True, True]
-    assert points[0].front.keys() == {"energy", "operations", "cores", "latency"}
 
 
 def test_expected_is_validation_times_what_is_kept_on_training_recordings():
-    (reached,), (network,), words = choices.with_expectations([point(1, 380, 50, 1, 1)], [made_network(trained=396)])
-    assert (reached.expected, network.expected, words) == (pytest.approx(0.9 * 0.95 / 0.99), 0.9, choices.VALIDATION)
+    made = [point(1, 380, 50, 1, 1), point(2, 190, 50, 1, 1, window=50)]  # the float model has 8 more on whole ones
+    assert [each.expected for each in study.with_expectations(made, [made_network()])] == pytest.approx(
+        [0.9 * 380 / 388, 0.9 * 190 / 388]
+    )
     # where one checkpoint knows no validation, training figures stand for all
-    networks = [made_network(trained=396), made_network("other", validation=None)]
-    (reached,), _, words = choices.with_expectations([point(1, 380, 50, 1, 1)], networks)
-    assert (reached.expected, words) == (pytest.approx(0.95), choices.TRAINING)
+    networks = [made_network(), made_network("other", validation=None)]
+    assert [each.expected for each in study.with_expectations(made, networks)] == pytest.approx([0.95, 0.475])
 
 
-# -- choices -----------------------------------------------------------------------------------------------------------
-def chosen(points, expected=0.9, bins=1):
-    return choices.recommended(points, [made_network(expected=expected, bins=bins)], BY, bin_s=0.02)
-
-
-def test_recommended_points(points):
-    # within one of a hundred test recordings: expected at least 89 %, that is 395.6 of 400 training recordings
-    assert chosen(points) == {"cheapest": 3, "fastest": 5, "best": 1}
-    assert chosen(points, expected=0.99) == {"cheapest": None, "fastest": None, "best": 1}
-
-
-def test_a_point_that_does_not_keep_pace_with_the_sensor_is_not_the_fastest(points):
-    points[4] = replace(points[4], train=replace(points[4].train, step_s={"clock": 0.03}))
-    assert chosen(points)["fastest"] == 3
-    assert chosen(points, bins=2)["fastest"] == 5  # steps of 40 ms
-
-
-def test_choices_do_not_look_at_the_test_split(points):
+def test_the_choice_does_not_look_at_the_test_split(points):
     blind = [replace(each, test=made_figures(1, 100, 1, 1)) for each in points]
-    assert chosen(blind) == chosen(points)
-    assert choices.pick(blind, fronts.parse_budgets(["energy=100uJ"]), BY).point == 3
+    for budgets in ((), ("energy=100uJ",), ("accuracy=89",)):
+        wanted = fronts.parse_budgets(budgets)
+        assert study.pick(blind, wanted, BY) == study.pick(points, wanted, BY)
 
 
-def test_saving_against_eight_bits(points):
-    found = choices.saving(points, BY)
-    assert (found.usual, found.chosen.point, found.seen.point) == (1, 3, 4)
-    assert found.chosen.energy == {"one": pytest.approx(200 / 60), "two": pytest.approx(200 / 60)}
-    assert found.chosen.accuracy == pytest.approx(-0.18)
-    assert found.seen.energy["one"] == pytest.approx(5.0)
-    assert found.seen.accuracy == pytest.approx(0.01)
+@pytest.mark.parametrize(
+    ("budgets", "number", "fitting"),
+    [
+        ([], 3, 5),  # the cheapest within a point of the best: expected at least 89 %, or 395.6 of 400
+        (["energy=50uJ"], 4, 1),
+        (["energy=150uJ"], 4, 3),  # within a point of the best that fits
+        (["accuracy=89"], 3, 4),  # an accuracy is reached as cheaply as can be
+        (["accuracy=50"], 4, 5),
+        (["accuracy=89.2"], 2, 3),
+        (["accuracy=90"], 1, 2),
+        (["energy=150uJ", "latency=2.2ms"], 3, 1),
+        (["accuracy=88", "latency=1.5ms"], 5, 1),
+    ],
+)
+def test_the_point_that_fits_all_budgets(points, budgets, number, fitting):
+    assert study.pick(points, fronts.parse_budgets(budgets), BY) == results.Pick(
+        budgets=tuple(budgets), fits=True, fitting=fitting, point=number
+    )
 
 
-def test_the_usual_mapping_is_the_manual_graph_at_eight_bits_on_whole_recordings(points):
-    assert choices.usual_point(points[1:]) is None
-    assert choices.saving(points[1:], BY) is None
-    other = point(6, 400, 80, 100, 1, bits=8, graph="knn:1")
-    assert choices.usual_point([other, *points]).number == 1
-    assert choices.usual_point([other, *points[1:]]).number == 6
-    for about in ({"fine_tuned": True}, {"prune": True}, {"window": 50}, {"planes": 2}, {"cores": "latency"}):
-        assert choices.usual_point([point(7, 400, 80, 100, 1, bits=8, **about)]) is None
+@pytest.mark.parametrize(
+    ("budgets", "number"), [(["energy=20uJ"], 4), (["energy=50uJ", "latency=2ms"], 3), (["accuracy=95"], 1)]
+)
+def test_the_nearest_point_of_budgets_that_nothing_fits(points, budgets, number):
+    found = study.pick(points, fronts.parse_budgets(budgets), BY)
+    assert (found.fits, found.fitting, found.point) == (False, 0, number)
+    with pytest.raises(OptionError, match=r"--budget latency: .*no time table"):
+        study.pick(points, fronts.parse_budgets(["latency=1ms"]), replace(BY, time=None))
 
 
 # -- budgets -----------------------------------------------------------------------------------------------------------
@@ -322,43 +300,6 @@ def test_a_budget_that_is_none(words):
         fronts.parse_budgets([words])
     with pytest.raises(OptionError, match="--budget latency=2ms: latency is limited twice; give it once"):
         fronts.parse_budgets(["latency=1ms", "latency=2ms"])
-
-
-@pytest.mark.parametrize(
-    ("budgets", "number", "fitting"),
-    [
-        (["energy=150uJ"], 2, 3),  # energy buys the best that fits
-        (["accuracy=89"], 3, 4),  # an accuracy is reached as cheaply as can be
-        (["accuracy=89.2"], 2, 3),
-        (["accuracy=90"], 1, 2),
-        (["energy=150uJ", "latency=2.2ms"], 3, 1),
-        (["accuracy=88", "latency=1.5ms"], 5, 1),
-    ],
-)
-def test_the_point_that_fits_all_budgets(points, budgets, number, fitting):
-    found = choices.pick(points, fronts.parse_budgets(budgets), BY)
-    assert (found.fits, found.point, found.fitting, found.misses) == (True, number, fitting, {})
-
-
-def test_what_is_given_up_beside_the_best(points):
-    assert choices.pick(points, (), BY) is None
-    found = choices.pick(points, fronts.parse_budgets(["energy=150uJ"]), BY)
-    assert found.best == 1
-    assert found.given_up.expected == pytest.approx(-0.0045)
-    assert found.given_up.accuracy == pytest.approx(0.02)
-    assert found.given_up.energy["one"] == pytest.approx(200 / 120)
-    assert found.given_up.time["clock"] == pytest.approx(4 / 3)
-
-
-def test_the_nearest_point_of_a_budget_that_nothing_fits(points):
-    found = choices.pick(points, fronts.parse_budgets(["energy=20uJ"]), BY)
-    assert (found.fits, found.fitting, found.point) == (False, 0, 4)
-    (miss,) = found.misses.values()
-    assert (miss["limit"], miss["found"]) == (pytest.approx(20 * UJ), pytest.approx(40 * UJ))
-    both = choices.pick(points, fronts.parse_budgets(["energy=50uJ", "latency=2ms"]), BY)
-    assert (both.point, list(both.misses)) == (3, ["energy"])
-    with pytest.raises(OptionError, match=r"--budget latency: .*no time table"):
-        choices.pick(points, fronts.parse_budgets(["latency=1ms"]), ChosenBy(energy="one", time=None))
 
 
 TARGET = load_target("loihi1")
@@ -425,9 +366,3 @@ def test_a_mistake_names_the_value_and_what_is_allowed(text, telling):
         parsed(text)
     assert str(caught.value).startswith("--grid ")
     assert telling in str(caught.value)
-
-
-def test_a_grid_that_is_too_large():
-    every = "/".join("+".join(map(str, widths)) for widths in product(WIDTHS, repeat=4))
-    with pytest.raises(OptionError, match="388,800 points a network, allowed are 100,000"):
-        parsed(f"bits={every},planes=1-3,window=1-100%:1")

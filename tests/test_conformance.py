@@ -54,8 +54,7 @@ LISTS = """
 anytime:
     bins chip_steps decisions files full labelled labels least_interval rules samples source split windows
 chart:
-    budget chosen_by command data expected format grid networks points recommended refused saving
-    spikeloom tables target
+    budget chosen_by command data format grid networks points refused spikeloom tables target
 compile:
     chips classes compartments cores layers limits neurons provenance sha256 synapses synapses_nonzero
     synapses_stored target taxels tiles bins? calibration? clocks? core_bound? exactness? facts? layout? path?

@@ -31,7 +31,7 @@ from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.report import drawing, html
 from spikeloom.runtime.report.encode import OPTIONAL, decode, encode, key
 from spikeloom.runtime.report.sections import Code, Details, Facts, Figure, Section, Table, Text, terminal
-from spikeloom.runtime.studies.chart.sections import page, panels, printed, series_of
+from spikeloom.runtime.studies.chart.sections import page, picture, printed, series_of
 
 REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data", "-o", "out.html")
 HEADINGS = ["Verdict", "Decisions", "Cores", "Taxels", "One recording", "Energy and time", "Provenance"]
@@ -413,7 +413,7 @@ def test_numbers_of_numpy_are_plain_and_what_has_no_form_is_refused():
         encode(object())
 
 
-PARTS = ["Networks", "Which one to deploy", "Accuracy against cost", "Every point", "Provenance"]
+PARTS = ["Which one to deploy", "Accuracy against cost", "Every point", "Provenance"]
 
 
 @pytest.fixture
@@ -426,7 +426,7 @@ def told(chart):
 
 
 # -- terminal and files ------------------------------------------------------------------------------------------------
-def test_the_terminal_shows_choices_fronts_saving_and_budget(chart, golden):
+def test_the_terminal_shows_the_choice_and_fronts(chart, golden):
     golden("chart.txt", told(chart))
 
 
@@ -438,11 +438,11 @@ def test_colours_are_for_networks_where_there_are_several_else_for_storage(chart
 
 
 def test_every_point_is_a_mark_that_tells_its_figures_and_commands(chart):
-    drawn = panels(chart, ["energy"], "a chart")
-    tips = [tip for _, _, tip in drawn.values()["tips"]]
-    assert sorted(int(tip[1:].split()[0]) for tip in tips) == [point.number for point in chart.points]
-    (first,) = (tip for tip in tips if tip.startswith("#1 "))
-    assert first.startswith("#1 grasps 2b, 50 %: test 68.00 % (58.3 … 76.3), float 70.00 %, expected ")
+    tips = [tip for _, _, tip in picture(chart).values()["tips"]]
+    for panel in (tips[:12], tips[12:]):  # over energy and over time
+        assert sorted(int(tip[1:].split()[0]) for tip in panel) == [point.number for point in chart.points]
+    first = next(tip for tip in tips if tip.startswith("#1 "))
+    assert first.startswith("#1 grasps 2b, 50 %: expected % 83.40, test % 68.00, interval 58.3 … 76.3, float % 70.00, ")
     assert first.splitlines()[1:] == list(chart.points[0].commands)
 
 
@@ -468,12 +468,12 @@ def page_file(chart, tmp_path):
 
 def test_in_a_browser_keys_and_pointer_read_the_points(page_file):
     script = """
-    const tips = JSON.parse(drawing("chart-energy").nextElementSibling.textContent).tips;
+    const tips = JSON.parse(drawing("chart").nextElementSibling.textContent).tips;
     const [x, y] = tips.find((tip) => tip[2].startsWith("#2 "));
-    return [press("chart-energy", "ArrowRight"), press("chart-energy", "ArrowLeft"), point("chart-energy", x, y)];"""
-    cheapest, dearest, second = browsed(page_file, script)
+    return [press("chart", "ArrowRight"), press("chart", "ArrowLeft"), point("chart", x, y)];"""
+    cheapest, slowest, second = browsed(page_file, script)
     assert cheapest.startswith("#7 grasps-knn1 2b, 50 %")
-    assert dearest.startswith("#6 grasps 8b, 100 %")
+    assert slowest.startswith("#12 grasps-knn1 8b, 100 %")
     assert second.startswith("#2 grasps 2b, 100 %")
 
 

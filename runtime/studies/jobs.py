@@ -15,7 +15,6 @@ import sqlite3
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -38,10 +37,6 @@ class Job:
 
     key: str  # Of everything that decides the result, see `content_key`
     label: str  # For messages
-
-
-class ProcessDied(Exception):  # noqa: N818 - it is handed over, not raised
-    """A process ended while it worked, and with it what the others had not finished."""
 
 
 def content_key(facts: Mapping[str, Any]) -> str:
@@ -74,8 +69,8 @@ def sweep(
     `fresh` what it holds is forgotten. `jobs` are processes at a time (one a core), whose libraries use one thread
     each; `label` says what is done.
 
-    What a measurement raises is raised with a note that names it; UnfinishedError, if a process died. The text of a
-    KeyboardInterrupt says what is kept.
+    What a measurement raises is raised with notes that name it and say what is kept, as does the text of a
+    KeyboardInterrupt; UnfinishedError, if a process died.
     """
     keys = list(dict.fromkeys(point.key for point in points))
     with only_one(store), closing(_opened(store, fresh=fresh)) as kept:
@@ -90,12 +85,7 @@ def sweep(
         with ended_by_signal():
             try:
                 progress(0, label)
-                for done, (index, found) in enumerate(side_by_side(waiting, measure, jobs=jobs), 1):
-                    if isinstance(found, ProcessDied):
-                        raise UnfinishedError(f"{found}\n{standing()}")
-                    if isinstance(found, Exception):
-                        found.add_note(waiting[index].label)
-                        raise found
+                for done, (index, found) in enumerate(side_by_side(waiting, partial(_named, measure), jobs=jobs), 1):
                     text = json.dumps(found, allow_nan=False)
                     with kept:
                         kept.execute("INSERT INTO results VALUES (?, ?)", (waiting[index].key, text))
@@ -106,10 +96,18 @@ def sweep(
             except sqlite3.OperationalError as error:  # a full disk, say
                 raise OSError(None, str(error), str(store)) from error
             except SpikeloomError as error:
-                if not isinstance(error, UnfinishedError):
-                    error.add_note(standing())
+                error.add_note(standing())
                 raise
         return {key: results[key] for key in keys}
+
+
+def _named(measure: Callable[[AJob], AResult], job: AJob) -> AResult:
+    """Measure a job; what that raises has a note that names it."""
+    try:
+        return measure(job)
+    except Exception as error:
+        error.add_note(job.label)
+        raise
 
 
 def _opened(store: Path, *, fresh: bool) -> sqlite3.Connection:
@@ -127,18 +125,18 @@ def _opened(store: Path, *, fresh: bool) -> sqlite3.Connection:
 
 def side_by_side(
     payloads: Sequence[APayload], run: Callable[[APayload], AResult], *, jobs: int | None = None
-) -> Iterator[tuple[int, AResult | Exception]]:
+) -> Iterator[tuple[int, AResult]]:
     """Work on payloads, begun in this order, in processes of their own in this folder; on a single one here.
 
-    Yields the place of a payload and what `run`, a function of a module, made of it, as they come: its value, the
-    exception that it raised, or `ProcessDied`, after which nothing comes.
+    Yields the place of a payload and what `run`, a function of a module, made of it, as they come. Raises what `run`
+    raised; UnfinishedError, if a process ended while it worked, and with it what the others had not finished.
     """
     if jobs is not None and jobs < 1:
         raise OptionError(f"--jobs {jobs}: allowed are 1 or more; choose another")
     processes = min(jobs or os.cpu_count() or 1, len(payloads))
     if processes <= 1:
         with _one_thread():
-            yield from (_attempt(run, index, payload) for index, payload in enumerate(payloads))
+            yield from ((index, run(payload)) for index, payload in enumerate(payloads))
         return
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.process_executor import TerminatedWorkerError
@@ -148,8 +146,10 @@ def side_by_side(
         work = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
         try:
             yield from work(attempt(index, payload) for index, payload in enumerate(payloads))
-        except TerminatedWorkerError:
-            yield -1, ProcessDied("a process ended early, perhaps for lack of memory; go on with fewer --jobs")
+        except TerminatedWorkerError as error:
+            raise UnfinishedError(
+                "a process ended early, perhaps for lack of memory; go on with fewer --jobs"
+            ) from error
 
 
 @contextmanager
@@ -166,24 +166,14 @@ def _one_thread() -> Iterator[None]:
             torch.set_num_threads(threads)
 
 
-def _attempt(run: Callable[[APayload], AResult], index: int, payload: APayload) -> tuple[int, AResult | Exception]:
-    """What `run` makes of a payload, or the exception that it raised, such that it can cross process borders."""
-    try:
-        return index, run(payload)
-    except (SpikeloomError, OSError, MemoryError) as error:
-        return index, error.with_traceback(None)
-    except Exception:  # a defect; not every exception survives the way
-        return index, RuntimeError(traceback.format_exc())
-
-
 def _in_child(
     parent: int, folder: Path, run: Callable[[APayload], AResult], index: int, payload: APayload
-) -> tuple[int, AResult | Exception]:
-    """As :func:`_attempt`, in a process that does not outlive the one that started it, even where that is killed."""
+) -> tuple[int, AResult]:
+    """Work on a payload in a process that does not outlive the one that started it, even where that is killed."""
     _end_with(parent)
     os.chdir(folder)  # the process may be left from earlier work in another one
     try:
-        return _attempt(run, index, payload)
+        return index, run(payload)
     except KeyboardInterrupt:
         if os.getppid() != parent:  # tidy by now, and nobody waits for a result
             os._exit(1)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.checkpoint import WEIGHTS
-from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.errors import OptionError, UnfinishedError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
@@ -24,7 +24,7 @@ from spikeloom.models.training.record import Reached, TrainingRecord
 from spikeloom.runtime.report.drawing import COLOURS, Drawing, sheet, styled
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.sections import Section, Table, Text
-from spikeloom.runtime.studies.jobs import ProcessDied, ended_by_signal, only_one, side_by_side
+from spikeloom.runtime.studies.jobs import ended_by_signal, only_one, side_by_side
 
 TITLES = {
     "last": "last epoch",
@@ -251,12 +251,11 @@ def _kept(done: Sequence[Job], jobs: Sequence[Job]) -> str:
 
 def _side_by_side(jobs: Sequence[Job], waiting: Sequence[int], results: dict[int, Finished]) -> None:
     """Run jobs in processes of their own; whatever ends this ends them all."""
-    for place, found in side_by_side([jobs[index] for index in waiting], run_job):
-        if isinstance(found, ProcessDied):
-            raise OptionError(f"{found}; go on with --resume, and with fewer --seeds")
-        if isinstance(found, Exception):
-            raise found
-        results[waiting[place]] = found
+    try:
+        for place, found in side_by_side([jobs[index] for index in waiting], run_job):
+            results[waiting[place]] = found
+    except UnfinishedError as error:
+        raise OptionError(f"{error}; go on with --resume, and with fewer --seeds") from error
 
 
 # -- for people --------------------------------------------------------------------------------------------------------

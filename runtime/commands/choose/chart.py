@@ -22,9 +22,9 @@ from spikeloom.runtime.studies.fronts import parse_budgets
 NOTES = """\
 Axes of the grid: bits (2-6, 8, or one a layer as in 8+4+4+8), planes (1-3), groups (1-8), prune (0, 1), cores (cores,
 latency, or LAYER:N as in fc1:6+conv1:4), window (per cent of each recording, 25-100% is every quarter,
-25-100%:5 every twentieth). Choices are made on the training split, the test split is reported. A chart that was
-interrupted goes on with the same command; netlists and figures are kept in FOLDER. The exit code is 1 if no point fits
-a budget.
+25-100%:5 every twentieth). The choice, the cheapest point that is at most a point less accurate than the best, is made
+on the training split, the test split is reported. A chart that was interrupted goes on with the same command; netlists
+and figures are kept in FOLDER. The exit code is 1 if no point fits a budget.
 """
 
 
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="WHAT=LIMIT",
-        help="pick a point: energy=0.1mJ, latency=5ms or accuracy=88; may be repeated, all of them hold",
+        help="of the point to deploy: energy=0.1mJ, latency=5ms or accuracy=88; may be repeated, all of them hold",
     )
     parser.add_argument("--table", metavar="NAME", help="energy table to choose and draw by (default: the first)")
     sweeps = parser.add_argument_group("sweep")
@@ -62,7 +62,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
     target = load_target(DEFAULT)
     grid = Grid() if arguments.grid is None else parse_grid(arguments.grid, target)
     budgets = parse_budgets(arguments.budget)
-    folder = _folder(arguments.output)
+    folder = Path(arguments.output)
+    if not folder.absolute().parent.is_dir() or (folder.exists() and not folder.is_dir()):
+        raise OptionError(f"-o {folder}: is not a folder, nor can it be made; give another name")
     networks = read_networks(arguments)
     tables = [table.name for table in target.energy]
     energy = tables[0] if arguments.table is None else arguments.table
@@ -81,21 +83,11 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_suited(networks, splits, data.sha256)
     require_grid(networks, grid, target)
     folder.mkdir(exist_ok=True)
-    charted = chart(
-        networks,
-        target,
-        data,
-        grid,
-        budgets,
-        folder,
-        energy=energy,
-        command=_command(arguments),
-        jobs=arguments.jobs,
-        fresh=arguments.fresh,
-    )
+    sweep = {"jobs": arguments.jobs, "fresh": arguments.fresh}
+    words = _command(arguments)
+    charted = chart(networks, target, data, grid, budgets, folder, energy=energy, command=words, **sweep)
     write_chart(folder, charted)
-    fits = charted.budget is None or charted.budget.fits
-    return Outcome(charted, partial(printed, folder=str(folder)), 0 if fits else 1)
+    return Outcome(charted, partial(printed, folder=str(folder)), 0 if charted.budget.fits else 1)
 
 
 def _command(arguments: argparse.Namespace) -> str:
@@ -103,13 +95,3 @@ def _command(arguments: argparse.Namespace) -> str:
     options = repeat.words(repeat.given(arguments, ("data", *repeat.NETWORK, "grid", "table", "bin")))
     budgets = [word for budget in arguments.budget for word in ("--budget", budget)]
     return repeat.command("chart", *arguments.checkpoints, *options, *budgets, "-o", arguments.output)
-
-
-def _folder(words: str) -> Path:
-    """Folder of the chart; refused if there cannot be one."""
-    folder = Path(words)
-    if folder.exists() and not folder.is_dir():
-        raise OptionError(f"-o {words}: is not a folder; give the name of one")
-    if not folder.absolute().parent.is_dir():
-        raise OptionError(f"-o {words}: the folder that it shall be in does not exist; make it first")
-    return folder

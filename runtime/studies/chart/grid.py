@@ -6,7 +6,6 @@ A grid is ``AXIS=VALUE,VALUE,AXIS=VALUE …``; values stand between commas or sl
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields
@@ -20,22 +19,16 @@ from spikeloom.models.recordings.evtouch import WHOLE
 WINDOW_STEP = 25
 """Per cent between the windows of a range that does not say."""
 
-MOST = 100_000
-"""Points that a grid may have for each checkpoint."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grid:
     """Values of every axis, in the order in which they were given; each once."""
 
-    # Storage widths: one number for all layers, or one for each
-    bits: tuple[tuple[int, ...], ...] = ((2,), (3,), (4,), (5,), (6,), (8,))
-    # planes, groups: Times that a synapse is stored, and scales in a layer
-    planes: tuple[int, ...] = (1,)
-    groups: tuple[int, ...] = (1,)
+    bits: tuple[tuple[int, ...], ...] = ((2,), (3,), (4,), (5,), (6,), (8,))  # For all layers, or one for each
+    planes: tuple[int, ...] = (1,)  # Times that a synapse is stored
+    groups: tuple[int, ...] = (1,)  # Scales in a layer
     prune: tuple[int, ...] = (0,)  # Whether neurons that never fired on training recordings are left out: 0 or 1
-    # What the layout is for, as ``--optimize`` names it, or least cores as in ``fc1:6+conv1:4``
-    cores: tuple[str, ...] = ("cores",)
+    cores: tuple[str, ...] = ("cores",)  # As ``--optimize`` names it, or least cores as in ``fc1:6+conv1:4``
     window: tuple[int, ...] = (25, 50, 75, WHOLE)  # Per cent of each recording
 
 
@@ -69,11 +62,7 @@ def parse_grid(text: str, target: Target) -> Grid:
         if not values:
             raise OptionError(f"--grid {axis}={value}: allowed are {allowed}")
         found[axis] |= dict.fromkeys(values)
-    grid = Grid(**{name: tuple(values) for name, values in found.items()})
-    points = math.prod(len(getattr(grid, axis)) for axis in AXES)
-    if points > MOST:
-        raise OptionError(f"--grid: {points:,} points a network, allowed are {MOST:,}; give fewer values")
-    return grid
+    return Grid(**{name: tuple(values) for name, values in found.items()})
 
 
 # -- values ------------------------------------------------------------------------------------------------------------
@@ -108,12 +97,13 @@ def _numbers(words: str, allowed: Collection[int], step: int = 1) -> list[int]:
 
 def _widths(words: str, allowed: Collection[int]) -> list[tuple[int, ...]]:
     """A width for all layers, a range of these, or one for each layer."""
-    if "+" not in words:
-        return [(width,) for width in _numbers(words, allowed)]
-    each = tuple(next(iter(_numbers(width, allowed)), 0) for width in words.split("+"))
-    if 0 in each or "-" in words:
+    each = [_numbers(width, allowed) for width in words.split("+")]
+    if len(each) == 1:
+        return [(width,) for width in each[0]]
+    widths = tuple(width for numbers in each for width in numbers)
+    if any(len(numbers) != 1 for numbers in each):
         return []
-    return [each[:1] if len(set(each)) == 1 else each]
+    return [widths[:1] if len(set(widths)) == 1 else widths]
 
 
 def _cores(words: str) -> list[str]:

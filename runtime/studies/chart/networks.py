@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import count, product
+from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar
 
 from spikeloom.compiler import Packing, check_packings
-from spikeloom.compiler.archive import COUNTERS, arrays_digest, is_netlist
+from spikeloom.compiler.archive import COUNTERS, arrays_digest
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats import ONNX
 from spikeloom.compiler.formats.counters import SYSTEM, counting_network, read_counters
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.base import Target
@@ -21,9 +20,8 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import NO_GRAPH
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import PRETRAINED, shipped
-from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, network_kind, propagation
-from spikeloom.runtime.machines.base import DEFAULT, trained_for
-from spikeloom.runtime.report.encode import HIDDEN
+from spikeloom.runtime.inputs.network import NETWORKS, load_checkpoint, load_graph, network_kind, propagation
+from spikeloom.runtime.report.encode import HIDDEN, key
 from spikeloom.runtime.studies.chart.grid import Grid
 
 
@@ -31,14 +29,14 @@ from spikeloom.runtime.studies.chart.grid import Grid
 class Storage:
     """How a network is stored on the chip: width of all layers or of each, planes, scale groups, pruning.
 
-    It is a network's own if it was fine-tuned for it.
+    It is a network's own if that was fine-tuned for it.
     """
 
     bits: tuple[int, ...]
     planes: int
     groups: int
     prune: bool
-    own: bool = False
+    own: bool = field(default=False, metadata=key("fine_tuned"))
 
     def options(self) -> JsonObject:
         """Options of ``compile`` that ask for it, where it is not the usual one."""
@@ -63,15 +61,13 @@ class Storage:
 class NetworkFile:
     """A network of a chart."""
 
-    json_properties: ClassVar = ("fine_tuned", "trained_by", "validation")
+    json_properties: ClassVar = ("validation",)
 
     path: str
     name: str  # Short, and no other network of the chart has it
-    target: str = DEFAULT  # Chip that it is compiled for
     graph: str  # That it was trained on; ``none`` of systems without
-    # sha256, weights, system: Of the file, and what of it is taken
     sha256: str
-    weights: str
+    weights: str  # Which of those in the file
     system: str
     bins: int = 1  # Bins of the recordings that a step joins
     length: int | None = field(default=None, metadata=HIDDEN)  # Steps that every recording is run, where it says so
@@ -80,20 +76,8 @@ class NetworkFile:
     taxels: int = field(metadata=HIDDEN)
     classes: int = field(metadata=HIDDEN)
     layers: tuple[str, ...] = field(metadata=HIDDEN)  # Names
-    # JSON values, as far as the file knows them
-    training: Mapping[str, Any] = field(metadata=HIDDEN, compare=False)
-    # Storage that it was fine-tuned for
-    forms: tuple[Form, ...] | None = field(default=None, metadata=HIDDEN, compare=False)
-
-    @property
-    def fine_tuned(self) -> bool:
-        """Whether it was trained for its storage."""
-        return self.forms is not None
-
-    @property
-    def trained_by(self) -> str | None:
-        """The command, where the file says so."""
-        return self.training.get("command")
+    training: Mapping[str, Any] = field(metadata=HIDDEN, compare=False)  # As far as the file knows it
+    forms: tuple[Form, ...] | None = field(default=None, metadata=HIDDEN, compare=False)  # That it was fine-tuned for
 
     @property
     def validation(self) -> float | None:
@@ -133,26 +117,22 @@ class NetworkFile:
 def read_networks(arguments: argparse.Namespace) -> tuple[NetworkFile, ...]:
     """Networks of ``checkpoints``; refused if one cannot be used, or is given twice."""
     paths: list[str] = arguments.checkpoints
-    named: dict[str, NetworkFile] = {}
     for path in paths:
         if paths.count(path) > 1:
             raise OptionError(f"{path}: is given twice; give each checkpoint once")
-        network = _read(path, arguments)
-        numbered = (f"{network.name}-{number}" for number in count(2))
-        name = network.name if network.name not in named else next(name for name in numbered if name not in named)
-        named[name] = replace(network, name=name)
-    return tuple(named.values())
+    stems = [Path(path.removeprefix(PRETRAINED)).stem for path in paths]
+    names = [stem if stems.count(stem) == 1 else f"{stem}-{number}" for number, stem in enumerate(stems, 1)]
+    return tuple(_read(path, name, arguments) for path, name in zip(paths, names, strict=True))
 
 
-def _read(path: str, arguments: argparse.Namespace) -> NetworkFile:
-    if path.endswith(ONNX):
-        raise ModelError(f"{path}: is an ONNX file, a chart takes checkpoints; give the checkpoint that it was made of")
-    file = shipped(path)
-    name = Path(path.removeprefix(PRETRAINED)).stem
-    if Path(file).is_file() and is_netlist(file) and trained_for(file) is None:
-        raise ModelError(f"{path}: is a netlist, a chart compiles its own; give the checkpoint that it was made from")
-    if network_kind(path) == COUNTERS:
+def _read(path: str, name: str, arguments: argparse.Namespace) -> NetworkFile:
+    kind = network_kind(path)
+    if kind == COUNTERS:
         return _counting(path, name)
+    if kind is not None:
+        raise ModelError(
+            f"{path}: is an {NETWORKS[kind]} file, a chart takes checkpoints; give the checkpoint that it was made of"
+        )
     checkpoint = load_checkpoint(path, arguments)
     typed = repeat.given(arguments, repeat.NETWORK)
     if checkpoint.edges is not None:  # one that knows its graph needs no option; others of the same call may
@@ -202,11 +182,10 @@ def require_suited(networks: Sequence[NetworkFile], splits: Mapping[str, Recordi
     """Refuse networks that do not belong together, or were trained on other recordings than these of this hash."""
     first = networks[0]
     for network in networks:
-        sizes = [(each.taxels, each.classes) for each in (first, network)]
-        if sizes[0] != sizes[1]:
+        if (network.taxels, network.classes) != (first.taxels, first.classes):
             raise ModelError(
-                f"{network.path}: has {sizes[1][0]} taxels and {sizes[1][1]} classes, {first.path} has "
-                f"{sizes[0][0]} and {sizes[0][1]}; chart networks of one data set at a time"
+                f"{network.path}: has {network.taxels} taxels and {network.classes} classes, {first.path} has "
+                f"{first.taxels} and {first.classes}; chart networks of one data set at a time"
             )
         if network.training.get("data_sha256") not in (None, digest):
             raise ModelError(

@@ -1,4 +1,4 @@
-"""What a chart is: networks, configurations with their figures on both splits, and the choices among them."""
+"""What a chart is: configurations of networks with their figures on both splits, and the one to deploy."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import ClassVar
 from spikeloom.runtime.report.encode import INLINE, key
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.chart.grid import Grid
-from spikeloom.runtime.studies.chart.networks import NetworkFile
+from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
 
-FORMAT = 2
+FORMAT = 3
 """Of what is measured; goes up when a figure means something else."""
 
 SPLITS = ("train", "test")
@@ -43,7 +43,7 @@ def share(correct: int, samples: int) -> Share:
 class Figures(Share):
     """A configuration on one split: accuracy, float model's, equal decisions, and costs of a mean recording.
 
-    Energy and time are by table, in joules and seconds; `step_s` is the longest step.
+    Energy and time are by table, in joules and seconds.
     """
 
     samples: int
@@ -51,7 +51,6 @@ class Figures(Share):
     equal: int
     energy_j: Mapping[str, float]
     time_s: Mapping[str, float]
-    step_s: Mapping[str, float]
     synaptic_operations: float
     steps: float
 
@@ -61,15 +60,15 @@ class Configuration:
     """A network in one storage and layout, by the axes of the grid."""
 
     network: str
-    target: str
-    graph: str
-    bits: tuple[int, ...]
-    planes: int
-    groups: int
-    prune: bool
-    fine_tuned: bool
-    storage: str
+    stored: Storage = field(metadata=INLINE)
     cores: str
+
+    json_properties: ClassVar = ("storage",)
+
+    @property
+    def storage(self) -> str:
+        """In short: ``4b 2p``."""
+        return self.stored.label()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +80,10 @@ class Refused(Configuration):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Point(Configuration):
-    """One on a part of every recording: its size, its figures, and the commands that give them."""
+    """One on a part of every recording: its size, its figures, and the commands that give them.
+
+    It is on the `front` of a cost if no other point is right more often on the test split for as little.
+    """
 
     number: int
     window: int
@@ -93,7 +95,7 @@ class Point(Configuration):
     train: Figures
     test: Figures
     commands: tuple[str, ...]
-    expected: float = 0.0
+    expected: float = 0.0  # Accuracy, see `study.with_expectations`
     front: Mapping[str, bool] = field(default_factory=dict)
 
     @property
@@ -104,60 +106,13 @@ class Point(Configuration):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ChartedNetwork:
-    """A network; accuracies of its float model by window and split, and what its points are expected to reach."""
-
-    file: NetworkFile = field(metadata=INLINE)
-    model: Mapping[int, Mapping[str, Share]] = field(metadata=key("float"))
-    expected: float = 0.0
-
-    json_properties: ClassVar = ("float_training",)
-
-    @property
-    def float_training(self) -> float:
-        """Accuracy of the float model on whole training recordings, or the longest parts that were measured."""
-        return self.model[max(self.model)]["train"].accuracy
-
-    @property
-    def whole(self) -> Share:
-        """The float model on test recordings, likewise."""
-        return self.model[max(self.model)]["test"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Against:
-    """A point beside another: how many times less test energy and time by table, and how much more accuracy."""
-
-    point: int
-    energy: Mapping[str, float | None]
-    time: Mapping[str, float | None]
-    accuracy: float
-    expected: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Saving:
-    """Points beside the usual mapping: `chosen` by what is expected, `seen` on the test split, which is no choice."""
-
-    usual: int
-    chosen: Against
-    seen: Against
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Pick:
-    """The point that fits the budgets best, how many fit, and what it gives up beside the best.
-
-    `misses` has the ``limit`` of each budget that it does not fit, and what was ``found``.
-    """
+    """The number of the point to deploy, and how many points fit the budgets; if none `fits`, the nearest one."""
 
     budgets: tuple[str, ...]
     fits: bool
     fitting: int
     point: int
-    misses: Mapping[str, Mapping[str, float]]
-    best: int
-    given_up: Against
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -179,6 +134,13 @@ class ChosenBy:
     energy: str
     time: str | None
 
+    def costs(self) -> dict[str, Callable[[Figures], float]]:
+        """Costs that accuracy is held against, by name: what gives them of figures."""
+        found: dict[str, Callable[[Figures], float]] = {"energy": lambda figures: figures.energy_j[self.energy]}
+        if (time := self.time) is not None:
+            found["latency"] = lambda figures: figures.time_s[time]
+        return found
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chart:
@@ -194,47 +156,13 @@ class Chart:
     tables: Mapping[str, Mapping[str, str]]
     chosen_by: ChosenBy
     grid: Grid
-    networks: tuple[ChartedNetwork, ...]
-    expected: str
+    networks: tuple[NetworkFile, ...]
     points: tuple[Point, ...]
     refused: tuple[Refused, ...]
-    recommended: Mapping[str, int | None]
-    saving: Saving | None
-    budget: Pick | None
+    budget: Pick
     format: int = FORMAT
 
-    def point(self, number: int) -> Point:
-        """A point by its number, from 1."""
-        return self.points[number - 1]
-
     @property
-    def taken(self) -> dict[int, list[str]]:
-        """Points to take by number, and what for."""
-        names: dict[int, list[str]] = {}
-        for name, number in self.recommended.items():
-            if number is not None:
-                names.setdefault(number, []).append(name)
-        return names
-
-
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """A cost that accuracy is drawn over: its title, the words below the axis, the unit, and the cost of a point."""
-
-    title: str
-    words: str
-    unit: str
-    value: Callable[[Point], float]
-
-
-def axes(chart: Chart) -> dict[str, Axis]:
-    """Costs of a chart by name."""
-    energy, time = chart.chosen_by.energy, chart.chosen_by.time
-    found = {"energy": Axis("energy", f"energy of a mean inference ({energy})", "J", lambda p: p.test.energy_j[energy])}
-    if time is not None:
-        named = f"time of a mean inference on the chip ({time})"
-        found["latency"] = Axis("time on the chip", named, "s", lambda point: point.test.time_s[time])
-    named = "synaptic operations of a mean inference"
-    found["operations"] = Axis("synaptic operations", named, "", lambda point: point.test.synaptic_operations)
-    found["cores"] = Axis("cores", "cores in use", "", lambda point: float(point.n_cores))
-    return found
+    def chosen(self) -> Point:
+        """The point to deploy."""
+        return self.points[self.budget.point - 1]

@@ -1,23 +1,34 @@
-"""A chart from networks and a grid: measure every configuration, then find fronts and the points to take."""
+"""A chart from networks and a grid: measure every configuration, find fronts, and choose which one to deploy.
+
+The *choice* is made on the training split alone; test figures are reported beside. *Fronts* are drawn on the test
+split: they describe.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.types import JsonObject
 from spikeloom.runtime.report.encode import decode
-from spikeloom.runtime.studies.chart import choices, work
+from spikeloom.runtime.studies.chart import work
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile
-from spikeloom.runtime.studies.chart.results import Chart, ChartedNetwork, ChosenBy, Data, Point, Refused
-from spikeloom.runtime.studies.fronts import Budget
+from spikeloom.runtime.studies.chart.results import Chart, ChosenBy, Data, Pick, Point, Refused
+from spikeloom.runtime.studies.fronts import Budget, front
 from spikeloom.runtime.studies.jobs import sweep
 
 STORE = "points.sqlite"
+
+NEAR = 1e-9
+"""Shares closer than this are equal."""
+
+LOSS = 0.01
+"""Accuracy that may be given up for less energy: a point."""
 
 
 def chart(
@@ -37,46 +48,44 @@ def chart(
 
     `command` repeats it; an OptionError says that the chip refuses all configurations.
     """
-    windows = tuple(sorted(grid.window))
     works = [
-        work.measurement(network, storage, grid.cores, windows, data, target, folder)
+        work.measurement(network, storage, grid, data, target, folder)
         for network in networks
         for storage in network.storages(grid)
     ]
     found = sweep(works, work.measure, folder / STORE, jobs=jobs, fresh=fresh, label="measuring")
-    measured = [(each, decode(work.Measured, found[each.key])) for each in works]
     points: list[Point] = []
     refused: list[Refused] = []
-    for each, (layout, built) in ((each, built) for each, result in measured for built in result.built.items()):
-        if built.refused:
-            refused.append(Refused(**_configuration(each, layout), why=built.refused))
-            continue
-        points += [
-            Point(
-                number=number,
-                **_configuration(each, layout),
-                window=window,
-                n_cores=built.cores,
-                neurons=built.neurons,
-                synapses=built.synapses,
-                netlist=f"netlists/{each.files[layout].name}",
-                netlist_sha256=built.sha256,
-                train=built.figures[window]["train"],
-                test=built.figures[window]["test"],
-                commands=work.commands(each, layout, window),
-            )
-            for number, window in enumerate(grid.window, len(points) + 1)
-        ]
+    for each in works:
+        for layout, measured in found[each.key].items():
+            built = decode(work.Built, measured)
+            axes: dict[str, Any] = {"network": each.network.name, "stored": each.storage, "cores": layout}
+            if built.refused:
+                refused.append(Refused(**axes, why=built.refused))
+                continue
+            points += [
+                Point(
+                    number=number,
+                    **axes,
+                    window=window,
+                    n_cores=built.cores,
+                    neurons=built.neurons,
+                    synapses=built.synapses,
+                    netlist=f"netlists/{each.files[layout].name}",
+                    netlist_sha256=built.sha256,
+                    train=built.figures[window]["train"],
+                    test=built.figures[window]["test"],
+                    commands=work.commands(each, layout, window),
+                )
+                for number, window in enumerate(grid.window, len(points) + 1)
+            ]
     if not points:
         raise OptionError(
             f"--grid: {target.name} refuses all {len(refused)} configurations; the first: {refused[0].why[0]}"
         )
     times = {table.name: table.title for table in target.time}
     by = ChosenBy(energy=energy, time=next(iter(times), None))
-    models = {each.network.name: result.model for each, result in measured}
-    charted = [ChartedNetwork(file=network, model=models[network.name]) for network in networks]
-    points, charted, expected = choices.with_expectations(points, charted)
-    points = choices.with_fronts(points, by)
+    points = with_fronts(with_expectations(points, networks), by)
     return Chart(
         spikeloom=__version__,
         target=target.name,
@@ -85,28 +94,71 @@ def chart(
         tables={"energy": {table.name: table.title for table in target.energy}, "time": times},
         chosen_by=by,
         grid=grid,
-        networks=tuple(charted),
-        expected=expected,
+        networks=tuple(networks),
         points=tuple(points),
         refused=tuple(refused),
-        recommended=choices.recommended(points, charted, by, bin_s=data.bin_s),
-        saving=choices.saving(points, by),
-        budget=choices.pick(points, budgets, by),
+        budget=pick(points, budgets, by),
     )
 
 
-def _configuration(each: work.Measurement, layout: str) -> JsonObject:
-    """Fields of a :class:`results.Configuration`."""
-    network, storage = each.network, each.storage
-    return {
-        "network": network.name,
-        "target": network.target,
-        "graph": network.graph,
-        "bits": storage.bits,
-        "planes": storage.planes,
-        "groups": storage.groups,
-        "prune": storage.prune,
-        "fine_tuned": storage.own,
-        "storage": storage.label(),
-        "cores": layout,
+def with_expectations(points: Sequence[Point], networks: Sequence[NetworkFile]) -> list[Point]:
+    """Points with the accuracy that is expected of them.
+
+    That is what the network's training reached on the recordings that it had left out (its validation), times the
+    share of the float model's training accuracy that the point keeps. If a checkpoint knows no validation, all points
+    have their training accuracy instead.
+    """
+    reached = {network.name: network.validation for network in networks}
+    whole = {
+        name: max((point for point in points if point.network == name), key=lambda point: point.window).train.model
+        for name in {point.network for point in points}
     }
+
+    def expected(point: Point) -> float:
+        if None in reached.values() or not whole[point.network].correct:
+            return point.train.accuracy
+        return (reached[point.network] or 0.0) * point.train.accuracy / whole[point.network].accuracy
+
+    return [replace(point, expected=expected(point)) for point in points]
+
+
+def with_fronts(points: Sequence[Point], by: ChosenBy) -> list[Point]:
+    """Points that know on which fronts of test accuracy and a cost they are."""
+    gains = [point.test.accuracy for point in points]
+    on = {name: front(gains, [cost(point.test) for point in points]) for name, cost in by.costs().items()}
+    return [replace(point, front={name: marks[i] for name, marks in on.items()}) for i, point in enumerate(points)]
+
+
+def pick(points: Sequence[Point], budgets: Sequence[Budget], by: ChosenBy) -> Pick:
+    """The point to deploy, by training figures.
+
+    It is the cheapest that fits the budgets and is expected to be at most a point less accurate than the best that
+    fits; where an accuracy is wanted, the cheapest that fits. If nothing fits, the point that misses by the smallest
+    factor.
+    """
+    costs = by.costs()
+    if any(budget.what not in (*costs, "accuracy") for budget in budgets):
+        raise OptionError("--budget latency: the chip has no time table, nothing is timed; omit it")
+
+    def energy(point: Point) -> float:
+        return costs["energy"](point.train)
+
+    def excess(point: Point) -> float:
+        """Factor by which a point misses the budgets; at most 1 where it fits."""
+        factors = [0.0]
+        for budget in budgets:
+            if budget.what == "accuracy":
+                factors.append(budget.limit / point.expected if point.expected else float("inf"))
+            else:
+                factors.append(costs[budget.what](point.train) / budget.limit)
+        return max(factors)
+
+    fitting = [point for point in points if excess(point) <= 1 + NEAR]
+    if not fitting:
+        chosen = min(points, key=lambda point: (excess(point), energy(point)))
+    else:
+        wanted = any(budget.what == "accuracy" for budget in budgets)
+        enough = 0.0 if wanted else max(point.expected for point in fitting) - LOSS - NEAR
+        chosen = min((point for point in fitting if point.expected >= enough), key=energy)
+    words = tuple(budget.words for budget in budgets)
+    return Pick(budgets=words, fits=bool(fitting), fitting=len(fitting), point=chosen.number)

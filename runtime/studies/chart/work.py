@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import Netlist, Options, __version__, lay_out_again, to_integers, write_netlist
+from spikeloom.compiler import Compilation, Options, __version__, lay_out_again, to_integers, write_netlist
 from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.recordings.events import joined_bins, of_length
-from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part, steps_of
+from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part
 from spikeloom.runtime.equivalence.reference import votes_so_far
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
@@ -29,6 +29,7 @@ from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.base import DEFAULT, Machine, Price, machine_of
 from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
 from spikeloom.runtime.studies.chart.results import FORMAT, SPLITS, Data, Figures, Share, share
 from spikeloom.runtime.studies.jobs import Job, content_key
@@ -57,36 +58,23 @@ class Built:
     refused: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
-    """Accuracies of the float model by window and split, and netlists by layout."""
-
-    model: Mapping[int, Mapping[str, Share]]
-    built: Mapping[str, Built]
-
-
 def measurement(
-    network: NetworkFile,
-    storage: Storage,
-    layouts: tuple[str, ...],
-    windows: tuple[int, ...],
-    data: Data,
-    target: Target,
-    folder: Path,
+    network: NetworkFile, storage: Storage, grid: Grid, data: Data, target: Target, folder: Path
 ) -> Measurement:
     """Work whose key, and the names of its netlists in a folder, are of everything that decides the result."""
 
     def keyed(what: str, **about: Any) -> str:
         shared = {"format": FORMAT, "spikeloom": __version__, "data": data.sha256, "bin_s": data.bin_s}
-        shared |= {"target": repr(target), "what": what, **network.identity, "storage": encode(storage)}
+        shared |= {"target": repr(target), "what": what, **network.identity, "storage": asdict(storage)}
         return content_key(shared | about)
 
+    windows = tuple(sorted(grid.window))
     return Measurement(
-        key=keyed("figures", layouts=layouts, windows=windows),
+        key=keyed("figures", layouts=grid.cores, windows=windows),
         label=f"{network.name} {storage.label()}",
         network=network,
         storage=storage,
-        files={layout: folder / "netlists" / f"{keyed('netlist', layout=layout)}.loom" for layout in layouts},
+        files={layout: folder / "netlists" / f"{keyed('netlist', layout=layout)}.loom" for layout in grid.cores},
         windows=windows,
         data=data,
     )
@@ -95,14 +83,8 @@ def measurement(
 # -- commands ----------------------------------------------------------------------------------------------------------
 
 
-def layout_options(layout: str) -> JsonObject:
-    """Options of ``compile`` that ask for a layout, where it is not the usual one.
-
-    Examples
-    --------
-    >>> layout_options("latency"), layout_options("fc1:6+conv1:4"), layout_options("cores")
-    ({'optimize': 'latency'}, {'cores_for': 'fc1=6,conv1=4'}, {})
-    """
+def _layout_options(layout: str) -> JsonObject:
+    """Options of ``compile`` that ask for a layout, where it is not the usual one."""
     if layout == "cores":
         return {}
     if ":" in layout:
@@ -116,7 +98,7 @@ def commands(work: Measurement, layout: str, window: int) -> tuple[str, str]:
     parts = [network.name, *storage.label().split(), *([] if layout == "cores" else [layout])]
     file = "-".join(parts).replace(":", "").replace("+", "-") + ".loom"
     calibrated = {"calibrate": data.path, "bin": data.bin_s}
-    stored = repeat.words(dict(network.options) | storage.options() | calibrated | layout_options(layout))
+    stored = repeat.words(dict(network.options) | storage.options() | calibrated | _layout_options(layout))
     part = None if window == WHOLE else f"{window}%"
     read = repeat.words({"data": data.path, "bin": data.bin_s, "detail": "counts", "window": part})
     return repeat.command("compile", network.path, *stored, "-o", file), repeat.command("run", file, *read)
@@ -148,18 +130,15 @@ def _loaded(network: NetworkFile) -> LoadedNetwork:
 
 @lru_cache(maxsize=8)
 def _decided(network: NetworkFile, data: Data, windows: tuple[int, ...]) -> dict[int, dict[str, IntArray]]:
-    """Decisions of the float32 model by window and split; one run each, since what comes later changes nothing."""
-    loaded, decided = _loaded(network), {window: dict[str, IntArray]() for window in windows}
-    for split, part in _in_steps(data, network).items():
-        if network.length is None:
-            votes = votes_so_far(loaded.network, loaded.model, part)
-            for window in windows:
-                decided[window][split] = vote(votes[np.arange(len(part)), steps_of(part.step_counts, window) - 1])
-        else:
-            for window in windows:
-                votes = votes_so_far(loaded.network, loaded.model, _part(network, part, window))
-                decided[window][split] = vote(votes[:, -1])
-    return decided
+    """Decisions of the float32 model by window and split."""
+    loaded, splits = _loaded(network), _in_steps(data, network)
+
+    def decisions(part: Recordings) -> IntArray:
+        return vote(votes_so_far(loaded.network, loaded.model, part)[:, -1])
+
+    return {
+        window: {split: decisions(_part(network, part, window)) for split, part in splits.items()} for window in windows
+    }
 
 
 def _part(network: NetworkFile, data: Recordings, window: int) -> Recordings:
@@ -171,18 +150,15 @@ def _part(network: NetworkFile, data: Recordings, window: int) -> Recordings:
 
 
 def measure(work: Measurement) -> JsonObject:
-    """Do one piece of a chart's work; the JSON of a :class:`Measured`."""
-    splits, decided = _in_steps(work.data, work.network), _decided(work.network, work.data, work.windows)
+    """Do one piece of a chart's work; the JSON of a :class:`Built` by layout."""
+    loaded = _loaded(work.network)
     try:
-        place = _rounded(work)
-        built = {layout: _built(work, place, layout) for layout in work.files}
+        stored = _rounded(work, loaded)
     except (CapacityError, ModelError) as error:
         built = dict.fromkeys(work.files, _refused(error))
-    model = {
-        window: {split: _share(decisions, splits[split].labels) for split, decisions in each.items()}
-        for window, each in decided.items()
-    }
-    found: JsonObject = encode(Measured(model=model, built=built))
+    else:
+        built = {layout: _built(work, stored, layout) for layout in work.files}
+    found: JsonObject = encode(built)
     return found
 
 
@@ -194,11 +170,17 @@ def _refused(error: CapacityError | ModelError) -> Built:
     return Built(refused=tuple(str(error).splitlines()))
 
 
-def _built(work: Measurement, place: Callable[[str], Netlist], layout: str) -> Built:
+def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
     """Write the netlist of a layout and measure it."""
+    asked = _compile_options(work, layout)
+    placing = Options(
+        cores_for=parse_cores(asked.cores_for),
+        optimize=asked.optimize,
+        provenance=provenance(asked, _loaded(work.network), calibrated=True),
+    )
     try:
-        netlist = place(layout)
-    except CapacityError as error:
+        netlist = lay_out_again(stored, placing).netlist
+    except (CapacityError, ModelError) as error:
         return _refused(error)
     file = work.files[layout]
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -220,31 +202,16 @@ def _built(work: Measurement, place: Callable[[str], Netlist], layout: str) -> B
     )
 
 
-def _rounded(work: Measurement) -> Callable[[str], Netlist]:
-    """Round a network; what places it in a layout, or raises CapacityError."""
-    loaded, options = _loaded(work.network), {layout: _compile_options(work, layout) for layout in work.files}
-    some = next(iter(options.values()))
-    stored = to_integers(
-        loaded.model,
-        Options(
-            forms=work.network.forms,
-            packings=parse_packings(some),
-            prune_unused=some.prune_unused,
-            training_events=_part(work.network, _in_steps(work.data, work.network)["train"], WHOLE).events,
-        ),
-        load_target(some.target),
+def _rounded(work: Measurement, loaded: LoadedNetwork) -> Compilation:
+    """A network in its storage; how it is laid out is yet to be said."""
+    asked = _compile_options(work, "cores")
+    options = Options(
+        forms=work.network.forms,
+        packings=parse_packings(asked),
+        prune_unused=asked.prune_unused,
+        training_events=_part(work.network, _in_steps(work.data, work.network)["train"], WHOLE).events,
     )
-
-    def place(layout: str) -> Netlist:
-        each = options[layout]
-        placing = Options(
-            cores_for=parse_cores(each.cores_for),
-            optimize=each.optimize,
-            provenance=provenance(each, loaded, calibrated=True),
-        )
-        return lay_out_again(stored, placing).netlist
-
-    return place
+    return to_integers(loaded.model, options, load_target(asked.target))
 
 
 def _compile_options(work: Measurement, layout: str) -> argparse.Namespace:
@@ -254,12 +221,12 @@ def _compile_options(work: Measurement, layout: str) -> argparse.Namespace:
         | {"target": DEFAULT}
         | {name: repeat.USUAL.get(name) for name in (*repeat.ROUNDING, *repeat.PLACING)}
         | {name: value for name, value in work.storage.options().items() if value is not None}
-        | layout_options(layout)
+        | _layout_options(layout)
     )
 
 
 def _figures(machine: Machine, data: Recordings, bin_s: float, decided: IntArray) -> Figures:
-    """Decisions, and the mean inference: operations, energy by table, time by table, the longest step."""
+    """Decisions, and the mean inference: operations, energy by table, time by table."""
     steps, size = data.step_counts, machine.batch(data.steps)
     parts = [slice(first, first + size) for first in range(0, len(data), size)]
     priced = [machine.price(data.events[part], bin_s=bin_s, lengths=steps[part]) for part in parts]
@@ -275,7 +242,6 @@ def _figures(machine: Machine, data: Recordings, bin_s: float, decided: IntArray
         equal=int(np.count_nonzero(decisions == decided)),
         energy_j=mean(lambda price: price.energy_j),
         time_s=mean(lambda price: price.time_s),
-        step_s={name: max(0.0, *(price.step_s[name] for price in prices)) for name in prices[0].time_s},
         synaptic_operations=float(np.concatenate([price.synaptic_operations for price in prices]).mean()),
         steps=float(steps.mean()),
     )
