@@ -42,8 +42,8 @@ class Activity:
     """Spikes of each population, and the values that were compared with the threshold."""
 
     spikes: tuple[BoolArray, ...]  # One array per population, all aligned with the data
-    # Membrane before the reset; floats in model units, or int64 register values
-    membranes: tuple[npt.NDArray[Any], ...] | None
+    # Membrane before the reset, where it is kept; floats in model units, or int64 register values
+    membranes: tuple[npt.NDArray[Any], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,15 +55,13 @@ class Layer:
     # What :func:`layer_kernel.run_layer` takes between the raster of `pres` and what it fills
     fixed: tuple[Any, ...]
 
-    def run(
-        self, sources: Sequence[BoolArray], *, membranes: bool = False
-    ) -> tuple[BoolArray, npt.NDArray[Any] | None]:
-        """Spikes, and membranes, of recordings from the spikes of `pres`, all (samples, steps, neurons)."""
+    def run(self, sources: Sequence[BoolArray], *, membranes: bool = False) -> tuple[BoolArray, npt.NDArray[Any]]:
+        """Spikes, and membranes if wanted, of recordings from the spikes of `pres`, all (samples, steps, neurons)."""
         shape = *sources[0].shape[:2], self.size
         spikes, kept = np.empty(shape, np.bool_), np.empty(shape if membranes else _NONE, self._kind)
         moved = np.zeros((2, 0), np.int32)
         self._run(raster(sources), spikes.view(np.uint8), kept, np.empty(_NONE, np.uint8), moved)
-        return spikes, kept if membranes else None
+        return spikes, kept
 
     def moved(self, sources: Raster, wanted: npt.NDArray[np.uint8]) -> npt.NDArray[np.int32]:
         """Entries in which neurons differ from those `wanted`, and spikes more than there; (2, neurons).
@@ -156,8 +154,8 @@ class Simulation:
     def run(self, events: BoolArray, *, membranes: bool = False) -> Activity:
         """Run recordings (samples, steps, channels), each from rest, some at a time on all cores."""
 
-        def batch(start: int) -> list[tuple[BoolArray, npt.NDArray[Any] | None]]:
-            done: list[tuple[BoolArray, npt.NDArray[Any] | None]] = []
+        def batch(start: int) -> list[tuple[BoolArray, npt.NDArray[Any]]]:
+            done: list[tuple[BoolArray, npt.NDArray[Any]]] = []
             for layer in self.layers:
                 sources = [events[start : start + BATCH] if pre == INPUT else done[pre][0] for pre in layer.pres]
                 done.append(layer.run(sources, membranes=membranes))
@@ -165,8 +163,8 @@ class Simulation:
 
         by_layer = list(zip(*threads().map(batch, range(0, len(events), BATCH)), strict=True))
         spikes = tuple(np.concatenate([spikes for spikes, _ in layer]) for layer in by_layer)
-        kept = [np.concatenate([kept for _, kept in layer if kept is not None]) for layer in by_layer if membranes]
-        return Activity(spikes=spikes, membranes=tuple(kept) if membranes else None)
+        kept = (np.concatenate([kept for _, kept in layer]) for layer in by_layer if membranes)
+        return Activity(spikes=spikes, membranes=tuple(kept))
 
 
 @cache

@@ -198,15 +198,14 @@ def test_roundings_and_magnitudes_of_the_released_operator_are_those_of_its_loop
 
 
 # -- against the chip --------------------------------------------------------------------------------------------------
-def by_hand(checkpoint, adjacency, recordings, chip, kept=None, lengths=None):
+def by_hand(checkpoint, adjacency, recordings, chip, kept, lengths):
     """Equal and different entries per layer, entry by entry."""
     found = []
     for layer, (certain, doubt) in enumerate(Certainty(Factored(checkpoint, adjacency)).spikes(recordings)):
         equal = different = 0
-        neurons = range(certain.shape[2]) if kept is None else kept[layer]
         for sample in range(len(recordings)):
-            for step in range(certain.shape[1] if lengths is None else lengths[sample]):
-                for place, neuron in enumerate(neurons):
+            for step in range(lengths[sample]):
+                for place, neuron in enumerate(kept[layer]):
                     if not doubt[sample, step, neuron]:
                         same = certain[sample, step, neuron] == chip[layer][sample, step, place]
                         equal, different = equal + bool(same), different + (not same)
@@ -214,41 +213,35 @@ def by_hand(checkpoint, adjacency, recordings, chip, kept=None, lengths=None):
     return found
 
 
-def test_entries_are_counted_once_each(folder):
-    checkpoint, adjacency = small_checkpoint(folder, last=weights(3))
-    netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(Packing(bits=4),))).netlist
-    recordings = events(4, samples=5, steps=12)
-    chip, decisions = on_chip(netlist, recordings)
-    found = certified(Factored(checkpoint, adjacency), lift(netlist), recordings, chip, decisions)
-    assert list(found.layers) == ["conv1", "fc1", "fc2", "fc3"]
-    expected = by_hand(checkpoint, adjacency, recordings, chip)
-    assert [(layer.equal, layer.different) for layer in found.layers.values()] == expected
-    assert [layer.entries for layer in found.layers.values()] == [60 * n for n in (TAXELS * FEATURES, 9, 8, CLASSES)]
-    assert all(layer.undecided == layer.entries - layer.equal - layer.different for layer in found.layers.values())
-    assert found.samples == 5
-    reference = float_spikes(checkpoint, adjacency, recordings)["fc3"].sum(axis=1).argmax(axis=1)
-    # no tie in these networks, so that nothing stands between certainty and the reference
-    assert found.decisions == np.count_nonzero(reference == decisions)
-    assert found.layers["conv1"].different > 0
+PARTS = [np.array([0, 7, 8]), np.arange(9), np.arange(2, 8), np.arange(CLASSES)]
 
 
-def test_parts_of_layers_and_of_recordings(folder):
+@pytest.mark.parametrize("kept", [None, PARTS], ids=["whole", "parts"])
+def test_entries_are_counted_once_each(folder, kept):
+    """Of recordings of their own length, some after others; where parts of layers are compared, of these."""
     checkpoint, adjacency = small_checkpoint(folder, last=weights(3))
     netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(Packing(bits=4),))).netlist
     recordings, lengths = events(4, samples=3, steps=12), np.array([5, 12, 9])
     for recording, length in zip(recordings, lengths, strict=True):
         recording[..., length:] = 0
-    kept = [np.array([0, 7, 8]), np.arange(9), np.arange(2, 8), np.arange(CLASSES)]
     chip, decisions = on_chip(netlist, recordings)
+    kept = kept or [np.arange(spikes.shape[2]) for spikes in chip]
     inside = (np.arange(12) < lengths[:, None])[:, :, None]
     parts = [spikes[..., part] & inside for spikes, part in zip(chip, kept, strict=True)]
     certifier = Certifier(Factored(checkpoint, adjacency), lift(netlist), kept)
     for rows in (slice(0, 1), slice(1, 3)):
         certifier.add(recordings[rows], [spikes[rows] for spikes in parts], decisions[rows], lengths[rows])
     found = certifier.certificate()
+    assert list(found.layers) == ["conv1", "fc1", "fc2", "fc3"]
     assert [layer.entries for layer in found.layers.values()] == [26 * len(part) for part in kept]
     expected = by_hand(checkpoint, adjacency, recordings, parts, kept, lengths)
     assert [(layer.equal, layer.different) for layer in found.layers.values()] == expected
+    assert all(layer.undecided == layer.entries - layer.equal - layer.different for layer in found.layers.values())
+    assert sum(layer.different for layer in found.layers.values()) > 0
+    assert found.samples == 3
+    voted = float_spikes(checkpoint, adjacency, recordings)["fc3"] & inside
+    # no tie in these networks, so that nothing stands between certainty and the reference
+    assert found.decisions == np.count_nonzero(voted.sum(axis=1).argmax(axis=1) == decisions)
 
 
 def far_from_thresholds():

@@ -223,17 +223,6 @@ def test_votes_of_several_neurons_add_up():
     assert predictions(netlist, spikes).tolist() == [1, 0, 0]  # ties go to the lowest class
 
 
-def test_wilson_of_published_examples():
-    # Newcombe, Statistics in Medicine 17, 1998, table I, method 3
-    for successes, trials, interval in (
-        (81, 263, (0.2553, 0.3662)),
-        (15, 148, (0.0624, 0.1605)),
-        (0, 20, (0.0000, 0.1611)),
-        (1, 29, (0.0061, 0.1718)),
-    ):
-        assert wilson(successes, trials) == pytest.approx(interval, abs=5e-5)
-
-
 @given(st.integers(1, 500), st.data())
 def test_wilson_solves_its_equation(trials, data):
     successes = data.draw(st.integers(0, trials))

@@ -105,27 +105,15 @@ def test_any_recording_is_a_run(lively_file, lines, low, inside):
         events = random_events(seed)
         found = objects(lively_file, lines(as_lines(events, seed, low=low, inside=inside)))
         assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(LIVELY, events)]
+        trace = engine.simulate(LIVELY, events.reshape(1, 20, -1), spikes=True, threads=1)
+        for t, counts in enumerate(class_counts(LIVELY, np.cumsum(trace.spikes[0], axis=0))[:40]):
+            second, best = np.sort(counts)[-2:]
+            shown = {"decision": counts.argmax(), "margin": best - second, "counts": counts.tolist()}
+            time_s = pytest.approx((t + 1) * 0.02, abs=1e-12)
+            assert found["bin"][t] == {"kind": "bin", "grasp": 1, "bins": t + 1, "time_s": time_s} | shown
         assert len(found["bin"]) == 40
         total = {"kind": "end", "grasps": 1, "bins": 40, "events": int(events.sum()), "repeated": 0, "late": 0}
         assert found["end"] == [total | {"interrupted": False}]
-
-
-def test_every_bin_is_printed(lively_file, lines):
-    events = random_events(7)
-    found = objects(lively_file, lines(as_lines(events)))
-    trace = engine.simulate(LIVELY, events.reshape(1, 20, -1), spikes=True, threads=1)
-    counts = class_counts(LIVELY, np.cumsum(trace.spikes[0], axis=0))
-    for t, shown in enumerate(found["bin"]):
-        best = np.sort(counts[t])
-        assert shown == {
-            "kind": "bin",
-            "grasp": 1,
-            "bins": t + 1,
-            "time_s": pytest.approx((t + 1) * 0.02, abs=1e-12),
-            "decision": counts[t].argmax(),
-            "margin": best[-1] - best[-2],
-            "counts": counts[t].tolist(),
-        }
 
 
 def test_several_grasps_are_runs_of_their_own(lively_file, lines):
@@ -403,13 +391,6 @@ def test_decision_and_margin(counts, decision, margin):
     assert (step.decision, step.margin) == (decision, margin)
 
 
-def test_a_network_without_lag_is_final_at_once():
-    netlist = voting(build([Neuron(), Neuron()], [Axon(source=0, targets=((1, 110),))], n_inputs=1, depths=[0]), 1)
-    stream = Stream(engine.prepare(netlist, stepwise=True))
-    assert stream.step([1]).counts.tolist() == [1]
-    assert stream.finish() == ()
-
-
 @pytest.mark.parametrize(
     ("events", "found"),
     [
@@ -428,14 +409,7 @@ def test_events_that_are_none(events, found):
     assert_is_run(netlist, play(stream, good), good)
 
 
-def test_nothing_after_the_end():
-    stream = Stream(engine.prepare(LIVELY, stepwise=True))
-    stream.finish()
-    refused(DataError, "a step after the end found|call reset()", stream.step, np.zeros(20))
-    refused(DataError, "a second end found|call reset()", stream.finish)
-
-
-def test_an_overflow_ends_the_stream_until_reset():
+def test_an_overflow_or_its_end_ends_the_stream_until_reset():
     axons = [Axon(source=0, exponent=7, targets=((0, 254), (0, 254))), Axon(source=1, targets=((0, 110),))]
     netlist = build([Neuron()], axons, n_inputs=2, depths=[0])
     stream = Stream(engine.prepare(netlist, stepwise=True))
@@ -444,3 +418,6 @@ def test_an_overflow_ends_the_stream_until_reset():
     refused(DataError, "", stream.finish)
     stream.reset()
     assert stream.step([0, 1]).spikes[0].tolist() == [True]
+    stream.finish()
+    refused(DataError, "a step after the end found|call reset()", stream.step, [0, 0])
+    refused(DataError, "a second end found|call reset()", stream.finish)

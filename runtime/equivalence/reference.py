@@ -96,9 +96,7 @@ def membranes_of(model: Factored | Network, events: npt.NDArray[np.uint8]) -> li
 
     if isinstance(model, Network):
         inputs = channels_last(events, model.input.clocks)
-        kept = run_float(model, inputs, dtype=np.float32, membranes=True).membranes
-        assert kept is not None, "membranes were wanted"
-        return list(kept)
+        return list(run_float(model, inputs, dtype=np.float32, membranes=True).membranes)
     return list(float_membranes(model.checkpoint, model.propagation, events).values())
 
 

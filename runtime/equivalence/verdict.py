@@ -191,14 +191,22 @@ def levels_of(verdict: Verdict) -> tuple[Level, ...]:
     equal = round(verdict.decision_agreement * len(verdict.files))
     only_float, only_chip, p = mcnemar(verdict.labels, verdict.float_predictions, verdict.chip_predictions)
     moved = int(abs(verdict.float_counts - verdict.chip_counts).sum())
+    further, tuned = "", verdict.quantised_different
+    if verdict.engine_different is not None:
+        where = f"{verdict.engine_different:,} differing spikes on {len(verdict.files)} recordings"
+        further = f"; {verdict.engine} beside it, {where}"
+    exact = "not applicable: the checkpoint was not fine-tuned on the chip's integers"
+    if tuned is not None:
+        spikes = sum(layer.chip for layer in verdict.spikes.values())
+        exact = f"fine-tuned model = chip: {tuned:,} differing spikes of {spikes:,} on {len(verdict.files)} recordings"
     return (
         Level(
             name="E0",
             share=float(verdict.spec_equals_engine),
             text=f"specification = engine {'in' if verdict.spec_equals_engine else 'NOT in'} every spike, membrane and "
-            f"count of {verdict.spec_samples} recordings{_further(verdict)}",
+            f"count of {verdict.spec_samples} recordings{further}",
         ),
-        _quantised_level(verdict),
+        Level(name="E1", share=None if tuned is None else float(tuned == 0), text=exact),
         Level(
             name="E2",
             share=agreement[worst],
@@ -211,27 +219,6 @@ def levels_of(verdict: Verdict) -> tuple[Level, ...]:
             text=f"{equal} of {len(verdict.files)} decisions equal; right on float only {only_float}, on chip only "
             f"{only_chip} (exact McNemar p = {p:.3g}); class votes moved: {moved:,} of {verdict.float_counts.sum():,}",
         ),
-    )
-
-
-def _further(verdict: Verdict) -> str:
-    if verdict.engine_different is None:
-        return ""
-    where = f"{verdict.engine_different:,} differing spikes on {len(verdict.files)} recordings"
-    return f"; {verdict.engine} beside it, {where}"
-
-
-def _quantised_level(verdict: Verdict) -> Level:
-    different = verdict.quantised_different
-    if different is None:
-        text = "not applicable: the checkpoint was not fine-tuned on the chip's integers"
-        return Level(name="E1", share=None, text=text)
-    spikes = sum(layer.chip for layer in verdict.spikes.values())
-    return Level(
-        name="E1",
-        share=float(different == 0),
-        text=f"fine-tuned model = chip: {different:,} differing spikes of {spikes:,} "
-        f"on {len(verdict.files)} recordings",
     )
 
 

@@ -112,7 +112,6 @@ def verify(
         reference = compared(reference_spikes(part))
         begin("chip", first)
         ran = machine.run(part, lengths=ends, spikes=True)
-        assert ran.spikes is not None, "spikes were wanted"
         chip = [ran.spikes[name][..., keep] for name, keep in zip(names, kept, strict=True)]
         if fine_tuned_spikes is not None and quantised_different is not None:
             begin("fine-tuned model", first)
@@ -212,9 +211,7 @@ def _first_divergence(
     ill_posed = bool(wide[index][sample, step, neuron] != reference[index][sample, step, neuron])
     neuron = int(np.arange(layer.size)[machine.compared()[index]][neuron])
     recording = events[sample : sample + 1, ..., : step + 1]
-    membranes = machine.run(recording, membranes=True).membranes
-    assert membranes is not None, "membranes were wanted"
-    register = int(membranes[layer.name][0, step, neuron])
+    register = int(machine.run(recording, membranes=True).membranes[layer.name][0, step, neuron])
     held = not machine.absent[index][neuron]  # a neuron that the chip leaves out stays at zero
     scale = float(layer.scale[neuron])
     taxel, feature = taxel_and_feature(model, index, neuron)

@@ -56,15 +56,15 @@ ENGINES = ("spikeloom", "onnx")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Run:
-    """Votes (samples, classes) int64 and, by layer, spikes and membranes (samples, steps, neurons) where kept.
+    """Votes (samples, classes) int64 and, by layer, those spikes and membranes (samples, steps, neurons) that are kept.
 
     `counts` are spikes of each neuron that the chip holds, in the order of the netlist; (samples, neurons).
     """
 
     votes: IntArray
     counts: IntArray
-    spikes: Mapping[str, BoolArray] | None = None
-    membranes: Mapping[str, npt.NDArray[np.int32]] | None = None
+    spikes: Mapping[str, BoolArray]
+    membranes: Mapping[str, npt.NDArray[np.int32]]
 
     @property
     def decisions(self) -> IntArray:
@@ -207,9 +207,9 @@ class Machine(ABC):
     def _run(self, trace: Any) -> Run:
         """What a trace comes to."""
 
-        def by_layer(array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]] | None:
+        def by_layer(array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]]:
             if array is None:
-                return None
+                return {}
             return {name: self.of_layer(array, index) for index, name in enumerate(self.layers)}
 
         return Run(

@@ -112,23 +112,15 @@ def run(arguments: argparse.Namespace) -> Outcome:
         return Outcome(CountingFacts.of(counters, sha256), counting_sections)
     given = tuple(name for name in ("beta", "theta") if getattr(arguments, name) is not None)
     checkpoint = load_checkpoint(arguments.path, arguments)
+    same = ("layout", "system", "taxels", "classes", "beta", "theta", "assumed", "graph", "training", "sha256")
     facts = CheckpointFacts(
-        layout=checkpoint.layout,
-        system=checkpoint.system,
-        taxels=checkpoint.taxels,
-        classes=checkpoint.classes,
+        **{name: getattr(checkpoint, name) for name in same},
         hops=len(checkpoint.hops) - 1 if checkpoint.system == TACTILESGNET else None,
         towers=checkpoint.towers if checkpoint.towers > 1 else None,
         bins=checkpoint.bins if checkpoint.bins > 1 else None,
         layers=[LayerSize(name=name, neurons=neurons) for name, neurons in checkpoint.neurons.items()],
-        beta=checkpoint.beta,
-        theta=checkpoint.theta,
         dynamics=None if checkpoint.dynamics.is_plain else checkpoint.dynamics,
         given=given,
-        assumed=checkpoint.assumed,
-        graph=checkpoint.graph,
-        training=checkpoint.training,
-        sha256=checkpoint.sha256,
     )
     return Outcome(facts, sections)
 

@@ -105,7 +105,6 @@ def _write_spikes(path: str, machine: Machine, data: Recordings, account: Accoun
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 shape: tuple[int, ...] = ()
                 for done in _runs("spikes kept", machine, data, account, spikes=True):
-                    assert done.spikes is not None, "spikes were wanted"
                     spikes = np.ascontiguousarray(done.spikes[name])
                     if not shape:
                         shape = len(data), *spikes.shape[1:]

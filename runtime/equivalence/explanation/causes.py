@@ -56,8 +56,6 @@ STORED, UNROUNDED, UNCLIPPED = range(3)
 def observe(machine: IntegerMachine, events: EventArray) -> Activity:
     """Spikes and membrane registers of each layer on recordings (samples, taxels, polarities, steps)."""
     ran = machine.run(events, spikes=True, membranes=True)
-    assert ran.spikes is not None, "spikes were wanted"
-    assert ran.membranes is not None, "membranes were wanted"
     return Activity(spikes=tuple(ran.spikes.values()), membranes=tuple(ran.membranes.values()))
 
 
@@ -145,8 +143,6 @@ def _name_causes(
     compensated: bool,
 ) -> list[RootCause]:
     """Causes of roots of one population, which are sorted by the length of what they remember."""
-    assert ideal.membranes is not None, "membranes were wanted"
-    assert observed.membranes is not None, "membranes were wanted"
     population, chip = network.populations[post], integer.populations[post]
     rows = np.array([root.neuron for root in roots])
     steps = np.array([root.step for root in roots])
