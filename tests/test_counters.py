@@ -19,6 +19,9 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds, held_out, linear_rules
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.studies.counting import decisions_of
+from spikeloom.runtime.studies.stress.bench import NAMES, Bench, distances, warm_state, whole
+from spikeloom.runtime.studies.stress.pair import Pair, evaluate
+from spikeloom.runtime.studies.stress.study import clean
 
 CLASSES, TAXELS, STEPS = 3, 4, 40
 PLANS = [
@@ -90,6 +93,27 @@ def test_network_decides_as_its_rule_and_the_chip_has_every_spike(plan):
         held = ~machine.unread[machine.layers.index(name)]
         assert_array_equal(ran.spikes[name][..., held], spikes[..., held])
     assert_array_equal(ran.decisions, decisions_of(counters, other))
+
+
+@pytest.mark.parametrize("plan", PLANS, ids=str)
+def test_stress_runs_them_to_the_end_of_their_ramp(plan):
+    data = counted(made(), plan)
+    counters = counters_of(data, fit(data, CLASSES), made(), CLASSES)
+    network, other = counting_network(counters), made(seed=1)
+    pair = Pair(netlist=compile_network(network).netlist, network=network)
+    lengths = np.full(len(other), STEPS)
+    nearness = distances(TAXELS, None, None)
+    bench = Bench(
+        pair=pair, distance=nearness, events=other.events, labels=other.labels, files=other.files, lengths=lengths
+    )
+    late = NAMES["start_late"](other.events, 5)
+    for found, recordings in (
+        (clean(bench)[0], other),
+        (evaluate(pair, whole(late, pair.netlist, lengths)), replace(other, events=late)),
+    ):
+        for side in ("float", "chip"):
+            assert_array_equal(found.decisions(side), decisions_of(counters, recordings))
+    assert set(warm_state(bench, 1, np.random.default_rng(0)).lengths) == {2 * counters.clocks.length}
 
 
 def counters_file(place):
