@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_crossbars import CHIP, both, with_limit
 
+from spikeloom.compiler import compile_network
 from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import CapacityError, ModelError, OptionError
@@ -16,6 +17,7 @@ from spikeloom.compiler.formats.counters import counting_network, write_counters
 from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.compiler.targets.truenorth.counting import LARGEST, planned, run_counters
 from spikeloom.models.training.counters import rounded
+from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.machines.votes import class_counts
 
 
@@ -71,6 +73,18 @@ def assert_exact(counters, events, chip=CHIP):
 def test_every_spike_is_the_models_and_the_votes_are_the_files(seed, parts, classes, most, rate):
     counters = random_counters(seed, parts=parts, classes=classes, most=most)
     assert_exact(counters, random_events(seed, counters, rate))
+
+
+@pytest.mark.parametrize("most", [1, 7, 11, LARGEST])
+def test_both_chips_have_the_same_whole_numbers_and_votes(most):
+    counters = random_counters(most, taxels=6, classes=8, most=most, ramp=60)
+    events = np.stack([random_events(seed, counters) for seed in range(6)])
+    made = compile_network(counting_network(counters)), CHIP.compile(counters)
+    np.testing.assert_array_equal(*(machine_of(each.netlist).run(events).votes for each in made))
+    scales = [population.scale for population in made[0].integer.populations]
+    for projection, held in zip(made[0].network.projections, made[0].integer.projections, strict=True):
+        whole = projection.weight.toarray() * scales[projection.post][:, None]
+        np.testing.assert_array_equal(held.effective().toarray(), whole)
 
 
 def test_sums_of_several_cores_come_together():

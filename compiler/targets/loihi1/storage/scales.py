@@ -190,18 +190,24 @@ def candidate(
 ) -> tuple[Rounded | None, bool]:
     """Best compromise between a fine weight scale and a fine threshold, see ``WORTHWHILE``.
 
+    Weights that are whole numbers stay so, up to their scale.
+
     `factor` says how far the scale may exceed the one that just holds the largest weight; the rest is clipped. Also
     whether registers, not that, limit the scale: a larger factor gives the same.
     """
     bits, peak = packing.bits, float(layer.peaks().max(initial=0))
     chosen, limited, finest = None, False, 0.0
+    whole = all(np.array_equal(p.weight.data, np.rint(p.weight.data)) for p in layer.projections)
+    worthwhile = 1.0 if whole else WORTHWHILE
     for exponent in sorted(exponents):
         stored = planes_from(exponent, bits, packing.planes, max(exponents))
         held = reach(bits, stored) * weight_step(bits) / peak if peak else 1.0 / layer.population.theta
+        if whole and held >= weight_step(bits):  # at a multiple of the step no weight is rounded
+            held -= held % weight_step(bits)
         fitted = fit(layer, bits, stored, held * factor)
         if fitted is None and chosen is None:
             continue  # the threshold is less than a unit, a larger exponent makes it more
-        if fitted is None or mantissa_scale(fitted) < WORTHWHILE * finest:
+        if fitted is None or mantissa_scale(fitted) < worthwhile * finest:
             break
         chosen, finest = fitted, max(finest, mantissa_scale(fitted))
         limited = finest < WORTHWHILE * held * factor
