@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import IntegerNetwork
@@ -67,11 +66,11 @@ class IntegerMachine(Machine):
         """
 
     @abstractmethod
-    def packed(self, channels: EventArray, lengths: IntArray) -> tuple[npt.NDArray[np.uint64], IntArray]:
-        """Spikes at a bit each, (samples, chip steps, words), and membranes that were clipped, (samples,), on a thread.
+    def on_a_thread(self, channels: EventArray, lengths: IntArray, first: int) -> tuple[Iterable[BoolArray], IntArray]:
+        """Spikes of each layer from the step `first` on, (samples, steps, neurons), and clipped membranes, (samples,).
 
-        Bits are in the order of the netlist's neurons; channels (samples, channels, steps) include the clocks. Raises
-        NumericRangeError if a register overflows in any recording.
+        Channels (samples, channels, steps) include the clocks. Raises NumericRangeError if a register overflows in any
+        recording.
         """
 
     @abstractmethod

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -16,13 +16,13 @@ from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.base import Done, EventArray, Price, T
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.stream import Stream
-from spikeloom.runtime.machines.loihi1.trace import Trace, aligned
+from spikeloom.runtime.machines.loihi1.trace import Trace, aligned, unpack
 from spikeloom.runtime.report.sections import Block, Outcome
 
 if TYPE_CHECKING:
@@ -112,11 +112,13 @@ class Loihi(IntegerMachine):
 
         return cumulative.least_intervals(self.netlist)
 
-    def packed(self, channels: EventArray, lengths: IntArray) -> tuple[npt.NDArray[np.uint64], IntArray]:
-        """Bits by compartment, as the engine packs them."""
+    def on_a_thread(self, channels: EventArray, lengths: IntArray, first: int) -> tuple[Iterable[BoolArray], IntArray]:
+        """Spikes by layer, as the float model counts time; at a bit each until they are looked at."""
         trace = engine.simulate(self._engine, channels, lengths=lengths, packed=True, threads=1)
         assert trace.packed is not None, "packed spikes were wanted"
-        return trace.packed, trace.counts.saturations.sum(axis=1)
+        spikes = unpack(trace.packed[:, first:], self.netlist.n_compartments)
+        layers = (aligned(self.netlist, spikes, layer) for layer in range(len(self.netlist.layers)))
+        return layers, trace.counts.saturations.sum(axis=1)
 
     def core_map(self, events: EventArray, lengths: IntArray, counts: IntArray) -> CoreMap:
         """Cores on the mesh."""

@@ -26,7 +26,6 @@ from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_o
 from spikeloom.runtime.machines.votes import readout_counts
 
 Events = npt.NDArray[np.uint8]
-Words = npt.NDArray[np.uint64]
 
 SIDES = ("float", "chip")
 
@@ -35,9 +34,6 @@ STOPPED = -1
 
 HELD = 1 << 23
 """Entries (recording, step, neuron) that run together."""
-
-STEPS = 4096
-"""Chip steps whose spikes are counted at a time."""
 
 LONG = 1 << 25
 """Entries of a recording that runs alone: its spikes may take some hundred megabytes."""
@@ -107,36 +103,27 @@ def evaluate(pair: Pair, inputs: Inputs) -> Outcome:
 
 def _part(pair: Pair, inputs: Inputs, rows: slice) -> list[Outcome]:
     """Some recordings together, or one by one if the simulator stops."""
-    from spikeloom.runtime.studies.stress.meeting import NOWHERE, UNREAD, meeting
-
-    netlist, events = pair.netlist, inputs.channels(rows)
-    lengths, begin, stopped = inputs.lengths[rows], inputs.begin[rows], False
+    netlist, readout, events = pair.netlist, pair.network.readout, inputs.channels(rows)
+    lengths, begin = inputs.lengths[rows], inputs.begin[rows]
+    stopped, first = np.zeros(len(events), np.bool_), int(begin.min())
     try:
-        packed, saturated = pair.chip.packed(events, lengths)
+        chip, saturated = pair.chip.on_a_thread(events, lengths, first)
     except NumericRangeError:
         if len(events) > 1:
             return [each for i in range(rows.start, rows.stop) for each in _part(pair, inputs, slice(i, i + 1))]
-        packed = np.zeros((1, events.shape[2] + netlist.max_depth, -(-netlist.n_compartments // 64)), np.uint64)
-        saturated, stopped = np.zeros(1, np.int64), True
-    spikes = np.zeros((len(netlist.layers), 3), np.int64)
-    votes = {side: np.zeros((len(events), netlist.classes), np.int64) for side in SIDES}
-    for index, (fired, layer) in enumerate(zip(float_layers(pair, events, lengths), netlist.layers, strict=True)):
-        ids = netlist.compartments_of(index)
-        seat = np.full(layer.neurons, NOWHERE)
-        seat[list(layer.unread)] = UNREAD
-        seat[netlist.neuron[ids]] = ids
-        ours, both = meeting(fired.view(np.uint8), packed, layer.depth, seat, begin)
-        step = np.arange(packed.shape[1])
-        counts = (step >= begin[:, None] + layer.depth) & (step < lengths[:, None] + layer.depth)
-        theirs = _ones(packed, ids, counts)
-        spikes[index] = ours, theirs, ours + theirs - 2 * both
-        for voter in ids[netlist.readout_class[ids] >= 0].tolist():
-            fires = (packed[..., voter // 64] >> np.uint64(voter % 64)) & np.uint64(1)
-            votes["chip"][:, netlist.readout_class[voter]] += np.where(counts, fires, 0).sum(axis=1).astype(np.int64)
-        if index == pair.network.readout.population:
-            late = fired & (np.arange(fired.shape[1]) >= begin[:, None])[:, :, None]
-            votes["float"] = readout_counts(pair.network.readout, netlist.classes, late)
-    return [Outcome(votes=votes, spikes=spikes, stopped=np.full(len(events), stopped), saturated=saturated)]
+        chip = [np.zeros((1, events.shape[2] - first, layer.neurons), np.bool_) for layer in netlist.layers]
+        stopped[:], saturated = True, np.zeros(1, np.int64)
+    spikes, votes, compared = np.zeros((len(netlist.layers), 3), np.int64), {}, pair.chip.compared()
+    step = np.arange(first, events.shape[2])
+    counts = ((step >= begin[:, None]) & (step < lengths[:, None]))[:, :, None]
+    for index, (fired, chip_fired) in enumerate(zip(float_layers(pair, events, lengths), chip, strict=True)):
+        ours, theirs = fired[:, first:] & counts, chip_fired & counts
+        if index == readout.population:
+            sides = zip(SIDES, (ours, theirs), strict=True)
+            votes = {side: readout_counts(readout, netlist.classes, spiked) for side, spiked in sides}
+        left, right = ours[..., compared[index]], theirs[..., compared[index]]
+        spikes[index] = np.count_nonzero(left), np.count_nonzero(right), np.count_nonzero(left != right)
+    return [Outcome(votes=votes, spikes=spikes, stopped=stopped, saturated=saturated)]
 
 
 def float_layers(pair: Pair, events: Events, lengths: IntArray) -> Iterator[BoolArray]:
@@ -158,19 +145,6 @@ def _from(spikes: BoolArray, step: int) -> BoolArray:
     moved = np.zeros_like(spikes)
     moved[:, :-step] = spikes[:, step:]
     return moved
-
-
-def _ones(packed: Words, ids: IntArray, counts: BoolArray) -> int:
-    """Spikes of some compartments in the steps that count, (recordings, chip steps)."""
-    mask = np.zeros(packed.shape[2], np.uint64)
-    np.bitwise_or.at(mask, ids // 64, np.left_shift(np.uint64(1), (ids % 64).astype(np.uint64)))
-    words = np.flatnonzero(mask)
-    found = 0
-    for first in range(0, packed.shape[1], STEPS):
-        steps = slice(first, first + STEPS)
-        ones = np.bitwise_count(packed[:, steps, words] & mask[words]).sum(axis=2, dtype=np.int64)
-        found += int(ones[counts[:, steps]].sum())
-    return found
 
 
 # -- perturbations -----------------------------------------------------------------------------------------------------
