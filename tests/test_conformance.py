@@ -102,7 +102,7 @@ report:
 run:
     accuracy counts files labelled labels predictions samples
 stress:
-    classes clean full missed not_applicable perturbations provenance recordings required seeds
+    classes clean missed not_applicable perturbations provenance recordings required seeds
 train:
     protocols runs
 verify:

@@ -159,7 +159,7 @@ def test_an_overflow_stops_its_recording_and_no_other(bench):
 @pytest.mark.parametrize("name", NAMES)
 def test_every_perturbation_runs_at_its_mildest_and_harshest_the_same_for_a_seed(bench, name):
     reference, undisturbed = clean(bench)
-    levels = NAMES[name].levels_of(TAXELS, full=False)
+    levels = NAMES[name].levels_of(TAXELS)
     for level in {levels[0], levels[-1]}:
         seeds = [0, 1] if NAMES[name].seeded else [0]
         runs = [measure(bench, name, level, seed, reference) for seed in seeds]
@@ -174,15 +174,12 @@ def test_every_perturbation_runs_at_its_mildest_and_harshest_the_same_for_a_seed
 def test_levels_are_in_order_and_make_sense():
     assert len(NAMES) == 26
     for known in NAMES.values():
-        for full in (False, True):
-            levels = list(known.levels_of(39, full=full))
-            assert levels in (sorted(levels), sorted(levels, reverse=True))
-            assert all(known.least <= level <= known.most for level in levels)
-            assert len(set(levels)) == len(levels)
+        levels = list(known.levels_of(39))
+        assert levels in (sorted(levels), sorted(levels, reverse=True))
+        assert all(known.least <= level <= known.most for level in levels)
+        assert len(set(levels)) == len(levels)
         assert known.to in ("events", "pair", "bench")
-    assert NAMES["taxels_dead"].levels_of(6, full=False, also=[2]) == (1, 2, 3, 5)
-    assert NAMES["taxels_dead"].levels_of(6, full=True) == (1, 2, 3, 4, 5)
-    assert NAMES["weight_bit_flips"].levels_of(6, full=True) == (1e-4, 0.00055, 1e-3, 0.0055, 0.01, 0.03, 0.05)
+    assert NAMES["taxels_dead"].levels_of(6, [2]) == (1, 2, 3, 5)
     assert NAMES["taxels_dead"].level_of("3") == 3
 
 
@@ -203,7 +200,7 @@ def test_all_systems_timed_and_joined(tmp_path, system):
         assert_array_equal(reference.votes["float"], readout_counts(network.readout, network.classes, spikes))
         for name, each in NAMES.items():
             assert each.why_not(made.pair) is None
-            run = measure(made, name, each.levels_of(39, full=False)[0], 0, reference)
+            run = measure(made, name, each.levels_of(39)[0], 0, reference)
             assert run.stopped in range(3)
 
 

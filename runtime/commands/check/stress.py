@@ -30,7 +30,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_netlist_and_model(parser)
     add_recordings(parser)
     parser.add_argument("--only", metavar="NAME[,…]", help="some perturbations (default: all)")
-    parser.add_argument("--full", action="store_true", help="dense curves")
     parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help=f"draws of each (default: {SEEDS})")
     parser.add_argument(
         "--require",

@@ -24,7 +24,7 @@ from spikeloom.compiler.fixedpoint import (
     round_half_even,
     weight_step,
 )
-from spikeloom.compiler.ir import INPUT, Network, Population, Projection
+from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.studies.stress.pair import Pair, perturbation
 
@@ -69,8 +69,7 @@ def _codes(netlist: Netlist) -> tuple[IntArray, IntArray]:
 
 def weight_steps(bits: IntArray) -> IntArray:
     """Distance of neighbouring mantissas of each width; as :func:`fixedpoint.weight_step`."""
-    known = np.array([0, 0, *(weight_step(width) for width in range(2, 9))])
-    return known[bits]
+    return np.array([0, 0, *(weight_step(width) for width in range(2, 9))])[bits]
 
 
 @perturbation("probability", (1e-4, 1e-3, 0.01, 0.05))
@@ -126,7 +125,7 @@ def stick_neurons(pair: Pair, share: float, rng: np.random.Generator, *, firing:
     stuck = np.zeros(netlist.n_compartments, np.bool_)
     stuck[rng.permutation(among)[: round(share * len(among))]] = True
     target = netlist.synapse_compartment()
-    changed = replace(
+    held = replace(
         netlist,
         synapse_weight=frozen(np.where(stuck[target], 0, netlist.synapse_weight).astype(netlist.synapse_weight.dtype)),
         bias_mantissa=read_only(np.where(stuck, int(firing), netlist.bias_mantissa)),
@@ -134,13 +133,7 @@ def stick_neurons(pair: Pair, share: float, rng: np.random.Generator, *, firing:
         threshold=read_only(np.where(stuck & firing, 0, netlist.threshold)),
     )
 
-    def population(number: int, old: Population) -> Population:
-        level = 2 * old.theta if firing else 0.0
-        return replace(old, bias=np.where(_neurons(netlist, stuck, number), level, old.bias))
-
-    populations = tuple(population(i, old) for i, old in enumerate(pair.network.populations))
-    free = [np.where(_neurons(netlist, stuck, i), 0.0, 1.0) for i in range(len(populations))]
-    return Pair(netlist=changed, network=replace(_rows_scaled(pair.network, free), populations=populations))
+    return Pair(netlist=held, network=inputs_scaled(pair, np.where(stuck, 0.0, 1.0), np.where(stuck, 2.0 * firing, 0.0)))
 
 
 def with_thresholds(pair: Pair, threshold: IntArray) -> Pair:
@@ -151,18 +144,26 @@ def with_thresholds(pair: Pair, threshold: IntArray) -> Pair:
     netlist = pair.netlist
     held = np.where(relays(pair), netlist.threshold, np.clip(threshold, 1, THRESHOLD_MANTISSA_MAX))
     factor = np.maximum(netlist.threshold, 1) / np.maximum(held, 1)
-    factors = []
-    for number, layer in enumerate(netlist.layers):
-        ids, whole = netlist.compartments_of(number), np.ones(layer.neurons)
-        whole[netlist.neuron[ids]] = factor[ids]
-        factors.append(whole)
-    network = _rows_scaled(pair.network, factors)
-    populations = tuple(
-        replace(population, bias=population.bias * by)
-        for population, by in zip(network.populations, factors, strict=True)
-    )
-    changed = replace(netlist, threshold=read_only(held))
-    return Pair(netlist=changed, network=replace(network, populations=populations))
+    network = inputs_scaled(pair, factor, np.zeros(len(factor)))
+    return Pair(netlist=replace(netlist, threshold=read_only(held)), network=network)
+
+
+def inputs_scaled(pair: Pair, factor: FloatArray, more: FloatArray) -> Network:
+    """The float network with weights and bias of each compartment's neuron times a factor, and `more` thresholds."""
+    netlist, populations, factors = pair.netlist, [], []
+    for number, population in enumerate(pair.network.populations):
+        ids = netlist.compartments_of(number)
+        scale, bias = np.ones(population.size), population.bias.copy()
+        scale[netlist.neuron[ids]] = factor[ids]
+        bias[netlist.neuron[ids]] = bias[netlist.neuron[ids]] * factor[ids] + population.theta * more[ids]
+        factors.append(scale)
+        populations.append(replace(population, bias=bias))
+    projections = []
+    for projection in pair.network.projections:
+        weight = projection.weight.copy()
+        weight.data *= np.repeat(factors[projection.post], np.diff(weight.indptr))
+        projections.append(replace(projection, weight=weight))
+    return replace(pair.network, populations=tuple(populations), projections=tuple(projections))
 
 
 def scale_thresholds(pair: Pair, factor: FloatArray | float) -> Pair:
@@ -206,25 +207,6 @@ def layers_late(pair: Pair, steps: int) -> Pair:
     """
     layers = tuple(replace(layer, depth=layer.depth + steps) if layer.depth else layer for layer in pair.netlist.layers)
     return Pair(netlist=replace(pair.netlist, layers=layers), network=pair.network)
-
-
-def _neurons(netlist: Netlist, flags: Mask, layer: int) -> Mask:
-    """Flags of compartments as those of a layer's neurons."""
-    neurons = np.zeros(netlist.layers[layer].neurons, np.bool_)
-    ids = netlist.compartments_of(layer)
-    neurons[netlist.neuron[ids]] = flags[ids]
-    return neurons
-
-
-def _rows_scaled(network: Network, factors: list[FloatArray]) -> Network:
-    """Multiply the input of each neuron by a factor of its own."""
-
-    def scaled(projection: Projection) -> Projection:
-        weight = projection.weight.copy()
-        weight.data *= np.repeat(factors[projection.post], np.diff(weight.indptr))
-        return replace(projection, weight=weight)
-
-    return replace(network, projections=tuple(scaled(projection) for projection in network.projections))
 
 
 # -- storage and decay -------------------------------------------------------------------------------------------------

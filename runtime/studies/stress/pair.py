@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import pairwise
 from threading import Lock
 from typing import Any
 
@@ -224,14 +223,9 @@ class Perturbation:
             raise OptionError(f"{self.name}:{words}: {words!r} is no level of it; give {kind} {limits} ({self.unit})")
         return int(level) if level == int(level) else level
 
-    def levels_of(self, taxels: int, *, full: bool, also: Sequence[Level] = ()) -> tuple[Level, ...]:
-        """Levels to measure on a sensor of so many taxels, further ones among them; with `full` those between, too."""
-        levels = list(self.levels)
-        if full:
-            between = [float(f"{(a + b) / 2:.2g}") for a, b in pairwise(levels)]
-            levels += [int(level) for level in between] if isinstance(levels[0], int) else between
-        if self.unit == TAXELS:
-            levels = [level for level in levels if level <= taxels]
+    def levels_of(self, taxels: int, also: Sequence[Level] = ()) -> tuple[Level, ...]:
+        """Levels to measure on a sensor of so many taxels, further ones among them."""
+        levels = [level for level in self.levels if self.unit != TAXELS or level <= taxels]
         return tuple(sorted({*levels, *also}, reverse=self.levels[0] > self.levels[-1]))
 
 

@@ -106,7 +106,6 @@ class Stress:
     recordings: int
     classes: int
     seeds: int
-    full: bool
     clean: Run
     perturbations: Mapping[str, Curve]
     not_applicable: Mapping[str, str]

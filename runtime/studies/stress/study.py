@@ -6,10 +6,10 @@ import argparse
 import os
 import zlib
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
+from joblib import Parallel, delayed
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
@@ -39,7 +39,7 @@ def study(arguments: argparse.Namespace, names: Sequence[str], requirements: Seq
         (name, level, seed)
         for name in names
         if reasons[name] is None
-        for level in _levels(name, taxels, requirements, full=arguments.full)
+        for level in NAMES[name].levels_of(taxels, [each.level for each in requirements if each.name == name])
         for seed in range(arguments.seeds if NAMES[name].seeded else 1)
     ]
     measured: dict[str, dict[Level, list[Run]]] = {}
@@ -50,7 +50,6 @@ def study(arguments: argparse.Namespace, names: Sequence[str], requirements: Seq
         recordings=recordings,
         classes=classes,
         seeds=arguments.seeds,
-        full=arguments.full,
         clean=undisturbed,
         perturbations=curves,
         not_applicable={name: reason for name, reason in reasons.items() if reason is not None},
@@ -58,11 +57,6 @@ def study(arguments: argparse.Namespace, names: Sequence[str], requirements: Seq
         missed=unmet(requirements, curves),
         provenance=_provenance(arguments, loaded, data),
     )
-
-
-def _levels(name: str, taxels: int, requirements: Sequence[Requirement], *, full: bool) -> tuple[Level, ...]:
-    """Those of a perturbation on a sensor of so many taxels, with those that are required."""
-    return NAMES[name].levels_of(taxels, full=full, also=[each.level for each in requirements if each.name == name])
 
 
 def _provenance(arguments: argparse.Namespace, loaded: LoadedNetwork, data: str) -> Provenance:
@@ -84,15 +78,12 @@ def _measured(
     points: Sequence[tuple[str, Level, int]], bench: Bench, reference: Outcome, jobs: int | None
 ) -> list[Run]:
     """The run of each point, several at a time in threads: kernels let go of the interpreter's lock."""
-    pool, progress = ThreadPoolExecutor(jobs or os.cpu_count()), Progress(len(points))
-    try:
-        waiting = [pool.submit(measure, bench, *point, reference) for point in points]
-        for done, finished in enumerate(as_completed(waiting), 1):
-            finished.result()
-            progress(done, "stress")
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return [each.result() for each in waiting]
+    work = Parallel(jobs or os.cpu_count(), backend="threading", return_as="generator")
+    runs, progress = [], Progress(len(points))
+    for done, run in enumerate(work(delayed(measure)(bench, *point, reference) for point in points), 1):
+        runs.append(run)
+        progress(done, "stress")
+    return runs
 
 
 # -- one point ---------------------------------------------------------------------------------------------------------
