@@ -147,9 +147,7 @@ def side_by_side(
         try:
             yield from work(attempt(index, payload) for index, payload in enumerate(payloads))
         except TerminatedWorkerError as error:
-            raise UnfinishedError(
-                "a process ended early, perhaps for lack of memory; go on with fewer --jobs"
-            ) from error
+            raise UnfinishedError("a process ended early, perhaps for lack of memory; use fewer --jobs") from error
 
 
 @contextmanager

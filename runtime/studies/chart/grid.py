@@ -16,9 +16,6 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
 from spikeloom.models.recordings.evtouch import WHOLE
 
-WINDOW_STEP = 25
-"""Per cent between the windows of a range that does not say."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grid:
@@ -79,7 +76,7 @@ def _readers(target: Target) -> dict[str, tuple[Callable[[str], Sequence[Any]], 
         "prune": (lambda words: _numbers(words, range(2)), "0 (keep) and 1 (leave out)"),
         "cores": (_cores, f"{', '.join(GOALS)}, or LAYER:N as in fc1:6+conv1:4, each layer once"),
         "window": (
-            lambda words: _numbers(words, range(1, WHOLE + 1), WINDOW_STEP),
+            lambda words: _numbers(words, range(1, WHOLE + 1), 25),  # by quarters where a range does not say
             f"1 to {WHOLE} per cent, or ranges as in 25-100%:5",
         ),
     }

@@ -27,16 +27,13 @@ from spikeloom.runtime.studies.chart.grid import Grid
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Storage:
-    """How a network is stored on the chip: width of all layers or of each, planes, scale groups, pruning.
-
-    It is a network's own if that was fine-tuned for it.
-    """
+    """How a network is stored on the chip: width of all layers or of each, planes, scale groups, pruning."""
 
     bits: tuple[int, ...]
     planes: int
     groups: int
     prune: bool
-    own: bool = field(default=False, metadata=key("fine_tuned"))
+    own: bool = field(default=False, metadata=key("fine_tuned"))  # Whether the network was fine-tuned for it
 
     def options(self) -> JsonObject:
         """Options of ``compile`` that ask for it, where it is not the usual one."""

@@ -41,16 +41,13 @@ def share(correct: int, samples: int) -> Share:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Figures(Share):
-    """A configuration on one split: accuracy, float model's, equal decisions, and costs of a mean recording.
-
-    Energy and time are by table, in joules and seconds.
-    """
+    """A configuration on one split: accuracy, float model's, equal decisions, and costs of a mean recording."""
 
     samples: int
     model: Share = field(metadata=key("float"))
     equal: int
-    energy_j: Mapping[str, float]
-    time_s: Mapping[str, float]
+    energy_j: Mapping[str, float]  # By table
+    time_s: Mapping[str, float]  # By table
     synaptic_operations: float
     steps: float
 
@@ -80,10 +77,7 @@ class Refused(Configuration):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Point(Configuration):
-    """One on a part of every recording: its size, its figures, and the commands that give them.
-
-    It is on the `front` of a cost if no other point is right more often on the test split for as little.
-    """
+    """One on a part of every recording: its size, its figures, and the commands that give them."""
 
     number: int
     window: int
@@ -96,7 +90,7 @@ class Point(Configuration):
     test: Figures
     commands: tuple[str, ...]
     expected: float = 0.0  # Accuracy, see `study.with_expectations`
-    front: Mapping[str, bool] = field(default_factory=dict)
+    front: Mapping[str, bool] = field(default_factory=dict)  # Of test accuracy and each cost
 
     @property
     def label(self) -> str:
@@ -144,16 +138,13 @@ class ChosenBy:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chart:
-    """Every configuration of a grid, and which one to deploy.
-
-    `tables` has the titles of tables of ``energy`` and ``time`` by name.
-    """
+    """Every configuration of a grid, and which one to deploy."""
 
     spikeloom: str
     target: str
     command: str
     data: Data
-    tables: Mapping[str, Mapping[str, str]]
+    tables: Mapping[str, Mapping[str, str]]  # Titles of tables of ``energy`` and ``time``, by name
     chosen_by: ChosenBy
     grid: Grid
     networks: tuple[NetworkFile, ...]
