@@ -12,7 +12,6 @@ first dense layer they are a bias that changes with time.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -114,22 +113,6 @@ class Dynamics:
 
 PLAIN = Dynamics()
 """One membrane decay for all layers, no current that outlasts its step, no clocks."""
-
-
-def dynamics_from_json(values: Mapping[str, Any], layers: int) -> Dynamics:
-    """Inverse of :meth:`Dynamics.to_json` for a network of so many layers; KeyError, TypeError, ValueError if none."""
-    clocks = [values["clocks"][name] for name in ("channels", "steps")]
-    if any(type(number) is not int for number in clocks):
-        raise ValueError(f"clocks of {clocks}")
-    found = Dynamics(
-        betas=tuple(float(beta) for beta in values["betas"]),
-        alphas=tuple(float(alpha) for alpha in values["alphas"]),
-        clocks=Clocks(channels=clocks[0], steps=clocks[1]),
-    )
-    faults = dynamics_faults(found, layers)
-    if faults:
-        raise ValueError("; ".join(faults))
-    return found
 
 
 def dynamics_faults(dynamics: Dynamics, layers: int) -> list[str]:

@@ -48,17 +48,6 @@ ONE_STEP_SUM_MAX = ACCUMULATOR_MAX >> MEMBRANE_SHIFT
 """Largest sum of effective weights (mantissa times 2**exponent) that one step may bring: 32767."""
 
 
-def round_half_even(x: FloatArray) -> IntArray:
-    """Round to the nearest integer, ties to the even one.
-
-    Examples
-    --------
-    >>> round_half_even(np.array([0.5, 1.5, -2.5, 2.4])).tolist()
-    [0, 2, -2, 2]
-    """
-    return np.rint(x).astype(np.int64)
-
-
 def weight_step(bits: int) -> int:
     """Distance between neighbouring mixed-sign weight mantissas of a storage width.
 
@@ -152,7 +141,7 @@ def round_steps(weight: FloatArray, scale: FloatArray | float, bits: int, expone
     [127, -38, 127]
     """
     limit = reach(bits, exponents)
-    return np.clip(round_half_even(weight * (scale / step_units(bits, exponents))), -limit, limit)
+    return np.clip(np.rint(weight * (scale / step_units(bits, exponents))), -limit, limit).astype(np.int64)
 
 
 def split_planes(steps: IntArray, bits: int, exponents: tuple[int, ...]) -> list[IntArray]:
@@ -168,7 +157,7 @@ def split_planes(steps: IntArray, bits: int, exponents: tuple[int, ...]) -> list
     codes, rest, mantissas = reach(bits, (0,)), steps, []
     for k in range(len(exponents) - 1, 0, -1):
         ratio = 1 << (exponents[k] - exponents[0])
-        code = np.clip(round_half_even(rest / ratio), -codes, codes)
+        code = np.clip(np.rint(rest / ratio), -codes, codes).astype(np.int64)
         code = np.where(np.abs(rest) <= reach(bits, exponents[:k]), 0, code)
         rest = rest - code * ratio
         mantissas.append(code * weight_step(bits))
@@ -189,7 +178,7 @@ def encode_bias(bias: FloatArray) -> tuple[IntArray, IntArray]:
     for candidate in range(1, BIAS_EXPONENT_MAX + 1):
         too_small = np.abs(np.rint(np.ldexp(bias, -exponent))) > BIAS_MANTISSA_MAX
         exponent = np.where(too_small, candidate, exponent)
-    mantissa = round_half_even(np.ldexp(bias, -exponent))
+    mantissa = np.rint(np.ldexp(bias, -exponent)).astype(np.int64)
     if np.any(np.abs(mantissa) > BIAS_MANTISSA_MAX):
         raise ValueError(f"bias of magnitude {np.abs(bias).max():.6g} exceeds 4095 * 2**7 membrane units")
     return mantissa, exponent

@@ -27,6 +27,7 @@ from spikeloom.compiler.ir import (
     Population,
     Projection,
     Sparse,
+    added_up,
 )
 from spikeloom.compiler.types import BoolArray, IntArray
 
@@ -137,9 +138,7 @@ def synapses_of(
     """Presynaptic populations; weights from these, and from the population itself, all planes together."""
     from spikeloom.compiler.layer_kernel import by_source, no_synapses
 
-    merged: dict[int, Sparse] = {}
-    for projection, weight in weights:
-        merged[projection.pre] = merged[projection.pre] + weight if projection.pre in merged else weight
+    merged = added_up((projection.pre, weight) for projection, weight in weights)
     own = merged.pop(weights[0][0].post, None) if loops and weights else None
     itself = no_synapses(dtype) if own is None else by_source([own], dtype)
     return tuple(merged), (by_source(list(merged.values()), dtype), itself)

@@ -203,21 +203,18 @@ def recurrent(network: Network | IntegerNetwork) -> tuple[str, ...]:
 
 def fan_in(network: Network | IntegerNetwork, post: int) -> IntArray:
     """Structural synapses into each neuron of a population, planes of one synapse counted once; shape (neurons,)."""
-    planes: dict[int, list[Sparse]] = {}
-    for projection in network.projections:
-        if projection.post == post:
-            planes.setdefault(projection.pre, []).append(projection.weight)
-    total = np.zeros(network.populations[post].size, np.int64)
-    for first, *others in planes.values():
-        pattern = first
-        for weight in others:
-            pattern = _ones(pattern) + _ones(weight)
-        total += np.diff(pattern.indptr)
-    return total
+    into = ((p.pre, p.weight) for p in network.projections if p.post == post)
+    ones = added_up((pre, with_data(weight, np.ones(weight.nnz, np.int32))) for pre, weight in into)
+    nothing = np.zeros(network.populations[post].size, np.int64)
+    return np.asarray(sum((np.diff(weight.indptr) for weight in ones.values()), start=nothing))
 
 
-def _ones(weight: Sparse) -> Sparse:
-    return with_data(weight, np.ones(weight.nnz, np.int32))
+def added_up(weights: Iterable[tuple[int, Sparse]]) -> dict[int, Sparse]:
+    """Weights from each source, those of several planes together."""
+    found: dict[int, Sparse] = {}
+    for pre, weight in weights:
+        found[pre] = found[pre] + weight if pre in found else weight
+    return found
 
 
 def with_data(weight: Sparse, data: npt.NDArray[Any]) -> Sparse:

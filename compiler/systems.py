@@ -23,13 +23,11 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import frozen
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 
 TACTILESGNET, GRID_CNN, MLP, GCN = SYSTEMS = ("tactilesgnet", "grid-cnn", "mlp", "gcn")
@@ -79,17 +77,6 @@ class Grid:
         """JSON values."""
         whole = {name: getattr(self, name) for name in ("rows", "columns", "stride", "padding")}
         return whole | {"cells": self.cells.tolist()}
-
-
-def grid_from_json(values: Mapping[str, Any]) -> Grid:
-    """Inverse of :meth:`Grid.to_json`; KeyError, TypeError or ValueError if they are no grid."""
-    sizes = [values[name] for name in ("rows", "columns", "stride", "padding")]
-    cells = np.array(values["cells"], np.int64).reshape(-1, 2)
-    if any(type(size) is not int or not 0 <= size <= SMALL_GRID for size in sizes) or 0 in sizes[:3]:
-        raise ValueError(f"grid of {sizes}")
-    if not len(cells) or cells.min() < 0 or np.any(cells >= sizes[:2]):
-        raise ValueError("taxels outside the grid")
-    return Grid(rows=sizes[0], columns=sizes[1], stride=sizes[2], padding=sizes[3], cells=frozen(cells))
 
 
 def feature_major(system: str) -> bool:

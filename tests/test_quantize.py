@@ -31,7 +31,6 @@ from spikeloom.compiler.fixedpoint import (
     THRESHOLD_MANTISSA_MAX,
     decay_registers,
     encode_bias,
-    round_half_even,
     round_steps,
     weight_step,
 )
@@ -359,10 +358,6 @@ def test_decay_of_beta_one_fifth_is_the_published_one():
 @given(st.integers(-(2**24), 2**24), st.integers(0, 4096))
 def test_decay_rounds_the_exact_product_toward_zero(x, lost):
     assert decayed(x, lost) == int(Fraction(x * (4096 - lost), 4096))  # int of a fraction truncates
-
-
-def test_round_half_even_goes_to_the_even_neighbour():
-    assert round_half_even(np.array([-1.5, -0.5, 0.5, 1.5, 2.5, 2.499, -2.501])).tolist() == [-2, 0, 0, 2, 2, 2, -3]
 
 
 @pytest.mark.parametrize(("bits", "largest"), LARGEST.items())

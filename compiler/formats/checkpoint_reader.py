@@ -47,16 +47,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.archive import AGAIN, GRAPH, Kind, arrays_digest, entry_faults, read_npy, stored_members
+from spikeloom.compiler.archive import AGAIN, CLOCKS, GRAPH, Kind, arrays_digest, entry_faults, read_npy, stored_members
 from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, constant_faults, layers_of
-from spikeloom.compiler.dynamics import MOST_STEPS, PLAIN, Dynamics, dynamics_from_json
+from spikeloom.compiler.dynamics import MOST_STEPS, PLAIN, Clocks, Dynamics, dynamics_faults
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import read_whole
 from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, plane_distance, read_only
 from spikeloom.compiler.formats.tensors import Arrays, apart, faults_of, taxel_faults, tower_faults, wanted_dense
 from spikeloom.compiler.formats.torch_checkpoint import DAMAGED, GIVE, NOT_A_CHECKPOINT, read_torch
 from spikeloom.compiler.ir import Form
-from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS, TITLES, Grid, grid_from_json, shape_faults
+from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SMALL_GRID, SYSTEMS, TITLES, Grid, shape_faults
 
 FORMAT = "spikeloom-checkpoint"
 VERSION = 6
@@ -72,6 +72,12 @@ ENTRIES: dict[str, Kind] = {
 MORE: dict[str, Kind] = {
     "towers": (2, MOST_STEPS),
     "bins": (2, MOST_STEPS),
+    "grid": {
+        **dict.fromkeys(("rows", "columns", "stride"), (1, SMALL_GRID)),
+        "padding": (0, SMALL_GRID),
+        "cells": [[(0, SMALL_GRID), 2], ...],
+    },
+    "dynamics": {"betas": [float], "alphas": [float], "clocks": CLOCKS},
     "forms": [{"layer": str, "bits": (2, 8), "exponents": [(-1, 7), ...], "threshold": [(1, THRESHOLD_MANTISSA_MAX)]}],
 }
 """What a manifest may leave out."""
@@ -159,14 +165,16 @@ def _read_own(content: bytes, members: dict[str, bytes], weights: str | None) ->
     system, towers = manifest["architecture"], manifest.get("towers", 1)
     edges = read_only(np.array(manifest["graph"]["edges"], np.int64).reshape(-1, 2))
     grid, dynamics = None, PLAIN
-    try:
-        if system == GRID_CNN:
-            grid = grid_from_json(manifest["grid"])
-        if "dynamics" in manifest:
-            stages = sum(re.fullmatch(r"fc\d+\.weight", name) is not None for name in chosen)
-            dynamics = dynamics_from_json(manifest["dynamics"], 1 + stages)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        faults.append(f"the manifest has an unusable grid or dynamics ({error})")
+    if system == GRID_CNN and (said := manifest.get("grid")):
+        grid = Grid(**said | {"cells": read_only(said["cells"])})
+        if np.any(grid.cells >= (grid.rows, grid.columns)):
+            faults.append("the manifest has an unusable grid or dynamics (taxels outside the grid)")
+    if said := manifest.get("dynamics"):
+        decays = {name: tuple(map(float, said[name])) for name in ("betas", "alphas")}
+        dynamics = Dynamics(**decays, clocks=Clocks(**said["clocks"]))
+        stages = sum(re.fullmatch(r"fc\d+\.weight", name) is not None for name in chosen)
+        if wrong := dynamics_faults(dynamics, 1 + stages):
+            faults.append(f"the manifest has an unusable grid or dynamics ({'; '.join(wrong)})")
     faults += tower_faults(chosen, towers)
     for tower in () if faults else apart(chosen, towers):
         faults = faults or _tower_faults(tower, manifest["taxels"], manifest["classes"], (system, grid, dynamics))

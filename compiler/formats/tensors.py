@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.checkpoint import SHARED, Checkpoint, towers_of
+from spikeloom.compiler.checkpoint import SHARED, Checkpoint, layers_of, towers_of
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.ir import Form
@@ -126,17 +126,8 @@ def members(checkpoint: Checkpoint) -> tuple[Checkpoint, ...]:
                 replace(form, threshold=form.threshold[(owner == tower) | (owner == SHARED)])
                 for form, owner in zip(checkpoint.forms, owners, strict=True)
             )
-        found.append(replace(_holding(checkpoint, arrays), forms=forms, towers=1))
+        found.append(replace(checkpoint, **layers_of(arrays), forms=forms, towers=1))
     return tuple(found)
-
-
-def _holding(checkpoint: Checkpoint, arrays: Arrays) -> Checkpoint:
-    """The checkpoint with other arrays."""
-    dense = tuple(
-        replace(stage, weight=arrays[f"{stage.name}.weight"], bias=arrays[f"{stage.name}.bias"])
-        for stage in checkpoint.dense
-    )
-    return replace(checkpoint, hops=arrays["conv1.hops"], conv_bias=arrays["conv1.bias"], dense=dense)
 
 
 def side_by_side(
@@ -179,8 +170,8 @@ def join(checkpoints: Sequence[Checkpoint], names: Sequence[str]) -> Checkpoint:
             "timing"
         )
     every = [member for checkpoint in checkpoints for member in members(checkpoint)]
-    arrays = together([arrays_of(member) for member in every])
-    joined = replace(_holding(every[0], arrays), forms=None, towers=len(every))
+    arrays = layers_of(together([arrays_of(member) for member in every]))
+    joined = replace(every[0], **arrays, forms=None, towers=len(every))
     return replace(joined, forms=_joined_forms(joined, every))
 
 

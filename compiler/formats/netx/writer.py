@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, THRESHOLD_MANTISSA_MAX, round_half_even
+from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, THRESHOLD_MANTISSA_MAX
 from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes, tree_of
 from spikeloom.compiler.formats.netx.reader import integers_of
 from spikeloom.compiler.interpret import run_integer
@@ -102,7 +102,7 @@ def _block(population: IntegerPopulation, weight: IntArray, inputs: int, thresho
     shift = _shift(name, weight, threshold)
     shifted = np.ldexp(weight.astype(np.float64), shift).astype(np.int64)
     steps = np.ldexp(population.bias.astype(np.float64), shift - MEMBRANE_SHIFT)
-    whole = round_half_even(steps)
+    whole = np.rint(steps).astype(np.int64)
     scaled = np.ldexp(float(threshold), shift)
     if np.abs(whole).max(initial=0) > BIAS_MANTISSA_MAX:
         raise ModelError(

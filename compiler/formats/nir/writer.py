@@ -24,7 +24,7 @@ from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.formats.nir.stages import require_step
-from spikeloom.compiler.ir import INPUT, IntegerPopulation, Sparse
+from spikeloom.compiler.ir import INPUT, IntegerPopulation, Sparse, added_up
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import FORGETS
 
@@ -50,11 +50,7 @@ def export(netlist: Netlist, dt: float) -> bytes:
     edges: list[tuple[str, str]] = []
     for post, (population, name) in enumerate(zip(network.populations, names, strict=True)):
         bias = population.bias / (1 << MEMBRANE_SHIFT)
-        sources: dict[int, Sparse] = {}
-        for projection in network.projections:
-            if projection.post == post:
-                weight = projection.effective()
-                sources[projection.pre] = sources[projection.pre] + weight if projection.pre in sources else weight
+        sources = added_up((p.pre, p.effective()) for p in network.projections if p.post == post)
         for number, (pre, weight) in enumerate(sorted(sources.items())):
             source = "input" if pre == INPUT else names[pre]
             synapses = f"{source}_to_{name}"

@@ -21,7 +21,6 @@ from spikeloom.compiler.fixedpoint import (
     decay_registers,
     frozen,
     read_only,
-    round_half_even,
     weight_step,
 )
 from spikeloom.compiler.ir import INPUT, Network
@@ -168,7 +167,7 @@ def inputs_scaled(pair: Pair, factor: FloatArray, more: FloatArray) -> Network:
 
 def scale_thresholds(pair: Pair, factor: FloatArray | float) -> Pair:
     """Multiply all thresholds by a factor, or each by its own (compartments,); rounded to what registers hold."""
-    return with_thresholds(pair, round_half_even(pair.netlist.threshold * np.asarray(factor)))
+    return with_thresholds(pair, np.rint(pair.netlist.threshold * np.asarray(factor)).astype(np.int64))
 
 
 @perturbation("standard deviation, share", (0.05, 0.1, 0.2, 0.4))
@@ -226,7 +225,7 @@ def fewer_bits(pair: Pair, width: int) -> Pair:
     code, bits = _codes(pair.netlist)
     factor = np.int64(1) << np.maximum(bits - width, 0)
     most = (np.int64(1) << (np.minimum(bits, width) - 1)) - 1
-    kept = np.clip(round_half_even(code / factor), -most, most) * factor
+    kept = np.clip(np.rint(code / factor).astype(np.int64), -most, most) * factor
     return with_weights(pair, kept * weight_steps(bits))
 
 
