@@ -132,7 +132,9 @@ def stick_neurons(pair: Pair, share: float, rng: np.random.Generator, *, firing:
         threshold=read_only(np.where(stuck & firing, 0, netlist.threshold)),
     )
 
-    return Pair(netlist=held, network=inputs_scaled(pair, np.where(stuck, 0.0, 1.0), np.where(stuck, 2.0 * firing, 0.0)))
+    return Pair(
+        netlist=held, network=inputs_scaled(pair, np.where(stuck, 0.0, 1.0), np.where(stuck, 2.0 * firing, 0.0))
+    )
 
 
 def with_thresholds(pair: Pair, threshold: IntArray) -> Pair:
