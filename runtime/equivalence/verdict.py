@@ -10,18 +10,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.equivalence.breakdowns import Breakdown
-from spikeloom.runtime.equivalence.certificates import Certificate
 from spikeloom.runtime.equivalence.rounding import Rounding
 from spikeloom.runtime.machines.simulated import Part
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Block, Section, Table, Text
+
+if TYPE_CHECKING:
+    from spikeloom.runtime.equivalence.certificates import Certificate  # it loads numba
 
 LEVELS = ("E0", "E1", "E2", "E3")
 

@@ -86,10 +86,12 @@ def load_recordings(
 ) -> Recordings:
     """Recordings that the options of a command name, held against a netlist; as `recordings` otherwise.
 
-    In steps of the network if `joined`, else in their own bins.
+    In steps of the network if `joined`, as long a part of each as a ``--window`` says, as long as the network needs;
+    else whole, in their own bins.
     """
+    window = parse_window(getattr(arguments, "window", "100%"))
     progress("reading the recordings")
-    return recordings(
+    data = recordings(
         arguments.data,
         arguments.split,
         limit=arguments.limit,
@@ -99,13 +101,7 @@ def load_recordings(
         bins=netlist.bins if joined else 1,
         labels_for=labels_for,
     )
-
-
-def netlist_recordings(arguments: argparse.Namespace, netlist: Netlist, *, labels_for: str | None = None) -> Recordings:
-    """Recordings that a netlist can take, as long a part of each as ``--window`` says."""
-    percent = parse_window(arguments.window)
-    data = first_part(load_recordings(arguments, netlist, labels_for=labels_for), percent)
-    return of_length(data, netlist.clocks.length)
+    return of_length(first_part(data, window), netlist.clocks.length) if joined else data
 
 
 def find_recording(data: Recordings, wanted: str, option: str) -> int:

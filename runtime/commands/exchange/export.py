@@ -62,23 +62,6 @@ class Written:
     facts: Any = field(metadata=INLINE)
 
 
-def _request(arguments: argparse.Namespace) -> Request:
-    def read(classes: int, taxels: int, bins: int) -> Recordings:
-        split, limit = arguments.split or "test", arguments.limit
-        return recordings(
-            arguments.data, split, limit=limit, classes=classes, taxels=taxels, bin_s=arguments.bin, bins=bins
-        )
-
-    return Request(
-        source=arguments.source,
-        output=arguments.output,
-        recordings=None if arguments.data is None else read,
-        recording=arguments.recording,
-        form=arguments.form,
-        dt=arguments.dt,
-    )
-
-
 def _require_fit(arguments: argparse.Namespace) -> None:
     """Refuse options that the format would ignore."""
     for name in {option: None for each in FORMATS.values() for option in each.options}:
@@ -93,7 +76,20 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Write the file."""
     _require_fit(arguments)
     require_place(arguments.output, "-o", arguments)
-    export = FORMATS[arguments.to].write(_request(arguments))
+
+    def read(classes: int, taxels: int, bins: int) -> Recordings:
+        asked = {"limit": arguments.limit, "bin_s": arguments.bin}
+        return recordings(arguments.data, arguments.split or "test", classes=classes, taxels=taxels, bins=bins, **asked)
+
+    request = Request(
+        source=arguments.source,
+        output=arguments.output,
+        recordings=None if arguments.data is None else read,
+        recording=arguments.recording,
+        form=arguments.form,
+        dt=arguments.dt,
+    )
+    export = FORMATS[arguments.to].write(request)
     digest, size = hashlib.sha256(), 0
     with write_atomically(arguments.output) as file:
         for chunk in export.content:

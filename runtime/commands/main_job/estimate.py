@@ -6,7 +6,7 @@ import argparse
 
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_detail, add_netlist, add_recordings
-from spikeloom.runtime.inputs.recordings import netlist_recordings
+from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.base import Machine, Price, Run, machine_for
 from spikeloom.runtime.machines.simulated import Account, Accounted
 from spikeloom.runtime.report.sections import Outcome
@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     machine = machine_for(arguments.netlist)
-    data = netlist_recordings(arguments, machine.netlist)
+    data = load_recordings(arguments, machine.netlist)
     account = Account(machine, data)
     _, price = priced(arguments, machine, data, account)
     account.begin("no float")

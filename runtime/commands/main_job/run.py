@@ -17,7 +17,7 @@ from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
 from spikeloom.runtime.commands.main_job.estimate import priced
 from spikeloom.runtime.commands.options import add_detail, add_netlist, add_recordings
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.recordings import netlist_recordings
+from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.base import Machine, Price, Run, machine_for
 from spikeloom.runtime.machines.simulated import Account, Accounted
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     require_place(arguments.spikes, "--spikes", arguments)
     machine = machine_for(arguments.netlist)
-    data = netlist_recordings(arguments, machine.netlist)
+    data = load_recordings(arguments, machine.netlist)
     account = Account(machine, data)
     price: Price | None = None
     if arguments.detail == "spikes":

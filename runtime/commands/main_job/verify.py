@@ -11,7 +11,7 @@ from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_check, add_net
 from spikeloom.runtime.equivalence.verdict import parse_requirements, sections
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.network import load_network
-from spikeloom.runtime.inputs.recordings import netlist_recordings
+from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.base import ENGINES, chip_module, machine_for
 from spikeloom.runtime.machines.simulated import Account
 from spikeloom.runtime.report.sections import Outcome
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     netlist = machine.netlist
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     original = None if arguments.original is None else load_network(arguments.original, arguments)
-    data = netlist_recordings(arguments, netlist, labels_for="verify")
+    data = load_recordings(arguments, netlist, labels_for="verify")
     account = Account(machine, data, checked=arguments.spec_samples)
     verdict = verify(
         netlist,

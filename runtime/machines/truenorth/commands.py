@@ -32,7 +32,7 @@ from spikeloom.compiler.types import BoolArray, IntArray, JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import NETWORKS, LoadedNetwork, load_network
-from spikeloom.runtime.inputs.recordings import netlist_recordings
+from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
 from spikeloom.runtime.machines.truenorth.description import describe, describe_trained
 from spikeloom.runtime.machines.truenorth.machine import load, machine_of
@@ -295,7 +295,7 @@ def verify(arguments: argparse.Namespace) -> Outcome:
         )
     else:
         model, first = _trained_model(network.network), {s.name: n for n, s in enumerate(network.network.stages)}
-    data = netlist_recordings(arguments, netlist, labels_for="verify")
+    data = load_recordings(arguments, netlist, labels_for="verify")
     steps = SPEC_STEPS if copies else None
     checked = arguments.spec_samples
     verdict = compare(netlist, model, first, data, spec_samples=checked, spec_steps=steps, network=compared)
