@@ -226,6 +226,13 @@ def test_commands_take_a_counting_network(monkeypatch, tmp_path):
     assert found["accuracy"] == {"float": share, "chip": share}
     assert all(layer["different"] == 0 for layer in found["spikes"].values())
     assert as_json("estimate", "c.loom", "--data", "synthetic", "--limit", "3")["samples"] == 3
+    few = ["c.loom", "--checkpoint", "c.pt", "--data", "synthetic", "--limit", "3"]
+    decided = as_json("run", "c.loom", "--data", "synthetic", "--limit", "3")
+    page = as_json("report", *few, "-o", "c.html")
+    assert page["decisions"]["chip"] == decided["predictions"]
+    assert page["recording"]["votes"]["chip"] == decided["counts"][0]
+    explained = as_json("explain", *few, "--sample", "0")
+    assert (explained["steps"], explained["different"]) == (page["recording"]["steps"], 0)
     chart = as_json(
         "chart", "c.pt", "--data", "synthetic", "--grid", "bits=8,window=50%/100%", "--jobs", "1", "-o", "ch"
     )
