@@ -3,6 +3,10 @@
     python benchmarks/systems.py DATA OUT.json 'NAME=NETWORK[@TARGET]' …
     python benchmarks/systems.py --draw OUT.png OBJECTS.json CONTAINERS.json
 
+Counters of longer bins are trained by `spikeloom train --data Ev-Objects.zip --system counters --ramp 16` with `--join 5
+--parts 2 --thresholds 1,4,16` (100 ms) and `--join 10 --thresholds 1,2,4,8,16` (200 ms); the joined network by the
+commands of `docs/training.md`.
+
 Each network is compiled with --calibrate DATA and decides and prices the test split once. The lines are the machines of
 `benchmarks/results/features-*.json`, which `python benchmarks/features.py` made: the linear and the radial one that are
 best by cross-validation on the training split.
@@ -23,8 +27,12 @@ from spikeloom.compiler import __version__
 from spikeloom.runtime.report.numbers import wilson
 
 RESULTS = Path(__file__).parent / "results"
-STYLES = {"TactileSGNet": ("o", "#1b6ca8"), "counters": ("s", "#c1440e"), "MLP": ("^", "#5c7f3a")}
-"""Marker and colour by the first word of a name."""
+WORDS = {"linear": "linear", "rbf": "RBF"}
+STYLES = {"TactileSGNet": ("o", "#1b6ca8"), "counters": ("s", "#c1440e")}
+"""Marker and colour of a system."""
+
+SVM = {"linear": ("linear SVM, no chip", "--"), "rbf": ("RBF SVM, no chip", ":")}
+TICKS = (1, 3, 10, 30, 100, 300)
 
 
 def measured(name: str, network: str, data: Any) -> dict[str, Any]:
@@ -40,48 +48,41 @@ def measured(name: str, network: str, data: Any) -> dict[str, Any]:
 
 
 def draw(place: str, files: list[str]) -> None:
-    """One panel for each data set."""
-    figure, panels = plt.subplots(1, len(files), figsize=(4.6 * len(files), 3.4), layout="constrained")
-    for axes, file in zip(np.atleast_1d(panels), files, strict=True):
+    """One panel for each data set, small labels beside each mark."""
+    figure, panels = plt.subplots(1, len(files), figsize=(4.6 * len(files), 3.6), layout="constrained", squeeze=False)
+    for axes, file in zip(panels[0], files, strict=True):
         found = json.loads(Path(file).read_text())
-        machines = json.loads(
-            (RESULTS / f"features-{found['data'].split('-')[1].split('.')[0].lower()}.json").read_text()
-        )
-        for kernel, line in (("linear", "--"), ("rbf", ":")):
-            best = max((m for m in machines["machines"] if m["kernel"] == kernel), key=lambda m: m["cross_validation"])
-            axes.axhline(100 * best["correct"] / machines["test_samples"], color="0.45", ls=line, lw=1)
-            axes.annotate(
-                f"{kernel} SVM, no chip",
-                (1, 100 * best["correct"] / machines["test_samples"]),
-                xycoords=("axes fraction", "data"),
-                ha="right",
-                va="bottom",
-                fontsize=7,
-                color="0.35",
-            )
+        title = found["data"].removesuffix(".zip").removeprefix("Ev-")
+        machines = json.loads((RESULTS / f"features-{title.lower()}.json").read_text())
+        best = {
+            kernel: max((m for m in machines["machines"] if m["kernel"] == kernel), key=lambda m: m["cross_validation"])
+            for kernel in SVM
+        }
+        for kernel, one in best.items():
+            words, line = SVM[kernel]
+            share = 100 * one["correct"] / machines["test_samples"]
+            axes.axhline(share, color="0.45", ls=line, lw=1)
+            above = one["correct"] == max(each["correct"] for each in best.values())
+            aside = {"xytext": (0, 2 if above else -2), "va": "bottom" if above else "top", "ha": "center"}
+            axes.annotate(words, (80, share), textcoords="offset points", fontsize=7, color="0.35", **aside)
         for each in found["networks"]:
-            marker, colour = STYLES[each["name"].split()[0].rstrip(",")]
+            name, _, label = each["name"].partition(", ")
+            marker, colour = STYLES[name]
             energies = 1e6 * np.array(list(each["energy_j"].values()))
             share = 100 * each["correct"] / each["samples"]
             low, high = (100 * bound for bound in wilson(each["correct"], each["samples"]))
-            axes.errorbar(
-                energies[0], share, [[share - low], [high - share]], color=colour, marker=marker, ms=5, lw=0.8
-            )
+            span = [[share - low], [high - share]]
+            axes.errorbar(energies[0], share, span, color=colour, marker=marker, ms=5, lw=0.8)
             axes.plot(energies, [share] * len(energies), color=colour, lw=2.5, alpha=0.35)
-            axes.annotate(
-                each["name"].partition(", ")[2],
-                (energies[0], share),
-                xytext=(6, 4),
-                textcoords="offset points",
-                fontsize=7,
-                color=colour,
-            )
+            beside = {"xytext": (4, -11), "textcoords": "offset points", "fontsize": 7, "color": colour}
+            axes.annotate(label.replace(", ", "\n"), (energies[0], share), va="top", **beside)
         axes.set_xscale("log")
-        axes.set(xlabel="dynamic energy a decision (µJ)", title=found["data"].removesuffix(".zip").removeprefix("Ev-"))
+        axes.set(xlabel="dynamic energy a decision (µJ)", title=title, xlim=(1, 600), xticks=TICKS, xticklabels=TICKS)
+        axes.minorticks_off()
         axes.grid(alpha=0.25)
-    np.atleast_1d(panels)[0].set_ylabel("test accuracy (%)")
-    handles = [plt.Line2D([], [], color=c, marker=m, ls="", label=n) for n, (m, c) in STYLES.items()]
-    np.atleast_1d(panels)[0].legend(handles=handles[:2], fontsize=8, loc="lower left")
+    panels[0, 0].set_ylabel("test accuracy (%)")
+    handles = [plt.Line2D([], [], color=c, marker=m, ls="", label=name) for name, (m, c) in STYLES.items()]
+    panels[0, 0].legend(handles=handles, fontsize=8, loc="lower left")
     figure.savefig(place, dpi=130)
 
 
