@@ -3,9 +3,9 @@
     python benchmarks/systems.py DATA OUT.json 'NAME=NETWORK[@TARGET]' …
     python benchmarks/systems.py --draw OUT.png OBJECTS.json CONTAINERS.json
 
-Counters of longer bins are trained by `spikeloom train --data Ev-Objects.zip --system counters --ramp 16` with `--join 5
---parts 2 --thresholds 1,4,16` (100 ms) and `--join 10 --thresholds 1,2,4,8,16` (200 ms); the joined network by the
-commands of `docs/training.md`.
+Counters of longer bins are trained by `spikeloom train --data Ev-Objects.zip --system counters --ramp 16` with
+`--join 5 --parts 2 --thresholds 1,4,16` (100 ms) and `--join 10 --thresholds 1,2,4,8,16` (200 ms); the joined network
+by the commands of `docs/training.md`.
 
 Each network is compiled with --calibrate DATA and decides and prices the test split once. The lines are the machines of
 `benchmarks/results/features-*.json`, which `python benchmarks/features.py` made: the linear and the radial one that are
