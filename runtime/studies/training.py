@@ -185,10 +185,7 @@ def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
 
 
 def _train(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
-    results: dict[int, Finished] = {}
-    for index, job in enumerate(jobs):
-        if resume and finished(job):
-            results[index] = recall(job)
+    results = {index: recall(job) for index, job in enumerate(jobs) if resume and finished(job)}
     _require_right_start(jobs, resume=resume, some_finished=bool(results))
     for index, job in enumerate(jobs):
         clear(job)
@@ -261,17 +258,11 @@ def _side_by_side(jobs: Sequence[Job], waiting: Sequence[int], results: dict[int
 # -- for people --------------------------------------------------------------------------------------------------------
 
 
-def reached(record: TrainingRecord, which: str) -> Reached:
-    """What one of the epochs of ``WEIGHTS`` reached."""
-    found: Reached = getattr(record, which)
-    return found
-
-
 def summary(records: Sequence[TrainingRecord]) -> dict[str, Accuracies]:
     """Accuracies over seeds by epoch."""
     result: dict[str, Accuracies] = {}
     for protocol in WEIGHTS:
-        values = [reached(record, protocol).accuracy for record in records]
+        values = [getattr(record, protocol).accuracy for record in records]
         spread = statistics.stdev(values) if len(values) > 1 else None
         result[protocol] = Accuracies(mean=statistics.fmean(values), std=spread, min=min(values), max=max(values))
     return result
@@ -283,25 +274,24 @@ def training_sections(result: TrainingReport) -> Iterable[Section]:
     rows = []
     for run in result.runs:
         for which in WEIGHTS:
-            epoch = reached(run, which)
+            epoch: Reached = getattr(run, which)
             low, high = wilson(epoch.correct, total)
             interval = f"{100 * low:.1f} … {100 * high:.1f}"
             name = f"seed {run.seed}, {TITLES[which]}"
             accuracy = f"{100 * epoch.correct / total:.2f} %"
             rows.append([name, str(epoch.epoch), f"{epoch.correct} of {total}", accuracy, interval])
     command, seed = result.runs[0].command.rsplit(" --seed ", 1)
-    several = [f"--seeds {len(result.runs)}"] if len(result.runs) > 1 else []
-    lines = []
-    if several:
-        means = (f"{100 * s.mean:.2f} % ± {100 * (s.std or 0.0):.2f}" for s in result.protocols.values())
-        last, best, clean = means
+    typed, lines = f"{command} --seed {seed}", []
+    if len(result.runs) > 1:
+        typed += f" --seeds {len(result.runs)}"
+        last, best, clean = (f"{100 * s.mean:.2f} % ± {100 * (s.std or 0.0):.2f}" for s in result.protocols.values())
         lines.append(f"  mean of {len(result.runs)} seeds: last {last}, best on test {best}, clean {clean}")
     files = ", ".join(run.file for run in result.runs)
     lines += textwrap.wrap(f"written: {files}", WIDTH, initial_indent="  ", subsequent_indent="    ")
     yield Section(
         "Training",
         [
-            Text(" ".join([command, f"--seed {seed}", *several])),
+            Text(typed),
             Table(["", "epoch", "correct", "accuracy", "95 % interval"], rows),
             Text("\n".join(lines)),
         ],

@@ -82,17 +82,7 @@ def warm_state(bench: Bench, before: int, rng: np.random.Generator) -> Inputs:
     steps, lengths = bench.steps()
     flat = with_clocks(steps, bench.pair.netlist.clocks)
     order = np.stack([rng.permutation(len(flat)) for _ in range(before)] + [np.arange(len(flat))], axis=1)
-    length = lengths[order].sum(axis=1)
-
-    def channels(rows: slice) -> Events:
-        chosen = order[rows]
-        events = np.zeros((len(chosen), flat.shape[1], int(length[rows].max())), np.uint8)
-        for row, parts in zip(events, chosen.tolist(), strict=True):
-            one = np.concatenate([flat[part, :, : lengths[part]] for part in parts], axis=1)
-            row[:, : one.shape[1]] = one
-        return events
-
-    return Inputs(channels=channels, lengths=length, begin=length - lengths)
+    return _last_of(order, lengths, lambda rows: _in_a_row(flat, lengths, order[rows]))
 
 
 @perturbation("times the length", (2, 10), least=1, most=100)
@@ -102,15 +92,23 @@ def longer(bench: Bench, rounds: int) -> Inputs:
     Clocks run on and end, as they would.
     """
     steps, lengths = bench.steps()
+    order, clocks = np.repeat(np.arange(len(steps))[:, None], rounds, axis=1), bench.pair.netlist.clocks
+    return _last_of(order, lengths, lambda rows: with_clocks(_in_a_row(steps, lengths, order[rows]), clocks))
 
-    def channels(rows: slice) -> Events:
-        own = lengths[rows]
-        events = np.zeros((len(own), *steps.shape[1:3], int(own.max()) * rounds), np.uint8)
-        for row, one, length in zip(events, steps[rows], own.tolist(), strict=True):
-            row[..., : length * rounds] = np.tile(one[..., :length], rounds)
-        return with_clocks(events, bench.pair.netlist.clocks)
 
-    return Inputs(channels=channels, lengths=lengths * rounds, begin=lengths * (rounds - 1))
+def _last_of(order: IntArray, lengths: IntArray, channels: Callable[[slice], Events]) -> Inputs:
+    """Recordings in a row, (rows, recordings), of which the last one counts."""
+    length = lengths[order].sum(axis=1)
+    return Inputs(channels=channels, lengths=length, begin=length - lengths)
+
+
+def _in_a_row(events: Events, lengths: IntArray, order: IntArray) -> Events:
+    """Recordings one after another, silence at the end."""
+    found = np.zeros((len(order), *events.shape[1:-1], int(lengths[order].sum(axis=1).max())), np.uint8)
+    for row, parts in zip(found, order.tolist(), strict=True):
+        one = np.concatenate([events[part, ..., : lengths[part]] for part in parts], axis=-1)
+        row[..., : one.shape[-1]] = one
+    return found
 
 
 _ALL = (*vars(disturbances).values(), warm_state, longer, *vars(damages).values())

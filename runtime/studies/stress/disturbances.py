@@ -102,11 +102,8 @@ def time_jitter(events: Events, sigma: float, rng: np.random.Generator) -> Event
 
     Not beyond the ends; what meets becomes one event.
     """
-    sample, taxel, polarity, step = np.nonzero(events)
-    moved = step + np.rint(sigma * rng.standard_normal(len(step))).astype(np.int64)
-    changed = np.zeros_like(events)
-    changed[sample, taxel, polarity, np.clip(moved, 0, events.shape[3] - 1)] = 1
-    return changed
+    last = events.shape[3] - 1
+    return moved(events, lambda step: np.clip(step + np.rint(sigma * rng.standard_normal(len(step))), 0, last))
 
 
 @perturbation("steps", STEPS, most=MOST_STEPS)
@@ -115,9 +112,7 @@ def start_late(events: Events, steps: int) -> Events:
 
     Silence first, the end is cut off.
     """
-    changed = np.zeros_like(events)
-    changed[..., steps:] = events[..., : max(events.shape[3] - steps, 0)]
-    return changed
+    return moved(events, lambda step: step + steps)
 
 
 @perturbation("steps", STEPS, most=MOST_STEPS)
@@ -126,9 +121,7 @@ def start_early(events: Events, steps: int) -> Events:
 
     Silence at the end.
     """
-    changed = np.zeros_like(events)
-    changed[..., : max(events.shape[3] - steps, 0)] = events[..., steps:]
-    return changed
+    return moved(events, lambda step: step - steps)
 
 
 @perturbation("times", TEMPO, least=1, most=MOST_STEPS)
@@ -145,11 +138,16 @@ def slower(events: Events, times: float) -> Events:
 
 def play(events: Events, speed: float) -> Events:
     """Events come at step / speed; those that meet become one, and each stays one event."""
+    return moved(events, lambda step: step / speed)
+
+
+def moved(events: Events, to: Callable[[IntArray], FloatArray | IntArray]) -> Events:
+    """Events at other steps, fractions cut off; what leaves the recording is lost."""
     sample, taxel, polarity, step = np.nonzero(events)
-    moved = (step / speed).astype(np.int64)
-    kept = moved < events.shape[3]
+    there = to(step).astype(np.int64)
+    kept = (0 <= there) & (there < events.shape[3])
     changed = np.zeros_like(events)
-    changed[sample[kept], taxel[kept], polarity[kept], moved[kept]] = 1
+    changed[sample[kept], taxel[kept], polarity[kept], there[kept]] = 1
     return changed
 
 
