@@ -400,21 +400,22 @@ def drawn(seed):
     adjacency = np.kron(np.eye(2), PAIR)
     events = (np.random.default_rng(seed).random((5, 4, 2, 12)) < 0.3).astype(np.uint8)
     network = expand(checkpoint, adjacency)
-    return checkpoint, adjacency, events, network, run_float(network, channels_last(events)).spikes
+    spikes = run_float(network, channels_last(events)).spikes
+    return checkpoint, adjacency, events, network, dict(zip(checkpoint.neurons, spikes, strict=True))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_counts_equal_those_of_loops(seed):
     checkpoint, adjacency, events, network, spikes = drawn(seed)
     bench = measure(checkpoint, adjacency, events, spikes).neurobench
-    acs, sources = 0, [channels_last(events), *spikes[:-1]]
+    acs, sources = 0, [channels_last(events), *list(spikes.values())[:-1]]
     for projection, source in zip(network.projections, sources, strict=True):
         weight = projection.weight.toarray()
         for sample, step, neuron in zip(*np.nonzero(source), strict=True):
             assert source[sample, step, neuron] == 1
             acs += np.count_nonzero(weight[:, neuron])
     assert bench.synaptic_operations.effective_acs == acs / len(events)
-    assert bench.activation_sparsity == pytest.approx(1 - np.mean(np.concatenate(spikes, axis=2)))
+    assert bench.activation_sparsity == pytest.approx(1 - np.mean(np.concatenate(list(spikes.values()), axis=2)))
 
 
 @pytest.mark.recordings
@@ -424,7 +425,7 @@ def test_the_released_network_in_round_figures(released_checkpoint, objects_zip)
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
     events = load_data(objects_zip, "test", limit=2).events
     spikes = run_float(expand(checkpoint, adjacency), channels_last(events), dtype=np.float32).spikes
-    found = encode(measure(checkpoint, adjacency, events, spikes))
+    found = encode(measure(checkpoint, adjacency, events, dict(enumerate(spikes))))
     classes = checkpoint.dense[-1].weight.shape[0]
     dense = 78 * 2496 + 2496 * 128 + 128 * 256 + 256 * classes
     assert found["neurobench"]["synaptic_operations"]["Dense"] == 250 * dense

@@ -24,7 +24,6 @@ import numpy.typing as npt
 
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GCN, TACTILESGNET
@@ -114,7 +113,7 @@ def measure(
     checkpoint: Checkpoint,
     adjacency: FloatArray,
     events: npt.NDArray[np.uint8],
-    spikes: Mapping[str, SpikeTrain] | Sequence[SpikeTrain],
+    spikes: Mapping[str, SpikeTrain],
     *,
     lengths: npt.NDArray[np.int64] | None = None,
 ) -> Yardsticks:
@@ -122,20 +121,13 @@ def measure(
 
     `adjacency` (taxels, taxels) is the normalised propagation matrix of its graph; `spikes` are trains (samples, steps,
     neurons) of every layer in order, of the float model or of the chip (aligned with the data); what comes after the
-    `lengths` (samples,) of the recordings is not counted. Raises DataError if they are not of one network.
+    `lengths` (samples,) of the recordings is not counted.
     """
     network = expand(checkpoint, adjacency)
     samples, steps = len(events), events.shape[-1]
-    given = list(spikes.values() if isinstance(spikes, Mapping) else spikes)
-    shapes = [(samples, steps, population.size) for population in network.populations]
-    if (found := [train.shape for train in given]) != shapes or samples == 0:
-        raise DataError(
-            f"yardsticks: spikes of shapes {found} found, {shapes} allowed for these {samples} recordings; "
-            "give the spikes of every layer of this network on these recordings"
-        )
     last = np.full(samples, steps) if lengths is None else lengths
     counted = np.arange(steps) < last[:, None]
-    trains = [train & counted[:, :, None] for train in given]
+    trains = [train & counted[:, :, None] for train in spikes.values()]
     inputs = with_clocks(events, checkpoint.dynamics.clocks).transpose(0, 2, 1) * counted[:, :, None]
 
     bench = _neurobench(network, inputs, trains, last)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.commands.options import add_netlist, add_recordings
 from spikeloom.runtime.inputs.files import require_place
@@ -15,7 +14,7 @@ from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.anytime import exits
-from spikeloom.runtime.studies.anytime.sections import picture, sections
+from spikeloom.runtime.studies.anytime.sections import sections
 from spikeloom.runtime.studies.anytime.study import study
 
 NOTES = """\
@@ -42,7 +41,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X",
         help=f"share of calibration races that may end otherwise (default: {DIFFER:g})",
     )
-    parser.add_argument("--picture", metavar="OUT.png", help="draw accuracy by window, and when recordings stop")
     parser.add_argument("-o", "--output", metavar="OUT.json", help="write the result with figures of every recording")
     parser.epilog = NOTES
 
@@ -50,7 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     require_place(arguments.output, "-o", arguments)
-    require_place(arguments.picture, "--picture", arguments)
     allowed = _allowed(arguments)
     machine = integer_machine_for(arguments.netlist)
     data = load_recordings(arguments, machine.netlist)
@@ -66,9 +63,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
         calibrated_on=arguments.calibrate,
         chosen=None if points is None else sorted(allowed).index(allowed[0]) + 1,
     )
-    if arguments.picture is not None:
-        with write_atomically(arguments.picture) as file:
-            file.write(picture(result).file("png"))
     write_json(arguments.output, result)
     return Outcome(result, sections)
 

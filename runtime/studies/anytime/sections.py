@@ -1,20 +1,16 @@
-"""The study of early decisions laid out for people, and drawn."""
+"""The study of early decisions laid out for people."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
-import numpy as np
-
-from spikeloom.runtime.report.drawing import CHIP, COLOURS, DASHES, GREY, Drawing, sheet, styled
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Section, Table, Text
 from spikeloom.runtime.studies.anytime.exits import Calibrated
 from spikeloom.runtime.studies.anytime.study import Anytime, Costs
 
 SHOWN = (5, 10, 25, 50, 75, 90, 100)
-"""Windows in the text; JSON and the picture have more."""
+"""Windows in the text; JSON has more."""
 
 
 def sections(result: Anytime) -> list[Section]:
@@ -80,58 +76,3 @@ def rule_table(result: Anytime) -> Table:
         changed = [str(rule.changes.differ), shown(rule.changes.correct)]
         rows.append([rule_name(rule.stop), ahead, *cells(rule.mean), *changed])
     return Table(head, rows)
-
-
-# -- picture -----------------------------------------------------------------------------------------------------------
-
-
-@styled
-def picture(result: Anytime) -> Drawing:
-    """Draw the study."""
-    title = f"{result.source}, {result.samples} recordings of split {result.split}"
-    drawing = sheet(title, 4.6, width=10.5)
-    windows, stops = drawing.figure.subplots(1, 2)
-    _draw_windows(windows, result)
-    _draw_stops(stops, result)
-    drawing.figure.suptitle(title)
-    return drawing
-
-
-def _draw_windows(axes: Any, result: Anytime) -> None:
-    """Accuracy of the chip with its interval."""
-    axes.set(title="accuracy against the window", xlabel="observed (% of the recording)", ylabel="right (%)")
-    axes.grid()
-    if not result.windows:
-        axes.text(0.5, 0.5, "no labels", transform=axes.transAxes, ha="center", color=GREY)
-        return
-    shares = [window.percent for window in result.windows]
-    right = [100 * window.chip.correct / result.labelled for window in result.windows]
-    low, high = 100 * np.array([window.chip.interval for window in result.windows]).T
-    axes.fill_between(shares, low, high, color=CHIP, alpha=0.13, linewidth=0)
-    axes.plot(shares, right, color=CHIP, marker="o", markersize=4, label="chip, 95 % interval")
-    axes.set_xlim(0, 102)
-    axes.set_ylim(0, 100)
-    _legend(axes)
-
-
-def _draw_stops(axes: Any, result: Anytime) -> None:
-    """Share of recordings that have stopped by the proof, the chosen rule and the loosest one, by chip step."""
-    whole = max(result.chip_steps)
-    shown = dict.fromkeys((0, result.chosen or 0, len(result.rules) - 1))
-    for order, index in enumerate(shown):
-        rule, colour, dash = result.rules[index], COLOURS[order], DASHES[order]
-        ends = np.sort(rule.samples.chip_steps)
-        stopped = 100 * np.arange(1, len(ends) + 1) / len(ends)
-        where = [0, *ends, whole], [0, *stopped, 100]
-        axes.step(*where, ls=dash, where="post", color=colour, linewidth=1.8, label=rule_name(rule.stop))
-        axes.axvline(ends.mean(), color=colour, ls=dash, linewidth=0.8, alpha=0.6)
-    axes.set(title="when recordings stop (thin: mean)", xlabel="chip steps", ylabel="stopped (%)")
-    axes.set_xlim(0, whole)
-    axes.set_ylim(0, 101)
-    axes.grid()
-    _legend(axes)
-
-
-def _legend(axes: Any) -> None:
-    """Below the panel, where nothing is."""
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, fontsize=8)

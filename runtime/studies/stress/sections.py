@@ -21,9 +21,6 @@ LOOKS: dict[str, tuple[str, str, Any, float]] = {
 }
 """Colour, marker, dash and shift of a side."""
 
-NAMED = 6
-"""Levels that are named below a panel, at most."""
-
 KEY = (
     "leaves: first level below the clean interval; chance: first level no better than chance; least: fewest decisions "
     "equal"
@@ -83,8 +80,7 @@ def figure(result: Stress, title: str = "", *, across: int = 3) -> Drawing:
         axes.axhline(100 / result.classes, color=GREY, ls=":", lw=1)
         for side in SIDES:
             _curve(drawing, axes, name, curve, side)
-        every = -(-len(curve.levels) // NAMED)
-        axes.set_xticks(range(0, len(curve.levels), every), list(map(_level, curve.levels))[::every], fontsize=7)
+        axes.set_xticks(range(len(curve.levels)), list(map(_level, curve.levels)), fontsize=7)
         axes.set(xlim=(-0.5, len(curve.levels) - 0.5), ylim=(-3, 103), title=_heading(name, curve), xlabel=curve.unit)
         axes.grid(axis="y")
     handles, labels = rows.flat[0].get_legend_handles_labels()

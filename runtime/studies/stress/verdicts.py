@@ -23,20 +23,12 @@ from spikeloom.runtime.studies.stress.results import Breaks, Curve, Point, Run, 
 
 ROBUST, DEGRADES, BREAKS = "robust", "degrades", "breaks"
 
-FULL = 0.5
-"""Share of all entries (neuron, step) from which on a layer is called saturated."""
-
-MOSTLY = 0.8
-"""Share of the decisions from which on one class is worth naming."""
-
-WITHOUT = 0.2
-"""Share of the recordings from which on missing votes, or an overflow, are named."""
-
-TWICE = 2.0
-"""Factor by which a layer must fire more or less often to be named."""
-
-REASONS = 2
-"""Reasons that are named at most."""
+# From what on something is named as a reason:
+FULL = 0.5  # Share of all entries (neuron, step): a layer is saturated
+MOSTLY = 0.8  # Share of the decisions: one class
+WITHOUT = 0.2  # Share of the recordings: missing votes, or an overflow
+TWICE = 2.0  # Factor by which a layer fires more or less often
+REASONS = 2  # So many are named at most
 
 
 # -- requirements ------------------------------------------------------------------------------------------------------
