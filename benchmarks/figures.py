@@ -19,6 +19,7 @@ import spikeloom
 from spikeloom.compiler.files import write_atomically
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import data_digest
+from spikeloom.runtime.report.numbers import wilson
 
 Json = dict[str, Any]
 
@@ -31,14 +32,19 @@ SHIPPED = {  # Row: network with its options, recordings, options of `compile`
     "objects-200ms": ("pretrained:objects-200ms", OBJECTS, ""),
     "objects-200ms, spike-exact": ("pretrained:objects-200ms", OBJECTS, "--spike-exact"),
     "containers": ("pretrained:containers", CONTAINERS, ""),
-    "containers-100ms": ("pretrained:containers-100ms", CONTAINERS, ""),
+    "objects-counters": ("pretrained:objects-counters", OBJECTS, ""),
+    "containers-counters": ("pretrained:containers-counters", CONTAINERS, ""),
     "grasps": ("pretrained:grasps", "synthetic", ""),
 }
+NETWORKS = ("objects", "objects-200ms", "objects-truenorth", "containers", "containers-truenorth", "grasps")
 LAYOUTS = ("", *(f"--cores-for {each}" for each in ("fc1=4", "fc1=6", "fc1=8", "conv1=6,fc1=6,fc2=3")))
 CHARTS = {
     OBJECTS: ("pretrained:objects", "bits=3,4,8,window=10%,20%,100%,cores=cores/latency"),
     CONTAINERS: ("pretrained:containers containers-knn1.pt", "bits=2,4,8,window=25-100%,cores=cores/latency"),
 }
+USUAL = ("8b", "cores", 100)
+"""Storage, layout and window that others are compared with, of the first network."""
+
 POINT = ("number", "network", "storage", "cores", "window", "n_cores", "test")
 
 
@@ -79,6 +85,21 @@ class Session:
         }
 
 
+def pretrained(session: Session) -> Json:
+    """What each shipped network's record says of its epochs."""
+    found = {}
+    for name in NETWORKS:
+        record = session.run(f"inspect pretrained:{name}")["training"]
+        samples = record["test_samples"]
+        found[name] = {"made_by": record["command"], "test_samples": samples, "validation": record["validation"]}
+        for which in ("last", "best", "clean"):
+            epoch, right = record[which]["epoch"], record[which]["correct"]
+            low, high = wilson(right, samples)
+            percent = {"accuracy": 100 * right / samples, "low": 100 * low, "high": 100 * high}
+            found[name][which] = {"epoch": epoch, "correct": right, **percent}
+    return found
+
+
 def shipped(session: Session) -> Json:
     """Decisions, spikes and costs at 8 bits."""
     found = {}
@@ -91,7 +112,7 @@ def shipped(session: Session) -> Json:
             **right,
             "equal": round(verdict["decision_agreement"] * verdict["samples"]),
             "certified": verdict["certificate"]["decisions"],
-            "spikes": {name: {key: n[key] for key in ("float", "different")} for name, n in verdict["spikes"].items()},
+            "spikes_moved": {layer: n["different"] / n["float"] for layer, n in verdict["spikes"].items()},
             **session.costs(data),
         }
     return found
@@ -111,6 +132,10 @@ def chart(session: Session, data: str) -> Json:
     networks, grid = CHARTS[data]
     found = session.run(f"chart {networks} --data {data} --grid {grid} -o chart", "chart/chart.json")
     points = {str(point["number"]): {key: point[key] for key in POINT} for point in found["points"]}
+    usual = next(each for each in points.values() if (each["storage"], each["cores"], each["window"]) == USUAL)
+    for point in points.values():
+        whole, energy = usual["test"]["energy_j"], point["test"]["energy_j"]
+        point["times_less"] = {table: whole[table] / energy[table] for table in energy}
     return {"points": points, "taken": found["budget"]["point"]}
 
 
@@ -127,6 +152,7 @@ def anytime(session: Session, data: str) -> Json:
 
 
 STUDIES = {
+    "pretrained": pretrained,
     "shipped": shipped,
     "layouts": layouts,
     "chart-objects": lambda session: chart(session, OBJECTS),

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import workload
 from growth_chart import draw
+from made import made
 
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
@@ -109,7 +110,7 @@ def main() -> None:
     asked = parser.parse_args()
 
     middle = prepare(network(WIDTH, DENSITY))
-    result = {
+    result = made() | {
         "machine": {"processors": len(os.sched_getaffinity(0)), "python": platform.python_version()},
         "units": "milliseconds per recording: CPU time of one thread, wall time where threads vary",
         "activity": [

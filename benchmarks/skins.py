@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from growth_chart import draw_skins
+from made import made
 from scipy import sparse
 
 from spikeloom.compiler import Options, compile_network
@@ -157,7 +158,8 @@ def main() -> None:
             f"run in {row['run_ms']:.0f} ms a recording ({each['run']:.0f}); peak {row['peak_bytes'] / 2**30:.2f} GiB",
             flush=True,
         )
-    result = {"machine": platform.processor() or platform.machine(), "steps": STEPS, "density": DENSITY, "skins": rows}
+    result = made() | {"machine": platform.processor() or platform.machine(), "steps": STEPS}
+    result |= {"density": DENSITY, "skins": rows}
     with write_atomically(arguments.output) as file:
         file.write(json.dumps(result, indent=1).encode() + b"\n")
     if arguments.chart:

@@ -98,7 +98,7 @@ def _flat(line: Line, planned_seeds: int) -> dict[str, Any]:
 def _columns(name: str, spread: Spread) -> dict[str, Any]:
     low, high = spread.interval or (None, None)
     values = {"mean": spread.mean, "std": spread.std, "low": low, "high": high}
-    return {f"{name}_{key}": "" if value is None else round(value, 3) for key, value in values.items()}
+    return {f"{name}_{key}": "" if value is None else round(value, 5) for key, value in values.items()}
 
 
 # -- Markdown ----------------------------------------------------------------------------------------------------------
