@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 
 class Work(Protocol):
@@ -24,26 +23,20 @@ LATER: Any = None
 """Of a field of the work that a pass fills in."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Pass(Generic[W]):
-    """One step of a compilation."""
-
-    name: str  # For ``--dump-after`` and the table in docs/compile.md
-    does: str  # Its contract in one sentence
-    keeps: str  # What is the same before and after it
-    apply: Callable[[W], W]  # Makes new work of what it is given, which stays as it is
+Pass = Callable[[W], W]
+"""One step of a compilation: new work of what it is given, which stays as it is. What each keeps: docs/compile.md."""
 
 
-def step(does: str, *, keeps: str) -> Callable[[Callable[[W], W]], Pass[W]]:
-    """Make a function the pass of its name; `does` and `keeps` as of :class:`Pass`."""
-    return lambda apply: Pass(name=apply.__name__.strip("_"), does=does, keeps=keeps, apply=apply)
+def name_of(step: Callable[..., Any]) -> str:
+    """Name of a pass, for ``--dump-after`` and the table in docs/compile.md: that of the function."""
+    return step.__name__.strip("_")
 
 
 def run(passes: Iterable[Pass[W]], work: W, after: Callable[[str, W], object] | None = None) -> W:
     """Apply passes in order and verify what each one made; `after` gets the name of each and its work."""
     for each in passes:
-        work = each.apply(work)
+        work = each(work)
         work.verify()
         if after is not None:
-            after(each.name, work)
+            after(name_of(each), work)
     return work
