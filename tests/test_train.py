@@ -270,8 +270,6 @@ def test_batches_do_not_mix(tmp_path):
 
 def test_gradients_are_those_of_the_rounded_float_model(tmp_path):
     """At 8 bits and with scales this fine the straight-through gradient is the float model's, to a few parts in 100."""
-    from spikeloom.models.networks.networks import Architecture, SpikingNet
-
     checkpoint, adjacency = small_checkpoint(tmp_path)
     data = drawn(checkpoint, 1, samples=3)
     model = QuantisedNet(checkpoint, adjacency, tuned_forms(checkpoint, adjacency, data.events, 8))
@@ -320,17 +318,10 @@ def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
     train, test = drawn(checkpoint, 0), drawn(checkpoint, 1)
     whole = finetune(checkpoint, adjacency, train, test, LOIHI, bits=[2], epochs=4, seed=3)
 
-    class StoppedError(Exception):
-        pass
-
-    def stop(epoch):
-        if epoch.epoch == 2:
-            raise StoppedError
-
     state = tmp_path / "x.state"
     options = {"bits": [2], "epochs": 4, "seed": 3, "state": state}
-    with pytest.raises(StoppedError):
-        finetune(checkpoint, adjacency, train, test, LOIHI, after_epoch=stop, **options)
+    with pytest.raises(KilledError):
+        finetune(checkpoint, adjacency, train, test, LOIHI, after_epoch=killed, **options)
     rest = finetune(checkpoint, adjacency, train, test, LOIHI, resume=True, **options)
     assert rest.history == whole.history
     for name, array in whole.weights.items():
