@@ -65,11 +65,8 @@ def test_levels_of_a_verdict():
     assert levels_of(verdict(quantised_different=0))[1].share == 1.0
     text = levels_of(verdict())[3].text
     assert "right on float only 1, on chip only 1 (exact McNemar p = 1); class votes moved: 8 of 13" in text
-
-
-def test_silent_layers_agree_and_disjoint_ones_do_not():
-    assert spike_agreement(layer(0, 0, 0)) == 1.0
-    assert spike_agreement(layer(5, 5, 10)) == 0.0
+    silent, disjoint = layer(0, 0, 0), layer(5, 5, 10)
+    assert (spike_agreement(silent), spike_agreement(disjoint)) == (1.0, 0.0)
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), max_size=30))

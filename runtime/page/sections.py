@@ -70,7 +70,7 @@ def _cards(report: Report) -> dict[str, tuple[str, str]]:
     if price.energy_j:
         ends = sorted(float(each.mean()) for each in price.energy_j.values())
         shown = dict.fromkeys(si(value, "J") for value in (ends[0], ends[-1]))
-        cards["energy an inference"] = " … ".join(shown), ", ".join(price.energy_j)
+        cards["dynamic energy an inference"] = " … ".join(shown), ", ".join(price.energy_j)
     for table, seconds in list(price.time_s.items())[:1]:
         cards["time an inference"] = si(float(seconds.mean()), "s"), f"at full speed, {table}, simple model"
     held = sum(core.compartments for core in report.cores.cores)

@@ -105,7 +105,7 @@ def _provenance(chart: Chart) -> list[Block]:
 
 def _head(by: ChosenBy) -> list[str]:
     timed = [] if by.time is None else [f"time ({by.time})"]
-    figures = ["expected %", "test %", "interval", "float %", "equal", f"energy ({by.energy})", *timed]
+    figures = ["expected %", "test %", "interval", "float %", "equal", f"dynamic energy ({by.energy})", *timed]
     return ["#", "configuration", *figures, "operations", "cores"]
 
 
@@ -196,7 +196,9 @@ def _scatter(drawing: Drawing, panel: Axes, chart: Chart, name: str) -> None:
     panel.plot([x, x], [100 * chosen.test.low, 100 * chosen.test.high], color=GREY, lw=1.0, zorder=2)
     panel.plot(x, y, "o", ms=12, mfc="none", mec=GREY, mew=1.4, ls="none", label=f"choice, #{chosen.number}", zorder=4)
     drawing.tips += [(panel, *place[point.number], _tip(by, point)) for point in points]
-    unit, what = ("J", f"energy of a mean inference ({by.energy})") if name == "energy" else ("s", f"time ({by.time})")
+    unit, what = "s", f"time ({by.time})"
+    if name == "energy":
+        unit, what = "J", f"dynamic energy of a mean inference ({by.energy})"
     panel.set(xscale="log", xlabel=what)
     panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     panel.xaxis.set_minor_formatter(NullFormatter())

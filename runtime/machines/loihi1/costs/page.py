@@ -77,11 +77,11 @@ def figures(found: CostReport) -> list[Block]:
     blocks: list[Block] = []
     if tables:
         layers = {layer.name: list(layer.amounts.energy_j.values()) for layer in found.layers}
-        title, caption = "Energy of a mean inference by layer", "Synapses belong to the layer that receives."
+        title, caption = "Dynamic energy of a mean inference by layer", "Synapses belong to the layer that receives."
         blocks.append(_bars("energy-layers", title, layers, tables, "J", caption))
         parts = next(iter(found.energy_by_part_j.values()))
         shares = {part: [found.energy_by_part_j[name][part] for name in tables] for part in parts}
-        title = "Energy of a mean inference by part of the chip"
+        title = "Dynamic energy of a mean inference by part of the chip"
         caption = "Synapse: visited entries; soma: neuron updates and spikes; network: packets and hops."
         blocks.append(_bars("energy-parts", title, shares, tables, "J", caption))
     if found.time:

@@ -6,13 +6,16 @@ from spikeloom.runtime.machines.loihi1.costs.result import Amounts, CostReport
 from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Section, Table, Text
 
+DYNAMIC = "dynamic energy, "
+"""Before the name of a table: what events take; what flows whatever happens, static power, stands by itself."""
+
 
 def sections(report: CostReport) -> list[Section]:
     """Amounts, layers, parts of the chip, cores, and what power and times come to."""
     steps = f"per inference of {report.chip_steps} chip steps, over {report.samples} recordings:"
     parts = report.energy_by_part_j
     rows = [[table, *(si(value, "J") for value in each.values())] for table, each in parts.items()]
-    by_part = [Table(["energy by part", *next(iter(parts.values()))], rows)] if parts else []
+    by_part = [Table(["dynamic energy by part", *next(iter(parts.values()))], rows)] if parts else []
     return [
         Section("Inference", [Text(steps), inference_table(report)]),
         Section("Layers", [layer_table(report)]),
@@ -33,7 +36,7 @@ def inference_table(report: CostReport) -> Table:
     known = [name for name in counted if getattr(report.per_inference, name) is not None]
     rows = [[name.replace("_", " "), *counts(name)] for name in known]
     tables = report.per_inference.energy_j
-    rows += [[f"energy, {name}", *(si(each.energy_j[name], "J") for each in columns)] for name in tables]
+    rows += [[f"{DYNAMIC}{name}", *(si(each.energy_j[name], "J") for each in columns)] for name in tables]
     rows += [
         [f"time, {each.table}, {each.model} model", *(si(each.inference_s[end], "s") for end in ("mean", "min", "max"))]
         for each in report.time
@@ -48,7 +51,8 @@ def layer_table(report: CostReport) -> Table:
         counts = amounts.synaptic_operations, amounts.spikes, amounts.neuron_updates
         return [*(f"{count:,.0f}" for count in counts), *(si(joules, "J") for joules in amounts.energy_j.values())]
 
-    head = ["layer (mean)", "synaptic operations", "spikes", "neuron updates", *report.per_inference.energy_j]
+    head = ["layer (mean)", "synaptic operations", "spikes", "neuron updates"]
+    head += [f"{DYNAMIC}{name}" for name in report.per_inference.energy_j]
     return Table(head, [[layer.name, *cells(layer.amounts)] for layer in report.layers])
 
 
@@ -68,7 +72,7 @@ def core_table(report: CostReport) -> Table:
         ]
         for core in report.cores
     ]
-    return Table([*head, *energies], rows)
+    return Table([*head, *(f"{DYNAMIC}{name}" for name in energies)], rows)
 
 
 def _lines(report: CostReport) -> list[str]:
@@ -76,7 +80,7 @@ def _lines(report: CostReport) -> list[str]:
     lines = []
     if ends is not None:
         low, high = (f"{si(ends[end].energy_j, 'J')} ({ends[end].table})" for end in ("low", "high"))
-        lines.append(f"sources differ: a mean inference takes {low} to {high}")
+        lines.append(f"sources differ: a mean inference takes a dynamic energy of {low} to {high}")
     real_time = ", ".join(f"{si(value, 'W')} ({name})" for name, value in pace.real_time_w.items())
     lines.append(f"dynamic power at the sensor's pace, {1000 * pace.bin_s:g} ms a step: {real_time}")
     lines += [
