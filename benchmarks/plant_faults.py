@@ -38,7 +38,7 @@ NUMERIC = {
     "compiler": "dynamics fixedpoint interpret range_proof",
     "compiler/passes": "calibrate expand prune",
     "compiler/targets/loihi1": "emit legalize lift",
-    "compiler/targets/loihi1/layout": "choose core_needs forecast partition place",
+    "compiler/targets/loihi1/layout": "choose core_needs partition place",
     "compiler/targets/loihi1/storage": "choose_storage compensate scales spike_exact weight_storage",
     "compiler/targets/truenorth": "codebook in_time legalize lower native",
     "models": "graphs",

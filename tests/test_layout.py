@@ -27,9 +27,8 @@ from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.ir import depths
 from spikeloom.compiler.passes.calibrate import Calibration, packed
 from spikeloom.compiler.targets.loihi1.emit import emit
-from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
+from spikeloom.compiler.targets.loihi1.layout.choose import Forecast, fastest, lay_out, sample
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
-from spikeloom.compiler.targets.loihi1.layout.forecast import Forecast, fastest, sample
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound, cut, partition
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count, chip_of_core, place_on_chips, share
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, require_legal

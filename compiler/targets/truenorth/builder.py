@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.base import Target
@@ -149,21 +148,17 @@ class Draft:
     def netlist(
         self,
         *,
-        taxels: int,
-        polarities: int,
-        classes: int,
         bin_ticks: int = 1,
-        bins: int = 1,
-        clocks: Clocks = NO_CLOCKS,
         target: str = "truenorth",
         provenance: Mapping[str, Any] | None = None,
+        **facts: Any,
     ) -> CrossbarNetlist:
-        """What was drafted, as arrays."""
+        """What was drafted, as arrays; `facts` are sizes of the sensor, classes, and whatever else a netlist says."""
         neurons = [entry for core in self.cores for entry in core.neurons]
         axons = [entry for core in self.cores for entry in core.axons]
         first = np.cumsum([0, *(len(core.neurons) for core in self.cores)])
 
-        def columns(table: Sequence[Any], *names: str) -> dict[str, IntArray]:
+        def columns(table: Sequence[Any], *names: str) -> dict[str, Any]:
             values = np.array(table, np.int64).reshape(-1, len(names))
             return {name: read_only(np.ascontiguousarray(column)) for name, column in zip(names, values.T, strict=True)}
 
@@ -178,11 +173,7 @@ class Draft:
         parameters = [name for name in Neuron.__dataclass_fields__ if name != "weights"]
         return CrossbarNetlist(
             target=target,
-            taxels=taxels,
-            polarities=polarities,
-            classes=classes,
             bin_ticks=bin_ticks,
-            bins=bins,
             layers=tuple(self.layers),
             core_neurons=read_only(first),
             core_axons=read_only(np.cumsum([0, *(len(core.axons) for core in self.cores)])),
@@ -199,5 +190,5 @@ class Draft:
             **columns(self.feeds, "feed_channel", "feed_core", "feed_line", "feed_tick"),
             **columns(self.clocks, "clock_core", "clock_line", "clock_period", "clock_phase"),
             provenance=dict(provenance or {}),
-            clocks=clocks,
+            **facts,
         )

@@ -38,7 +38,6 @@ from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.truenorth.native import NativeNetwork, Stage, faults
 from spikeloom.compiler.types import IntArray
 
-FORMAT = TRAINED
 VERSION = 1
 PARTS = {"inputs": 2, "level": 3, "threshold": 1, "floor": 1, "leak": 1}
 """Arrays of a stage, in file order, and their axes."""
@@ -85,7 +84,7 @@ def write_trained(
     """
     one = next(iter(networks.values()))
     manifest = {
-        "format": FORMAT,
+        "format": TRAINED,
         "version": VERSION,
         **{name: getattr(one, name) for name in ("taxels", "polarities", "classes", "copies")},
         "clocks": one.clocks.to_json(),
@@ -106,7 +105,7 @@ def write_trained(
 
 def is_trained(path: str | os.PathLike[str]) -> bool:
     """Whether a file is an archive that says it holds such a network."""
-    return stated(Path(path), "format") == FORMAT
+    return stated(Path(path), "format") == TRAINED
 
 
 def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) -> Trained:
@@ -120,7 +119,7 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
         members = product(manifest["weights"], manifest["layers"], PARTS)
         return [f"{which}/0/{layer}/{part}" for which, layer, part in members]
 
-    manifest, members = read_trained_archive(path, FORMAT, VERSION, KINDS, names)
+    manifest, members = read_trained_archive(path, TRAINED, VERSION, KINDS, names)
     sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
     chosen = sets[0] if weights is None else weights
     if chosen not in sets:

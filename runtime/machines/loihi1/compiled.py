@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX
 from spikeloom.compiler.passes.prune import Removal
 from spikeloom.compiler.passes.range_proof import RangeProof
-from spikeloom.compiler.targets.loihi1.layout import choose
-from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation
+from spikeloom.compiler.targets.loihi1.layout.choose import Expectation, Layout
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.passes import Compilation
@@ -75,7 +74,7 @@ def outcome(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> Outcom
     return Outcome(result, sections)
 
 
-def _layout(layout: choose.Layout) -> LayoutFacts:
+def _layout(layout: Layout) -> LayoutFacts:
     return LayoutFacts(cores=len(layout.cores), expected=layout.expected)
 
 
