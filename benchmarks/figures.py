@@ -13,7 +13,10 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from statistics import fmean
 from typing import Any
+
+from scipy.stats import ttest_ind
 
 import spikeloom
 from spikeloom.compiler.files import write_atomically
@@ -151,12 +154,46 @@ def anytime(session: Session, data: str) -> Json:
     return {"full": found["full"], "windows": windows, "rules": rules}
 
 
+def lean(session: Session, data: str) -> Json:
+    """What a network does without, when one decision of a hundred may differ and when none may."""
+    network = f"{MANUAL} --graph manual" if data == OBJECTS else "pretrained:containers"
+    found: Json = {}
+    for differ in ("0.01", "0"):
+        result = session.run(f"lean {network} --data {data} --differ {differ}")
+        found[differ] = {row.pop("name"): row for row in result["rows"]}
+        found["taxels_without_change"] = sum(taxel["training_differ"] == 0 for taxel in result["taxels"])
+    return found
+
+
+def longer_bins(session: Session) -> Json:
+    """Chip accuracy on Objects, 200 ms less 20 ms: points, and Welch's p over networks; from stored results."""
+    cells = json.loads((RESULTS / "paper" / "cells.json").read_text())
+    short = [cell for name, cell in cells.items() if name.startswith("objects-tactilesgnet-manual-e100-")]
+    found: Json = {"validation_20ms": sorted({cell["validation"]["correct"] for cell in short})}
+    for row, file in {
+        "200 ms": "variants-objects-200ms",
+        "200 ms, spike-exact": "variants-objects-200ms-exact",
+    }.items():
+        variant = json.loads((RESULTS / f"{file}.json").read_text())["variants"][row]
+        found[row] = {}
+        for epoch in ("last", "clean"):
+            long = [100 * network["chip"] / 144 for network in variant[epoch]["networks"]]
+            ours = [100 * cell["chip"][epoch]["correct"] / 144 for cell in short]
+            p = float(ttest_ind(long, ours, equal_var=False).pvalue)
+            found[row][epoch] = {"difference": fmean(long) - fmean(ours), "p": p}
+    session.commands.append("from paper/cells.json, variants-objects-200ms.json and -exact.json")
+    return found
+
+
 STUDIES = {
+    "longer-bins": longer_bins,
     "pretrained": pretrained,
     "shipped": shipped,
     "layouts": layouts,
     "chart-objects": lambda session: chart(session, OBJECTS),
     "chart-containers": lambda session: chart(session, CONTAINERS),
+    "lean-objects": lambda session: lean(session, OBJECTS),
+    "lean-containers": lambda session: lean(session, CONTAINERS),
     "anytime-objects": lambda session: anytime(session, OBJECTS),
     "anytime-containers": lambda session: anytime(session, CONTAINERS),
 }
