@@ -48,6 +48,9 @@ CHARTS = {
 USUAL = ("8b", "cores", 100)
 """Storage, layout and window that others are compared with, of the first network."""
 
+FILLINGS = 5
+"""Of each of four containers, classes in order."""
+
 POINT = ("number", "network", "storage", "cores", "window", "n_cores", "test")
 
 
@@ -165,6 +168,17 @@ def lean(session: Session, data: str) -> Json:
     return found
 
 
+def confusion(session: Session) -> Json:
+    """What the chip takes for what on Containers: another container, or another filling of the same."""
+    session.run(f"compile pretrained:containers --calibrate {CONTAINERS} -o net.loom")
+    found = session.run(f"run net.loom --data {CONTAINERS}")
+    pairs = list(zip(found["labels"], found["predictions"], strict=True))
+    other = sum(label // FILLINGS != decided // FILLINGS for label, decided in pairs)
+    wrong = sum(label != decided for label, decided in pairs)
+    near = sum(label // FILLINGS == decided // FILLINGS and abs(label - decided) == 1 for label, decided in pairs)
+    return {"test_samples": len(pairs), "wrong": wrong, "other_container": other, "next_filling": near, "pairs": pairs}
+
+
 def longer_bins(session: Session) -> Json:
     """Chip accuracy on Objects, 200 ms less 20 ms: points, and Welch's p over networks; from stored results."""
     cells = json.loads((RESULTS / "paper" / "cells.json").read_text())
@@ -186,6 +200,7 @@ def longer_bins(session: Session) -> Json:
 
 
 STUDIES = {
+    "confusion-containers": confusion,
     "longer-bins": longer_bins,
     "pretrained": pretrained,
     "shipped": shipped,
