@@ -12,6 +12,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -199,7 +200,7 @@ def longer_bins(session: Session) -> Json:
     return found
 
 
-STUDIES = {
+STUDIES: dict[str, Callable[[Session], Json]] = {
     "confusion-containers": confusion,
     "longer-bins": longer_bins,
     "pretrained": pretrained,
