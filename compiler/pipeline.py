@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
 
 
 class Work(Protocol):
@@ -23,20 +24,26 @@ LATER: Any = None
 """Of a field of the work that a pass fills in."""
 
 
-Pass = Callable[[W], W]
-"""One step of a compilation: new work of what it is given, which stays as it is. What each keeps: docs/compile.md."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pass(Generic[W]):
+    """One step of a compilation."""
+
+    name: str  # For ``--dump-after`` and the table in docs/compile.md
+    does: str  # Its contract in one sentence
+    keeps: str  # What is the same before and after it
+    apply: Callable[[W], W]  # Makes new work of what it is given, which stays as it is
 
 
-def name_of(step: Callable[..., Any]) -> str:
-    """Name of a pass, for ``--dump-after`` and the table in docs/compile.md: that of the function."""
-    return step.__name__.strip("_")
+def step(does: str, *, keeps: str) -> Callable[[Callable[[W], W]], Pass[W]]:
+    """Make a function the pass of its name; `does` and `keeps` as of :class:`Pass`."""
+    return lambda apply: Pass(name=apply.__name__.strip("_"), does=does, keeps=keeps, apply=apply)
 
 
 def run(passes: Iterable[Pass[W]], work: W, after: Callable[[str, W], object] | None = None) -> W:
     """Apply passes in order and verify what each one made; `after` gets the name of each and its work."""
     for each in passes:
-        work = each(work)
+        work = each.apply(work)
         work.verify()
         if after is not None:
-            after(name_of(each), work)
+            after(each.name, work)
     return work

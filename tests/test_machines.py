@@ -14,7 +14,6 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.pipeline import name_of
 from spikeloom.compiler.targets import base
 from spikeloom.compiler.targets.loihi1.legalize import REMEDIES
 from spikeloom.compiler.targets.loihi1.netlist import write_netlist
@@ -96,13 +95,15 @@ PASSES = """
 import numpy as np
 from dataclasses import replace
 from spikeloom.compiler.passes.prune import without_channels
+from spikeloom.compiler.pipeline import Pass
 from spikeloom.compiler.targets.loihi1 import passes
 from spikeloom.compiler.targets.loihi1.options import Options
 
 def unplug(done):
     return replace(done, integer=without_channels(done.integer, np.arange(done.integer.input.size) == 0))
 
-PASSES = (*passes.FLOATS, unplug, *passes.INTEGERS, *passes.LAYOUT)
+PASSES = (*passes.FLOATS, Pass(name="unplug", does="ignores channel 0", keeps="the rest", apply=unplug),
+          *passes.INTEGERS, *passes.LAYOUT)
 
 def start(source, options, target):
     return passes.start(source, options, target)[0], PASSES
@@ -135,7 +136,7 @@ def test_a_third_chip_is_a_folder_of_the_compiler_and_one_of_the_machines(tmp_pa
     base.shipped.cache_clear()
     try:
         done = compile_network(expand(random_checkpoint(), ring(5)), target="toy")
-        assert [name_of(step) for step in base.load_target("toy").module.PASSES][4] == "unplug"
+        assert [step.name for step in base.load_target("toy").module.PASSES][4] == "unplug"
         assert np.diff(done.netlist.core_compartments).max() <= 8
         assert not (done.netlist.axon_source == 0).any()
         write_netlist(done.netlist, tmp_path / "net.loom")

@@ -2,7 +2,6 @@
 
 import dataclasses
 from dataclasses import replace
-from functools import wraps
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +28,7 @@ from spikeloom.compiler.ir import INPUT, depths, fan_in
 from spikeloom.compiler.passes.expand import Factored, expand, hop_powers, synapses
 from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, removable, removals
 from spikeloom.compiler.passes.range_proof import prove_ranges
-from spikeloom.compiler.pipeline import name_of, run
+from spikeloom.compiler.pipeline import run
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
@@ -43,7 +42,7 @@ def test_the_passes_run_in_order_and_hand_on_what_they_make():
     seen = {}
     source = Factored(checkpoint=random_checkpoint(), propagation=ring(5))
     done = compile_network(source, after=lambda name, made: seen.setdefault(name, made.newest))
-    assert list(seen) == [name_of(step) for step in load_target("loihi1").module.PASSES]
+    assert list(seen) == [step.name for step in load_target("loihi1").module.PASSES]
     assert [seen[name] for name in ("expand", "quantize", "remove", "emit")] == [
         done.network,
         done.integer,
@@ -64,7 +63,7 @@ def test_the_passes_run_in_order_and_hand_on_what_they_make():
 def test_the_table_of_passes_in_the_docs():
     docs = (Path(__file__).parents[1] / "docs" / "compile.md").read_text("utf-8")
     for step in load_target("loihi1").module.PASSES:
-        assert f"\n| {name_of(step)} |" in docs
+        assert f"| {step.name} | {step.does} | {step.keeps} |" in docs
 
 
 @pytest.mark.parametrize(
@@ -76,9 +75,9 @@ def test_the_table_of_passes_in_the_docs():
     ],
 )
 def test_a_pass_that_breaks_a_rule_is_named_at_once(name, change):
-    every = load_target("loihi1").module.PASSES
     passes = [
-        wraps(step)(lambda done, step=step: change(step(done))) if name_of(step) == name else step for step in every
+        replace(step, apply=lambda done, apply=step.apply: change(apply(done))) if step.name == name else step
+        for step in load_target("loihi1").module.PASSES
     ]
     work, _ = start(expand(random_checkpoint(), ring(5)), Options(), load_target("loihi1"))
     seen = []

@@ -12,7 +12,7 @@ from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.passes.prune import Masks, Removal
 from spikeloom.compiler.passes.range_proof import RangeProof, prove_ranges
-from spikeloom.compiler.pipeline import LATER, Pass, run
+from spikeloom.compiler.pipeline import LATER, Pass, run, step
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.choose import Layout, lay_out
@@ -71,16 +71,19 @@ class Compilation:
         FILE.verify(self.newest)
 
 
+@step(
+    "writes the graph convolution out as synapses, W = sum over hops k of A^k x W_k, in float64",
+    keeps="every spike, up to the rounding of a differently ordered sum",
+)
 def _expand(done: Compilation) -> Compilation:
-    """Write the first layer out as synapses."""
     assert not isinstance(done.source, IntegerNetwork), "integers start behind the passes of float networks"
     source = done.source
     network = source if isinstance(source, Network) else expand.expand(source.checkpoint, source.propagation)
     return replace(done, network=network)
 
 
+@step("runs the float network on training recordings, where there are any", keeps="the network")
 def _calibrate(done: Compilation) -> Compilation:
-    """Run the float network on training recordings, where there are any."""
     options = done.options
     if options.training_events is None:
         return done
@@ -92,8 +95,12 @@ def _calibrate(done: Compilation) -> Compilation:
     return replace(done, calibration=found, rates=found.rates)
 
 
+@step(
+    "zeroes the weights of neurons that no input can make fire; with --prune-unused also of those that never "
+    "fired in training",
+    keeps="every spike on any input; with --prune-unused on any input on which these stay silent",
+)
 def _disconnect(done: Compilation) -> Compilation:
-    """Zero the weights of neurons that cannot fire, or on request that never did."""
     quiet = prune.none_of(done.network)
     if done.options.keep_all or done.options.forms is not None:
         return replace(done, connected=done.network, quiet=quiet)
@@ -104,8 +111,11 @@ def _disconnect(done: Compilation) -> Compilation:
     return replace(done, connected=prune.disconnect(done.network, gone), quiet=quiet)
 
 
+@step(
+    "chooses the scales of each layer and rounds weights, biases, thresholds and decays to registers",
+    keeps="the decisions, as well as the width allows; every training spike where --spike-exact succeeds",
+)
 def _quantize(done: Compilation) -> Compilation:
-    """Choose the scales of each layer and round to registers."""
     options, network, target = done.options, done.connected, done.target
     packings = options.packings or (Packing(),)
     if options.forms is not None:
@@ -120,13 +130,16 @@ def _quantize(done: Compilation) -> Compilation:
     return replace(done, integer=integer, choices=choices, connected=LATER)  # large, and no pass needs it again
 
 
+@step("bounds every register by the weights alone", keeps="the network")
 def _prove(done: Compilation) -> Compilation:
-    """Bound every register by the weights alone."""
     return replace(done, proofs=prove_ranges(done.integer))
 
 
+@step(
+    "takes out the neurons that no input can make fire and those whose spikes reach no neuron",
+    keeps="every spike of the neurons that are left, on any input",
+)
 def _remove(done: Compilation) -> Compilation:
-    """Take out the neurons that cannot fire and those whose spikes reach no neuron."""
     integer, network = done.integer, done.network
     none = prune.none_of(integer)
     silent, unread = (none, none) if done.options.keep_all else prune.removable(integer)
@@ -136,8 +149,12 @@ def _remove(done: Compilation) -> Compilation:
     return replace(done, held=held, identity=identity, silent=silent, unread=unread, removals=removals)
 
 
+@step(
+    "cuts the layers over as few cores as every limit allows and puts the cores on tiles with the fewest "
+    "spike-hops, or as --optimize asks",
+    keeps="every spike: where a neuron sits has no influence on any",
+)
 def _place(done: Compilation) -> Compilation:
-    """Cut the layers over cores, and put these on tiles."""
     options = done.options
     rates = done.rates and tuple(rate[ids] for rate, ids in zip(done.rates, done.identity, strict=True))
     layout, usual = lay_out(
@@ -153,8 +170,8 @@ def _place(done: Compilation) -> Compilation:
     return replace(done, layout=layout, usual=usual)
 
 
+@step("writes cores, axons and synapse lists down as a netlist", keeps="every synapse that is not zero, stored once")
 def _emit(done: Compilation) -> Compilation:
-    """Write cores, axons and synapse lists down."""
     provenance = dict(done.options.provenance)
     if done.choices:
         provenance["compensated"] = [choice.layer for choice in done.choices if choice.compensated]
@@ -171,8 +188,8 @@ def _emit(done: Compilation) -> Compilation:
     return replace(done, netlist=made)
 
 
+@step("measures every limit again on the netlist and refuses one that breaks any", keeps="the netlist")
 def _legalize(done: Compilation) -> Compilation:
-    """Measure every limit again and refuse a netlist that breaks any."""
     return replace(done, uses=require_legal(done.netlist, done.target))
 
 
@@ -223,4 +240,4 @@ def without(done: Compilation, gone: Masks, *, rates: tuple[FloatArray, ...] | N
     """
     options = Options(provenance=done.netlist.provenance)
     work = replace(done, options=options, calibration=None, rates=rates, gone=gone)
-    return lay_out_again(_remove(work), options).netlist
+    return lay_out_again(_remove.apply(work), options).netlist

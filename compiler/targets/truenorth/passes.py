@@ -14,7 +14,7 @@ from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import CapacityError, ModelError, OptionError
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes import expand
-from spikeloom.compiler.pipeline import LATER, Pass
+from spikeloom.compiler.pipeline import LATER, Pass, step
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.codebook import COPIES, LevelNetwork, in_levels
 from spikeloom.compiler.targets.truenorth.counting import lower_counters
@@ -62,8 +62,11 @@ class Compilation:
         FILE.verify(self.newest)
 
 
+@step(
+    "writes the graph convolution out as synapses, in float64; refuses what no layout could hold",
+    keeps="every spike, up to the rounding of a differently ordered sum",
+)
 def _expand(done: Compilation) -> Compilation:
-    """Write the first layer out as synapses; refuse what no layout could hold."""
     source = done.source
     assert not isinstance(source, NativeNetwork | Counters), "whole numbers start behind the passes of float networks"
     network = source if isinstance(source, Network) else expand.expand(source.checkpoint, source.propagation)
@@ -76,8 +79,11 @@ def _expand(done: Compilation) -> Compilation:
     return replace(done, network=network)
 
 
+@step(
+    "rounds the weights of each neuron to a few levels of a step of its own",
+    keeps="the decisions, as well as the levels allow",
+)
 def _levels(done: Compilation) -> Compilation:
-    """Round the weights of each neuron to a few levels of a step of its own."""
     copies = done.options.in_time
     assert copies is not None, "refused by the pass before"
     try:
@@ -86,8 +92,12 @@ def _levels(done: Compilation) -> Compilation:
         raise ModelError(f"{error}; {FORGET}") from error
 
 
+@step(
+    "puts neurons on cores, inputs on axons of the types that make their levels, and copies or relays where "
+    "a spike has several targets",
+    keeps="every spike; partial sums that travel in time saturate at 19",
+)
 def _place(done: Compilation) -> Compilation:
-    """Put neurons on cores, inputs on axons, and copies or relays where a spike has several targets."""
     provenance = done.options.provenance
     if isinstance(done.source, NativeNetwork):
         return replace(done, netlist=lower(done.source, done.target, provenance=provenance))
@@ -96,8 +106,8 @@ def _place(done: Compilation) -> Compilation:
     return replace(done, netlist=lower_in_time(done.levels, done.target, provenance=provenance))
 
 
+@step("holds the netlist against every rule and refuses one that breaks any", keeps="the netlist")
 def _legalize(done: Compilation) -> Compilation:
-    """Refuse a netlist that breaks any rule."""
     require_legal(done.netlist, done.target)
     return done
 

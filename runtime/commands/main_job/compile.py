@@ -22,7 +22,6 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.formats.text import text
-from spikeloom.compiler.pipeline import name_of
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_bin_option, add_network, group
@@ -100,7 +99,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     chip = load_target(arguments.target)
     if isinstance(arguments.checkpoint, str) and arguments.checkpoint.endswith(NETX):
         return _compile_integers(arguments)
-    names = [name_of(step) for step in chip.module.PASSES]
+    names = [step.name for step in chip.module.PASSES]
     if unknown := set(arguments.dump_after) - set(names):
         raise OptionError(f"--dump-after {', '.join(sorted(unknown))}: no such pass; allowed: {', '.join(names)}")
     own = trained_for(arguments.checkpoint) or chip_module(arguments.target, "commands")
