@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from made import made as made_by
 from nested import DRAWS, ROUNDS, spread, tried, whole
 
 from spikeloom.compiler.files import write_atomically
@@ -133,7 +134,12 @@ def main() -> None:
         }
         mean, low, high = (100 * value for value in points[point]["accuracy"])
         print(f"{point:18} {mean:.2f} ({low:.2f} … {high:.2f})   test {sum(own['right'])} of {len(own['right'])}")
-    found = {"data": Path(arguments.recordings).name, "recordings": len(data), "test_samples": len(data) - training}
+    halves = data.part(slice(training)), data.part(slice(training, None))
+    found: Json = made_by(*halves) | {
+        "data": Path(arguments.recordings).name,
+        "recordings": len(data),
+        "test_samples": len(data) - training,
+    }
     found |= {"plan": {name: getattr(arguments, name) for name in OPTIONS}, "points": points}
     with write_atomically(arguments.output) as file:
         file.write(json.dumps(found, indent=1).encode() + b"\n")

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from made import made as made_by
 from sklearn.svm import SVC
 
 from spikeloom.compiler.files import write_atomically
@@ -233,7 +234,13 @@ def main() -> None:
         rights = {system: sum(each["right"]) for system, each in done[name]["systems"].items()}
         print(name, f"of {held.sum()}:", rights, flush=True)
     nested = [name for name in split if name != "split"]
-    found = {"data": Path(arguments.recordings).name, "recordings": len(data), "rounds": ROUNDS, "folds": FOLDS}
+    halves = data.part(slice(training)), data.part(slice(training, None))
+    found: Json = made_by(*halves) | {
+        "data": Path(arguments.recordings).name,
+        "recordings": len(data),
+        "rounds": ROUNDS,
+        "folds": FOLDS,
+    }
     found |= {"nested": summary([done[name] for name in nested], [split[name] for name in nested], len(data))}
     own = done["split"]
     found["split"] = {
