@@ -80,6 +80,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_place(arguments.html, "--html", arguments)
     budgets = parse_budgets([words for each in arguments.budget for words in each.split(",")], LIMITS)
     target = load_target(arguments.target)
+    if target.name != DEFAULT_TARGET:
+        raise OptionError(f"--target {target.name}: networks are searched for {DEFAULT_TARGET} alone; omit it")
     taxels = None if arguments.taxels is None else len(sensor_places(arguments.taxels))
     training, test = both_splits(arguments.data, taxels, arguments.bin)
     sensor = _sensor(arguments, training.taxels)

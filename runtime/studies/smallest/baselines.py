@@ -26,7 +26,7 @@ from spikeloom.runtime.studies.yardsticks import HOROWITZ
 
 LINEAR, RBF = "linear-svm", "rbf-svm"
 
-STRENGTHS = {LINEAR: (0.01, 0.001, 0.1), RBF: (10.0, 1.0, 3.0, 30.0)}
+STRENGTHS = {LINEAR: (0.1, 0.01, 1.0), RBF: (10.0, 1.0, 3.0, 30.0)}
 """Constants C that are tried, the first on the first rung."""
 
 PARTS = (1, 5, 10)
@@ -77,13 +77,14 @@ def features(data: Recordings, candidate: Candidate) -> FloatArray:
 
 
 def machine(system: str, strength: float) -> Any:
-    """What is fitted: features of unit spread, then a support vector machine."""
+    """What is fitted: features of unit spread, then a support vector machine; a linear one is one class against the rest."""
+    from sklearn.multiclass import OneVsRestClassifier
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
-    from sklearn.svm import SVC, LinearSVC
+    from sklearn.svm import SVC
 
-    linear = LinearSVC(C=strength, dual="auto", random_state=0, max_iter=20_000)
-    return make_pipeline(StandardScaler(), linear if system == LINEAR else SVC(C=strength, gamma="scale"))
+    linear = OneVsRestClassifier(SVC(C=strength, kernel="linear"))
+    return make_pipeline(StandardScaler(), linear if system == LINEAR else SVC(C=strength))
 
 
 def decided(system: str, strength: float, seen: FloatArray, labels: IntArray, fold: IntArray) -> IntArray:
@@ -100,7 +101,7 @@ def processor(system: str, strength: float, data: Recordings, candidate: Candida
     seen = features(data, candidate)
     fitted = machine(system, strength).fit(seen, data.labels)[-1]
     if system == LINEAR:
-        products, lookups = int(fitted.coef_.size), 0
+        products, lookups = len(fitted.estimators_) * seen.shape[1], 0
     else:  # distances to all support vectors, an exponential of each, and a sum for each pair of classes
         vectors, classes = len(fitted.support_), len(fitted.classes_)
         products, lookups = vectors * (seen.shape[1] + classes - 1), vectors
