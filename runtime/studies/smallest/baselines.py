@@ -77,7 +77,7 @@ def features(data: Recordings, candidate: Candidate) -> FloatArray:
 
 
 def machine(system: str, strength: float) -> Any:
-    """What is fitted: features of unit spread, then a support vector machine; a linear one has a plane for each class."""
+    """What is fitted: features of unit spread, then a support vector machine, if linear one plane for each class."""
     from sklearn.multiclass import OneVsRestClassifier
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
