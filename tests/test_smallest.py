@@ -11,6 +11,7 @@ from numpy.testing import assert_array_equal
 from spikeloom.compiler.errors import OptionError
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit
+from spikeloom.runtime.commands.choose import smallest
 from spikeloom.runtime.studies.counting import decisions_of
 from spikeloom.runtime.studies.fronts import parse_budgets
 from spikeloom.runtime.studies.pruning.results import Costs
@@ -75,6 +76,8 @@ def test_the_cheapest_that_is_not_shown_to_be_worse():
 def test_the_difference_is_of_recordings_that_both_decided():
     fold = work.Measured(right=(1, 0, 0, 0), tried=(1, 1, 0, 0), setting=0.1)
     assert choice.accuracy(fold) == 0.5
+    none = work.Measured(right=(0,) * 4, tried=(0,) * 4, setting=0.1, refused="too large")
+    assert (choice.accuracy(none), choice.gap(fold, none)) == (0.0, (0.0, 0.0))
     ahead, error = choice.gap(work.Measured(right=(5, 3, 0, 0), tried=(5,) * 4, setting=0.1), fold)
     assert (ahead, error) == (pytest.approx(0.3), pytest.approx(0.3))
 
@@ -169,6 +172,20 @@ def test_the_command(few, monkeypatch):
     assert files == {name: (few / name).read_bytes() for name in files}
     assert as_json(*words, "--budget", "accuracy=100,energy=1nJ", codes=(1,))["choice"]["fits"] is False
     assert "nothing fits" in run(*words, "--budget", "energy=1nJ")[1]
+
+
+def test_a_network_that_is_trained_by_gradients(few, monkeypatch):
+    monkeypatch.setattr(smallest, "counting", lambda *_: [])
+    monkeypatch.setattr(space, "NETWORKS", (("mlp", 10, 4, "8,8"),))
+    monkeypatch.setattr(space, "EPOCHS", 2)
+    found = as_json("smallest", "--data", "synthetic", "--jobs", "1", "-o", "a.loom", "--html", "a.html")
+    (network,) = found["tried"]
+    assert (network["system"], network["rung"]) == ("mlp", 3)
+    assert len(found["baselines"]) in (0, 4)
+    netlist = (few / "a.loom").read_bytes()
+    assert run(*shlex.split(found["commands"][1])[1:])[0] == 0
+    assert (few / "a.loom").read_bytes() == netlist
+    assert "The smallest network for synthetic" in (few / "a.html").read_text()
 
 
 @pytest.mark.usefixtures("few")

@@ -23,8 +23,8 @@ LIMITS = ("energy", "time", "operations", "cores", "accuracy")
 
 def accuracy(found: Measured) -> float:
     """Share of right decisions, over recordings that were decided at all, each with the same weight."""
-    tried = np.array(found.tried)
-    return float((np.array(found.right)[tried > 0] / tried[tried > 0]).mean())
+    right, tried = np.array([found.right, found.tried])
+    return float((right[tried > 0] / tried[tried > 0]).mean()) if tried.any() else 0.0
 
 
 def gap(best: Measured, other: Measured) -> tuple[float, float]:
@@ -40,6 +40,8 @@ def gap(best: Measured, other: Measured) -> tuple[float, float]:
     both = (tried > 0).all(axis=0)
     share = (np.array([best.right, other.right]) / np.maximum(tried, 1))[:, both]
     ahead = share[0] - share[1]
+    if not len(ahead):
+        return 0.0, 0.0
     error = ahead.std(ddof=1) / np.sqrt(len(ahead)) if len(ahead) > 1 else 0.0
     return float(ahead.mean()), float(error)
 

@@ -144,7 +144,8 @@ def _network(work: Trial, training: Recordings) -> Measured:
         try:
             netlist = without(plan, training, held, epochs, target)
         except (CapacityError, ModelError) as error:
-            return Measured(right=(), tried=(), setting=epochs, refused=str(error).splitlines()[0])
+            none = (0,) * len(training)
+            return Measured(right=none, tried=none, setting=epochs, refused=str(error).splitlines()[0])
         costs = costs or priced(netlist, some(steps))[1]
         right[held], tried[held] = decisions_on_chip(netlist, steps.part(held)) == training.labels[held], 1
     return Measured(right=tuple(right.tolist()), tried=tuple(tried.tolist()), setting=epochs, costs=costs)
