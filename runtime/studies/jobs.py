@@ -15,6 +15,7 @@ import sqlite3
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -142,7 +143,8 @@ def side_by_side(
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     attempt = delayed(partial(_in_child, os.getpid(), Path.cwd(), run))
-    with parallel_config("loky", n_jobs=processes, inner_max_num_threads=1):
+    with parallel_config("loky", n_jobs=processes, inner_max_num_threads=1), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "A worker stopped")  # one that has grown is replaced, and nothing lost
         work = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
         try:
             yield from work(attempt(index, payload) for index, payload in enumerate(payloads))

@@ -50,14 +50,18 @@ KEPT = {1: 24, 2: 12}
 """Candidates that go on from a rung."""
 
 
+BEST = 20
+"""How much more it weighs to be behind a cheaper one than behind the best: the front goes on, down to cheap ones."""
+
+
 def going_on(tried: Iterable[Tried], rung: int) -> list[Tried]:
-    """Those that may still be chosen: least behind a cheaper one, and by a fifth of that, behind the best."""
+    """Those that may still be chosen: least behind a cheaper one, or, which weighs less, behind the best."""
     able = [each for each in tried if each.costs is not None]
     top = max((each.accuracy for each in able), default=0.0)
 
     def lag(each: Tried) -> float:
         cheaper = max(other.accuracy for other in able if energy(other) <= energy(each))
-        return cheaper - each.accuracy + (top - each.accuracy) / 5
+        return cheaper - each.accuracy + (top - each.accuracy) / BEST
 
     return sorted(able, key=lambda each: (lag(each), energy(each)))[: KEPT[rung]]
 

@@ -252,6 +252,8 @@ def _panel(drawing: Drawing, panel: Axes, result: Smallest, unit: str) -> None:
             ([each for each in own if each.rung < last], 9, 0.35),
             ([each for each in own if each.rung == last], 34, 1.0),
         ):
+            if not members:
+                continue
             x, y = [cost(each) for each in members], [100 * each.accuracy for each in members]
             name = system if alpha == 1.0 else f"{system}, dropped"
             panel.scatter(x, y, s=size, marker=marker, color=colour, alpha=alpha, linewidths=0, label=name, zorder=3)
