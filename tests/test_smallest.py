@@ -114,7 +114,7 @@ def test_who_goes_on():
     dominated = tried(6, 20, 20 * UJ)
     assert choice.going_on([dominated, *POOL], 1)[-1] == dominated
     assert choice.going_on([replace(dominated, costs=None)], 2) == []
-    assert len(choice.going_on([dominated] * 30, 2)) == 12
+    assert len(choice.going_on([dominated] * 30, 2)) == 24
 
 
 @pytest.mark.parametrize(

@@ -46,11 +46,11 @@ def gap(best: Measured, other: Measured) -> tuple[float, float]:
     return float(ahead.mean()), float(error)
 
 
-KEPT = {1: 24, 2: 12}
+KEPT = {1: 24, 2: 24}
 """Candidates that go on from a rung."""
 
 
-BEST = 20
+BEST = 50
 """How much more it weighs to be behind a cheaper one than behind the best: the front goes on, down to cheap ones."""
 
 

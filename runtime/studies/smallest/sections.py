@@ -27,7 +27,7 @@ MEANINGS = (
     "came to the last rung (five rounds of five parts), small ones were dropped before. The dashed line is the front: "
     "no other candidate of the last rung is as accurate for less. The ring is the choice. Horizontal bars are support "
     "vector machines on event counts: on a small processor they take between their arithmetic and memory accesses, and "
-    "those with an instruction for every operation."
+    "those with an instruction for every operation. What is far below the last rung is in the tables only."
 )
 
 
