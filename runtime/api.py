@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.types import JsonObject
 from spikeloom.runtime.report.sections import Outcome, Section, terminal
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ class Compiled:
 
     path: Path
     network: str | Network | None
-    options: dict[str, Any]
+    options: JsonObject
     result: Result
 
     def verify(self, data: Recordings | str, **options: Any) -> Result:
@@ -128,7 +129,7 @@ class Compiled:
 
         return machine_for(self.path).stream()
 
-    def _origin(self, what: str) -> dict[str, Any]:
+    def _origin(self, what: str) -> JsonObject:
         if self.network is None:
             raise OptionError(f"{what}: of a loaded netlist needs its network; give load(…, network=…)")
         return {"checkpoint": self.network, **self.options}
@@ -190,7 +191,7 @@ def load(path: str, *, network: str | None = None, **options: Any) -> Compiled:
     return Compiled(Path(path), network, options, _command("main_job.inspect", path=path))
 
 
-def _defaults(command: str) -> dict[str, Any]:
+def _defaults(command: str) -> JsonObject:
     """What every option of a command is where it is not given."""
     parser = argparse.ArgumentParser()
     module = import_module(f"spikeloom.runtime.commands.{command}")

@@ -145,11 +145,7 @@ def recall(job: Job) -> Finished:
     kind = kind_of(job.plan.system)
     found = kind.read(job.output)
     record = dict(found.training or {})
-    wanted = {
-        "epochs": job.epochs,
-        "seed": job.seed,
-        "data_sha256": data_digest(job.training, job.test),
-    }
+    wanted = {"epochs": job.epochs, "seed": job.seed, "data_sha256": data_digest(job.training, job.test)}
     differing = [name.removesuffix("_sha256") for name, value in wanted.items() if record.get(name) != value]
     differing += kind.differing(found, job.plan)
     if record.get("recipe", RELEASED.to_json()) != job.plan.recipe.to_json():

@@ -155,7 +155,7 @@ def describe(recordings: Recordings, bin_s: float) -> Described:
     alive = total > 0
     middle = float(np.median(total[alive])) if alive.any() else 0.0
     rate = per_taxel / (lengths.sum() * bin_s)
-    falling, rising = (float(rate[:, polarity].sum()) for polarity in (0, 1))
+    totals = {name: float(rate[:, polarity].sum()) for polarity, name in enumerate(("falling", "rising"))}
     labels = dict(zip(*(found.tolist() for found in np.unique(recordings.labels, return_counts=True)), strict=True))
     ends = {"shortest": lengths.min(), "median": np.median(lengths), "longest": lengths.max()}
     return Described(
@@ -170,11 +170,7 @@ def describe(recordings: Recordings, bin_s: float) -> Described:
         found=recordings.counts,
         unlabelled=labels.pop(UNLABELLED, 0),
         labels=labels,
-        rate=Rate(
-            falling=falling,
-            rising=rising,
-            taxels=[{"falling": low, "rising": high} for low, high in rate.tolist()],
-        ),
+        rate=Rate(**totals, taxels=[dict(zip(totals, each, strict=True)) for each in rate.tolist()]),
         dead=tuple(np.flatnonzero(~alive).tolist()),
         one_sided=tuple(np.flatnonzero((per_taxel > 0).sum(axis=1) == 1).tolist()),
         hot=tuple(np.flatnonzero(total > HOT * middle).tolist()),
@@ -214,8 +210,7 @@ def _convert(arguments: Arguments) -> Outcome:
     lines = arguments.output.lower().endswith(".csv")
     if lines or arguments.output.lower().endswith(".zip"):
         require_place(arguments.output, "-o", arguments)
-    bins = arguments.join
-    require_bins(bins)
+    require_bins(bins := arguments.join)
     count, places = _layout(arguments.taxels)
     present = tuple(SPLITS) if arguments.source == SYNTHETIC else data_splits(arguments.source)
     loaded = [_load(arguments.source, split, arguments.bin, count, places) for split in present or (arguments.split,)]
@@ -228,16 +223,13 @@ def _convert(arguments: Arguments) -> Outcome:
         write_event_lines(arguments.output, loaded, bins * arguments.bin)
     else:
         write_released(arguments.output, [_grown(recordings, taxels, steps) for recordings in loaded])
-    splits = {
-        recordings.split: ConvertedSplit(recordings=len(recordings), found=recordings.counts) for recordings in loaded
-    }
     result = Converted(
         source=arguments.source,
         output=arguments.output,
         taxels=taxels,
         steps=steps,
         names=None if lines else SOURCES,
-        splits=splits,
+        splits={each.split: ConvertedSplit(recordings=len(each), found=each.counts) for each in loaded},
     )
     return Outcome(result, _convert_sections)
 

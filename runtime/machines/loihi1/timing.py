@@ -172,7 +172,7 @@ def charges(tables: Tables) -> Charges:
     return Charges(sources=sources, updates=updates)
 
 
-def _ends(spent: npt.NDArray[Any], steps: IntArray, barrier: int) -> dict[str, Any]:
+def _ends(spent: npt.NDArray[Any], steps: IntArray, barrier: int) -> dict[str, npt.NDArray[Any]]:
     """Fields of :class:`StepTimes`, of what cores take to send, then to receive, (samples, chip steps, 2 * cores)."""
     runs, longest = np.arange(spent.shape[1]) < steps[:, None], spent.argmax(axis=2)
     receives, core = np.divmod(longest, spent.shape[2] // 2)

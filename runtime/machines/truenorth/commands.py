@@ -21,10 +21,9 @@ from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.interpret import channels_last, float_simulation, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.truenorth.codebook import LevelNetwork, PartialSums, in_levels, run_levels
-from spikeloom.compiler.targets.truenorth.counting import Plan, planned, run_counters
+from spikeloom.compiler.targets.truenorth.codebook import PartialSums, in_levels, run_levels
+from spikeloom.compiler.targets.truenorth.counting import planned, run_counters
 from spikeloom.compiler.targets.truenorth.in_time import first_spikes
-from spikeloom.compiler.targets.truenorth.native import NativeNetwork
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Compilation, Options, Source
@@ -114,7 +113,8 @@ def provenance(trained: Trained) -> JsonObject:
 
 # -- chip against definition and model: every spike of every copy of every neuron --------------------------------------
 
-Model = Callable[[npt.NDArray[np.uint8]], tuple[Mapping[str, BoolArray], tuple[PartialSums, ...]]]
+Modelled = tuple[Mapping[str, BoolArray], tuple[PartialSums, ...]]
+Model = Callable[[npt.NDArray[np.uint8]], Modelled]
 """Spikes (steps, neurons) of each layer for events (taxels, polarities, steps); partial sums that travel in time."""
 
 
@@ -283,34 +283,27 @@ def verify(arguments: argparse.Namespace) -> Outcome:
     if made.get("checkpoint_sha256") != network.sha256:
         raise OptionError(f"--checkpoint {path}: {arguments.netlist} was compiled from another file; give that one")
     compared: Network | None = None
+    model: Model
     if isinstance(network, LoadedNetwork) and counting:
         plan, compared = planned(read_counters(shipped(path))[0], machine.target), network.network
-        model, first = _counting_model(plan), plan.first
+        model, first = (lambda events: (run_counters(plan, events), ())), plan.first
     elif isinstance(network, LoadedNetwork):
         levels = in_levels(network.network, copies, machine.target)
-        model, first = _level_model(levels), first_spikes(levels)
+        model, first = (lambda events: run_levels(levels, events.reshape(-1, events.shape[-1]))), first_spikes(levels)
     elif made.get("weights") != network.weights:
         raise OptionError(
             f"--weights {network.weights}: {arguments.netlist} was compiled from {made.get('weights')}; give the same"
         )
     else:
-        model, first = _trained_model(network.network), {s.name: n for n, s in enumerate(network.network.stages)}
+        from spikeloom.models.truenorth.network import run_network  # torch, so only here
+
+        trained, first = network.network, {s.name: n for n, s in enumerate(network.network.stages)}
+
+        def model(events: npt.NDArray[np.uint8]) -> Modelled:
+            return {name: held[0] for name, held in run_network(trained, events[None]).items()}, ()
+
     data = load_recordings(arguments, netlist, labels_for="verify")
     steps = SPEC_STEPS if copies else None
     checked = arguments.spec_samples
     verdict = compare(netlist, model, first, data, spec_samples=checked, spec_steps=steps, network=compared)
     return Outcome(verdict, sections, 0 if verdict.exact else 1)
-
-
-def _level_model(levels: LevelNetwork) -> Model:
-    return lambda events: run_levels(levels, events.reshape(-1, events.shape[-1]))
-
-
-def _counting_model(plan: Plan) -> Model:
-    return lambda events: (run_counters(plan, events), ())
-
-
-def _trained_model(network: NativeNetwork) -> Model:
-    from spikeloom.models.truenorth.network import run_network  # torch, so only here
-
-    return lambda events: ({name: held[0] for name, held in run_network(network, events[None]).items()}, ())

@@ -51,11 +51,6 @@ def _allowed(rule: Calibrated) -> str:
     return f"{100 * (rule.allowed or 0):g} %"
 
 
-def rule_name(rule: Calibrated) -> str:
-    """What a rule allows."""
-    return "proven" if rule.allowed is None else f"sure, {_allowed(rule)} may differ"
-
-
 def rule_table(result: Anytime) -> Table:
     """Costs, differing and right decisions of each rule."""
     full = result.full
@@ -72,7 +67,9 @@ def rule_table(result: Anytime) -> Table:
 
     rows = [["all is seen", "", *cells(full.costs), "", shown(full.correct)]]
     for rule in result.rules:
-        ahead = "more than can come" if rule.stop.allowed is None else f"{rule.stop.factor:.3f}·√left"
+        name, ahead = "proven", "more than can come"
+        if rule.stop.allowed is not None:
+            name, ahead = f"sure, {_allowed(rule.stop)} may differ", f"{rule.stop.factor:.3f}·√left"
         changed = [str(rule.changes.differ), shown(rule.changes.correct)]
-        rows.append([rule_name(rule.stop), ahead, *cells(rule.mean), *changed])
+        rows.append([name, ahead, *cells(rule.mean), *changed])
     return Table(head, rows)

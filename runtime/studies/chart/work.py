@@ -155,7 +155,7 @@ def measure(work: Measurement) -> JsonObject:
     try:
         stored = _rounded(work, loaded)
     except (CapacityError, ModelError) as error:
-        built = dict.fromkeys(work.files, _refused(error))
+        built = dict.fromkeys(work.files, Built(refused=tuple(str(error).splitlines())))
     else:
         built = {layout: _built(work, stored, layout) for layout in work.files}
     found: JsonObject = encode(built)
@@ -164,10 +164,6 @@ def measure(work: Measurement) -> JsonObject:
 
 def _share(decisions: IntArray, wanted: IntArray) -> Share:
     return share(int(np.count_nonzero(decisions == wanted)), len(wanted))
-
-
-def _refused(error: CapacityError | ModelError) -> Built:
-    return Built(refused=tuple(str(error).splitlines()))
 
 
 def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
@@ -181,7 +177,7 @@ def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
     try:
         netlist = lay_out_again(stored, placing).netlist
     except (CapacityError, ModelError) as error:
-        return _refused(error)
+        return Built(refused=tuple(str(error).splitlines()))
     file = work.files[layout]
     file.parent.mkdir(parents=True, exist_ok=True)
     sha256 = write_netlist(netlist, file)

@@ -124,16 +124,12 @@ def _point(level: Level, runs: Sequence[Run], clean: Run, recordings: int) -> Po
         model=accuracy["float"],
         chip=accuracy["chip"],
         equal=sum(run.equal for run in runs) / (recordings * len(runs)),
-        common={name: _common(*counts[:3]) for name, counts in layers.items()},
+        # as ``verify`` counts it
+        common={name: 1 - moved / (a + b) if a + b else 1.0 for name, (a, b, moved, _) in layers.items()},
         stopped=sum(run.stopped for run in runs),
         saturated=sum(run.saturated for run in runs),
         why={side: reasons(side, runs, layers, clean, recordings) for side in SIDES},
     )
-
-
-def _common(model: int, chip: int, different: int) -> float:
-    """Share of spikes in common, as ``verify`` counts it."""
-    return 1 - different / (model + chip) if model + chip else 1.0
 
 
 def reasons(
