@@ -70,10 +70,7 @@ class Data:
     def split(self, name: str) -> Recordings:
         """Recordings of a split: ``events`` (samples, taxels, 2, steps) uint8, ``labels``, ``files``.
 
-        Raises
-        ------
-        DataError
-            If there are none, or they cannot be read.
+        Raises DataError if there are none, or they cannot be read.
         """
         from spikeloom.runtime.inputs.recordings import recordings as read
 

@@ -84,17 +84,14 @@ def undecided(before: IntArray, after: IntArray, files: Sequence[str]) -> list[B
         text = f"the chip decides class {decided[0]} for every recording, the float model {len(set(wanted))} classes"
         found.append(Breakdown(kind="one class", layer=None, count=len(decided), text=text))
     most = after.max(axis=1, initial=0)
-    without = np.flatnonzero(most == 0)
-    if len(without):
-        text = f"without a single vote, so class {vote(after[without])[0]} by rule: {_listed(without, files)}"
-        found.append(Breakdown(kind="no vote", layer=None, count=len(without), text=text))
-    tied = np.flatnonzero((most > 0) & (np.count_nonzero(after == most[:, None], axis=1) > 1))
-    if len(tied):
-        text = f"decided among equal votes, the first class taken: {_listed(tied, files)}"
-        found.append(Breakdown(kind="tied votes", layer=None, count=len(tied), text=text))
+    tied = (most > 0) & (np.count_nonzero(after == most[:, None], axis=1) > 1)
+    for kind, what, where in (
+        ("no vote", "without a single vote, so class 0 by rule", most == 0),
+        ("tied votes", "decided among equal votes, the first class taken", tied),
+    ):
+        if count := int(np.count_nonzero(where)):
+            named = ", ".join(files[i] for i in np.flatnonzero(where)[:LISTED])
+            more = f" and {count - LISTED} more" if count > LISTED else ""
+            text = f"{what}: {count} of {len(files)} recordings ({named}{more})"
+            found.append(Breakdown(kind=kind, layer=None, count=count, text=text))
     return found
-
-
-def _listed(places: IntArray, files: Sequence[str]) -> str:
-    more = f" and {len(places) - LISTED} more" if len(places) > LISTED else ""
-    return f"{len(places)} of {len(files)} recordings ({', '.join(files[i] for i in places[:LISTED])}{more})"

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from spikeloom.compiler.types import FloatArray
-from spikeloom.runtime.machines.core_map import Core, CoreMap
+from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.page.recording import Trace
 from spikeloom.runtime.page.results import Taxels
 from spikeloom.runtime.report.drawing import CHIP, COLOURS, DASHES, FLOAT, GREY, Drawing, sheet, styled
@@ -47,7 +47,9 @@ def mesh(cores: CoreMap) -> Drawing:
         axes.add_patch(Rectangle((x, y), wide, high, fill=False, edgecolor=GREY))
         label = f"{core.core}: {' '.join(core.layers)}" if across <= 4 and wide > 0.3 else str(core.core)
         axes.text(x + wide / 2, y + 0.06, label, fontsize=7, ha="center", va="center")
-        drawing.tips.append((axes, x + wide / 2, y + high / 2, _core_tip(core)))
+        limits = ", ".join(f"{name} {100 * use.share:.0f} %" for name, use in core.fill.items())
+        tip = f"core {core.core}, {' '.join(core.layers)}, {core.compartments:,} compartments; {limits}"
+        drawing.tips.append((axes, x + wide / 2, y + high / 2, tip))
     axes.set(xlim=(-0.04, across), ylim=(down + 0.1, -0.15))
     axes.axis("off")
     return drawing
@@ -76,11 +78,6 @@ def _places(cores: CoreMap) -> tuple[dict[int, Place], Place, dict[Place, int], 
             places[core.core] = x + 0.03 + column * (wide + 0.03), y + 0.12 + row * (high + 0.02)
         top += max(core.y for core in held) - upper + 1.2
     return places, (wide, high), tiles, chips
-
-
-def _core_tip(core: Core) -> str:
-    limits = ", ".join(f"{name} {100 * use.share:.0f} %" for name, use in core.fill.items())
-    return f"core {core.core}, {' '.join(core.layers)}, {core.compartments:,} compartments; {limits}"
 
 
 # -- taxels ------------------------------------------------------------------------------------------------------------

@@ -31,12 +31,8 @@ class Progress:
 def show(text: str) -> None:
     """Write a result to standard output; a reader that goes away early (``| head``) is no mistake.
 
-    Letters that the terminal's encoding lacks become question marks.
-
-    Raises
-    ------
-    OSError
-        If the output cannot take the text, for example on a full disk.
+    Letters that the terminal's encoding lacks become question marks. Raises OSError if the output cannot take the text,
+    for example on a full disk.
     """
     encoding = sys.stdout.encoding or "utf-8"
     try:

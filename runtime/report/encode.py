@@ -21,7 +21,6 @@ Result = TypeVar("Result")
 OPTIONAL: Mapping[str, bool] = {"optional": True}
 """Metadata of a field that is left out of the JSON where it is None."""
 
-
 HIDDEN: Mapping[str, bool] = {"hidden": True}
 """Metadata of a field that the JSON does not show."""
 
@@ -37,12 +36,7 @@ def key(name: str) -> Mapping[str, str]:
 def encode(value: Any) -> Any:
     """A JSON value: dataclasses by field, and by the properties that their class lists in ``json_properties``.
 
-    Arrays become lists, infinities and NaN become null.
-
-    Raises
-    ------
-    TypeError
-        If a value has no form in JSON.
+    Arrays become lists, infinities and NaN become null. Raises TypeError if a value has no form in JSON.
 
     Examples
     --------
@@ -79,12 +73,8 @@ def encode(value: Any) -> Any:
 def decode(kind: type[Result], value: Any) -> Result:
     """A dataclass from what :func:`encode` made of it; keys without a field are passed over.
 
-    Fields hold dataclasses, tuples, sequences, mappings, plain values, or one of these or None.
-
-    Raises
-    ------
-    TypeError, ValueError, KeyError
-        If the value is not of this kind, for instance since another version wrote it.
+    Fields hold dataclasses, tuples, sequences, mappings, plain values, or one of these or None. Raises TypeError,
+    ValueError or KeyError if the value is not of this kind, for instance since another version wrote it.
     """
     if not isinstance(value, Mapping):
         raise TypeError(f"{type(value).__name__}: is no {kind.__name__}")
@@ -108,10 +98,7 @@ def write_json(path: str | None, result: Any) -> None:
 def read_json(kind: type[Result], path: Path, option: str, command: str) -> Result:
     """What :func:`write_json` wrote; `option` named it, `command` makes it.
 
-    Raises
-    ------
-    DataError
-        If it is not there, something else, or of another version.
+    Raises DataError if it is not there, something else, or of another version.
     """
     if not path.is_file():
         raise DataError(f"{option} {path}: no such file; write it with {command}")

@@ -13,29 +13,18 @@ if TYPE_CHECKING:
 
 
 def page(title: str, about: str, sections: Iterable[Section]) -> str:
-    """A whole page.
-
-    Parameters
-    ----------
-    title, about : str
-        Its heading, and a sentence below it.
-    sections : iterable of Section
-        Its chapters, which the page links to; each has a title.
-    """
+    """A whole page: its heading, a sentence below it, and chapters that it links to; each has a title."""
     from spikeloom.compiler import __version__
 
     files = resources.files("spikeloom.runtime.report")
-    return (
-        _environment()
-        .get_template("page.html")
-        .render(
-            title=title,
-            about=about,
-            sections=list(sections),
-            style=files.joinpath("page.css").read_text("utf-8"),
-            script=files.joinpath("page.js").read_text("utf-8"),
-            version=__version__,
-        )
+    template = _environment().get_template("page.html")
+    return template.render(
+        title=title,
+        about=about,
+        sections=list(sections),
+        style=files.joinpath("page.css").read_text("utf-8"),
+        script=files.joinpath("page.js").read_text("utf-8"),
+        version=__version__,
     )
 
 

@@ -196,8 +196,8 @@ def _train(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
     except KeyboardInterrupt as interrupt:
         for job in jobs:
             clear(job)
-        done = [jobs[index] for index in waiting if index in results]
-        raise KeyboardInterrupt(_kept(done, jobs)) from interrupt
+        written = [str(jobs[index].output) for index in waiting if index in results]
+        raise KeyboardInterrupt(_kept(written, jobs)) from interrupt
     return [results[index] for index in range(len(jobs))]
 
 
@@ -232,9 +232,8 @@ def _require_right_start(jobs: Sequence[Job], *, resume: bool, some_finished: bo
         )
 
 
-def _kept(done: Sequence[Job], jobs: Sequence[Job]) -> str:
+def _kept(written: Sequence[str], jobs: Sequence[Job]) -> str:
     """What an interrupt left, and how to go on; empty if nothing."""
-    written = [str(job.output) for job in done]
     kept = [str(file) for job in jobs for file in states(job)]
     parts = [f"{', '.join(written)} {'is' if len(written) == 1 else 'are'} finished"] if written else []
     if kept:

@@ -177,7 +177,7 @@ def _layer_table(layers: Sequence[LayerFacts]) -> Table:
         "stored": [f"{layer.synapses_stored:,}" for layer in layers],
         "from itself": [f"{layer.synapses_from_itself or 0:,}" for layer in layers],
         "fan-in": [str(layer.max_fan_in) for layer in layers],
-        "bits": [_width(layer) for layer in layers],
+        "bits": [f"{len(x.exponents)}×{x.weight_bits}" if len(x.exponents) > 1 else str(x.weight_bits) for x in layers],
         "scale": [_span(layer.scale) for layer in layers],
         "threshold": [_span(layer.threshold) for layer in layers],
         "θ": [_span(layer.theta_realised) for layer in layers],
@@ -190,12 +190,6 @@ def _layer_table(layers: Sequence[LayerFacts]) -> Table:
     if all(layer.alpha_realised is None for layer in layers):
         del columns["α"]
     return Table(list(columns), [list(row) for row in zip(*columns.values(), strict=True)])
-
-
-def _width(layer: LayerFacts) -> str:
-    """Storage width of a synapse: bits, times planes where there are several."""
-    planes = len(layer.exponents)
-    return f"{planes}×{layer.weight_bits}" if planes > 1 else str(layer.weight_bits)
 
 
 def _span(values: OneOrMany) -> str:

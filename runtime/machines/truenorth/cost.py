@@ -31,7 +31,6 @@ NOT_PRICED = (
 )
 """Said with every estimate."""
 
-
 TICK = "tick"
 """Name of the one time table: every tick takes the same time, whatever happens in it."""
 

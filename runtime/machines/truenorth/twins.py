@@ -48,9 +48,11 @@ def find_twins(netlist: CrossbarNetlist, half: int) -> Twins:
     single = np.bincount(np.concatenate(aims), minlength=netlist.n_axons) == 1
     sources = _sources(netlist, aims, single)
     registers = _registers(netlist, single[aims[_WIRE]])
-    kind = np.arange(netlist.n_neurons)
+    kind, wired = np.arange(netlist.n_neurons), sources[:, 0] == _WIRE
     while True:
-        axon_kind = _axon_kinds(sources, kind)
+        known = sources.copy()
+        known[wired, 1] = kind[sources[wired, 1]]
+        axon_kind = np.unique(known, axis=0, return_inverse=True)[1].reshape(-1)
         pairs, weights = _pairs(axon_kind, neuron, axon, halves)
         found = _neuron_kinds(registers, pairs, weights)
         if found.max(initial=-1) == kind.max(initial=-1):
@@ -98,15 +100,6 @@ def _registers(netlist: CrossbarNetlist, alone: BoolArray) -> IntArray:
     columns = [*(getattr(netlist, name) for name in _REGISTERS), netlist.readout_class >= 0, *leads.T]
     rows = np.stack(columns, axis=1).astype(np.int64).reshape(netlist.n_neurons, -1)
     found: IntArray = np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
-    return found
-
-
-def _axon_kinds(sources: IntArray, kind: IntArray) -> IntArray:
-    """Kind of each axon from that of the neurons."""
-    known = sources.copy()
-    wired = known[:, 0] == _WIRE
-    known[wired, 1] = kind[known[wired, 1]]
-    found: IntArray = np.unique(known, axis=0, return_inverse=True)[1].reshape(-1)
     return found
 
 

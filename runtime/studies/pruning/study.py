@@ -71,7 +71,15 @@ def study(
     return Lean(
         taken=taken,
         samples={"training": len(training), "test": len(test)},
-        layers=tuple(_use(whole, layer, spikes) for layer in range(len(whole.layers))),
+        layers=tuple(
+            LayerUse(
+                name=layer.name,
+                neurons=layer.neurons,
+                on_chip=len(ids),
+                never_fired=int(np.count_nonzero(spikes[ids] == 0)),
+            )
+            for layer, ids in zip(whole.layers, map(whole.compartments_of, range(len(whole.layers))), strict=True)
+        ),
         taxels=tuple(
             TaxelUse(events=sent, training_differ=differing)
             for sent, differing in zip(events.tolist(), alone.tolist(), strict=True)
@@ -91,17 +99,6 @@ def _hops(loaded: LoadedNetwork) -> list[tuple[int, ...]]:
         return []
     every = tuple(range(len(checkpoint.hops)))
     return [*((hop,) for hop in every), *(every[first:] for first in every[1:-1])]
-
-
-def _use(netlist: Netlist, layer: int, spikes: IntArray) -> LayerUse:
-    """Neurons of a layer by what they do."""
-    ids = netlist.compartments_of(layer)
-    return LayerUse(
-        name=netlist.layers[layer].name,
-        neurons=netlist.layers[layer].neurons,
-        on_chip=len(ids),
-        never_fired=int(np.count_nonzero(spikes[ids] == 0)),
-    )
 
 
 def _changed(whole: IntArray, less: IntArray, labels: IntArray) -> Changed:

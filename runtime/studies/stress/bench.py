@@ -37,10 +37,6 @@ class Bench:
     files: tuple[str, ...]
     lengths: IntArray  # (recordings,) int64; bins of each
 
-    def steps(self) -> tuple[Events, IntArray]:
-        """Recordings in steps of the network, and how many steps each has."""
-        return in_steps(self.events, self.lengths, self.pair.netlist)
-
 
 def in_steps(events: Events, lengths: IntArray, netlist: Netlist) -> tuple[Events, IntArray]:
     """Recordings in steps of a network, and how many steps of each count."""
@@ -79,7 +75,7 @@ def warm_state(bench: Bench, before: int, rng: np.random.Generator) -> Inputs:
 
     Clocks start again with each.
     """
-    steps, lengths = bench.steps()
+    steps, lengths = in_steps(bench.events, bench.lengths, bench.pair.netlist)
     flat = with_clocks(steps, bench.pair.netlist.clocks)
     order = np.stack([rng.permutation(len(flat)) for _ in range(before)] + [np.arange(len(flat))], axis=1)
     return _last_of(order, lengths, lambda rows: _in_a_row(flat, lengths, order[rows]))
@@ -91,7 +87,7 @@ def longer(bench: Bench, rounds: int) -> Inputs:
 
     Clocks run on and end, as they would.
     """
-    steps, lengths = bench.steps()
+    steps, lengths = in_steps(bench.events, bench.lengths, bench.pair.netlist)
     order, clocks = np.repeat(np.arange(len(steps))[:, None], rounds, axis=1), bench.pair.netlist.clocks
     return _last_of(order, lengths, lambda rows: with_clocks(_in_a_row(steps, lengths, order[rows]), clocks))
 

@@ -11,7 +11,7 @@ from spikeloom.runtime.report.drawing import CHIP, FLOAT, GREY, WIDTH, Drawing, 
 from spikeloom.runtime.report.numbers import percent, wilson
 from spikeloom.runtime.report.sections import Figure, Section, Table, Text
 from spikeloom.runtime.studies.stress.pair import SIDES
-from spikeloom.runtime.studies.stress.results import Curve, Point, Spread, Stress, shown
+from spikeloom.runtime.studies.stress.results import Curve, Spread, Stress, shown
 
 NONE = "–"
 
@@ -80,7 +80,7 @@ def figure(result: Stress, title: str = "", *, across: int = 3) -> Drawing:
         axes.axhline(100 / result.classes, color=GREY, ls=":", lw=1)
         for side in SIDES:
             _curve(drawing, axes, name, curve, side)
-        axes.set_xticks(range(len(curve.levels)), list(map(_level, curve.levels)), fontsize=7)
+        axes.set_xticks(range(len(curve.levels)), [shown(point.level) for point in curve.levels], fontsize=7)
         axes.set(xlim=(-0.5, len(curve.levels) - 0.5), ylim=(-3, 103), title=_heading(name, curve), xlabel=curve.unit)
         axes.grid(axis="y")
     handles, labels = rows.flat[0].get_legend_handles_labels()
@@ -101,7 +101,7 @@ def _curve(drawing: Drawing, axes: Any, name: str, curve: Curve, side: str) -> N
     if (leaves := curve.breaks[side].leaves) is not None:
         axes.axvline(order.index(leaves) + 2 * shift, color=colour, ls=dash, lw=1, alpha=0.6)
     for x, point, a, b, c in zip(at, curve.levels, low, mean, high, strict=True):
-        tip = f"{_heading(name, curve)}; {_level(point)}, {side}: {b:.1f} % ({a:.1f} … {c:.1f})"
+        tip = f"{_heading(name, curve)}; {shown(point.level)}, {side}: {b:.1f} % ({a:.1f} … {c:.1f})"
         drawing.tips.append((axes, x, b, tip))
 
 
@@ -150,17 +150,13 @@ def _heading(name: str, curve: Curve) -> str:
     return f"{name}: {curve.verdict}"
 
 
-def _level(point: Point) -> str:
-    return shown(point.level)
-
-
 def _table(curve: Curve, caption: str = "", *, most: int | None = None) -> Table:
     """Levels side by side; accuracies of both sides, equal decisions and common spikes below."""
     points = curve.levels
     rows = [[side, *(_accuracy(point.spread(side)) for point in points)] for side in SIDES]
     rows.append(["equal", *(f"{100 * point.equal:.0f}" for point in points)])
     rows.append(["spikes", *(f"{100 * min(point.common.values()):.0f}" for point in points)])
-    return Table(["", *map(_level, points)], rows, caption, most=most)
+    return Table(["", *(shown(point.level) for point in points)], rows, caption, most=most)
 
 
 def _accuracy(spread: Spread) -> str:

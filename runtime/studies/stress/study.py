@@ -15,7 +15,6 @@ from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import sha256_of
 from spikeloom.runtime.equivalence.breakdowns import undecided
-from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.report.console import Progress, progress
 from spikeloom.runtime.studies.stress.bench import NAMES, Bench, bench_of, by_length, whole
 from spikeloom.runtime.studies.stress.pair import SIDES, TAXELS, Inputs, Level, Outcome, evaluate
@@ -55,22 +54,18 @@ def study(arguments: argparse.Namespace, names: Sequence[str], requirements: Seq
         not_applicable={name: reason for name, reason in reasons.items() if reason is not None},
         required=tuple(map(str, requirements)),
         missed=unmet(requirements, curves),
-        provenance=_provenance(arguments, loaded, data),
-    )
-
-
-def _provenance(arguments: argparse.Namespace, loaded: LoadedNetwork, data: str) -> Provenance:
-    return Provenance(
-        spikeloom=__version__,
-        netlist_sha256=sha256_of(arguments.netlist),
-        checkpoint_sha256=loaded.sha256,
-        **loaded.read_as,
-        graph=loaded.graph,
-        data_sha256=data,
-        netlist=Path(arguments.netlist).name,
-        checkpoint=Path(arguments.checkpoint).name,
-        data=Path(arguments.data).name,
-        split=arguments.split,
+        provenance=Provenance(
+            spikeloom=__version__,
+            netlist_sha256=sha256_of(arguments.netlist),
+            checkpoint_sha256=loaded.sha256,
+            **loaded.read_as,
+            graph=loaded.graph,
+            data_sha256=data,
+            netlist=Path(arguments.netlist).name,
+            checkpoint=Path(arguments.checkpoint).name,
+            data=Path(arguments.data).name,
+            split=arguments.split,
+        ),
     )
 
 
