@@ -219,10 +219,7 @@ def test_calibration_allows_what_it_says():
 def two_classes(*neurons):
     """Output neurons of classes 0, 1, …; input 0 excites all of them by 100."""
     netlist = build(
-        list(neurons),
-        [Axon(source=0, targets=tuple((i, 100) for i in range(len(neurons))))],
-        n_inputs=1,
-        depths=[0],
+        list(neurons), [Axon(source=0, targets=tuple((i, 100) for i in range(len(neurons))))], n_inputs=1, depths=[0]
     )
     return replace(netlist, classes=len(neurons), readout_class=read_only(range(len(neurons))))
 

@@ -175,26 +175,3 @@ def test_the_shipped_network_of_longer_bins(tmp_path, objects_zip):
     mean = report["costs"]["per_inference"]
     assert 1.1e6 < mean["synaptic_operations"] < 1.2e6
     assert 30e-6 < mean["energy_j"]["davies2018"] < 36e-6
-
-
-# -- without the recordings --------------------------------------------------------------------------------------------
-
-WITHOUT_TORCH = """
-import sys
-from spikeloom.runtime.cli import main
-code = main(sys.argv[1:])
-unwanted = "torch" in sys.modules
-sys.exit("torch was imported" if unwanted else code)
-"""
-
-
-@pytest.mark.parametrize(
-    "words",
-    [["run", "net.loom", "--data", "data", "--spikes", "out.npz"], ["estimate", "net.loom", "--data", "data"]],
-    ids=["run", "estimate"],
-)
-def test_run_and_estimate_never_import_torch(place, words):
-    done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_TORCH, *words], cwd=place, capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")

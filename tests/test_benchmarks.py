@@ -102,11 +102,7 @@ def test_workers_run_in_pairs_and_those_that_cannot_are_skipped(module, task):
             name=name, rival="ours", options=(mode, "few"), computes="", together=False, against=against
         )
 
-    entries = [
-        entry("ours", "spikes"),
-        entry("rival", "totals", "spikes"),
-        entry("odd", "fastest", "counts"),
-    ]
+    entries = [entry("ours", "spikes"), entry("rival", "totals", "spikes"), entry("odd", "fastest", "counts")]
     found = rivals.measure(task.path, entries, {}, rounds=1)
     assert found["odd"]["skipped"].startswith("there is no mode fastest")
     assert found["rival"]["against"] == "ours"

@@ -227,7 +227,7 @@ NEEDED = {
     "export --help": "networkx",
     "export g.loom --to netx -o g.net": "h5py",
     "verify --help": "numba",
-    "run g.loom --data synthetic": "",
+    "run g.loom --data synthetic --spikes g.npz": "",
     "estimate g.loom --data synthetic": "",
     "verify g.loom --checkpoint pretrained:grasps --data synthetic --limit 2": "",
 }

@@ -176,13 +176,7 @@ def test_every_lacking_price_is_named():
     assert costs.energy == {}
     # nothing was stored dense here, and a spike may be priced with its neuron's update
     assert costs.unpriced == {
-        "poor": (
-            "synaptic_operation_sparse",
-            "neuron_idle",
-            "neuron_active",
-            "hop_east_west",
-            "hop_north_south",
-        )
+        "poor": ("synaptic_operation_sparse", "neuron_idle", "neuron_active", "hop_east_west", "hop_north_south")
     }
 
 

@@ -228,9 +228,7 @@ OPTIONS = [
     ("--cores-for fc1=1|2 cores at least", laying_out((1, 4, 9), small_target(core_axons_out=7), fc1=1, fc2=3)),
     ("--cores-for fc1=7|3 chips|6 cores", lambda: least_cores(full(6, 8), {"fc1": 7}, small_target(chip_cores=2), 3)),
 ]
-NETWORKS = [
-    ("fc1|6 bits|32767 units|more bits", rounding(1e6, packings=(Packing(bits=6),))),
-]
+NETWORKS = [("fc1|6 bits|32767 units|more bits", rounding(1e6, packings=(Packing(bits=6),)))]
 RECORDINGS = [
     ("calibration|split is empty", compiling(training_events=EVENTS[:0])),
     ("calibration|split is empty", calibrating((0, 5, 2))),

@@ -41,8 +41,7 @@ def made(events, **changes) -> Recordings:
 def one(path, **options):
     """Events of one recording as (taxel, polarity, bin), and the counts."""
     recordings = load_data(path, **options)
-    counts = recordings.counts
-    return np.argwhere(recordings.events[0]).tolist(), counts
+    return np.argwhere(recordings.events[0]).tolist(), recordings.counts
 
 
 @pytest.mark.parametrize("bin_s", ["0.02", "0.001", "0.1", "0.03", "0.7", "1"])
@@ -185,19 +184,17 @@ def test_flat_folders_stand_for_any_split(write, save, tmp_path):
     np.save(tmp_path / "d" / "sample_4_label_5.npy", np.ones((2, 2, 3), dtype=np.float32))
     for split in ("train", "test", "third"):
         recordings = load_data(tmp_path / "d", split)
-        counts = recordings.counts
         assert recordings.files == ("a_label_0.CSV", "b_label_1.csv", "c.npz", "sample_4_label_5.npy")
         assert recordings.labels.tolist() == [0, 1, 2, 5]
         assert recordings.split == split
         assert recordings.events.shape == (4, 2, 2, 26)
         assert recordings.step_counts.tolist() == [26, 6, 1, 3]
-        assert (counts.events, counts.shorter) == (3 + 12, 3)
+        assert (recordings.counts.events, recordings.counts.shorter) == (3 + 12, 3)
         assert recordings.events[3].sum(axis=(0, 1)).tolist() == [4] * 3 + [0] * 23  # padded at the end
     assert data_splits(tmp_path / "d") == ()
     first = load_data(tmp_path / "d", limit=2, taxels=7)
-    counts = first.counts
     assert first.events.shape == (2, 7, 2, 26)
-    assert counts.shorter == 1
+    assert first.counts.shorter == 1
 
 
 def test_folders_with_splits(write, tmp_path):
@@ -244,8 +241,7 @@ def test_the_released_layout_goes_its_own_way(tmp_path):
     for name in ("d", "d.zip", "again.zip"):
         write_released(tmp_path / name, [split])
         recordings = load_data(tmp_path / name, classes=6, taxels=39)
-        counts = recordings.counts
-        assert counts is None
+        assert recordings.counts is None
         assert np.array_equal(recordings.events, grasps.events)
         assert recordings.files == tuple(f"sample_{i:02}_label_{i % 6}.npy" for i in range(12))
         assert data_splits(tmp_path / name) == ("test",)
@@ -270,9 +266,8 @@ def test_any_recording_survives_as_events(tmp_path, data):
         f"{step * BIN_S + late:.6f},{taxel},{polarity or falling}\n"
         for (taxel, polarity, step), late in zip(rows.tolist(), inside.tolist(), strict=True)
     )
-    path = tmp_path / "a.csv"
-    path.write_text(text)
-    recordings = load_data(path)
+    (tmp_path / "a.csv").write_text(text)
+    recordings = load_data(tmp_path / "a.csv")
     counts = recordings.counts
     assert np.array_equal(recordings.events[0], grid)
     assert (counts.events, counts.duplicates) == (len(rows), len(found) // 2)
@@ -379,10 +374,9 @@ def listed(write):
 def test_a_table_gives_labels(listed):
     folder = listed("own/labels.csv", "File, weight ,LABEL\na.csv,3.5,7\n\nb_label_2.csv,,2\nother.csv,,1\n").parent
     recordings = load_data(folder)
-    counts = recordings.counts
     assert recordings.files == ("a.csv", "b_label_2.csv", "c.csv")
     assert recordings.labels.tolist() == [7, 2, UNLABELLED]
-    assert counts.notes == ("own: labels.csv: gives the labels of 2 of 3 recordings",)
+    assert recordings.counts.notes == ("own: labels.csv: gives the labels of 2 of 3 recordings",)
 
 
 def test_a_table_above_the_splits(write):

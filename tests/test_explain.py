@@ -19,15 +19,7 @@ from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_fo
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence.explanation.causes import explain
-from spikeloom.runtime.equivalence.explanation.results import (
-    BETA,
-    BIAS,
-    LEFT_OUT,
-    SATURATION,
-    TIE,
-    TRUNCATION,
-    WEIGHTS,
-)
+from spikeloom.runtime.equivalence.explanation.results import BETA, BIAS, LEFT_OUT, SATURATION, TIE, TRUNCATION, WEIGHTS
 from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots, sources_of
 from spikeloom.runtime.equivalence.rounding import LayerRounding, Rounding
 from spikeloom.runtime.machines.loihi1 import engine
@@ -163,15 +155,7 @@ def test_equal_spikes_have_no_diagnosis():
         # 128, 32, 8, 2, and then nothing instead of a half
         (chain([[0.5]], beta=0.25), ([2],), "x . . . x", TRUNCATION, 4, (128, 128), 0.5 / 256),
         # the register ends at -65.5 membrane units, the float model goes down to -80
-        (
-            chain([[-16.0, 16.0]], beta=1.0),
-            ([1000], (7,)),
-            "x. x. x. x. x. .x .x .x .x .x",
-            SATURATION,
-            9,
-            None,
-            None,
-        ),
+        (chain([[-16.0, 16.0]], beta=1.0), ([1000], (7,)), "x. x. x. x. x. .x .x .x .x .x", SATURATION, 9, None, None),
         # 0.1 + 0.2 > 0.3 in float64; on the chip 10 + 20 are not more than 30
         (chain([[0.1, 0.2]], theta=0.3), ([30],), "xx", TIE, 0, (1920, 1920), None),
     ],

@@ -116,8 +116,6 @@ def test_a_training_does_not_depend_on_the_longest_recording(folder):
 
 
 BINS = 3
-
-
 TRAINED = ("--graph", "manual", "--epochs", "1")
 
 
@@ -184,10 +182,7 @@ def test_unusable_bins_are_refused(place, tmp_path, bins):
             f"train --system {NATIVE} --graph manual --data fine --join 2 -o y.pt",
             f"--join 2: a network of system {NATIVE} takes bins as they are|spikeloom data convert --join",
         ),
-        (
-            "verify plain.loom --checkpoint x.pt --data fine",
-            f"netlist and checkpoint disagree|bins of a step {BINS}",
-        ),
+        ("verify plain.loom --checkpoint x.pt --data fine", f"netlist and checkpoint disagree|bins of a step {BINS}"),
     ],
 )
 def test_other_bins_are_refused(refusal, words, told):
