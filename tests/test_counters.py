@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from commands import as_json, run
 from numpy.testing import assert_array_equal
+from oracles import refused
 
 from spikeloom.compiler import compile_network
 from spikeloom.compiler.archive import read_members
@@ -172,8 +173,7 @@ def test_impossible_plans_are_refused(plan, said):
 
 def test_recordings_without_events_are_refused():
     silent = replace(made(), events=np.zeros((30, TAXELS, 2, STEPS), np.uint8))
-    with pytest.raises(DataError, match="none of them spikes"):
-        fit(counted(silent, PLANS[0]), CLASSES)
+    refused(DataError, "none of them spikes", fit, counted(silent, PLANS[0]), CLASSES)
 
 
 @pytest.mark.parametrize("plan", PLANS, ids=str)
@@ -200,8 +200,7 @@ def test_levels_are_told_apart_by_their_boundaries():
     ]
     assert right[0] < 0.9
     assert right[1] == 1
-    with pytest.raises(OptionError, match="--levels 2: 3 classes"):
-        fit(counted(data, replace(plan, levels=2)), CLASSES)
+    refused(OptionError, "--levels 2: 3 classes", fit, counted(data, replace(plan, levels=2)), CLASSES)
 
 
 def test_folds_share_out_every_class():

@@ -177,8 +177,7 @@ def server(monkeypatch, tmp_path):
 
 def test_fetches_once_and_is_found(server, tmp_path):
     path = tmp_path / "data" / "Ev-Objects.zip"
-    with pytest.raises(DataError, match=r"objects: not on this machine .*run 'spikeloom data fetch objects'"):
-        find_data("objects")
+    refused(DataError, "objects: not on this machine|run 'spikeloom data fetch objects'", find_data, "objects")
     report, _, code = start("fetch", "objects")
     assert (code, report["new"], report["path"], report["data"]) == (0, True, str(path), "objects")
     assert path.read_bytes() == CONTENT

@@ -314,8 +314,7 @@ def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(np.lib.format, "write_array", breaks)
     for name in ("d", "d.zip"):
         calls.clear()
-        with pytest.raises(OSError, match="No space left on device"):
-            write_released(tmp_path / name, [grasps])
+        refused(OSError, "No space left on device", write_released, tmp_path / name, [grasps])
     assert list(tmp_path.iterdir()) == []
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_files import events, small_checkpoint
-from oracles import probed
+from oracles import probed, refused
 from random_networks import (
     assert_same_layers,
     chain,
@@ -81,8 +81,7 @@ def test_a_pass_that_breaks_a_rule_is_named_at_once(name, change):
     ]
     work, _ = start(expand(random_checkpoint(), ring(5)), Options(), load_target("loihi1"))
     seen = []
-    with pytest.raises(VerifyError):
-        run(passes, work, lambda name, _: seen.append(name))
+    refused(VerifyError, "", run, passes, work, lambda name, _: seen.append(name))
     assert name not in seen
 
 

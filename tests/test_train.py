@@ -320,8 +320,7 @@ def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
 
     state = tmp_path / "x.state"
     options = {"bits": [2], "epochs": 4, "seed": 3, "state": state}
-    with pytest.raises(KilledError):
-        finetune(checkpoint, adjacency, train, test, LOIHI, after_epoch=killed, **options)
+    refused(KilledError, "", finetune, checkpoint, adjacency, train, test, LOIHI, after_epoch=killed, **options)
     rest = finetune(checkpoint, adjacency, train, test, LOIHI, resume=True, **options)
     assert rest.history == whole.history
     for name, array in whole.weights.items():

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import swept
 from commands import RUNTIME, as_json, refusal, run
+from oracles import refused
 from swept import Square, begun, points, square
 
 from spikeloom.compiler.errors import DataError, OptionError, UnfinishedError
@@ -316,14 +317,12 @@ def test_an_interrupt_keeps_all(tmp_path):
 
 def test_what_is_refused(tmp_path):
     made = points(tmp_path / "log", 2)
-    with pytest.raises(OptionError, match="--jobs 0"):
-        swept_here(tmp_path, made, jobs=0)
+    refused(OptionError, "--jobs 0", swept_here, tmp_path, made, jobs=0)
     swept_here(tmp_path, made, jobs=1)
     with only_one(tmp_path / "x.store"), pytest.raises(OptionError, match="another process is working on it"):
         swept_here(tmp_path, made)
     (tmp_path / "x.store").write_text("precious" * 100)
-    with pytest.raises(DataError, match="is no store of results"):
-        swept_here(tmp_path, made)
+    refused(DataError, "is no store of results", swept_here, tmp_path, made)
     assert (tmp_path / "x.store").read_text() == "precious" * 100
 
 
