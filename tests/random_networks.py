@@ -154,7 +154,7 @@ def random_checkpoint(*, taxels=5, features=3, hops=4, sizes=(6, 5, 4), seed=0, 
 
 
 def _wiring(draw):
-    """Population sizes by depth, and projections as (pre, post): between neighbouring depths, and to itself."""
+    """A sensor, population sizes by depth, projections (pre, post, shape) to the next depth and to itself, votes."""
     by_depth = draw(st.lists(st.lists(st.integers(1, 7), min_size=1, max_size=2), min_size=1, max_size=3))
     ids, sizes = [], []
     for layer in by_depth:
@@ -165,28 +165,20 @@ def _wiring(draw):
         for post in after:
             pairs += [(pre, post) for pre in draw(st.lists(st.sampled_from(before), min_size=1, unique=True))]
     pairs += [(post, post) for post in draw(st.lists(st.integers(0, len(sizes) - 1), unique=True))]
-    return sizes, pairs
-
-
-def _structure(rng, density, rows, columns):
-    return rng.random((rows, columns)) < density
-
-
-def _readout(draw, sizes):
+    sensor = Input(taxels=draw(st.integers(1, 5)), polarities=draw(st.sampled_from([1, 2])))
+    every = {INPUT: sensor.size} | dict(enumerate(sizes))
     classes = draw(st.integers(1, 4))
     label = draw(st.lists(st.integers(0, classes - 1), min_size=sizes[-1], max_size=sizes[-1]))
-    return Readout(population=len(sizes) - 1, label=np.array(label)), classes
+    votes = {"readout": Readout(population=len(sizes) - 1, label=np.array(label)), "classes": classes}
+    return sensor, sizes, [(pre, post, (every[post], every[pre])) for pre, post in pairs], votes
 
 
 @st.composite
 def float_networks(draw, *, betas=(0.0, 0.2, 0.5, 0.9)) -> Network:
     """Float networks whose weights and biases are multiples of 1/64, so that sums are exact in any order."""
-    sizes, pairs = _wiring(draw)
-    sensor = Input(taxels=draw(st.integers(1, 5)), polarities=draw(st.sampled_from([1, 2])))
+    sensor, sizes, pairs, votes = _wiring(draw)
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     spread, density = draw(st.sampled_from([1, 8, 64, 300])), draw(st.sampled_from([0.3, 0.8, 1.0]))
-    every = {INPUT: sensor.size} | dict(enumerate(sizes))
-    readout, classes = _readout(draw, sizes)
     return Network(
         input=sensor,
         populations=tuple(
@@ -202,32 +194,26 @@ def float_networks(draw, *, betas=(0.0, 0.2, 0.5, 0.9)) -> Network:
             Projection(
                 pre=pre,
                 post=post,
-                weight=stored(
-                    rng.integers(-spread, spread + 1, (every[post], every[pre])) / 64,
-                    _structure(rng, density, every[post], every[pre]),
-                ),
+                weight=stored(rng.integers(-spread, spread + 1, shape) / 64, rng.random(shape) < density),
             )
-            for pre, post in pairs
+            for pre, post, shape in pairs
         ),
-        readout=readout,
-        classes=classes,
+        **votes,
     )
 
 
 @st.composite
 def integer_networks(draw, *, exponents=(-1, 0, 1, 3), bits=BITS) -> IntegerNetwork:
     """Integer networks with registers at their extremes, several thresholds, and stored zeros."""
-    sizes, pairs = _wiring(draw)
-    sensor = Input(taxels=draw(st.integers(1, 5)), polarities=draw(st.sampled_from([1, 2])))
+    sensor, sizes, pairs, votes = _wiring(draw)
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     density = draw(st.sampled_from([0.0, 0.3, 0.8, 1.0]))
-    every = {INPUT: sensor.size} | dict(enumerate(sizes))
 
-    def projection(pre, post):
+    def projection(pre, post, shape):
         width = draw(st.sampled_from(bits))
         step = weight_step(width)
-        structure = _structure(rng, density, every[post], every[pre])
-        mantissa = rng.integers(-256 // step, (256 - step) // step, structure.shape, endpoint=True) * step
+        structure = rng.random(shape) < density
+        mantissa = rng.integers(-256 // step, (256 - step) // step, shape, endpoint=True) * step
         return IntegerProjection(
             pre=pre,
             post=post,
@@ -236,7 +222,6 @@ def integer_networks(draw, *, exponents=(-1, 0, 1, 3), bits=BITS) -> IntegerNetw
             bits=width,
         )
 
-    readout, classes = _readout(draw, sizes)
     return IntegerNetwork(
         input=sensor,
         populations=tuple(
@@ -251,9 +236,8 @@ def integer_networks(draw, *, exponents=(-1, 0, 1, 3), bits=BITS) -> IntegerNetw
             )
             for i, size in enumerate(sizes)
         ),
-        projections=tuple(projection(pre, post) for pre, post in pairs),
-        readout=readout,
-        classes=classes,
+        projections=tuple(projection(*pair) for pair in pairs),
+        **votes,
     )
 
 

@@ -12,14 +12,10 @@ import torch
 from commands import as_json
 from made_files import TAXELS
 from oracles import refused
-from random_netlists import assert_equal, by_engine
 from torch import nn
 
 import spikeloom as api
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.targets.loihi1.netlist import read_netlist
-from spikeloom.models.recordings.events import load_data
-from spikeloom.runtime.machines.loihi1 import spec
 from spikeloom.runtime.report.encode import encode
 
 
@@ -150,16 +146,6 @@ def test_verify_passes(compiled, released_checkpoint, objects_zip, shared_dir):
     first = report["first_divergence"]
     assert first["file"] == expected["files"][0]
     assert (first["float_membrane"] > first["theta"]) != (first["chip_membrane"] > first["chip_theta"])
-
-
-@pytest.mark.recordings
-def test_specification_equals_engine_on_objects(compiled, objects_zip):
-    netlist, objects = read_netlist(compiled[0]), load_data(objects_zip, "test").events
-    assert objects.shape == (144, 39, 2, 250)
-    for recording in objects[[0, 143], ..., :80].reshape(2, netlist.n_inputs, -1):
-        expected = spec.simulate(netlist, recording)
-        assert_equal(by_engine(netlist, recording), expected)
-        assert all(expected.counts.spikes[netlist.compartments_of(layer)].any() for layer in range(4))
 
 
 @pytest.mark.recordings

@@ -65,21 +65,11 @@ def test_compile_counts_and_says_what_was_realised(as_json, tmp_path, place):
 
 def test_provenance_names_everything_that_decided(as_json, place):
     report = as_json("inspect", "net.loom")
-    assert report["provenance"] == {
-        "spikeloom": __version__,
-        "checkpoint_sha256": hashlib.sha256((place / "net.pt").read_bytes()).hexdigest(),
-        "run": 0,
-        "weights": "last",
-        "graph": "ring",
-        "weight_bits": 8,
-        "planes": 1,
-        "scale_groups": 1,
-        "spike_exact": False,
-        "keep_all": False,
-        "prune_unused": False,
-        "calibrated": True,
-        "compensated": ["conv1", "fc1", "fc2", "fc3"],
-    }
+    source = {"checkpoint_sha256": hashlib.sha256((place / "net.pt").read_bytes()).hexdigest()}
+    source |= {"spikeloom": __version__, "run": 0, "weights": "last", "graph": "ring"}
+    storage = {"weight_bits": 8, "planes": 1, "scale_groups": 1, "compensated": ["conv1", "fc1", "fc2", "fc3"]}
+    options = {"spike_exact": False, "keep_all": False, "prune_unused": False, "calibrated": True}
+    assert report["provenance"] == source | storage | options
 
 
 def test_dumps_go_to_standard_error(spikeloom, tmp_path):

@@ -263,15 +263,6 @@ def test_all_details_have_the_same_spikes_and_events(small, found):
             np.testing.assert_array_equal(priced.costs.energy[name], energy)
 
 
-def test_parts_and_cores_add_up_to_the_whole(found):
-    _, priced = found["cycle"]
-    for name, whole in priced.costs.energy.items():
-        parts = cost.by_part(LOIHI, priced.costs.events)[name]
-        assert set(parts) == {"synapse", "soma", "network"}
-        np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-12)
-        np.testing.assert_allclose(priced.cores[name].sum(axis=1), whole.sum(axis=1), rtol=1e-12)
-
-
 def test_a_batch_is_its_recordings_one_by_one(small, found):
     netlist, recordings = small
     for index, length in enumerate(LENGTHS):

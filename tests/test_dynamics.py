@@ -160,17 +160,6 @@ def test_gradients_of_a_whole_network_equal_plain_autograd(surrogate, dynamics):
         assert plain.abs().max() > 0
 
 
-def test_recordings_that_were_filled_up_count_as_long_as_they_are():
-    network = SpikingNet(SMALL, ADJACENCY, seed=1)
-    louder(network)
-    events = (torch.rand(12, 2, 39, 2, generator=torch.Generator().manual_seed(2)) < 0.3).float()
-    events[7:, 1] = 0
-    together = network(events, torch.tensor([12, 7]))
-    assert_allclose(together[0].detach(), network(events[:, :1])[0].detach(), atol=1e-6)
-    assert_allclose(together[1].detach(), network(events[:7, 1:])[0].detach(), atol=1e-6)
-    assert together.max() > 0
-
-
 # --- files ---------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("system", ["tactilesgnet", "gcn", "mlp", "grid-cnn"])
 def test_a_checkpoint_holds_the_dynamics_and_its_float_model_is_the_network(tmp_path, system):

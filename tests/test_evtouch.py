@@ -88,12 +88,7 @@ def test_files_sort_as_strings_and_limit_takes_the_first(tmp_path):
     names = [f"sample_{n}_label_{n % 7}.npy" for n in (2, 10, 1, 100)]
     path = archive(tmp_path / "my.zip", {f"top/train/{name}": GOOD for name in names})
     recordings = load_data(path, "train")
-    assert recordings.files == (
-        "sample_100_label_2.npy",
-        "sample_10_label_3.npy",
-        "sample_1_label_1.npy",
-        "sample_2_label_2.npy",
-    )
+    assert recordings.files == tuple(f"sample_{n}_label_{n % 7}.npy" for n in (100, 10, 1, 2))
     assert recordings.labels.tolist() == [2, 3, 1, 2]
     assert load_data(path, "train", limit=3).files == recordings.files[:3]
 

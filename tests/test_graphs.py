@@ -43,25 +43,6 @@ def test_every_released_edge_list_is_reproduced_in_its_order_and_the_plain_name_
     assert [tuple(row) for row in build_graph(name).edges.tolist()] == list(dict.fromkeys(map(tuple, rows)))
 
 
-@pytest.mark.parametrize(
-    ("name", "edges", "collapsed"),
-    [
-        ("manual", 146, 146),
-        ("knn:1", 78, 66),
-        ("knn:3", 234, 156),
-        ("knn:8", 624, 382),
-        ("mst:0", 76, 76),
-        ("mst:1.5", 84, 76),
-        ("mst:2", 132, 96),
-        ("mst:3.5", 330, 254),
-        ("mst:4", 406, 330),
-    ],
-)
-def test_numbers_of_edges(name, edges, collapsed):
-    assert len(build_graph(f"released:{name}").edges) == edges
-    assert len(build_graph(name).edges) == collapsed
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_every_graph_is_symmetric_without_loops(name):
     adjacency = normalised_adjacency(build_graph(name).edges, 39)

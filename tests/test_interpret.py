@@ -42,23 +42,33 @@ def weights_hit(incoming, spikes, post, neuron, t):
             yield from (w for w, spike in zip(weight[neuron], spikes[pre][heard], strict=True) if spike)
 
 
-def simulate_float(network, events):
-    """One neuron and one step at a time, in Python floats."""
-    spikes = {INPUT: events.tolist()}
-    membranes = {}
+def simulate(network, events, weights, step):
+    """Spikes and membranes, one neuron and one step at a time; `step` gives a neuron's next state, both after it."""
+    spikes, membranes = {INPUT: events.tolist()}, {}
     for post, population in enumerate(network.populations):
-        steps = len(events)
-        spikes[post] = [[False] * population.size for _ in range(steps)]
-        membranes[post] = [[0.0] * population.size for _ in range(steps)]
-        incoming = [(p.pre, p.weight.toarray().tolist()) for p in network.projections if p.post == post]
-        u, s = [0.0] * population.size, [0] * population.size
-        for t in range(steps):
+        spikes[post] = [[False] * population.size for _ in events]
+        membranes[post] = [[0] * population.size for _ in events]
+        incoming = [(pre, weight.tolist()) for pre, weight in weights(post).items()]
+        states = [(0, 0)] * population.size
+        for t in range(len(events)):
             for i in range(population.size):
-                current = sum(weights_hit(incoming, spikes, post, i, t))
-                u[i] = population.beta * u[i] * (1 - s[i]) + (current + float(population.bias[i]))
-                s[i] = int(u[i] > population.theta)
-                spikes[post][t][i], membranes[post][t][i] = bool(s[i]), u[i]
+                arrived = sum(weights_hit(incoming, spikes, post, i, t))
+                states[i], membranes[post][t][i], spikes[post][t][i] = step(population, i, arrived, states[i])
     return spikes, membranes
+
+
+def simulate_float(network, events):
+    """In Python floats."""
+
+    def step(population, i, arrived, state):
+        u, fired = state
+        u = population.beta * u * (1 - fired) + (arrived + float(population.bias[i]))
+        return (u, u > population.theta), u, u > population.theta
+
+    def weights(post):
+        return {p.pre: p.weight.toarray() for p in network.projections if p.post == post}
+
+    return simulate(network, events, weights, step)
 
 
 def decayed(value, lost):
@@ -67,26 +77,21 @@ def decayed(value, lost):
 
 
 def simulate_integer(network, events):
-    """One neuron and one step at a time, in Python integers: the rule of hardware references, layers aligned."""
-    spikes = {INPUT: events.tolist()}
-    membranes = {}
-    for post, population in enumerate(network.populations):
-        steps = len(events)
-        spikes[post] = [[False] * population.size for _ in range(steps)]
-        membranes[post] = [[0] * population.size for _ in range(steps)]
-        incoming = [(pre, weight.tolist()) for pre, weight in dense_weights(network, post).items()]
-        u, v = [0] * population.size, [0] * population.size
-        bias = [int(m) * 2 ** int(e) for m, e in zip(population.bias_mantissa, population.bias_exponent, strict=True)]
-        for t in range(steps):
-            for i in range(population.size):
-                arrived = sum(weights_hit(incoming, spikes, post, i, t))
-                u[i] = decayed(u[i], population.decay_u + 1) + 64 * arrived
-                v[i] = decayed(v[i], population.decay_v) + u[i] + bias[i]
-                v[i] = max(-(2**23 - 1), min(2**23 - 1, v[i]))
-                spikes[post][t][i], membranes[post][t][i] = v[i] > 64 * int(population.threshold[i]), v[i]
-                if spikes[post][t][i]:
-                    v[i] = 0
-    return spikes, membranes
+    """In Python integers: the rule of hardware references, layers aligned."""
+
+    def step(population, i, arrived, state):
+        u, v = state
+        u = decayed(u, population.decay_u + 1) + 64 * arrived
+        v = (
+            decayed(v, population.decay_v)
+            + u
+            + int(population.bias_mantissa[i]) * 2 ** int(population.bias_exponent[i])
+        )
+        v = max(-(2**23 - 1), min(2**23 - 1, v))
+        fired = v > 64 * int(population.threshold[i])
+        return (u, 0 if fired else v), v, fired
+
+    return simulate(network, events, lambda post: dense_weights(network, post), step)
 
 
 @pytest.mark.parametrize(

@@ -81,6 +81,12 @@ def test_verify_compares_each_recording_at_its_own_length(folder):
     assert together["decision_agreement"] == pytest.approx(np.mean([part["decision_agreement"] for part in parts]))
 
 
+def test_the_page_draws_a_recording_at_its_own_length(folder):
+    words = ("report", "x.loom", "--checkpoint", "x.pt", "--data", "data", "-o", "x.html", "--recording", "0")
+    recording = as_json(*words)["recording"]
+    assert (recording["file"], recording["steps"]) == (files(folder)[0].name, STEPS[0])
+
+
 def test_estimate_prices_each_recording_at_its_own_length(folder):
     together = as_json("estimate", "x.loom", "--data", "data")
     parts = [as_json("estimate", "x.loom", "--data", str(file)) for file in files(folder)]

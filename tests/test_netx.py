@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from commands import as_json, run
+from commands import as_json
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from made_netx import conv, dense, even, events, flatten, given_input, neuron, write
@@ -26,7 +26,6 @@ from spikeloom.compiler.formats.netx.reader import integers_of, read_netx
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.sensor_layout import sensor_layout
-from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.runtime.machines.loihi1 import engine
 
 W = np.full((4, 6), 2)
@@ -288,19 +287,6 @@ def test_the_command_counts_what_it_moves(tmp_path):
     back = read_netx(out, polarities=1).network
     assert back.input.size == network.input.size
     assert [population.decay_u for population in back.populations] == [p.decay_u for p in network.populations]
-
-
-def test_what_is_exact_comes_back(tmp_path):
-    rng = np.random.default_rng(6)
-    path = write(tmp_path / "a.net", dense(even(rng, 12, 6), bias=even(rng, 12, most=8)), dense(even(rng, 5, 12)))
-    assert run("compile", path, "--keep-all", "-o", tmp_path / "a.loom")[0] == 0
-    code, text, _ = run("export", tmp_path / "a.loom", "--to", "netx", "-o", tmp_path / "b.net")
-    assert code == 0
-    assert text.splitlines()[1] == "biases, thresholds and weights are the netlist's"
-    assert run("compile", tmp_path / "b.net", "--keep-all", "-o", tmp_path / "b.loom")[0] == 0
-    ours, back = (lift(read_netlist(tmp_path / name)) for name in ("a.loom", "b.loom"))
-    for one, other in zip(ours.projections, back.projections, strict=True):
-        assert_array_equal(one.effective().toarray(), other.effective().toarray())
 
 
 @pytest.mark.parametrize(

@@ -151,13 +151,10 @@ def test_structure(words, change):
 
 def test_time_steps(tmp_path):
     for dt in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(OptionError, match=f"--dt {dt:g}: is no time step"):
-            read_nir(GOOD, dt=dt)
-    with pytest.raises(OptionError, match=r"no time step, but its r is tau / 0.0001"):
-        read_nir(GOOD)
+        oracles.refused(OptionError, f"--dt {dt:g}: is no time step", read_nir, GOOD, dt=dt)
+    oracles.refused(OptionError, "no time step, but its r is tau / 0.0001", read_nir, GOOD)
     nir.write(tmp_path / "a.nir", two_layers())
-    with pytest.raises(OptionError, match=r"NIR keeps no time step; give --dt SECONDS"):
-        read_nir(tmp_path / "a.nir")
+    oracles.refused(OptionError, "NIR keeps no time step; give --dt SECONDS", read_nir, tmp_path / "a.nir")
 
 
 def nested(file):

@@ -13,9 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes
 from spikeloom.runtime import cli
-from spikeloom.runtime.equivalence.verify import verify
 
 build_parser = functools.cache(cli.build_parser)
 
@@ -63,22 +61,6 @@ def anchors(text):
     headings = re.findall(r"^#+ (.+)$", FENCED.sub("", text), flags=re.MULTILINE)
     plain = [re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings]
     return [name if name not in plain[:i] else f"{name}-{plain[:i].count(name)}" for i, name in enumerate(plain)]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _each_verdict_once():
-    """The README verifies one netlist on the same recordings twice, in its shell and in Python: it is done once."""
-    made = {}
-
-    def once(netlist, source, events, *given, **options):
-        key = netlist_bytes(netlist), events.tobytes()
-        if key not in made:
-            made[key] = verify(netlist, source, events, *given, **options)
-        return made[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("spikeloom.runtime.commands.main_job.verify.verify", once)
-        yield
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)

@@ -106,13 +106,6 @@ def test_every_netlist_comes_back_whole(tmp_path_factory, network):
     assert inconsistencies(original) == []
 
 
-@pytest.mark.parametrize("name", ARRAYS)
-def test_every_array_changes_the_bytes(netlist, name):
-    array = getattr(netlist, name).copy()
-    array[-1] += 1
-    assert netlist_bytes(dataclasses.replace(netlist, **{name: array})) != netlist_bytes(netlist)
-
-
 def test_numpy_alone_reads_the_file(path, netlist):
     with np.load(path, allow_pickle=False) as members:
         assert set(members.files) == {"manifest", "sha256", *ARRAYS}

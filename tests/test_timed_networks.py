@@ -30,9 +30,7 @@ from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_stor
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.equivalence.certificates import Certainty
-from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.equivalence.verify import verify
-from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
@@ -209,17 +207,6 @@ def test_the_decay_alone_is_a_rung_of_the_ladder(tmp_path):
         moved.append(different["beta"] - different["float64"])
     assert moved[0] == 0
     assert moved[1] > 0
-
-
-def test_a_wrong_current_register_is_named(timed, compilation):
-    _, _, network = timed
-    decay = compilation.netlist.decay_u.copy()
-    decay[compilation.netlist.compartments_of(1)] = 100
-    wrong = replace(compilation.netlist, decay_u=fixedpoint.read_only(decay))
-    assert check_rounding(integer_machine_of(compilation.netlist), network).holds
-    assert check_rounding(integer_machine_of(wrong), network).layers["fc1"].faults == (
-        "fc1 has decay registers 100 and 2867 instead of 204 and 2867",
-    )
 
 
 SETTINGS = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])

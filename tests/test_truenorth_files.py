@@ -209,39 +209,18 @@ def small(**changes):
 
 def test_the_schema_of_ranc():
     written = json.loads("\n".join(ranc.export(small(), np.array([[1, 0]], np.uint8))))
-    assert {key: value for key, value in written.items() if key.startswith(("num", "max", "neuron_r"))} == {
-        "num_neurons": 256,
-        "num_axons": 256,
-        "num_weights": 4,
-        "num_cores_x": 2,
-        "num_cores_y": 3,
-        "max_tick_offset": 16,
-        "neuron_reset_type": 0,
-    }
+    sizes = {"num_neurons": 256, "num_axons": 256, "num_weights": 4, "num_cores_x": 2, "num_cores_y": 3}
+    sizes |= {"max_tick_offset": 16, "neuron_reset_type": 0}
+    assert {key: value for key, value in written.items() if key.startswith(("num", "max", "neuron_r"))} == sizes
     assert written["output_bus"] == {"coordinates": [0, 2], "num_outputs": 2}
     packet = {"destination_core": [1, 1], "destination_axon": 2, "destination_tick": 0}
     fed = {"destination_core": [0, 0], "destination_axon": 0, "destination_tick": 0}
     assert written["packets"] == [[], [fed, packet], [], [], [packet]]
     first, second = written["cores"]
-    assert first == {
-        "axons": [1],
-        "connections": [[1]],
-        "coordinates": [0, 0],
-        "neurons": [
-            {
-                "weights": [0, 4, 0, 0],
-                "leak": 0,
-                "positive_threshold": 3,
-                "negative_threshold": -2,
-                "reset_potential": 0,
-                "reset_mode": 0,
-                "current_potential": 0,
-                "destination_core_offset": [1, 1],
-                "destination_axon": 2,
-                "destination_tick": 14,
-            }
-        ],
-    }
+    neuron = {"weights": [0, 4, 0, 0], "leak": 0, "positive_threshold": 3, "negative_threshold": -2}
+    neuron |= {"reset_potential": 0, "reset_mode": 0, "current_potential": 0}
+    neuron |= {"destination_core_offset": [1, 1], "destination_axon": 2, "destination_tick": 14}
+    assert first == {"axons": [1], "connections": [[1]], "coordinates": [0, 0], "neurons": [neuron]}
     assert second["axons"] == [0, 0, 3]
     assert second["connections"] == [[0, 0, 1], [0, 0, 1]]
     voter, lost = second["neurons"]

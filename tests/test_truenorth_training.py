@@ -9,6 +9,7 @@ import pytest
 import torch
 from commands import as_json, refusal
 from made_files import CLASSES, STEPS, TAXELS, events, own_file, recordings_folder
+from oracles import refused
 from random_crossbars import random_network
 from zoo import specimen
 
@@ -152,8 +153,7 @@ def test_round_trip(tmp_path):
             for part in PARTS:
                 np.testing.assert_array_equal(getattr(one, part), getattr(other, part))
     assert read_trained(path).weights == "last"
-    with pytest.raises(ModelError, match="--weights clean: the file holds last, best"):
-        read_trained(path, weights="clean")
+    refused(ModelError, "--weights clean: the file holds last, best", read_trained, path, weights="clean")
 
 
 def restated(path, **changes):
@@ -185,8 +185,7 @@ def test_files_that_are_refused(tmp_path, change, said):
     path = tmp_path / "x.pt"
     written(path)
     change(path)
-    with pytest.raises(ModelError, match=f"{said}.*; copy or train it again"):
-        read_trained(path)
+    refused(ModelError, f"{said}|; copy or train it again", read_trained, path)
 
 
 # -- commands ----------------------------------------------------------------------------------------------------------

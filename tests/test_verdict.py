@@ -272,6 +272,8 @@ def test_words(network):
     assert fault.startswith(f"fc1 neuron {netlist.neuron[first]} has threshold {netlist.threshold[first] + 3} instead")
     (fault,) = faults(change(netlist, "decay_v", netlist.compartments_of(2), -5))
     assert fault == "fc2 has decay registers 4095 and 3272 instead of 4095 and 3277"
+    (fault,) = faults(change(netlist, "decay_u", netlist.compartments_of(1), -5))
+    assert fault == "fc1 has decay registers 4090 and 3277 instead of 4095 and 3277"
     (fault,) = faults(change(netlist, "bias_mantissa", first, 40))
     assert fault == "fc1 has 1 of 9 biases that are not"
     largest = int(np.argmax(np.abs(netlist.synapse_weight)))

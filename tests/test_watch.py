@@ -78,10 +78,7 @@ def votes_of_run(netlist: Netlist, events: np.ndarray) -> list[int]:
 
 
 def as_lines(events: np.ndarray, seed: int = 0, *, low: int = 0, inside: int = 0) -> str:
-    """Event lines of a recording (taxels, 2, T), in any order within each bin of 20 ms.
-
-    `inside` is how far, at most, in microseconds, an event lies behind the beginning of its bin.
-    """
+    """Event lines of a recording (taxels, 2, T), in any order, up to `inside` microseconds into each bin of 20 ms."""
     rng = np.random.default_rng(seed)
     text = []
     for t, bin_events in enumerate(np.moveaxis(events, -1, 0)):
