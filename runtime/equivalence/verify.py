@@ -70,11 +70,8 @@ def verify(
     progress : callable, optional
         Called with the name of each part as it starts, and the number of recordings that are done.
 
-    Raises
-    ------
-    ModelError, DataError, NumericRangeError, OptionError
-        If the parts do not belong together, a register of the chip overflows, or the further engine is not installed or
-        cannot hold the netlist.
+    Raises ModelError, DataError, NumericRangeError or OptionError if the parts do not belong together, a register of
+    the chip overflows, or the further engine is not installed or cannot hold the netlist.
     """
     if not 1 <= spec_samples:
         raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")

@@ -84,14 +84,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_grid(networks, grid, target)
     folder.mkdir(exist_ok=True)
     sweep = {"jobs": arguments.jobs, "fresh": arguments.fresh}
-    words = _command(arguments)
-    charted = chart(networks, target, data, grid, budgets, folder, energy=energy, command=words, **sweep)
+    options = repeat.words(repeat.given(arguments, ("data", *repeat.NETWORK, "grid", "table", "bin")))
+    options += [word for budget in arguments.budget for word in ("--budget", budget)]
+    command = repeat.command("chart", *arguments.checkpoints, *options, "-o", arguments.output)
+    charted = chart(networks, target, data, grid, budgets, folder, energy=energy, command=command, **sweep)
     write_chart(folder, charted)
     return Outcome(charted, partial(printed, folder=str(folder)), 0 if charted.budget.fits else 1)
-
-
-def _command(arguments: argparse.Namespace) -> str:
-    """The words that ask for the same chart."""
-    options = repeat.words(repeat.given(arguments, ("data", *repeat.NETWORK, "grid", "table", "bin")))
-    budgets = [word for budget in arguments.budget for word in ("--budget", budget)]
-    return repeat.command("chart", *arguments.checkpoints, *options, *budgets, "-o", arguments.output)

@@ -40,16 +40,11 @@ def _in_range(netlist: Netlist) -> bool:
     )
 
 
-def _is_pipeline(netlist: Netlist) -> bool:
-    """Whether every layer receives from the depth before it only, so that none has to wait for another."""
-    depth = np.array([layer.depth for layer in netlist.layers])[netlist.layer]
-    sent = np.append(np.full(netlist.n_inputs, -1), depth)[netlist.axon_source[netlist.axon_of_synapse()]]
-    return bool(np.all(sent == depth[netlist.synapse_compartment()] - 1))
-
-
 def lay_out_blocks(netlist: Netlist) -> Blocks | str:
     """Make blocks of a netlist, or say why there are none."""
-    if not _is_pipeline(netlist):
+    depth = np.array([layer.depth for layer in netlist.layers])[netlist.layer]
+    sent = np.append(np.full(netlist.n_inputs, -1), depth)[netlist.axon_source[netlist.axon_of_synapse()]]
+    if np.any(sent != depth[netlist.synapse_compartment()] - 1):  # else no layer has to wait for another
         return "a layer is recurrent or receives from others than the one before it"
     if not _in_range(netlist):
         return "a sum may leave 16 bits, or a membrane or current its register"

@@ -56,7 +56,12 @@ def run(prepared: engine.Engine, target: Target, events: EventArray, lengths: In
     netlist = prepared.netlist
     latencies = timing.tables_of(netlist, target)
     meter = cost.prepare(netlist, target, "whole")
-    parts = [vote_charges(netlist), _event_charges(netlist, meter), *map(timing.charges, latencies.values())]
+    # what events add to the amounts that the meter knows, and to neuron updates
+    sources = np.pad(meter.caused.astype(np.int64), ((0, 0), (0, 1)))
+    updates = np.zeros((netlist.n_compartments, sources.shape[1]), np.int64)
+    updates[:, -1] = 1
+    amounts = Charges(sources=sources, updates=updates)
+    parts = [vote_charges(netlist), amounts, *map(timing.charges, latencies.values())]
     trace = engine.simulate(prepared, events, lengths=lengths, charges=side_by_side(parts))
     assert trace.charged is not None, "sums were wanted"
     ends = np.cumsum([part.sources.shape[1] for part in parts])[:-1]
@@ -78,14 +83,6 @@ def run(prepared: engine.Engine, target: Target, events: EventArray, lengths: In
             for (name, each), own in zip(latencies.items(), times, strict=True)
         },
     )
-
-
-def _event_charges(netlist: Netlist, meter: cost.Meter) -> Charges:
-    """What events add to the amounts that a meter knows, and to neuron updates."""
-    sources = np.pad(meter.caused.astype(np.int64), ((0, 0), (0, 1)))
-    updates = np.zeros((netlist.n_compartments, sources.shape[1]), np.int64)
-    updates[:, -1] = 1
-    return Charges(sources=sources, updates=updates)
 
 
 def _events(meter: cost.Meter, happened: IntArray, runs: BoolArray) -> dict[str, FloatArray]:
