@@ -66,10 +66,7 @@ def affine(rng, rows, columns, gain=1.0, bias=0.3):
 
 
 def simulate(graph, events, dt, convention="euler", late=()):
-    """Spikes of each spiking node, (steps, neurons) bool, by the names of the nodes; nested graphs are not read.
-
-    Membranes start at their reset, currents at zero. Along the edges in `late` comes what was sent in the step before.
-    """
+    """Spikes (steps, neurons) of each spiking node by name, from rest; edges in `late` bring what was sent before."""
     received = {name: [a for a, b in graph.edges if b == name] for name in graph.nodes}
     order, ready = [], {name: [a for a in sources if (a, name) not in late] for name, sources in received.items()}
     while len(order) < len(received):

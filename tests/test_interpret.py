@@ -82,12 +82,8 @@ def simulate_integer(network, events):
     def step(population, i, arrived, state):
         u, v = state
         u = decayed(u, population.decay_u + 1) + 64 * arrived
-        v = (
-            decayed(v, population.decay_v)
-            + u
-            + int(population.bias_mantissa[i]) * 2 ** int(population.bias_exponent[i])
-        )
-        v = max(-(2**23 - 1), min(2**23 - 1, v))
+        bias = int(population.bias_mantissa[i]) * 2 ** int(population.bias_exponent[i])
+        v = max(-(2**23 - 1), min(2**23 - 1, decayed(v, population.decay_v) + u + bias))
         fired = v > 64 * int(population.threshold[i])
         return (u, 0 if fired else v), v, fired
 

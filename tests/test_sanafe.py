@@ -66,8 +66,7 @@ def interpreter() -> str:
 
 
 def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> list[SimpleNamespace]:
-    """Run recordings, (recordings, n_inputs, T), in SANA-FE and here, under its conventions: spikes, times in ns per
-    step, energies in joules per part.
+    """Spikes, times (ns a step) and energies (J a part) of recordings (recordings, n_inputs, T) in SANA-FE and here.
 
     Its channels fire one step before they act, and every layer integrates in each of T + depth + 1 steps.
     """
