@@ -211,8 +211,8 @@ def test_folds_share_out_every_class():
 
 def test_commands_take_a_counting_network(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    train = ["train", "--data", "synthetic", "--system", "counters", "--join", "5", "--window", "50", "-o", "c.pt"]
-    record = as_json(*train)["record"]
+    train = ["train", "--data", "synthetic", "--system", "counters", "--join", "5", "--window", "50", "--parts", "2"]
+    record = as_json(*train, "-o", "c.pt")["record"]
     assert record["test_correct"] > 100
     assert as_json("inspect", "c.pt")["training"]["plan"]["bins"] == 5
     assert "whatever its own length" in run("compile", "c.pt", "--calibrate", "synthetic", "-o", "c.loom")[1]
@@ -242,6 +242,7 @@ def test_commands_take_a_counting_network(monkeypatch, tmp_path):
     ("words", "said"),
     [
         (["--system", "counters", "--epochs", "3"], "--epochs 3: counters are trained without; omit it"),
+        (["--system", "counters", "--window", "50"], "--window 50: counters see what comes later; give --parts 2"),
         (["--system", "counters", "--seed", "3"], "omit --recipe, --seed and --seeds"),
         (["--system", "mlp", "--parts", "3"], "--parts 3: is for --system counters; omit it"),
         (["--system", "mlp", "--hops", "2"], "--hops 2: an MLP has no hops to choose; omit it"),

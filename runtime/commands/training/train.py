@@ -181,6 +181,10 @@ def _count(arguments: argparse.Namespace) -> Outcome:
         asked["bits"] = asked.pop("weight_bits")
     plan = Plan(bins=arguments.join, **asked)
     plan.require_possible()
+    if plan.window < WHOLE and plan.parts == 1:
+        raise OptionError(
+            f"--window {plan.window}: counters see what comes later; give --parts 2 or more, which gates them"
+        )
     taxels = None if arguments.taxels is None else len(sensor_places(arguments.taxels))
     training, test = both_splits(arguments.data, taxels, arguments.bin)
     report = train_counters(plan, training, test, repeat.command("train", *typed), arguments.output)
