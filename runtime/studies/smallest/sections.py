@@ -11,7 +11,7 @@ from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.report import html
 from spikeloom.runtime.report.drawing import COLOURS, GREY, MARKERS, Drawing, scale, sheet, styled
 from spikeloom.runtime.report.numbers import percent, si
-from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Section, Table, Text
+from spikeloom.runtime.report.sections import Code, Details, Figure, Section, Table, Text
 from spikeloom.runtime.studies.smallest import baselines
 from spikeloom.runtime.studies.smallest.choice import energy, worse
 from spikeloom.runtime.studies.smallest.results import Smallest, Tried
@@ -23,11 +23,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MEANINGS = (
-    "Accuracy is that of cross-validation inside the training split, lines are 95 % intervals (Wilson). Large marks "
-    "came to the last rung (five rounds of five parts), small ones were dropped before. The dashed line is the front: "
-    "no other candidate of the last rung is as accurate for less. The ring is the choice. Horizontal bars are support "
-    "vector machines on event counts: on a small processor they take between their arithmetic and memory accesses, and "
-    "those with an instruction for every operation. What is far below the last rung is in the tables only."
+    "Accuracy by cross-validation inside the training split, with 95 % intervals (Wilson). Small marks were dropped "
+    "before the last rung, the dashed line is its front, the ring the choice. Bars are support vector machines: on a "
+    "small processor they take between arithmetic and memory accesses alone, and an instruction for every operation."
 )
 
 
@@ -36,7 +34,7 @@ def sections(result: Smallest) -> Iterator[Section]:
     last = max(each.rung for each in result.tried)
     tried = sorted((each for each in result.tried if each.rung == last), key=energy)
     beside = [each for each in result.baselines if each.rung == last]
-    yield Section("The choice", [Facts(_facts(result)), *map(Text, [*_why(result), *_needless(result)])])
+    yield Section("The choice", [*map(Text, [*_why(result), *_needless(result)])])
     figure = Figure("front", partial(picture, result), "Accuracy over energy and time of a mean inference.")
     yield Section("Accuracy against cost", [figure, Details("What is drawn", [Text(MEANINGS)], unfolded=True)])
     yield Section(
@@ -48,9 +46,7 @@ def sections(result: Smallest) -> Iterator[Section]:
         ],
     )
     yield Section("On the chip", [Text(_checked(result))])
-    yield Section(
-        "Again", [Code([result.command, *result.commands]), Details("Where figures are from", _sources(result))]
-    )
+    yield Section("Again", [Code([result.command, *result.commands]), Text(baselines.SOURCE)])
 
 
 def page(result: Smallest) -> str:
@@ -69,20 +65,6 @@ def _joules(each: Tried) -> str:
 
 def _share(each: Tried) -> str:
     return f"{100 * each.accuracy:.1f} %"
-
-
-def _facts(result: Smallest) -> dict[str, tuple[str, str]]:
-    chosen, costs, right = result.chosen, result.checked.costs, result.checked.right
-    test = f"{right.correct} of {result.data.test}; 95 % interval {100 * right.low:.1f} … {100 * right.high:.1f}"
-    facts = {
-        "choice": (f"#{chosen.number}", chosen.candidate.name),
-        "cross-validation": (_share(chosen), f"95 % interval {100 * chosen.low:.1f} … {100 * chosen.high:.1f}"),
-        "test split, looked at once": (f"{100 * right.accuracy:.1f} %", test),
-        "energy": (si(costs.least, "J"), f"{costs.operations:,.0f} synaptic operations, {number(costs.cores, 'core')}"),
-    }
-    if (table := result.chosen_by.time) is not None:
-        facts["time"] = si(costs.time_s[table], "s"), table
-    return facts
 
 
 def _why(result: Smallest) -> Iterator[str]:
@@ -208,12 +190,6 @@ def _checked(result: Smallest) -> str:
             f"written: {checked.netlist}, sha256 {checked.netlist_sha256}",
         ]
     )
-
-
-def _sources(result: Smallest) -> list[Block]:
-    titles = [[f"{kind}, {name}", title] for kind, tables in result.tables.items() for name, title in tables.items()]
-    titles += [["processor", baselines.SOURCE], ["recordings", f"{result.data.path}, sha256 {result.data.sha256}"]]
-    return [Table(["", "source"], titles, "Tables of prices and times, and recordings", words=True)]
 
 
 # -- the figure --------------------------------------------------------------------------------------------------------
