@@ -18,7 +18,8 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.commands.choose.anytime import ALLOWED
 from spikeloom.runtime.inputs.network import propagation
-from spikeloom.runtime.machines.integer import integer_machine_of
+from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.report.sections import Table
 from spikeloom.runtime.studies.anytime import exits
 
@@ -35,11 +36,11 @@ def main() -> None:
         checkpoint = read_checkpoint(path)
         netlist = compile_network(expand(checkpoint, propagation(checkpoint, None, path)[1])).netlist
         seen, reported = (
-            integer_machine_of(netlist).cumulative(data.events, own).votes
+            integer_machine(machine_of(netlist)).cumulative(data.events, own).votes
             for data, own in zip(splits, lengths, strict=True)
         )
         at = exits.standing(reported, lengths[1])
-        sure = exits.proven(reported, at, exits.most_votes(integer_machine_of(netlist), splits[1].steps))
+        sure = exits.proven(reported, at, exits.most_votes(integer_machine(machine_of(netlist)), splits[1].steps))
         factors = {("proven", 0.0): np.inf}
         for name, race in (("races", exits.races(seen, lengths[0])), ("votes", exits.standing(seen, lengths[0]))):
             points = exits.turning_points(race)
@@ -47,7 +48,7 @@ def main() -> None:
         rows = np.arange(len(reported))
         for key, factor in factors.items():
             ends = exits.exits(sure, at, factor)
-            early, depth = at.leader[rows, ends], integer_machine_of(netlist).read_out_lag
+            early, depth = at.leader[rows, ends], integer_machine(machine_of(netlist)).read_out_lag
             saved = 1 - np.mean(ends + 1 + depth) / (splits[1].steps + netlist.max_depth)
             right = [np.count_nonzero(decided == splits[1].labels) for decided in (early, at.decision)]
             found.setdefault(key, []).append(

@@ -30,7 +30,8 @@ from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.machines.integer import integer_machine_of
+from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.trace import aligned
@@ -66,7 +67,7 @@ def measure(
     assert trace.spikes is not None
     meter = cost.prepare(netlist, load_target(netlist.target))
     costs = cost.price(meter, trace.counts, test.steps + netlist.max_depth)
-    kept = integer_machine_of(netlist).compared()
+    kept = integer_machine(machine_of(netlist)).compared()
     different = {
         layer.name: int(np.count_nonzero((aligned(netlist, trace.spikes, i) != reference[layer.name])[..., kept[i]]))
         for i, layer in enumerate(netlist.layers)

@@ -19,7 +19,8 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
-from spikeloom.runtime.machines.integer import LONGEST, integer_machine_of
+from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.integer import LONGEST, integer_machine
 from spikeloom.runtime.machines.loihi1 import engine, kernel
 from spikeloom.runtime.machines.loihi1.costs import cost, estimate
 from spikeloom.runtime.machines.loihi1.trace import Counts
@@ -104,9 +105,9 @@ def test_recordings_of_different_length_end_on_their_own(place, monkeypatch):
     monkeypatch.chdir(place)
     netlist, data = read_netlist("net.loom"), load_data("data", "test")
     lengths = np.array([60, 1, 7, 24, 33, 2, 50, 59, 60, 60, 3, 40])
-    ran = integer_machine_of(netlist).cumulative(data.events, lengths)
+    ran = integer_machine(machine_of(netlist)).cumulative(data.events, lengths)
     at = exits.standing(ran.votes, lengths)
-    sure = exits.proven(ran.votes, at, exits.most_votes(integer_machine_of(netlist), STEPS))
+    sure = exits.proven(ran.votes, at, exits.most_votes(integer_machine(machine_of(netlist)), STEPS))
     ends = exits.exits(sure, at)
     assert np.all(ends < lengths)
     for i, length in enumerate(lengths):
@@ -235,12 +236,12 @@ def test_how_often_an_output_neuron_can_spike():
         Neuron(threshold=150, decay_u=2047),  # the current adds up to twice the weight
         Neuron(threshold=1, bias=-101, bias_exponent=6),
     )
-    assert integer_machine_of(netlist).least_intervals.tolist() == [1, 2, 2, 4, 0, 3, 1, 0]
-    most = exits.most_votes(integer_machine_of(netlist), 5)[[0, 1, 3, 4]]
+    assert integer_machine(machine_of(netlist)).least_intervals.tolist() == [1, 2, 2, 4, 0, 3, 1, 0]
+    most = exits.most_votes(integer_machine(machine_of(netlist)), 5)[[0, 1, 3, 4]]
     assert most.tolist() == [[0, 1, 2, 3, 4, 5], [0, 1, 1, 2, 2, 3], [0, 1, 1, 1, 1, 2], [0] * 6]
     slow = two_classes(Neuron(threshold=2**17 - 1, decay_v=0), Neuron(threshold=1))
     quiet = replace(slow, bias_mantissa=read_only([0, 0]), synapse_weight=read_only([2, 2]))
-    assert integer_machine_of(quiet).least_intervals.tolist() == [LONGEST, 1]  # looked at only so far
+    assert integer_machine(machine_of(quiet)).least_intervals.tolist() == [LONGEST, 1]  # looked at only so far
 
 
 @settings(deadline=None)
@@ -255,7 +256,7 @@ def test_no_output_neuron_spikes_more_often(data):
     except NumericRangeError:
         return
     voters = np.flatnonzero(netlist.readout_class >= 0)
-    machine = integer_machine_of(netlist)
+    machine = integer_machine(machine_of(netlist))
     for voter, interval in zip(voters, machine.least_intervals, strict=True):
         times = np.flatnonzero(spikes[:, voter])
         assert interval or not len(times)
@@ -273,7 +274,7 @@ def test_live_and_recorded_votes_end_alike():
     netlist = replace(netlist, classes=3, readout_class=read_only(np.arange(netlist.n_compartments) % 4 - 1))
     events = (np.random.default_rng(1).random((6, netlist.n_inputs, 40)) < 0.3).astype(np.uint8)
     lengths = np.full(6, 40)
-    machine = integer_machine_of(netlist)
+    machine = integer_machine(machine_of(netlist))
     votes, depth = machine.cumulative(events[:, :, None], lengths).votes, machine.read_out_lag
     at = exits.standing(votes, lengths)
     sure = exits.proven(votes, at, exits.most_votes(machine, 40))

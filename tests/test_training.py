@@ -212,6 +212,7 @@ def test_no_worker_outlives_the_command(data):
 @dataclass(frozen=True)
 class Named:
     output: Path
+    state: Path = Path("x.state")
 
 
 def dies(_job):
@@ -226,11 +227,11 @@ def fails(_job):
 @pytest.mark.parametrize(
     ("run", "error", "told"), [(dies, OptionError, "go on with --resume"), (fails, DataError, "the loss is nan")]
 )
-def test_a_worker_that_fails_ends_all(run, error, told, monkeypatch):
+def test_a_worker_that_fails_ends_all(run, error, told, monkeypatch, tmp_path):
     monkeypatch.setattr(trainings, "run_job", run)
-    job = Named(output=Path("x.pt"))
+    jobs = [Named(output=tmp_path / name) for name in ("x.pt", "y.pt")]
     with pytest.raises(error, match=told):
-        trainings._side_by_side([job, job], [0, 1], {})
+        trainings.train_seeds(jobs, resume=False)
 
 
 def swept_here(folder, made, **how):

@@ -27,7 +27,8 @@ from spikeloom.runtime.equivalence.verdict import (
     unmet,
 )
 from spikeloom.runtime.equivalence.verify import verify
-from spikeloom.runtime.machines.integer import integer_machine_of
+from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.integer import integer_machine
 
 
 # -- levels ------------------------------------------------------------------------------------------------------------
@@ -190,7 +191,7 @@ def compiled(network, **options):
 
 def checked(netlist, network, **provenance):
     netlist = dataclasses.replace(netlist, provenance=netlist.provenance | provenance)
-    return check_rounding(integer_machine_of(netlist), network)
+    return check_rounding(integer_machine(machine_of(netlist)), network)
 
 
 @pytest.fixture(scope="module")

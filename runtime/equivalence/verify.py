@@ -31,8 +31,8 @@ from spikeloom.runtime.equivalence.reference import (
 )
 from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.equivalence.verdict import Divergence, LayerSpikes, Rung, Verdict
-from spikeloom.runtime.machines.base import ENGINES
-from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_of
+from spikeloom.runtime.machines.base import ENGINES, machine_of
+from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
 from spikeloom.runtime.machines.votes import readout_counts
 
 Layers = Sequence[BoolArray]
@@ -79,7 +79,7 @@ def verify(
     model = source if original is None else original
     require_match(netlist, source)
     require_match(netlist, model)
-    machine = integer_machine_of(netlist)
+    machine = integer_machine(machine_of(netlist))
     network, integer, names = float_network(model), machine.integer, machine.layers
     machine.require_sensor(events)
     beside = machine.beside(engine_name)

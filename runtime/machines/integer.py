@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -13,9 +12,8 @@ import numpy as np
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import IntegerNetwork
-from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.machines.base import EventArray, Machine, Price, machine_for, machine_of
+from spikeloom.runtime.machines.base import EventArray, Machine, Price
 from spikeloom.runtime.report.sections import Block
 
 if TYPE_CHECKING:
@@ -123,13 +121,3 @@ def integer_machine(machine: Machine) -> IntegerMachine:
             "another chip"
         )
     return machine
-
-
-def integer_machine_of(netlist: Netlist) -> IntegerMachine:
-    """As :func:`machine_of`; raises as :func:`integer_machine`."""
-    return integer_machine(machine_of(netlist))
-
-
-def integer_machine_for(path: str | os.PathLike[str]) -> IntegerMachine:
-    """As :func:`machine_for`; raises as :func:`integer_machine`."""
-    return integer_machine(machine_for(path))

@@ -177,28 +177,27 @@ def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
     with ExitStack() as locks:
         for job in jobs:
             locks.enter_context(only_one(job.output))
-        return _train(jobs, resume=resume)
-
-
-def _train(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
-    results = {index: recall(job) for index, job in enumerate(jobs) if resume and finished(job)}
-    _require_right_start(jobs, resume=resume, some_finished=bool(results))
-    for index, job in enumerate(jobs):
-        clear(job)
-        if index in results:
-            sys.stderr.write(f"spikeloom: {job.output}: is finished, not trained again\n")
-        elif resume and not states(job):
-            sys.stderr.write(f"spikeloom: {job.output}: was not begun, trained from the start\n")
-    waiting = [index for index in range(len(jobs)) if index not in results]
-    try:
-        with ended_by_signal():
-            _side_by_side(jobs, waiting, results)
-    except KeyboardInterrupt as interrupt:
+        results = {job: recall(job) for job in jobs if resume and finished(job)}
+        _require_right_start(jobs, resume=resume, some_finished=bool(results))
         for job in jobs:
             clear(job)
-        written = [str(jobs[index].output) for index in waiting if index in results]
-        raise KeyboardInterrupt(_kept(written, jobs)) from interrupt
-    return [results[index] for index in range(len(jobs))]
+            if job in results:
+                sys.stderr.write(f"spikeloom: {job.output}: is finished, not trained again\n")
+            elif resume and not states(job):
+                sys.stderr.write(f"spikeloom: {job.output}: was not begun, trained from the start\n")
+        waiting = [job for job in jobs if job not in results]
+        try:
+            with ended_by_signal():
+                for place, found in side_by_side(waiting, run_job):
+                    results[waiting[place]] = found
+        except UnfinishedError as error:
+            raise OptionError(f"{error}; go on with --resume, and with fewer --seeds") from error
+        except KeyboardInterrupt as interrupt:
+            for job in jobs:
+                clear(job)
+            written = [str(job.output) for job in waiting if job in results]
+            raise KeyboardInterrupt(_kept(written, jobs)) from interrupt
+        return [results[job] for job in jobs]
 
 
 def finished(job: Job) -> bool:
@@ -241,15 +240,6 @@ def _kept(written: Sequence[str], jobs: Sequence[Job]) -> str:
     return f"{' and '.join(parts)}; go on with the same command and --resume" if parts else ""
 
 
-def _side_by_side(jobs: Sequence[Job], waiting: Sequence[int], results: dict[int, Finished]) -> None:
-    """Run jobs in processes of their own; whatever ends this ends them all."""
-    try:
-        for place, found in side_by_side([jobs[index] for index in waiting], run_job):
-            results[waiting[place]] = found
-    except UnfinishedError as error:
-        raise OptionError(f"{error}; go on with --resume, and with fewer --seeds") from error
-
-
 # -- for people --------------------------------------------------------------------------------------------------------
 
 
@@ -283,14 +273,8 @@ def training_sections(result: TrainingReport) -> Iterable[Section]:
         lines.append(f"  mean of {len(result.runs)} seeds: last {last}, best on test {best}, clean {clean}")
     files = ", ".join(run.file for run in result.runs)
     lines += textwrap.wrap(f"written: {files}", WIDTH, initial_indent="  ", subsequent_indent="    ")
-    yield Section(
-        "Training",
-        [
-            Text(typed),
-            Table(["", "epoch", "correct", "accuracy", "95 % interval"], rows),
-            Text("\n".join(lines)),
-        ],
-    )
+    table = Table(["", "epoch", "correct", "accuracy", "95 % interval"], rows)
+    yield Section("Training", [Text(typed), table, Text("\n".join(lines))])
 
 
 @styled

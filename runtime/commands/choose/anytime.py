@@ -9,7 +9,8 @@ from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.commands.options import add_netlist, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import load_recordings
-from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
+from spikeloom.runtime.machines.base import machine_for
+from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
@@ -49,7 +50,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     require_place(arguments.output, "-o", arguments)
     allowed = _allowed(arguments)
-    machine = integer_machine_for(arguments.netlist)
+    machine = integer_machine(machine_for(arguments.netlist))
     data = load_recordings(arguments, machine.netlist)
     machine.require_sensor(data.events)
     points = _races(arguments, machine)

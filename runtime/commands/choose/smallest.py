@@ -47,7 +47,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_data(parser)
     add_graph_options(parser, f"of the built-in sensor (default: {GRAPH})")
     parser.add_argument("--levels", type=int, metavar="N", help=LEVELS)
-    parser.add_argument("--target", default=DEFAULT_TARGET, help=f"chip (default: {DEFAULT_TARGET})")
     parser.add_argument(
         "--budget",
         action="append",
@@ -79,9 +78,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
         require_place(str(place), option, arguments)
     require_place(arguments.html, "--html", arguments)
     budgets = parse_budgets([words for each in arguments.budget for words in each.split(",")], LIMITS)
-    target = load_target(arguments.target)
-    if target.name != DEFAULT_TARGET:
-        raise OptionError(f"--target {target.name}: networks are searched for {DEFAULT_TARGET} alone; omit it")
     taxels = None if arguments.taxels is None else len(sensor_places(arguments.taxels))
     training, test = both_splits(arguments.data, taxels, arguments.bin)
     sensor = _sensor(arguments, training.taxels)
@@ -98,7 +94,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         [*counting(training.steps, arguments.levels or 1), *networks(training.steps, systems)],
         (training, test),
         data,
-        target,
+        load_target(DEFAULT_TARGET),
         budgets,
         store,
         str(output),
@@ -124,6 +120,6 @@ def _sensor(arguments: argparse.Namespace, taxels: int) -> Sensor:
 
 def _command(arguments: argparse.Namespace) -> str:
     """The words that ask for the same search."""
-    words = repeat.words(repeat.given(arguments, ("data", "bin", *SENSOR, "levels", "target", "store")))
+    words = repeat.words(repeat.given(arguments, ("data", "bin", *SENSOR, "levels", "store")))
     budgets = [word for budget in arguments.budget for word in ("--budget", budget)]
     return repeat.command("smallest", *words, *budgets, "-o", arguments.output)

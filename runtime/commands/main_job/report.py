@@ -13,8 +13,8 @@ from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
-from spikeloom.runtime.machines.base import describe
-from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
+from spikeloom.runtime.machines.base import describe, machine_for
+from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
 from spikeloom.runtime.machines.simulated import Account
 from spikeloom.runtime.page.recording import recording
 from spikeloom.runtime.page.results import Decisions, Report, provenance, taxels
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; nothing is written before everything is known."""
     require_place(arguments.output, "-o", arguments)
-    machine = integer_machine_for(arguments.netlist)
+    machine = integer_machine(machine_for(arguments.netlist))
     netlist = machine.netlist
     battery = None
     if arguments.stress is not None:

@@ -102,26 +102,17 @@ def sections(result: Lean) -> list[Section]:
     trained, tested = result.samples["training"], result.samples["test"]
     whole, taken = result.rows[0], result.rows[result.taken]
     layers = [[e.name, *(f"{n:,}" for n in (e.neurons, e.on_chip, e.never_fired))] for e in result.layers]
+    right = f"{percent(whole.test.right, tested)} on {result.split}, {whole.training.right} of {trained} in training"
     last = [f"least energy in training: {taken.name}", *_removed(taken.removed)]
+    last += [] if result.output is None else [f"written without them: {result.output}"]
     return [
-        Section(
-            "Accuracy",
-            [
-                Text(
-                    f"chip accuracy: {percent(whole.test.right, tested)} on {result.split}, "
-                    f"{whole.training.right} of {trained} in training"
-                )
-            ],
-        ),
+        Section("Accuracy", [Text(f"chip accuracy: {right}")]),
         Section(
             "Use",
             [Table(["layer", "neurons", "on chip", "never fired in training"], layers), Text(_taxels(result.taxels))],
         ),
         Section("Without", [_rows(result)]),
-        Section(
-            "Taken",
-            [Text("\n".join(last + ([] if result.output is None else [f"written without them: {result.output}"])))],
-        ),
+        Section("Taken", [Text("\n".join(last))]),
     ]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.studies.fronts import Budget
-from spikeloom.runtime.studies.smallest.results import Choice, Tried
+from spikeloom.runtime.studies.smallest.results import RUNGS, Choice, Tried
 from spikeloom.runtime.studies.smallest.work import Measured
 
 NEAR = 1e-9
@@ -81,9 +81,8 @@ def choose(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
     """
     priced = [each for each in tried if each.costs is not None]
     if not priced:
-        raise OptionError(f"--target: the chip holds no candidate; the first: {tried[0].refused}")
-    last = max(each.rung for each in priced)
-    pool = [each for each in priced if each.rung == last]
+        raise OptionError(f"the chip holds no candidate; the first: {tried[0].refused}")
+    pool = [each for each in priced if each.rung == RUNGS]
 
     def fitting(each: Tried) -> bool:
         return all(excess(each, budget) <= 1 + NEAR for budget in budgets)

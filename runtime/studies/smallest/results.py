@@ -13,6 +13,9 @@ from spikeloom.runtime.studies.smallest.baselines import Processor
 from spikeloom.runtime.studies.smallest.space import Candidate
 from spikeloom.runtime.studies.smallest.work import Measured
 
+RUNGS = 3
+"""What comes to the last one may be chosen."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tried:

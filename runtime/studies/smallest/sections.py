@@ -14,7 +14,7 @@ from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Code, Details, Figure, Section, Table, Text
 from spikeloom.runtime.studies.smallest import baselines
 from spikeloom.runtime.studies.smallest.choice import energy, worse
-from spikeloom.runtime.studies.smallest.results import Smallest, Tried
+from spikeloom.runtime.studies.smallest.results import RUNGS, Smallest, Tried
 
 LOWER = 12
 """Points below the last rung's intervals that are drawn."""
@@ -31,9 +31,10 @@ MEANINGS = (
 
 def sections(result: Smallest) -> Iterator[Section]:
     """All of a search."""
-    last = max(each.rung for each in result.tried)
-    tried = sorted((each for each in result.tried if each.rung == last), key=energy)
-    beside = [each for each in result.baselines if each.rung == last]
+    tried = sorted((each for each in result.tried if each.rung == RUNGS), key=energy)
+    beside = [each for each in result.baselines if each.rung == RUNGS]
+    dropped = [each for each in (*result.tried, *result.baselines) if each.rung < RUNGS]
+    dropped.sort(key=lambda each: (-each.rung, -each.accuracy))
     yield Section("The choice", [*map(Text, [*_why(result), *_needless(result)])])
     figure = Figure("front", partial(picture, result), "Accuracy over energy and time of a mean inference.")
     yield Section("Accuracy against cost", [figure, Details("What is drawn", [Text(MEANINGS)], unfolded=True)])
@@ -41,8 +42,8 @@ def sections(result: Smallest) -> Iterator[Section]:
         "Candidates",
         [
             _table(result, [*tried, *beside], "Candidates of the last rung, cheapest first, then baselines"),
-            Text("\n".join(_dropped(result))),
-            Details("All that was dropped", [_table(result, _others(result), "Candidates of earlier rungs", 0)]),
+            Text("\n".join(_dropped(result, dropped))),
+            Details("All that was dropped", [_table(result, dropped, "Candidates of earlier rungs", 0)]),
         ],
     )
     yield Section("On the chip", [Text(_checked(result))])
@@ -103,7 +104,7 @@ def _behind(each: Tried) -> str:
 
 def _needless(result: Smallest) -> Iterator[str]:
     """Whether a processor does the job as well: the best of the baselines, and the cheapest that is no worse."""
-    last = [each for each in result.baselines if each.processor and each.rung == max(e.rung for e in result.baselines)]
+    last = [each for each in result.baselines if each.processor and each.rung == RUNGS]
     if not last:
         yield baselines.MISSING
         return
@@ -131,17 +132,12 @@ def _table(result: Smallest, tried: Sequence[Tried], caption: str, most: int | N
     by = result.chosen_by
     head = ["#", "candidate", "accuracy %", "interval", "behind the best", f"energy ({by.energy})"]
     head += [] if by.time is None else [f"time ({by.time})"]
-    rows = []
+    chosen, best, rows = result.chosen, result.candidate(result.choice.best), []
     for each in tried:
-        marks = {
-            "choice": each is result.chosen,
-            "best": each is result.candidate(result.choice.best),
-            "front": each.front,
-        }
+        mark = f"#{each.number}" if each.processor is None else "–"
+        marks = {mark: True, "choice": each is chosen, "best": each is best, "front": each.front}
         row = [
-            " ".join(
-                [f"#{each.number}" if each.processor is None else "–", *(name for name, on in marks.items() if on)]
-            ),
+            " ".join(name for name, on in marks.items() if on),
             each.candidate.name,
             f"{100 * each.accuracy:.1f}",
             f"{100 * each.low:.1f} … {100 * each.high:.1f}",
@@ -160,15 +156,9 @@ def _table(result: Smallest, tried: Sequence[Tried], caption: str, most: int | N
     return Table([*head, "operations", "cores"], rows, caption, most=most)
 
 
-def _others(result: Smallest) -> list[Tried]:
-    last = max(each.rung for each in result.tried)
-    left = [each for each in (*result.tried, *result.baselines) if each.rung < last]
-    return sorted(left, key=lambda each: (-each.rung, -each.accuracy))
-
-
-def _dropped(result: Smallest) -> Iterator[str]:
+def _dropped(result: Smallest, dropped: Sequence[Tried]) -> Iterator[str]:
     """How many stayed behind on each rung, and what the chip does not hold."""
-    counts = Counter((each.rung, each.candidate.system) for each in _others(result))
+    counts = Counter((each.rung, each.candidate.system) for each in dropped)
     for rung in sorted({rung for rung, _ in counts}):
         words = ", ".join(f"{count} {system}" for (at, system), count in sorted(counts.items()) if at == rung)
         yield f"dropped after rung {rung}, since a cheaper one is ahead: {words}"
@@ -206,8 +196,7 @@ def picture(result: Smallest) -> Drawing:
     if by.time is not None:
         _panel(drawing, panels[1], result, "s")
         panels[1].set_xlabel(f"time of a mean inference on the chip ({by.time})")
-    handles, names = panels[0].get_legend_handles_labels()
-    drawing.figure.legend(handles, names, loc="outside lower center", ncols=5, fontsize=8)
+    drawing.figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
     return drawing
 
 
@@ -219,25 +208,18 @@ def _panel(drawing: Drawing, panel: Axes, result: Smallest, unit: str) -> None:
         assert each.costs is not None, "only what is priced is drawn"
         return energy(each) if unit == "J" else each.costs.time_s[str(result.chosen_by.time)]
 
-    last = max(each.rung for each in result.tried)
     priced = [each for each in result.tried if each.costs is not None]
     for index, system in enumerate(dict.fromkeys(each.candidate.system for each in priced)):
-        own = [each for each in priced if each.candidate.system == system]
         colour, marker = COLOURS[index], MARKERS[index]
-        for members, size, alpha in (
-            ([each for each in own if each.rung < last], 9, 0.35),
-            ([each for each in own if each.rung == last], 34, 1.0),
-        ):
-            if not members:
-                continue
-            x, y = [cost(each) for each in members], [100 * each.accuracy for each in members]
-            name = system if alpha == 1.0 else f"{system}, dropped"
-            panel.scatter(x, y, s=size, marker=marker, color=colour, alpha=alpha, linewidths=0, label=name, zorder=3)
-        for each in own:
-            if each.rung == last:
-                ends = [100 * each.low, 100 * each.high]
-                panel.plot([cost(each)] * 2, ends, color=colour, alpha=0.5, lw=1.0, zorder=2)
-    front = sorted((cost(each), 100 * each.accuracy) for each in priced if each.rung == last and each.front)
+        for last, size, alpha, name in ((False, 9, 0.35, f"{system}, dropped"), (True, 34, 1.0, system)):
+            members = [each for each in priced if each.candidate.system == system and (each.rung == RUNGS) is last]
+            if members:
+                x, y = [cost(each) for each in members], [100 * each.accuracy for each in members]
+                panel.scatter(x, y, size, marker=marker, color=colour, alpha=alpha, linewidths=0, label=name, zorder=3)
+            if members and last:
+                low, high = [100 * each.low for each in members], [100 * each.high for each in members]
+                panel.vlines(x, low, high, color=colour, alpha=0.5, lw=1.0, zorder=2)
+    front = sorted((cost(each), 100 * each.accuracy) for each in priced if each.rung == RUNGS and each.front)
     panel.step(*zip(*front, strict=True), where="post", color=GREY, lw=1.0, ls=(0, (5, 2)), label="front", zorder=1)
     chosen = result.chosen
     at = cost(chosen), 100 * chosen.accuracy
@@ -245,7 +227,7 @@ def _panel(drawing: Drawing, panel: Axes, result: Smallest, unit: str) -> None:
     drawing.tips += [(panel, cost(each), 100 * each.accuracy, _tip(each)) for each in sorted(priced, key=cost)]
     if unit == "J":
         _processors(drawing, panel, result)
-    shown = [each for each in (*result.tried, *result.baselines) if each.rung == last]
+    shown = [each for each in (*result.tried, *result.baselines) if each.rung == RUNGS]
     panel.set_ylim(100 * min(each.low for each in shown) - LOWER, min(100, 100 * max(each.high for each in shown) + 2))
     panel.set_xscale("log")
     panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if unit == "s" else (1,)))
@@ -256,8 +238,7 @@ def _panel(drawing: Drawing, panel: Axes, result: Smallest, unit: str) -> None:
 
 def _processors(drawing: Drawing, panel: Axes, result: Smallest) -> None:
     """Baselines of the last rung, between what they take on a processor at least and at most."""
-    last = max((each.rung for each in result.baselines), default=0)
-    for index, each in enumerate(each for each in result.baselines if each.rung == last):
+    for index, each in enumerate(each for each in result.baselines if each.rung == RUNGS):
         if (costs := each.processor) is not None:
             x, y, colour = [costs.least_j, costs.most_j], 100 * each.accuracy, COLOURS[2 + index % 2]
             panel.plot(x, [y, y], color=colour, lw=3.0, alpha=0.8, label=each.candidate.system, zorder=4)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -31,12 +31,10 @@ from spikeloom.runtime.studies.jobs import sweep
 from spikeloom.runtime.studies.pruning.trials import priced
 from spikeloom.runtime.studies.smallest import choice, work
 from spikeloom.runtime.studies.smallest.baselines import baselines
-from spikeloom.runtime.studies.smallest.results import Checked, Smallest, Tried
+from spikeloom.runtime.studies.smallest.results import RUNGS, Checked, Smallest, Tried
 from spikeloom.runtime.studies.smallest.space import Candidate, variants
 from spikeloom.runtime.studies.smallest.trained import Sensor, arguments, compiled, plan_of
 from spikeloom.runtime.studies.training import Job, run_job
-
-RUNGS = 3
 
 
 def smallest(
@@ -57,13 +55,14 @@ def smallest(
 
     `splits` are training and test recordings; `command` repeats it.
     """
-    about: dict[str, Any] = {"sensor": sensor, "jobs": jobs}
-    beside = search(baselines(), most_accurate, data, target, store, fresh=fresh, **about)
-    tried = search(candidates, choice.going_on, data, target, store, fresh=False, **about)
+    trial = partial(work.trial, data=data, sensor=sensor, target=target.name)
+    beside = search(baselines(), most_accurate, trial, store, jobs=jobs, fresh=fresh)
+    tried = search(candidates, choice.going_on, trial, store, jobs=jobs)
     taken = choice.choose(tried, budgets)
     best = tried[taken.best - 1]
     tried = [_beside(each, best, tried) for each in tried]
-    by = ChosenBy(energy=next(iter(taken.cheapest)), time=next((table.name for table in target.time), None))
+    times = {table.name: table.title for table in target.time}
+    by = ChosenBy(energy=next(iter(taken.cheapest)), time=next(iter(times), None))
     chosen = tried[taken.cheapest[by.energy] - 1]
     checked, commands = train_again(chosen.candidate, sensor, splits, data, target, output)
     return Smallest(
@@ -71,10 +70,7 @@ def smallest(
         command=command,
         target=target.name,
         data=data,
-        tables={
-            "energy": {table.name: table.title for table in target.energy},
-            "time": {table.name: table.title for table in target.time},
-        },
+        tables={"energy": {table.name: table.title for table in target.energy}, "time": times},
         chosen_by=by,
         tried=tuple(tried),
         baselines=tuple(_beside(each, best, ()) for each in beside),
@@ -87,13 +83,11 @@ def smallest(
 def search(
     candidates: Iterable[Candidate],
     going_on: Callable[[Sequence[Tried], int], Sequence[Tried]],
-    data: Data,
-    target: Target,
+    trial: Callable[[Candidate, int, float | None], work.Trial],
     store: Path,
     *,
-    sensor: Sensor,
     jobs: int | None,
-    fresh: bool,
+    fresh: bool = False,
 ) -> list[Tried]:
     """All candidates, as far as each came; `going_on` chooses those that go on from a rung."""
     known: dict[str, Tried] = {}
@@ -101,14 +95,14 @@ def search(
     for rung in range(1, RUNGS + 1):
         before = [known.get(each.name) for each in alive]
         works = [
-            work.trial(each, rung, None if old is None else old.setting, data, sensor, target.name)
-            for each, old in zip(alive, before, strict=True)
+            trial(each, rung, None if old is None else old.setting) for each, old in zip(alive, before, strict=True)
         ]
         label = f"rung {rung} of {RUNGS}"
         found = sweep(works, work.measure, store, jobs=jobs, fresh=fresh and rung == 1, label=label)
         for candidate, old, each in zip(alive, before, works, strict=True):
             measured = decode(work.Measured, found[each.key])
-            measured = work.with_costs(measured, None if old is None else old.measured)
+            if old is not None and measured.costs is None:
+                measured = replace(measured, costs=old.costs, refused=old.refused)
             number = len(known) + 1 if old is None else old.number
             known[candidate.name] = _tried(number, candidate, rung, measured)
         if rung < RUNGS:

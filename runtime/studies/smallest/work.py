@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 from typing import Any
@@ -211,8 +211,3 @@ def costs_of(made: Counters, training: Recordings, target: str) -> tuple[Costs |
         return None, str(error).splitlines()[0]
     steps = of_length(joined_bins(some(training), made.bins), made.clocks.length)
     return priced(netlist, steps)[1], None
-
-
-def with_costs(found: Measured, before: Measured | None) -> Measured:
-    """What is measured on the last rung with the costs that the one before knows."""
-    return found if before is None or found.costs else replace(found, costs=before.costs, refused=before.refused)

@@ -21,7 +21,8 @@ from spikeloom.compiler.errors import NumericRangeError, OptionError
 from spikeloom.compiler.interpret import Simulation, cut, float_simulation, vote
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_of
+from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
 from spikeloom.runtime.machines.votes import readout_counts
 
 Events = npt.NDArray[np.uint8]
@@ -50,7 +51,7 @@ class Pair:
     @cached_property
     def chip(self) -> IntegerMachine:
         """The netlist, ready to run."""
-        return integer_machine_of(self.netlist)
+        return integer_machine(machine_of(self.netlist))
 
     @cached_property
     def model(self) -> Simulation:
