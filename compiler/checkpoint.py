@@ -39,13 +39,11 @@ class Dense:
 class Checkpoint:
     """Trained weights, and what is known about them."""
 
-    # (filters, features, channels) float32; filters of the first layer: of a TactileSGNet K + 1, one for each hop
-    hops: Float32Array
+    hops: Float32Array  # (filters, features, channels) float32; of a TactileSGNet K + 1 filters, one for each hop
     conv_bias: Float32Array  # (features,) float32
     dense: tuple[Dense, ...]  # Fully connected stages in order
-    # beta, theta: Membrane decay and threshold
-    beta: float
-    theta: float
+    beta: float  # Membrane decay
+    theta: float  # Threshold
     layout: str  # {"spikeloom", "released", "state_dict"}; kind of file
     sha256: str  # Of the file
     assumed: tuple[str, ...] = ()  # Which of ``beta`` and ``theta`` neither the file nor the user gave

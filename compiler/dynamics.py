@@ -87,10 +87,8 @@ def with_clocks(events: npt.NDArray[Any], clocks: Clocks) -> npt.NDArray[Any]:
 class Dynamics:
     """Decays of each layer, and clocks."""
 
-    # betas, alphas: Shares of the membrane and of the synaptic current that a step keeps, by layer; empty where all
-    # layers have the common membrane decay, or no current outlasts its step
-    betas: tuple[float, ...] = ()
-    alphas: tuple[float, ...] = ()
+    betas: tuple[float, ...] = ()  # Share of the membrane that a step keeps, by layer; empty: the common one
+    alphas: tuple[float, ...] = ()  # The same of the synaptic current; empty: none outlasts its step
     clocks: Clocks = NO_CLOCKS
 
     @property

@@ -56,9 +56,7 @@ class Readout:
     """Spike-count vote over one population."""
 
     population: int  # Index of the population that votes
-    # (neurons,) int64; class that each of its neurons votes for. The class with most spikes wins, the lowest index on a
-    # tie.
-    label: IntArray
+    label: IntArray  # (neurons,) int64; class that each votes for; most spikes win, the lowest index on a tie
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -69,13 +67,11 @@ class Population:
     """
 
     name: str  # Unique in the network
-    # beta, theta: Decay (0 to 1) and threshold, in the model's membrane units
-    beta: float
-    theta: float
+    beta: float  # Decay, 0 to 1
+    theta: float  # Threshold, in the model's membrane units
     bias: FloatArray  # (neurons,) float64; added in every step
     alpha: float = 0.0  # Share of the synaptic current that a step keeps, 0 to below 1
-    # How many of the last neurons relay a clock each: whatever is rounded, they must spike when it ticks
-    relays: int = 0
+    relays: int = 0  # Neurons at the end that relay a clock each: whatever is rounded, they must spike when it ticks
 
     @property
     def size(self) -> int:
@@ -87,9 +83,8 @@ class Population:
 class Projection:
     """Synapses from one population to another, or to itself."""
 
-    # pre, post: Population indices; `pre` may be ``INPUT``. If they are equal, spikes of a step arrive in the next one.
-    pre: int
-    post: int
+    pre: int  # Index of the source population, or ``INPUT``
+    post: int  # Index of the target; if it is the source, spikes of a step arrive in the next one
     weight: Sparse  # ``weight[i, j]`` is from neuron j of `pre` to neuron i of `post`
 
 
@@ -118,17 +113,14 @@ class IntegerPopulation:
     """The same neurons in the chip's registers; units as in :class:`netlist.Netlist`."""
 
     name: str  # Unique in the network
-    # beta, theta, alpha: Of the float model
-    beta: float
+    beta: float  # Of the float model, as theta and alpha
     theta: float
     scale: FloatArray  # (neurons,) float64; weight units per membrane unit of the float model
-    # decay_u, decay_v: Decay registers
-    decay_u: int
-    decay_v: int
+    decay_u: int  # Decay register of the current
+    decay_v: int  # Decay register of the membrane
     threshold: IntArray  # (neurons,) int64; threshold mantissas
-    # bias_mantissa, bias_exponent: (neurons,) int64; encoded biases
-    bias_mantissa: IntArray
-    bias_exponent: IntArray
+    bias_mantissa: IntArray  # (neurons,) int64
+    bias_exponent: IntArray  # (neurons,) int64
     alpha: float = 0.0
 
     @property

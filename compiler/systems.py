@@ -23,7 +23,7 @@ References
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -46,12 +46,10 @@ SMALL_GRID = 4096
 class Grid:
     """A grid of cells over a sensor, and how a window moves over it."""
 
-    # rows, columns: Cells
-    rows: int
+    rows: int  # Cells
     columns: int
-    # stride, padding: Of the window; the padding is empty
-    stride: int
-    padding: int
+    stride: int  # Of the window
+    padding: int  # Empty cells around the grid
     cells: IntArray  # (taxels, 2) int64; row and column of each taxel; two in one cell add up
 
     def places(self, kernel: int) -> tuple[int, int]:
@@ -75,8 +73,7 @@ class Grid:
 
     def to_json(self) -> JsonObject:
         """JSON values."""
-        whole = {name: getattr(self, name) for name in ("rows", "columns", "stride", "padding")}
-        return whole | {"cells": self.cells.tolist()}
+        return asdict(self) | {"cells": self.cells.tolist()}
 
 
 def feature_major(system: str) -> bool:

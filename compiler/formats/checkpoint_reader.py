@@ -66,7 +66,7 @@ ENTRIES: dict[str, Kind] = {
     **dict.fromkeys(("taxels", "classes"), (1, 2**31)),
     **dict.fromkeys(("beta", "theta"), float),
     "graph": GRAPH,
-    "weights": [str, ...],
+    "weights": [frozenset(WEIGHTS), ...],
     "training": dict,
 }
 MORE: dict[str, Kind] = {
@@ -155,7 +155,8 @@ def _read(content: bytes, run: int, weights: str | None) -> Checkpoint:
 def _read_own(content: bytes, members: dict[str, bytes], weights: str | None) -> Checkpoint:
     """Check a file of our own format, and take one set of weights from its members."""
     manifest, arrays = _signed_content(members)
-    if faults := _manifest_faults(manifest):
+    kinds = ENTRIES | {name: kind for name, kind in MORE.items() if name in manifest}
+    if faults := entry_faults(manifest, kinds) or constant_faults(manifest["beta"], manifest["theta"]):
         raise ModelError(f"{'; '.join(faults)}; {AGAIN}")
     sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
     weights = sets[0] if weights is None else weights
@@ -219,15 +220,6 @@ def _signed_content(members: Mapping[str, bytes]) -> tuple[dict[str, Any], Array
     if content_digest(manifest, arrays) != manifest.get("sha256"):
         raise ModelError(f"its content does not match its hash, so it was altered; {AGAIN}")
     return manifest, arrays
-
-
-def _manifest_faults(manifest: Mapping[str, Any]) -> list[str]:
-    """What in the manifest is missing or of another kind."""
-    kinds = ENTRIES | {name: kind for name, kind in MORE.items() if name in manifest}
-    if faults := entry_faults(manifest, kinds):
-        return faults
-    unknown = set(WEIGHTS).isdisjoint(manifest["weights"])
-    return ["the manifest has no usable weights"] * unknown + constant_faults(manifest["beta"], manifest["theta"])
 
 
 def _forms(entries: list[dict[str, Any]], checkpoint: Checkpoint) -> tuple[Form, ...]:

@@ -51,7 +51,8 @@ def faults_of(
             sizes = dict(zip(shape, array.shape, strict=True)) | sizes
         expected = tuple(sizes.get(word, word) for word in shape)
         if array.shape != expected:
-            faults.append(f"{name} is {array.shape}, wanted {_shown(expected)}")
+            shown = str(expected).replace("'", "")
+            faults.append(f"{name} is {array.shape}, wanted {shown}")
         elif bad := int(np.count_nonzero(~np.isfinite(array))):
             faults.append(f"{name} has {bad} of {array.size} values NaN or infinite")
     return faults + [f"{printable(name)} is not part of {title}" for name in arrays if name not in wanted]
@@ -107,10 +108,6 @@ def tower_faults(arrays: Mapping[str, npt.NDArray[Any]], towers: int) -> list[st
 def _tower_axis(name: str) -> int:
     """Axis along which the towers of a joined network lie: the features of filters, the rows of all else."""
     return 1 if name == "conv1.hops" else 0
-
-
-def _shown(shape: tuple[int | str, ...]) -> str:
-    return f"({', '.join(str(length) for length in shape)}{',' if len(shape) == 1 else ''})"
 
 
 def members(checkpoint: Checkpoint) -> tuple[Checkpoint, ...]:

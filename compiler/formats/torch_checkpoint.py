@@ -17,7 +17,7 @@ import pickle
 import re
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +33,7 @@ CHANNELS = 2
 DENSE_STAGES = 3
 
 GIVE = "give a file of spikeloom train or of the released layout"
+GIVE_WEIGHTS = "give the weights of a TactileSGNet"
 NOT_A_CHECKPOINT = f"is not a checkpoint; {GIVE}"
 DAMAGED = "is truncated or damaged; copy it again"
 
@@ -98,13 +99,10 @@ def _arrays(state: Any, file_size: int) -> Arrays:
             f"holds neither net_list nor weights of a TactileSGNet, but {', '.join(keys[:5]) or 'nothing'}; "
             "give its state_dict"
         )
-    faults = [
-        f"{printable(str(name))} {fault}"
-        for name, value in state.items()
-        if (fault := _tensor_fault(value, file_size)) is not None
-    ]
+    checked = ((printable(str(name)), _tensor_fault(value, file_size)) for name, value in state.items())
+    faults = [f"{name} {fault}" for name, fault in checked if fault]
     if faults:
-        _refuse(faults)
+        raise ModelError(f"{'; '.join(faults)}; {GIVE_WEIGHTS}")
     return {str(name): value.detach().to(torch.float32).numpy() for name, value in state.items()}
 
 
@@ -137,17 +135,13 @@ def _unified(arrays: Arrays) -> Arrays:
         columns = arrays["conv1.lin.weight"].shape[1]
         faults = [f"conv1.lin.weight has {columns} columns, not a whole number of hops with {CHANNELS} channels each"]
     if faults:
-        _refuse(faults)
+        raise ModelError(f"{'; '.join(faults)}; {GIVE_WEIGHTS}")
     if hops:
         filters = np.stack([arrays.pop(f"conv1.lins.{k}.weight") for k in range(len(hops))])
     else:
         side_by_side = arrays.pop("conv1.lin.weight")
         filters = side_by_side.reshape(len(side_by_side), -1, CHANNELS).transpose(1, 0, 2)
     return {"conv1.hops": filters, "conv1.bias": arrays.pop(bias), **arrays}
-
-
-def _refuse(faults: list[str]) -> NoReturn:
-    raise ModelError(f"{'; '.join(faults)}; give the weights of a TactileSGNet")
 
 
 def _training(loaded: Mapping[str, Any], run: int, runs: int) -> JsonObject:

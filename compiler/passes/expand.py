@@ -1,6 +1,6 @@
 """Write the first layer of a system out as synapses: fan-in weights per place and taxel.
 
-A topology adaptive graph convolution (TAGConv) gathers the features of its taxels over K hops [1]_::
+A topology adaptive graph convolution (see :mod:`compiler.systems`) gathers the features of its taxels over K hops::
 
     y = sum_k A^k x W_k + b          x (taxels, channels), W_k (channels, features), k = 0 … K
 
@@ -10,10 +10,6 @@ which is one matrix for all taxels and channels at once, a Kronecker product for
 
 The other systems differ in what stands for the powers ``A^k``: a stack of matrices (places, taxels), one for each
 filter. Outputs equal those of the factored form up to floating-point rounding (float64 throughout).
-
-References
-----------
-.. [1] J. Du et al., "Topology Adaptive Graph Convolutional Networks", 2017, arXiv:1710.10370.
 """
 
 from __future__ import annotations
@@ -37,8 +33,7 @@ class Factored:
     """Trained weights and what their first layer sees, not yet written out as synapses."""
 
     checkpoint: Checkpoint  # Trained weights
-    # (taxels, taxels) or (filters, places, taxels) float64; of a TactileSGNet the normalised adjacency A, whose powers
-    # make the stack; of the others the stack itself
+    # Of a TactileSGNet the normalised adjacency A, (taxels, taxels); else the stack (filters, places, taxels); float64
     propagation: FloatArray
 
 

@@ -19,8 +19,7 @@ class RangeProof:
     json_properties: ClassVar = ("holds",)
 
     layer: str  # Population
-    # accumulator, current, membrane: Largest magnitude that any input can bring to any neuron; infinite where nothing
-    # bounds it
+    # Largest magnitudes that any input can bring to any neuron; infinite where nothing bounds them
     accumulator: float
     current: float
     membrane: float

@@ -27,10 +27,7 @@ COMPARTMENTS, CROSSBARS = "compartments", "crossbars"
 
 _NOT_MODELLED = {"loihi2": "not modelled; no public per-event energies"}
 
-
-PRICE_UNIT = "pJ"
-POWER_UNIT = "mW"
-TIME_UNIT = "ns"
+PRICE_UNIT, POWER_UNIT, TIME_UNIT = "pJ", "mW", "ns"
 PICOSECONDS = 1000
 """In a TIME_UNIT; finer latencies are rounded."""
 
@@ -52,8 +49,7 @@ LATENCIES = (
     *("neuron_access", "neuron_update", "spike", "axon_out", "axon_in"),
     *("synaptic_operation_dense", "synaptic_operation_sparse", "hop_east_west", "hop_north_south"),
 )
-"""What a time table must give in nanoseconds, beside ``link_buffer`` and ``barrier.N``, the barrier from N used tiles
-on."""
+"""What a time table must give, beside ``link_buffer`` and ``barrier.N``, the barrier from N used tiles on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,12 +84,10 @@ class EnergyTable:
 class TimeTable:
     """Latencies per event; all are whole picoseconds, so that sums of them are exact."""
 
-    # name, title: For humans
     name: str
     title: str
     latencies: Mapping[str, Quantity]  # Of each of ``LATENCIES``
-    # Length of the barrier that ends a step, by the least number of used tiles that it holds for
-    barriers: Mapping[int, Quantity]
+    barriers: Mapping[int, Quantity]  # Length of the barrier that ends a step, from so many used tiles on
     link_buffer: Quantity  # Messages that a link of the mesh holds
 
     def picoseconds(self, event: str) -> int:
@@ -213,9 +207,6 @@ def load_target(name: str, cores: str | None = None) -> Target:
         why = why if found is None else f"its cores are {found.cores}, this is for {cores}"
         raise OptionError(f"--target {name}: {why}; allowed: {', '.join(known_targets(cores))}")
     return found
-
-
-# -- numbers from TOML -------------------------------------------------------------------------------------------------
 
 
 def _toml(path: str | os.PathLike[str], what: str) -> JsonObject:

@@ -45,8 +45,7 @@ class Netlist:
     __slots__ = ()
 
     target: str  # Name of the chip
-    # taxels, polarities, classes: Sensor size and number of classes
-    taxels: int
+    taxels: int  # Sensor size, and number of classes
     polarities: int
     classes: int
     core_axons: IntArray  # (cores + 1,) int64; range bounds into the axons

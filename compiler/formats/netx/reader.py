@@ -242,9 +242,8 @@ def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopul
         raise block.fail(
             f"has neurons of type {str(kind)[:20]!r}, allowed are {' and '.join(NEURONS)}; train with them"
         )
-    graded = entries.get("gradedSpike")
-    bits = entries.get("messageBits")
-    if any(isinstance(value, np.ndarray) and np.any(value) for value in (graded, bits)):
+    graded = entries.get("gradedSpike"), entries.get("messageBits")
+    if any(isinstance(value, np.ndarray) and np.any(value) for value in graded):
         raise block.fail("sends graded spikes, which Loihi 1 does not have; train without")
     for key, (least, most) in REGISTERS.items():
         if (key in entries or key not in ("refDelay", "wgtExp")) and not least <= neuron.few(key)[0] <= most:

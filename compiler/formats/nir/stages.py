@@ -184,10 +184,6 @@ def _each(node: Node, key: str, size: int) -> FloatArray:
     return values
 
 
-def _scale(node: Node, value: Value, _steps: Steps) -> Value:
-    return scaled(value, spread(node, "scale", value.size, value.shape))
-
-
 def _image(node: Node, value: Value, axes: int) -> tuple[int, ...]:
     """Channels and space of what a node gets; axes of length 1 in front are the batch's."""
     sizes = list(value.shape)
@@ -272,21 +268,17 @@ def _integrator(node: Node, value: Value, steps: Steps) -> Value:
         return filtered(value, alpha, gain, drive)
 
 
-def _same(_node: Node, value: Value, _steps: Steps) -> Value:
-    return value
-
-
 STAGES: dict[str, Callable[[Node, Value, Steps], Value]] = {
     "Affine": _linear,
     "AvgPool2d": _pool,
     "Conv1d": _conv,
     "Conv2d": _conv,
     "Flatten": _flatten,
-    "Identity": _same,
+    "Identity": lambda _node, value, _steps: value,
     "LI": _integrator,
     "Linear": _linear,
-    "Output": _same,
-    "Scale": _scale,
+    "Output": lambda _node, value, _steps: value,
+    "Scale": lambda node, value, _steps: scaled(value, spread(node, "scale", value.size, value.shape)),
     "SumPool2d": _pool,
 }
 """By type what a node makes of a value; each raises ModelError, with the node's name."""

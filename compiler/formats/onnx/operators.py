@@ -35,12 +35,7 @@ from spikeloom.compiler.formats.onnx.file import BOOL, Graph, Node
 _SHIFTS = frozenset(("Add", "Cast", "Div", "Identity", "Mul", "Sub"))
 """Operators that may stand between a membrane and its comparison, as in ``u - theta > 0``."""
 
-MIRRORED = {
-    "Greater": "Less",
-    "GreaterOrEqual": "LessOrEqual",
-    "Less": "Greater",
-    "LessOrEqual": "GreaterOrEqual",
-}
+MIRRORED = {"Greater": "Less", "GreaterOrEqual": "LessOrEqual", "Less": "Greater", "LessOrEqual": "GreaterOrEqual"}
 """Comparisons with a threshold, and each with its sides exchanged."""
 
 CONSTANT = "is computed from constants by an operator that is not known here; fold constants before the export"

@@ -43,23 +43,15 @@ import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_ONE, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.formats.names import plain_names
-from spikeloom.compiler.formats.onnx.builder import (
-    Model,
-    Nodes,
-    Port,
-    model_bytes,
-    one_each,
-    whole_recordings,
-)
+from spikeloom.compiler.formats.onnx.builder import Model, Nodes, Port, model_bytes, one_each, whole_recordings
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, Reach, netlist_bytes, reach
 from spikeloom.compiler.types import IntArray
 
 FORMS = ("step", "scan")
 
-ONE = 2**DECAY_BITS
 SIZE_LIMIT = 2**31 - 2**20
 """Bytes of weights that a file of this format can hold, a little below protobuf's 2 GiB."""
 
@@ -159,8 +151,8 @@ def _layer(netlist: Netlist, index: int, name: str, sources: dict[int, IntArray]
     bias = netlist.bias_mantissa[ids] << netlist.bias_exponent[ids]
     held = np.minimum(stored, MEMBRANE_MAX)
     widest = max(
-        int((held * (ONE - lost_v)).max()),
-        int((current * (ONE - lost_u)).max()),
+        int((held * (DECAY_ONE - lost_v)).max()),
+        int((current * (DECAY_ONE - lost_u)).max()),
         int((held + current + np.abs(bias)).max()) + _gathered(sources),
     )
     return Layer(
@@ -169,7 +161,7 @@ def _layer(netlist: Netlist, index: int, name: str, sources: dict[int, IntArray]
         ids=ids,
         depth=netlist.layers[index].depth,
         sources=sources,
-        remembers=bool(np.any(lost_u != ONE)),
+        remembers=bool(np.any(lost_u != DECAY_ONE)),
         saturates=bool(np.any(np.maximum(highest, stored) > MEMBRANE_MAX)),
         kind=np.int32 if widest <= NARROW else np.int64,
     )
@@ -303,5 +295,5 @@ def _sum(graph: Nodes, layer: Layer, spikes: list[str]) -> str:
 
 def _decayed(graph: Nodes, layer: Layer, register: str, lost: IntArray, name: str) -> str:
     """Keep ``(4096 - lost) / 4096``: a product and an integer division, which truncates toward zero."""
-    product = graph.add("Mul", [register, one_each(2**DECAY_BITS - lost, layer.kind)], f"{name}/product")
-    return graph.add("Div", [product, layer.kind(2**DECAY_BITS)], name)
+    product = graph.add("Mul", [register, one_each(DECAY_ONE - lost, layer.kind)], f"{name}/product")
+    return graph.add("Div", [product, layer.kind(DECAY_ONE)], name)

@@ -50,12 +50,10 @@ class Layer:
 
     name: str  # ``conv1``, ``fc1`` …
     neurons: int  # Neurons of the float model's layer; the chip may hold fewer compartments
-    # Neurons left out although they fire, as their spikes reach no neuron; any other that is missing cannot fire
-    unread: tuple[int, ...]
+    unread: tuple[int, ...]  # Neurons left out as their spikes reach no neuron; others that are missing cannot fire
     depth: int  # Steps that the layer lags behind the data
-    # beta, theta: Decay and threshold of the float model
-    beta: float
-    theta: float
+    beta: float  # Decay of the float model
+    theta: float  # Its threshold
     weight_bits: int  # Storage width of the mantissas
     synapses: int  # Structural synapses into the layer, before zeros were dropped
     max_fan_in: int  # Largest structural fan-in of a neuron
@@ -71,38 +69,31 @@ class Netlist(netlist_file.Netlist):
     polarities: int
     classes: int
     layers: tuple[Layer, ...]  # In order of depth; ``readout_class`` says which of them votes
-    # (cores,) int64; tile of each core, row-major on the mesh (``x = tile % width``, ``y = tile // width``)
-    core_tile: IntArray
+    core_tile: IntArray  # (cores,) int64; tile of each core, row-major on the mesh: ``x = tile % width``
     # core_compartments, core_axons: (cores + 1,) int64; range bounds, see above
     core_compartments: IntArray
     core_axons: IntArray
     # layer, neuron: (compartments,) int64; which neuron of which layer a compartment is
     layer: IntArray
     neuron: IntArray
-    # decay_u, decay_v: (compartments,) int64; registers: the current loses ``(decay_u + 1)/4096``, the membrane
-    # ``decay_v/4096`` a step
-    decay_u: IntArray
-    decay_v: IntArray
+    decay_u: IntArray  # (compartments,) int64; register: the current loses ``(decay_u + 1)/4096`` a step
+    decay_v: IntArray  # (compartments,) int64; register: the membrane loses ``decay_v/4096`` a step
     threshold: IntArray  # (compartments,) int64; mantissa; a spike needs ``v > 64 * threshold``
-    # bias_mantissa, bias_exponent: (compartments,) int64; ``mantissa * 2**exponent`` is added to the membrane,
-    # unshifted
+    # (compartments,) int64; ``mantissa * 2**exponent`` is added to the membrane, unshifted
     bias_mantissa: IntArray
     bias_exponent: IntArray
-    # (compartments,) float64; weight units (mantissa times 2**exponent) per unit of the float model's membrane; a
-    # membrane register holds 64ths of a weight unit, so float membrane = register / (64 * scale). No register of the
-    # chip.
+    # (compartments,) float64; weight units (mantissa times 2**exponent) per unit of the float model's membrane, which
+    # is register / (64 * scale); no register of the chip
     scale: FloatArray
     readout_class: IntArray  # (compartments,) int64; class that a spike votes for, -1 for none
     # axon_source, axon_format: (axons,) int64; source id and synapse format of each axon
     axon_source: IntArray
     axon_format: IntArray
     axon_synapses: IntArray  # (axons + 1,) int64; range bounds into the synapses
-    # synapse_target, synapse_weight: (synapses,) of an integer type; compartment within the core, and mantissa; in as
-    # few bytes as hold them
+    # (synapses,) of the narrowest integer type: compartment within the core, and mantissa
     synapse_target: IntArray
     synapse_weight: IntArray
-    # format_weight_bits, format_exponent, format_index_bits: (formats,) int64; synapse formats of the whole netlist; a
-    # core uses some of them
+    # (formats,) int64; synapse formats of the whole netlist, of which a core uses some
     format_weight_bits: IntArray
     format_exponent: IntArray
     format_index_bits: IntArray

@@ -39,8 +39,7 @@ class Options:
     spike_exact: bool = False
     keep_all: bool = False  # Keep neurons that provably do nothing, too
     prune_unused: bool = False  # Remove neurons that did not fire on any training recording, too
-    # (samples, taxels, polarities, steps), optional; training recordings for calibration, of which 32, evenly spaced,
-    # are used; with several planes 256
+    # (samples, taxels, polarities, steps); recordings for calibration: 32, evenly spaced, are used, of planes 256
     training_events: npt.NDArray[Any] | None = None
     # Least number of cores of a layer, by name; they hold no other. Its neurons are cut as evenly as possible.
     cores_for: Mapping[str, int] = field(default_factory=dict)

@@ -34,8 +34,7 @@ class Compilation:
     target: Target  # Chip
     network: Network = LATER  # Float network, a synapse for each pair of neurons (`expand`)
     calibration: Calibration | None = None  # What it did on training recordings, where there are any (`calibrate`)
-    # Spikes per step by population, likewise; the placement weighs traffic by them
-    rates: tuple[FloatArray, ...] | None = None
+    rates: tuple[FloatArray, ...] | None = None  # Spikes per step by population, likewise, by which traffic weighs
     connected: Network = LATER  # The same network without the weights of neurons that do nothing (`disconnect`)
     quiet: Masks = ()  # Neurons that never fired in training and are to go for it, although some input makes them fire
     gone: Masks = ()  # Neurons that are to go in any case, see :func:`without`
@@ -45,13 +44,11 @@ class Compilation:
     proofs: tuple[RangeProof, ...] = ()  # Worst-case register values of each layer (`prove`)
     held: IntegerNetwork = LATER  # What the chip holds of it (`remove`)
     identity: tuple[IntArray, ...] = ()  # Which neurons these are, by population
-    # silent, unread: Neurons that it does not hold: they cannot fire, or their spikes reach no neuron
-    silent: Masks = ()
-    unread: Masks = ()
+    silent: Masks = ()  # Neurons that it does not hold as they cannot fire
+    unread: Masks = ()  # Neurons that it does not hold as their spikes reach no neuron
     removals: tuple[Removal, ...] = ()  # The same in numbers, and why
-    # layout, usual: Cores and tiles, and those of the layout of fewest cores; often they are one (`place`)
-    layout: Layout = LATER
-    usual: Layout = LATER
+    layout: Layout = LATER  # Cores and tiles (`place`)
+    usual: Layout = LATER  # The layout of fewest cores, often the same
     netlist: Netlist = LATER  # The result (`emit`)
     uses: tuple[LimitUse, ...] = ()  # Use of every limit by every core (`legalize`)
 

@@ -26,8 +26,7 @@ Place = tuple[int, int]
 class Neuron:
     """Parameters of a neuron; meanings as in :class:`netlist.CrossbarNetlist`."""
 
-    weights: tuple[int, ...] = (1,)
-    """Of the axon types; zero for those that are not named."""
+    weights: tuple[int, ...] = (1,)  # Of the axon types; zero for those that are not named
     leak: int = 0
     leak_reversal: bool = False
     threshold: int = 1

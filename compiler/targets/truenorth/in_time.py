@@ -27,14 +27,7 @@ import numpy as np
 
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.truenorth.builder import (
-    RELAY,
-    Draft,
-    Neuron,
-    Place,
-    crossing_points,
-    history_free,
-)
+from spikeloom.compiler.targets.truenorth.builder import RELAY, Draft, Neuron, Place, crossing_points, history_free
 from spikeloom.compiler.targets.truenorth.codebook import BIN_TICKS, EMPTYING, MOST, WEIGHTS, Layer, LevelNetwork
 from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_LINEAR, RESET_TO, CrossbarNetlist
 from spikeloom.compiler.types import IntArray

@@ -52,8 +52,7 @@ def faults(netlist: CrossbarNetlist, chip: Target) -> tuple[Violation, ...]:
 
 def require_legal(netlist: CrossbarNetlist, chip: Target) -> None:
     """Refuse a network that breaks a rule; the CapacityError lists every fault."""
-    found = faults(netlist, chip)
-    if found:
+    if found := faults(netlist, chip):
         raise CapacityError(found)
 
 

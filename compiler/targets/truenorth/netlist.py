@@ -80,9 +80,7 @@ class CrossbarNetlist(netlist_file.Netlist):
     synapse_neuron: IntArray  # (synapses,) int64; neuron on the core
     weight: IntArray  # (neurons, 4) int64; by axon type
     leak: IntArray  # (neurons,) int64; added in every tick
-    # (neurons,) int64; 1 where the leak takes the sign of the membrane; a membrane that it would carry past zero is
-    # then zero
-    leak_reversal: IntArray
+    leak_reversal: IntArray  # (neurons,) int64; 1 where the leak takes the membrane's sign, and stops at zero
     threshold: IntArray  # (neurons,) int64; a spike needs a membrane of at least this
     # reset_mode, reset: (neurons,) int64; ``RESET_TO``, ``RESET_LINEAR`` or ``RESET_NONE``, and the value of the first
     reset_mode: IntArray
@@ -93,19 +91,15 @@ class CrossbarNetlist(netlist_file.Netlist):
     # layer, neuron: (neurons,) int64; which neuron of which layer it is; copies of one share the numbers
     layer: IntArray
     neuron: IntArray
-    # readout_class, readout_first: (neurons,) int64; class that a spike votes for, -1 for none, and the tick from which
-    # on it does
-    readout_class: IntArray
-    readout_first: IntArray
-    # wire_neuron, wire_x, wire_y, wire_line, wire_delay: (wires,) int64; from a neuron to a line of the core at a
-    # place, ticks on the way
+    readout_class: IntArray  # (neurons,) int64; class that a spike votes for, -1 for none
+    readout_first: IntArray  # (neurons,) int64; tick from which on it does
+    # (wires,) int64: from a neuron to a line of the core at a place, and ticks on the way
     wire_neuron: IntArray
     wire_x: IntArray
     wire_y: IntArray
     wire_line: IntArray
     wire_delay: IntArray
-    # feed_channel, feed_core, feed_line, feed_tick: (feeds,) int64; from an input channel (channel ``taxel * polarities
-    # + polarity``, then the clocks of `clocks`) to a line of a core
+    # (feeds,) int64: from an input channel (``taxel * polarities + polarity``, then `clocks`) to a line of a core
     feed_channel: IntArray
     feed_core: IntArray
     feed_line: IntArray
@@ -182,16 +176,12 @@ class CrossbarNetlist(netlist_file.Netlist):
 
 def _places(held: tuple[IntArray, IntArray], wanted: tuple[IntArray, IntArray]) -> IntArray:
     """First index at which each wanted pair is held, -1 where it is not."""
-    pairs, index = np.unique(_codes(held), return_index=True)
+    codes, sought = (first * 2**32 + second for first, second in (held, wanted))  # both are of 32 bits
+    pairs, index = np.unique(codes, return_index=True)
     if not len(pairs):
-        return np.full(len(wanted[0]), -1)
-    at = np.minimum(np.searchsorted(pairs, _codes(wanted)), len(pairs) - 1)
-    return np.where(pairs[at] == _codes(wanted), index[at], -1)
-
-
-def _codes(pair: tuple[IntArray, IntArray]) -> IntArray:
-    """Pairs of 32-bit numbers as one number each."""
-    return pair[0] * 2**32 + pair[1]
+        return np.full(len(sought), -1)
+    at = np.minimum(np.searchsorted(pairs, sought), len(pairs) - 1)
+    return np.where(pairs[at] == sought, index[at], -1)
 
 
 def inconsistencies(netlist: CrossbarNetlist) -> list[str]:

@@ -149,9 +149,6 @@ class Forecast:
         )
 
 
-# -- search ------------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trial:
     """Layers cut evenly, each chunk on a core of its own."""
@@ -274,9 +271,6 @@ def fastest(forecast: Forecast) -> Trial | None:
     search = _Search(forecast)
     trials = search.shrink()
     return search.polish(min(trials, key=lambda trial: trial.score)) if trials else None
-
-
-# -- choice ------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

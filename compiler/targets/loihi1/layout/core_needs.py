@@ -50,12 +50,10 @@ class Lists:
     projection: int  # Index in the network
     source: IntArray  # (lists,) int64; neuron of the source population
     nonzero: IntArray  # (lists,) int64; non-zero synapses of each list
-    # row, mantissa: (synapses,); neuron of the chunk (counted within it, ascending in each list) and non-zero weight
-    row: IntArray
-    mantissa: IntArray
-    # first, last: (lists,) int64; first and last row of each list
-    first: IntArray
-    last: IntArray
+    row: IntArray  # (synapses,); neuron within the chunk, ascending in each list
+    mantissa: IntArray  # (synapses,); non-zero weight
+    first: IntArray  # (lists,) int64; first row of each list
+    last: IntArray  # (lists,) int64; last row of each list
 
 
 def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
@@ -67,19 +65,16 @@ def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
             part.eliminate_zeros()
             bounds, row = part.indptr.astype(np.int64), part.indices.astype(np.int64)
             source = np.flatnonzero(np.diff(bounds))
-            first, last = row[bounds[source]], row[bounds[source + 1] - 1]
-            nonzero = np.diff(bounds)[source]
-            found.append(
-                Lists(
-                    projection=index,
-                    source=source,
-                    nonzero=nonzero,
-                    row=row,
-                    mantissa=part.data,
-                    first=first,
-                    last=last,
-                )
+            lists = Lists(
+                projection=index,
+                source=source,
+                nonzero=np.diff(bounds)[source],
+                row=row,
+                mantissa=part.data,
+                first=row[bounds[source]],
+                last=row[bounds[source + 1] - 1],
             )
+            found.append(lists)
     return tuple(found)
 
 

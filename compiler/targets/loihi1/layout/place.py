@@ -133,9 +133,6 @@ def place(traffic: FloatArray, target: Target) -> Placement:
     return Placement(tiles=tiles, spike_hops=float(spent))
 
 
-# -- several chips -----------------------------------------------------------------------------------------------------
-
-
 def chip_tiles(target: Target) -> int:
     """Tiles of one chip."""
     return target.limit("mesh.width") * target.limit("mesh.height")

@@ -69,9 +69,7 @@ class Choice:
     candidates: int  # Scales that were compared
     flips: int | None  # Calibration spikes that differ from float64; None without calibration
     spikes: int | None  # Calibration spikes of the float64 model
-    # Share of the accumulator that the worst case leaves free; of the current's register where a current that outlasts
-    # its step fills that sooner
-    headroom: float
+    headroom: float  # Share that the worst case leaves free of the register that it fills first, see ``Rounded``
 
 
 def _register(population: Population) -> str:

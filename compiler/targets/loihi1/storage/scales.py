@@ -190,10 +190,9 @@ def candidate(
 ) -> tuple[Rounded | None, bool]:
     """Best compromise between a fine weight scale and a fine threshold, see ``WORTHWHILE``.
 
-    Weights that are whole numbers stay so, up to their scale.
-
-    `factor` says how far the scale may exceed the one that just holds the largest weight; the rest is clipped. Also
-    whether registers, not that, limit the scale: a larger factor gives the same.
+    Weights that are whole numbers stay so, up to their scale. `factor` says how far the scale may exceed the one that
+    just holds the largest weight; the rest is clipped. Also whether registers, not that, limit the scale: a larger
+    factor gives the same.
     """
     bits, peak = packing.bits, float(layer.peaks().max(initial=0))
     chosen, limited, finest = None, False, 0.0
@@ -212,9 +211,6 @@ def candidate(
         chosen, finest = fitted, max(finest, mantissa_scale(fitted))
         limited = finest < WORTHWHILE * held * factor
     return chosen, limited
-
-
-# -- a scale for each group of neurons ---------------------------------------------------------------------------------
 
 
 def finest_thresholds(layer: FloatLayer, bits: int, exponents: tuple[int, ...]) -> IntArray:

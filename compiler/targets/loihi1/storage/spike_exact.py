@@ -25,13 +25,7 @@ from spikeloom.compiler.targets.loihi1.storage.choose_storage import (
     explain_choice,
     round_with_more,
 )
-from spikeloom.compiler.targets.loihi1.storage.scales import (
-    FloatLayer,
-    Rounded,
-    finest_thresholds,
-    judged,
-    layer_of,
-)
+from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, finest_thresholds, judged, layer_of
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 
 SHARED = 0.8
