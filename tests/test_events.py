@@ -13,7 +13,7 @@ from spikeloom.models.recordings.eventfiles import EventStream, read_stream
 from spikeloom.models.recordings.events import BIN_S, MAX_STEPS, bin_events, data_splits, load_data, need_labels
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
-from spikeloom.models.recordings.release import write_released
+from spikeloom.models.recordings.release import write_event_lines, write_released
 from spikeloom.runtime.commands.exchange.data import describe
 
 HEADER = "time_s,taxel,polarity\n"
@@ -397,3 +397,14 @@ def test_a_table_above_the_splits(write):
 )
 def test_a_table_that_cannot_be(listed, rows, line):
     assert message(load_data, listed("own/labels.csv", f"file,label\n{rows}").parent) == line
+
+
+def test_any_number_of_polarities(tmp_path):
+    """Arrays have as many as the sensor, all alike; event lines and rates by polarity are for two."""
+    for number, polarities in enumerate((3, 3, 1)):
+        np.save(tmp_path / f"sample_{number}_label_0.npy", np.ones((2, polarities, 4), np.uint8))
+    assert load_data(tmp_path, limit=2).events.shape == (2, 2, 3, 4)
+    with pytest.raises(DataError, match=r"shape \(2, 1, 4\), the recordings before it have \(2, 3, 4\)"):
+        load_data(tmp_path)
+    with pytest.raises(DataError, match="has 3 polarities"):
+        write_event_lines(tmp_path / "lines.csv", [load_data(tmp_path, limit=1)], 0.02)

@@ -102,12 +102,12 @@ def load_data(
         for file, (name, member) in zip(files, chosen, strict=True):
             where = source if path == file else f"{source}: {folder}{name}"
             read.append(_read(file, members[member], where, bin_s, taxels, table.get(file)))
-            _require_alike(read[-1], read[0] if released else None)
+            _require_alike(read[-1], read[0], released)
             require_class(where, read[-1].label, classes)
             held += read[-1].grid.size
             require_memory(source, held)
     steps = np.array([each.grid.shape[2] for each in read], np.int64)
-    shape = max(each.grid.shape[0] for each in read), 2, int(steps.max())
+    shape = max(each.grid.shape[0] for each in read), read[0].grid.shape[1], int(steps.max())
     require_memory(source, len(read) * math.prod(shape))
     events = np.zeros((len(read), *shape), dtype=np.uint8)
     for index, each in enumerate(read):
@@ -131,13 +131,13 @@ def load_data(
     )
 
 
-def _require_alike(read: _Recording, first: _Recording | None) -> None:
-    """Refuse a recording of the released layout that has no label, or another shape than the `first` one."""
-    if first is not None and read.label == UNLABELLED:
+def _require_alike(read: _Recording, first: _Recording, released: bool) -> None:
+    """Refuse other polarities than the first recording has; in the released layout another shape, and no label."""
+    if released and read.label == UNLABELLED:
         raise DataError(
             f"{read.where}: no label in the name, allowed is sample_N_label_L.npy; rename or remove the file"
         )
-    if first is not None and read.grid.shape != first.grid.shape:
+    if read.grid.shape[1] != first.grid.shape[1] or (released and read.grid.shape != first.grid.shape):
         raise DataError(
             f"{read.where}: shape {read.grid.shape}, the recordings before it have {first.grid.shape}; "
             "all of a split must agree"

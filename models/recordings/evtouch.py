@@ -1,7 +1,8 @@
 """Recordings in one array, and the layout of the released ones: folders, zips and npy files, checked.
 
 The layout is ``train/`` and ``test/`` with files ``sample_N_label_L.npy``, possibly inside one top folder. A
-recording is (taxels, 2, steps), values 0 and 1; polarity 1 is the rising one (it leads at first contact).
+recording is (taxels, polarities, steps), values 0 and 1; of two polarities, 1 is the rising one (it leads at first
+contact).
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings.counts import EventCounts
 
+MAX_POLARITIES = 8
+"""Of a taxel; an array with more has its axes in another order."""
+
 MAX_TOTAL_BYTES = 4 << 30
 MAX_FILE_BYTES = 64 << 20  # the released recordings have 0.1 MB
 
@@ -41,8 +45,8 @@ Members = Mapping[str, Callable[[], IO[Any]]]
 class Recordings:
     """Event recordings of one split, in one array: shorter ones are filled up with silence that does not count."""
 
-    # (samples, taxels, 2, steps) uint8; 1 where a taxel sent an event of that polarity in that step; C-contiguous,
-    # read-only
+    # (samples, taxels, polarities, steps) uint8; 1 where a taxel sent an event of that polarity in that step;
+    # C-contiguous, read-only
     events: NDArray[np.uint8]
     labels: NDArray[np.int64]  # (samples,) int64; class of each recording, or `UNLABELLED`; read-only
     files: tuple[str, ...]  # File name of each recording
@@ -172,11 +176,11 @@ def parse_npy(where: str, opener: Callable[[], IO[Any]]) -> NDArray[Any]:
 
 
 def parse_bins(where: str, opener: Callable[[], IO[Any]], taxels: int | None) -> NDArray[np.uint8]:
-    """Events (taxels, 2, steps) of an npy file; DataError if it holds anything else, or has not so many `taxels`."""
+    """Events (taxels, polarities, steps) of an npy file; DataError if it holds anything else, or not the `taxels`."""
     values = parse_npy(where, opener)
     shape = values.shape
-    if len(shape) != 3 or 0 in shape or shape[1] != 2:
-        raise DataError(f"{where}: shape {shape}, allowed is (taxels, 2, steps); one recording per file")
+    if len(shape) != 3 or 0 in shape or shape[1] > MAX_POLARITIES:
+        raise DataError(f"{where}: shape {shape}, allowed is (taxels, polarities, steps); one recording per file")
     if taxels is not None and shape[0] != taxels:
         raise DataError(f"{where}: has {shape[0]} taxels, the network has {taxels}; use recordings of its sensor")
     values = values.view(np.uint8) if values.dtype == np.bool_ else values  # a byte of 2 is no truth value
@@ -204,6 +208,13 @@ def require_class(where: str, label: int, classes: int | None) -> None:
             f"{where}: label {label}, the network has {classes} classes (0..{classes - 1}); "
             "use the network that was trained on these objects"
         )
+
+
+def require_polarities(recordings: Recordings) -> None:
+    """Refuse events that are neither falling nor rising: of another number of polarities than two; a DataError."""
+    if recordings.events.shape[2] != 2:
+        found = recordings.events.shape[2]
+        raise DataError(f"{recordings.source}: has {found} polarities, allowed are falling and rising; choose another")
 
 
 def data_digest(training: Recordings, test: Recordings) -> str:

@@ -19,7 +19,7 @@ from spikeloom.compiler.archive import ZIP_DATE, npy_bytes
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.files import beside, write_atomically
 from spikeloom.models.recordings.events import need_labels
-from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.evtouch import Recordings, require_polarities
 
 SOURCES = "sources.csv"
 """Table of split, new name and old name of every recording."""
@@ -89,6 +89,7 @@ def write_event_lines(path: str | os.PathLike[str], splits: Sequence[Recordings]
         raise DataError(
             f"-o {path}: {count} recordings, a .csv holds one; give one recording, or a folder or zip to -o"
         )
+    require_polarities(splits[0])
     step, taxel, polarity = np.nonzero(splits[0].events[0].transpose(2, 0, 1))
     times = (step + 0.5) * bin_s
     lines = [f"{t:.9g},{n},{p}\n" for t, n, p in zip(times.tolist(), taxel.tolist(), polarity.tolist(), strict=True)]

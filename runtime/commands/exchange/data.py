@@ -11,7 +11,7 @@ import numpy as np
 from spikeloom.compiler.types import FloatArray
 from spikeloom.models.recordings.counts import EventCounts, number, show_notes
 from spikeloom.models.recordings.events import data_splits, joined_bins, load_data, require_events
-from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
+from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings, require_polarities
 from spikeloom.models.recordings.fetch import DATA_SETS, Fetched, fetch_data
 from spikeloom.models.recordings.grasps import SPLITS, SYNTHETIC, synthetic_split
 from spikeloom.models.recordings.release import SOURCES, write_event_lines, write_released
@@ -143,6 +143,7 @@ def _fetch_sections(result: Fetched) -> Iterator[Section]:
 def _describe(arguments: Arguments) -> Outcome:
     count, _ = _layout(arguments.taxels)
     recordings = _load(arguments.source, arguments.split, arguments.bin, count)
+    require_polarities(recordings)
     show_notes(recordings.counts)
     return Outcome(describe(recordings, arguments.bin), described_sections)
 
