@@ -31,26 +31,33 @@ def prepare_job(task: Task, _options: list[str]) -> Job:
 
     source = LoihiSpikeGeneratorGroup(task.events.shape[2], *of(0))
     always = LoihiSpikeGeneratorGroup(1, np.zeros(steps, int), np.arange(steps))
-    parts, monitors, before = [source, always], [], source
-    for layer in task.layers:
-        weight, unit = layer.mantissas()
-        neurons = LoihiNeuronGroup(
-            layer.size, refractory=1, threshold_v_mant=layer.common_threshold() >> 6, decay_v=4096 - 819, decay_I=4096
+    groups = [
+        LoihiNeuronGroup(
+            layer.size, refractory=1, threshold_v_mant=layer.common_threshold() >> 6, decay_v=layer.decay, decay_I=4096
         )
-        synapses = LoihiSynapses(
-            before, neurons, sign_mode=synapse_sign_mode.MIXED, w_exp=unit.bit_length() - 2
-        )  # 2w at log2(unit) - 1
-        to, frm = np.nonzero(weight)
-        synapses.connect(i=frm, j=to)
-        synapses.w = 2 * weight[to, frm].astype(int)
+        for layer in task.layers
+    ]
+    monitors = [LoihiSpikeMonitor(neurons) for neurons in groups]
+    parts = [source, always, *groups, *monitors]
+    for layer, neurons in zip(task.layers, groups, strict=True):
+        for before in layer.weights:
+            weight, unit = layer.mantissas(before)
+            synapses = LoihiSynapses(
+                groups[before] if before >= 0 else source,
+                neurons,
+                sign_mode=synapse_sign_mode.MIXED,
+                w_exp=unit.bit_length() - 2,
+            )  # 2w at log2(unit) - 1
+            to, frm = np.nonzero(weight)
+            synapses.connect(i=frm, j=to)
+            synapses.w = 2 * weight[to, frm].astype(int)
+            parts.append(synapses)
         biases = brian2.Synapses(
             always, neurons, model="bias : 1 (constant)", on_pre="I_post += bias", delay=0 * brian2.ms
         )
         biases.connect(i=0, j=np.arange(layer.size))
         biases.bias = layer.bias.astype(float)
-        monitors.append(LoihiSpikeMonitor(neurons))
-        parts += [neurons, synapses, biases, monitors[-1]]
-        before = neurons
+        parts.append(biases)
     network = LoihiNetwork(*parts)
     network.run(0)  # generates and compiles
     network.store()

@@ -27,7 +27,7 @@ def make_block(layer: Layer, ids: Any, name: str) -> LoihiBlock:
     block = LoihiBlock(len(ids), label=name)
     neurons = block.compartment
     neurons.decay_u = np.full(len(ids), 4095, np.int32)
-    neurons.decay_v = np.full(len(ids), 4096 - 819, np.int32)
+    neurons.decay_v = np.full(len(ids), layer.decay, np.int32)
     neurons.refract_delay = np.ones(len(ids), np.int32)
     neurons.vth = layer.threshold[ids].astype(np.int32)
     neurons.bias = layer.bias[ids].astype(np.int32)
@@ -58,22 +58,23 @@ def prepare_job(task: Task, options: list[str]) -> Job:
     model = Model()
     spike_input = SpikeInput(task.events.shape[2])
     model.add_input(spike_input)
-    before: list[tuple[SpikeInput | LoihiBlock, Any]] = [(spike_input, np.arange(task.events.shape[2]))]
-    probes: list[list[tuple[LoihiProbe, Any]]] = []
+    sources: dict[int, list[tuple[SpikeInput | LoihiBlock, Any]]] = {
+        -1: [(spike_input, np.arange(task.events.shape[2]))]
+    }
     for i, layer in enumerate(task.layers):
         place = layer.core if options == ["cores"] else np.zeros(layer.size, np.int64)
-        blocks = []
-        for core in np.unique(place):
-            ids = np.flatnonzero(place == core)
-            block = make_block(layer, ids, f"layer{i} core{core}")
-            for source, neurons in before:
-                connect(source, block, layer.weight[np.ix_(ids, neurons)])
+        members = {int(core): np.flatnonzero(place == core) for core in np.unique(place)}
+        sources[i] = [(make_block(layer, ids, f"layer{i} core{core}"), ids) for core, ids in members.items()]
+    probes: list[list[tuple[LoihiProbe, Any]]] = []
+    for i, layer in enumerate(task.layers):
+        for block, ids in sources[i]:
+            for before, weight in layer.weights.items():
+                for source, neurons in sources[before]:
+                    connect(source, block, weight[np.ix_(ids, neurons)])
             model.add_block(block)
-            blocks.append((block, ids))
-        probes.append([(LoihiProbe(target=block, key="spiked"), ids) for block, ids in blocks])
+        probes.append([(LoihiProbe(target=block, key="spiked"), ids) for block, ids in sources[i]])
         for probe, _ in probes[-1]:
             model.add_probe(probe)
-        before = blocks
     emulator: list[EmulatorInterface] = []
 
     def reset(unit: int) -> None:

@@ -17,14 +17,15 @@ def make_network(task: Task, architecture: Any) -> Any:
     """Neurons, synapses and their cores."""
     network = sanafe.Network()
     cores = architecture.cores()
-    before = network.create_neuron_group("in", task.events.shape[2])
+    channels = network.create_neuron_group("in", task.events.shape[2])
     for channel in range(task.events.shape[2]):
-        before[channel].set_attributes(
+        channels[channel].set_attributes(
             soma_hw_name=f"loihi_inputs[{channel}]", log_spikes=False, model_attributes={"spikes": []}
         )
-        before[channel].map_to_core(cores[0])
+        channels[channel].map_to_core(cores[0])
+    groups = {-1: channels}
     for i, layer in enumerate(task.layers):
-        group = network.create_neuron_group(
+        groups[i] = group = network.create_neuron_group(
             f"layer{i}",
             layer.size,
             soma_hw_name="loihi_lif",
@@ -33,7 +34,7 @@ def make_network(task: Task, architecture: Any) -> Any:
             default_dendrite_hw_name="loihi_dendrites",
             model_attributes={
                 "reset": 0.0,
-                "leak_decay": 819 / 4096,
+                "leak_decay": 1 - layer.decay / 4096,
                 "input_decay": 0.0,
                 "reset_mode": "hard",
                 "force_update": True,
@@ -42,10 +43,11 @@ def make_network(task: Task, architecture: Any) -> Any:
         for neuron, (bias, threshold, core) in enumerate(zip(layer.bias, layer.threshold, layer.core, strict=True)):
             group[neuron].set_attributes(model_attributes={"bias": bias / 64, "threshold": threshold / 64})
             group[neuron].map_to_core(cores[1 + core])
-        to, frm = np.nonzero(layer.weight)
-        pairs = list(zip(frm.tolist(), to.tolist(), strict=True))
-        before.connect_neurons_sparse(group, {"weight": layer.weight[to, frm].astype(float).tolist()}, pairs)
-        before = group
+    for i, layer in enumerate(task.layers):
+        for before, weight in layer.weights.items():
+            to, frm = np.nonzero(weight)
+            pairs = list(zip(frm.tolist(), to.tolist(), strict=True))
+            groups[before].connect_neurons_sparse(groups[i], {"weight": weight[to, frm].astype(float).tolist()}, pairs)
     return network
 
 

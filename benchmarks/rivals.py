@@ -207,7 +207,7 @@ def write_task(path: Path, netlist: Netlist, events: workload.SpikeArray, few: A
     chain = workload.chain_of(netlist)
     arrays: dict[str, Any] = {"layers": len(chain), "events": events.view(np.uint8), "few": few}
     for index, stage in enumerate(chain):
-        arrays |= {f"{key}{index}": getattr(stage, key) for key in ("weight", "bias", "threshold", "core", "dense")}
+        arrays |= stage.arrays(index)
     chosen = events[few]
     padded = np.concatenate([chosen, np.zeros_like(chosen[:, : len(chain)])], axis=1)
     aligned = workload.reference(chain, chosen)

@@ -44,66 +44,103 @@ class Stage:
 
     Parameters
     ----------
-    weight : (neurons, sources) int64
-        Weight units.
+    weights : dict of int to (neurons, sources) int64
+        Weight units, by the layer that is listened to; the input is -1.
     bias : (neurons,) int64
         Added to the membrane in every step.
     threshold : (neurons,) int64
         A spike needs a membrane above it.
     core : (neurons,) int64
         Where our placer put each neuron.
+    decay : int
+        4096ths of the membrane that a step takes.
     dense : bool
         Whether most of its synapses are stored in dense lists.
     """
 
-    weight: IntArray
+    weights: dict[int, IntArray]
     bias: IntArray
     threshold: IntArray
     core: IntArray
+    decay: int
     dense: bool
+
+    @property
+    def weight(self) -> IntArray:
+        """Weights of a stage that listens to one other."""
+        (weight,) = self.weights.values()
+        return weight
+
+    def arrays(self, index: int) -> dict[str, object]:
+        """What a task file holds of it."""
+        held: dict[str, object] = {f"weight{index} {source}": weight for source, weight in self.weights.items()}
+        return held | {f"{key}{index}": getattr(self, key) for key in ("bias", "threshold", "core", "decay", "dense")}
 
 
 Chain = tuple[Stage, ...]
 """Layers that each listen to the one before, the first to the input; decay 819/4096, currents without memory."""
 
 
+def stages_of(netlist: Netlist) -> Chain:
+    """Dense matrices of a netlist of any wiring.
+
+    Raises
+    ------
+    ValueError
+        If a current outlasts its step, or the decays of a layer differ.
+    """
+    forgets, _ = decay_registers(BETA)
+    if np.any(netlist.decay_u != forgets):
+        raise ValueError("currents that outlast a step are not given to the rivals")
+    source = netlist.axon_source[netlist.axon_of_synapse()]
+    target = netlist.synapse_compartment()
+    weight = netlist.effective_weight()
+    dense = (netlist.format_index_bits[netlist.axon_format] == 0)[netlist.axon_of_synapse()]
+    sources = {-1: np.arange(netlist.n_inputs)}
+    sources |= {i: netlist.n_inputs + netlist.compartments_of(i) for i in range(len(netlist.layers))}
+    place, layer_of = np.zeros((2, netlist.n_inputs + netlist.n_compartments), np.int64)
+    for index, members in sources.items():
+        place[members], layer_of[members] = np.arange(len(members)), index
+    stages = []
+    for layer in range(len(netlist.layers)):
+        ids = netlist.compartments_of(layer)
+        mine = netlist.layer[target] == layer
+        weights = {}
+        for index in np.unique(layer_of[source[mine]]).tolist():
+            matrix = np.zeros((len(ids), len(sources[index])), np.int64)
+            chosen = mine & (layer_of[source] == index)
+            rows, columns = place[netlist.n_inputs + target[chosen]], place[source[chosen]]
+            np.add.at(matrix, (rows, columns), weight[chosen])
+            weights[index] = matrix
+        (decay,) = np.unique(netlist.decay_v[ids])
+        stages.append(
+            Stage(
+                weights=weights,
+                bias=(netlist.bias_mantissa << netlist.bias_exponent)[ids],
+                threshold=netlist.threshold[ids] << 6,
+                core=netlist.core_of_compartment()[ids],
+                decay=int(decay),
+                dense=bool(dense[mine].mean() > 0.5),
+            )
+        )
+    return tuple(stages)
+
+
 def chain_of(netlist: Netlist) -> Chain:
-    """Dense matrices of a netlist.
+    """Dense matrices of a netlist that is a chain.
 
     Raises
     ------
     ValueError
         If it is no chain of layers, or its decays are others.
     """
-    decay_u, decay_v = decay_registers(BETA)
-    if np.any(netlist.decay_u != decay_u) or np.any(netlist.decay_v != decay_v):
-        raise ValueError(f"decays other than {BETA} are not given to the rivals")
-    source = netlist.axon_source[netlist.axon_of_synapse()]
-    target = netlist.synapse_compartment()
-    weight = netlist.effective_weight()
-    dense = (netlist.format_index_bits[netlist.axon_format] == 0)[netlist.axon_of_synapse()]
-    before = np.arange(netlist.n_inputs)
-    stages = []
-    for layer in range(len(netlist.layers)):
-        ids = netlist.compartments_of(layer)
-        row, column = np.full((2, netlist.n_inputs + netlist.n_compartments), -1)
-        row[ids], column[before] = np.arange(len(ids)), np.arange(len(before))
-        mine = row[target] >= 0
-        if np.any(column[source[mine]] < 0):
-            raise ValueError(f"{netlist.layers[layer].name}: listens to another layer than the one before")
-        matrix = np.zeros((len(ids), len(before)), np.int64)
-        np.add.at(matrix, (row[target[mine]], column[source[mine]]), weight[mine])
-        stages.append(
-            Stage(
-                weight=matrix,
-                bias=(netlist.bias_mantissa << netlist.bias_exponent)[ids],
-                threshold=netlist.threshold[ids] << 6,
-                core=netlist.core_of_compartment()[ids],
-                dense=bool(dense[mine].mean() > 0.5),
-            )
-        )
-        before = netlist.n_inputs + ids
-    return tuple(stages)
+    stages, (_, decay) = stages_of(netlist), decay_registers(BETA)
+    for index, stage in enumerate(stages):
+        if stage.decay != decay:
+            raise ValueError(f"decays other than {BETA} are not given to the rivals")
+        if list(stage.weights) != [index - 1]:
+            raise ValueError(f"{netlist.layers[index].name}: listens to another layer than the one before")
+    return stages
 
 
 def recurrence(current: IntArray, threshold: IntArray | int) -> SpikeArray:

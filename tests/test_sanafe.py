@@ -27,33 +27,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist, write_netlist
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost
 
-PROGRAM = """
-import json, sys
-import numpy as np
-import sanafe
-
-network, given, output = sys.argv[1:]
-given = np.load(given)
-chip = sanafe.SpikingChip(sanafe.load_loihi())
-chip.load(sanafe.load_net(network, sanafe.load_loihi()))
-runs = []
-for events in given["events"]:
-    for model in given["models"]:
-        if runs:
-            chip.reset()
-        for neuron, train in zip(chip.mapped_neuron_groups["input"], events):
-            neuron.set_attributes(model_attributes={"spikes": [bool(bit) for bit in train]})
-        run = chip.sim(int(given["steps"]), timing_model=str(model), processing_threads=1, spike_trace=True,
-                       perf_trace=True)
-        runs.append({
-            "spikes": [[step, spike.group_name, spike.neuron_offset]
-                       for step, row in enumerate(run["spike_trace"]) for spike in row],
-            "energy": run["energy"],
-            "trace": {name: list(values) for name, values in run["perf_trace"].items()},
-        })
-with open(output, "w") as file:
-    json.dump(runs, file)
-"""
+PROGRAM = Path(__file__).parents[1] / "benchmarks" / "sanafe_file.py"
 
 
 @pytest.fixture(scope="session")
@@ -73,7 +47,7 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
     steps = events.shape[2] + netlist.max_depth + 1
     (folder / "net.yaml").write_text("\n".join(sanafe.export(netlist, LOIHI)) + "\n", "utf-8")
     np.savez(folder / "given.npz", events=events, steps=steps, models=["simple", "detailed"])
-    words = [python, "-c", PROGRAM, *(str(folder / name) for name in ("net.yaml", "given.npz", "runs.json"))]
+    words = [python, PROGRAM, *(str(folder / name) for name in ("net.yaml", "given.npz", "runs.json"))]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     theirs = json.loads((folder / "runs.json").read_text("utf-8"))
