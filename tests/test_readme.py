@@ -3,6 +3,7 @@
 import argparse
 import doctest
 import functools
+import json
 import os
 import pkgutil
 import re
@@ -125,28 +126,40 @@ def test_every_link_leads_somewhere(page):
             assert anchor in anchors(TEXTS[there]), link
 
 
-def test_the_square_sensor_example_reaches_a_decision(tmp_path):
-    # `spikeloom` is whatever this interpreter runs, installed or not
+@pytest.fixture
+def environment(tmp_path):
+    """Variables of a shell whose `spikeloom` is whatever this interpreter runs, installed or not."""
     command = tmp_path / "bin" / "spikeloom"
     command.parent.mkdir()
     command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m spikeloom "$@"\n')
     command.chmod(0o755)
-    environment = os.environ | {
-        "PATH": f"{command.parent}{os.pathsep}{os.environ['PATH']}",
-        "PYTHONPATH": str(ROOT / "src"),
-    }
-    done = subprocess.run(
-        ["bash", ROOT / "examples" / "square_sensor.sh", tmp_path / "made"],
-        capture_output=True,
-        text=True,
-        env=environment,
-        timeout=540,
-        check=False,
-    )
+    path = f"{command.parent}{os.pathsep}{os.environ['PATH']}"
+    return os.environ | {"PATH": path, "PYTHONPATH": str(ROOT / "src"), "MPLBACKEND": "agg"}
+
+
+def run_example(environment, *command, **options):
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=540, check=False, **options)
     assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_square_sensor_example_reaches_a_decision(tmp_path, environment):
     made = tmp_path / "made"
+    shown = run_example(environment, "bash", ROOT / "examples" / "square_sensor.sh", made)
     for name in ("coords.csv", "training.png", "square.pt", "square.loom", "grasp.csv"):
         assert (made / name).stat().st_size > 0
-    assert "E0  specification = engine in every" in done.stdout
-    assert "grasp 1: class " in done.stdout
-    assert "1 grasp, 100 bins" in done.stdout
+    assert "E0  specification = engine in every" in shown
+    assert "grasp 1: class " in shown
+    assert "1 grasp, 100 bins" in shown
+
+
+def test_the_notebook_runs(tmp_path, environment):
+    """Its code in one process, a line with ! by the shell."""
+    cells = json.loads((ROOT / "examples" / "touch.ipynb").read_text("utf-8"))["cells"]
+    code = "".join("".join(cell["source"]) + "\n" for cell in cells if cell["cell_type"] == "code")
+    code = re.sub(r"^!(.+)$", r"subprocess.run('\1', shell=True, check=True)", code, flags=re.MULTILINE)
+    (tmp_path / "square_snntorch.nir").write_bytes((ROOT / "examples" / "square_snntorch.nir").read_bytes())
+    shown = run_example(environment, sys.executable, "-c", f"import subprocess\n{code}", cwd=tmp_path)
+    assert "chip accuracy:   95.14 % (137 of 144" in shown
+    for name in ("square.pt", "square.loom", "square.html"):
+        assert (tmp_path / name).stat().st_size > 0
