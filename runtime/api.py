@@ -99,8 +99,8 @@ class Compiled:
     options: JsonObject
     result: Result
 
-    def verify(self, data: Recordings | str, **options: Any) -> Result:
-        """Compare chip and float model on recordings; options as of ``spikeloom verify``."""
+    def verify(self, data: Recordings | str | None = None, **options: Any) -> Result:
+        """Compare chip and float model, without recordings only what they store; options as of ``spikeloom verify``."""
         return _command("main_job.verify", netlist=str(self.path), data=data, **self._origin("verify"), **options)
 
     def estimate(self, data: Recordings | str, **options: Any) -> Result:

@@ -106,7 +106,7 @@ verify:
     accuracy breakdowns certificate decision_agreement engine engine_different first_divergence ladder levels missed
     not_compared quantised_different same_checkpoint samples spec_equals_engine spec_samples spikes weights
 verify, crossbars:
-    E0 E1 correct exact membranes_saturated samples target E3? spec_steps? sums?
+    E0 E1 EN correct exact membranes_saturated samples target E3? spec_steps? sums?
 watch bin:
     bins counts decision grasp kind margin time_s
 watch end:
@@ -397,6 +397,7 @@ def digest(values):
 @pytest.mark.parametrize("name", NETWORKS)
 def test_integers_votes_and_costs_are_as_recorded(name, golden):
     net = spikeloom.compile(f"pretrained:{name}", **NETWORKS[name])
+    assert net.verify().value.holds
     netlist = machine_for(net.path).netlist
     arrays = {each.name: getattr(netlist, each.name) for each in fields(netlist)}
     found = {key: digest(value) for key, value in arrays.items() if isinstance(value, np.ndarray)}

@@ -56,7 +56,8 @@ def test_the_passes_run_in_order_and_hand_on_what_they_make():
     assert tuple(done.netlist.core_tile) == done.placement.tiles
     assert (core_bound(done.held, done.target), done.netlist.n_cores) == (1, 1)
     assert all(use.used <= use.allowed for use in done.uses)
-    assert done.netlist.provenance == {"compensated": []}
+    assert done.netlist.provenance["compensated"] == []
+    assert list(done.netlist.provenance["digests"]) == ["conv1", "fc1", "fc2", "fc3"]
     assert (done.layout, done.layout.expected) == (done.usual, None)
 
 

@@ -16,7 +16,7 @@ from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
-from spikeloom.runtime.equivalence.rounding import check_rounding
+from spikeloom.runtime.equivalence.rounding import Rounding, check_rounding
 from spikeloom.runtime.equivalence.verdict import (
     LayerSpikes,
     Level,
@@ -51,6 +51,7 @@ def verdict(**changes):
         "quantised_different": None,
         "engine": "spikeloom",
         "engine_different": None,
+        "weights": Rounding(layers={}),
     }
     return SimpleNamespace(**(base | changes))
 
@@ -62,9 +63,9 @@ def test_levels_of_a_verdict():
         ({"quantised_different": 3}, 1, 0),
     ):
         levels = {level.name: level.share for level in levels_of(verdict(**changes))}
-        assert levels == {"E0": e0, "E1": e1, "E2": 0.8, "E3": 0.5}
-    assert levels_of(verdict(quantised_different=0))[1].share == 1.0
-    text = levels_of(verdict())[3].text
+        assert levels == {"EN": 1.0, "E0": e0, "E1": e1, "E2": 0.8, "E3": 0.5}
+    assert levels_of(verdict(quantised_different=0))[2].share == 1.0
+    text = levels_of(verdict())[4].text
     assert "right on float only 1, on chip only 1 (exact McNemar p = 1); class votes moved: 8 of 13" in text
     silent, disjoint = layer(0, 0, 0), layer(5, 5, 10)
     assert (spike_agreement(silent), spike_agreement(disjoint)) == (1.0, 0.0)
@@ -93,7 +94,7 @@ def test_requirements_are_read_and_held_against_levels():
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        *((words, "give each of E0, E1, E2=SHARE, E3=SHARE once at most") for words in ("E4", "E0,E0")),
+        *((words, "give each of EN, E0, E1, E2=SHARE, E3=SHARE once at most") for words in ("E4", "E0,E0")),
         ("E2", "needs a share, as in E2=0.98"),
         ("E0=1", "takes no share"),
         *((f"E3={share}", "give a number from 0 to 1") for share in ("2", "nan")),
@@ -212,7 +213,9 @@ def test_what_the_compiler_makes_is_the_rounding_of_what_it_got(network, packing
     netlist = compiled(network, packings=(packing,), keep_all=keep_all)
     found = checked(netlist, network)
     assert found.holds
-    assert found.text == "every weight, bias, threshold and decay is the checkpoint's, rounded to the nearest"
+    assert (
+        found.text == "every connection, weight, bias, threshold and decay is the checkpoint's, rounded to the nearest"
+    )
     for layer, population in zip(found.layers.values(), network.populations, strict=True):
         assert 0 < layer.nearest == layer.weights <= population.size**2 * 20
         assert 0 < layer.farthest_steps <= 0.5 + 1e-9 or packing.planes > 1
@@ -276,11 +279,11 @@ def test_words(network):
     (fault,) = faults(change(netlist, "decay_u", netlist.compartments_of(1), -5))
     assert fault == "fc1 has decay registers 4090 and 3277 instead of 4095 and 3277"
     (fault,) = faults(change(netlist, "bias_mantissa", first, 40))
-    assert fault == "fc1 has 1 of 9 biases that are not"
+    assert fault == f"fc1 has 1 of 9 biases that are not, the first of neuron {netlist.neuron[first]}"
     largest = int(np.argmax(np.abs(netlist.synapse_weight)))
     (fault,) = faults(change(netlist, "synapse_weight", largest, -6 * np.sign(netlist.synapse_weight[largest])))
     assert "1 of " in fault
-    assert "weights that are not the nearest, off by up to " in fault
+    assert "weights that are not the nearest, the farthest, from " in fault
 
 
 def test_in_a_compensated_layer_biases_make_up_for_no_more_than_the_weights_lose(network):
@@ -314,5 +317,5 @@ def test_verify_fails_where_the_weights_are_not_the_checkpoints(spikeloom, place
     words = ("verify", "net.loom", "--data", "data", "--min-agreement", "0", "--checkpoint", "other.pt")
     code, out, _ = spikeloom(*words)
     assert code == 1
-    assert "\nweights: NOT the rounding of this checkpoint: conv1 has " in out
-    assert "\nmissed: weights: NOT the rounding" in out
+    assert "\nEN  NOT the rounding of this checkpoint: conv1 has " in out
+    assert "\nmissed: EN: NOT the rounding" in out

@@ -7,7 +7,7 @@ become finer. Left out on request only: neurons that did not fire on the trainin
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -132,7 +132,7 @@ def disconnect(network: Network, gone: Masks) -> Network:
             for population, mask in zip(network.populations, gone, strict=True)
         ),
         projections=tuple(
-            replace(p, weight=_zeroed(p.weight, gone[p.post], _of(gone, p.pre, p.weight.shape[1])))
+            replace(p, weight=zeroed(p.weight, gone[p.post], of_source(gone, p.pre, p.weight.shape[1])))
             for p in network.projections
         ),
     )
@@ -180,7 +180,7 @@ def without_channels(network: IntegerNetwork, channels: Mask) -> IntegerNetwork:
     """Set the weights from some input channels, (channels,) bool, to zero; the structure stays."""
     none = none_of(network)
     projections = (
-        replace(p, weight=_zeroed(p.weight, none[p.post], channels)) if p.pre == INPUT else p
+        replace(p, weight=zeroed(p.weight, none[p.post], channels)) if p.pre == INPUT else p
         for p in network.projections
     )
     return replace(network, projections=tuple(projections))
@@ -227,7 +227,7 @@ def removals(network: Network, silent: Masks, unread: Masks, quiet: Masks) -> tu
         synapses = 0
         for p in network.projections:
             if p.post == post:
-                lost = _touched(p.weight, gone[post], _of(gone, p.pre, p.weight.shape[1]))
+                lost = _touched(p.weight, gone[post], of_source(gone, p.pre, p.weight.shape[1]))
                 synapses += int((lost & (p.weight.data != 0)).sum())
         found.append(
             Removal(
@@ -246,7 +246,8 @@ def _without_voters(network: Network, masks: Masks) -> Masks:
     return tuple(np.zeros_like(mask) if i == voting else mask for i, mask in enumerate(masks))
 
 
-def _of(masks: Masks, pre: int, size: int) -> Mask:
+def of_source(masks: Sequence[Mask], pre: int, size: int) -> Mask:
+    """Of `masks` that of a source; none of the `size` channels if it is the input."""
     return np.zeros(size, np.bool_) if pre == INPUT else masks[pre]
 
 
@@ -255,5 +256,6 @@ def _touched(weight: Sparse, rows: Mask, columns: Mask) -> Mask:
     return np.asarray(np.repeat(rows, np.diff(weight.indptr)) | columns[weight.indices])
 
 
-def _zeroed(weight: Sparse, rows: Mask, columns: Mask) -> Sparse:
+def zeroed(weight: Sparse, rows: Mask, columns: Mask) -> Sparse:
+    """Set some rows and columns to zero; the structure stays."""
     return with_data(weight, np.where(_touched(weight, rows, columns), 0, weight.data))

@@ -67,15 +67,15 @@ def add_graph_options(parser: argparse.ArgumentParser, purpose: str) -> None:
     options.add_argument("--directed", action="store_true", help="take --edges as they are, one way")
 
 
-def add_data(parser: argparse.ArgumentParser) -> None:
+def add_data(parser: argparse.ArgumentParser, *, required: bool = True) -> None:
     """Add the options that name recordings, all splits of them."""
-    group(parser, "recordings").add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
+    group(parser, "recordings").add_argument("--data", required=required, metavar="PATH", help=DATA_HELP)
     add_bin_option(parser)
 
 
-def add_recordings(parser: argparse.ArgumentParser, *, window: bool = False) -> None:
+def add_recordings(parser: argparse.ArgumentParser, *, window: bool = False, required: bool = True) -> None:
     """Add the options that name recordings to run; with `window` also the one that names a part of each."""
-    add_data(parser)
+    add_data(parser, required=required)
     options = group(parser, "recordings")
     options.add_argument("--split", default="test", help="split to read (default: test)")
     options.add_argument("--limit", type=int, metavar="N", help="first N recordings only")

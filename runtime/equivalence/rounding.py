@@ -1,26 +1,29 @@
-"""Whether a netlist holds its checkpoint, rounded: every weight, bias, threshold and decay.
+"""Level EN, whether a netlist holds its checkpoint, rounded: every neuron, connection, weight and register.
 
 All is judged at the netlist's own scale, threshold / theta of each neuron, so only the choice of the scale is free:
 
 * a threshold is theta times the scale, exactly;
 * decay registers are those nearest to the checkpoint's decays;
 * a weight is the nearest whole number of steps of its layer's finest plane, at most as large as the planes reach;
-* a bias is the nearest ``mantissa * 2**exponent``.
+* a bias is the nearest ``mantissa * 2**exponent``;
+* layers lag behind the data as their paths are long, neurons vote for their classes, no limit of the chip is broken.
 
-The last two are not so in a layer that was rounded on recordings so that its errors cancel
-(:mod:`storage.compensate`). Which neighbours it took follows from those recordings, which the netlist does not carry.
-Of such a layer it is checked that most weights are the nearest, and that no bias makes up for more than its neuron's
-weights have lost, beside what calibration moves it by at most.
+Weights and biases are not so in a layer that was rounded on recordings so that its errors cancel
+(:mod:`storage.compensate`), and neurons may be left out because they did not fire in them. What these recordings chose
+is held against the digests that the compiler took before it placed the network (:mod:`passes.digest`). Besides, most
+weights must be the nearest, and no bias may make up for more than its neuron's weights have lost, beside what
+calibration moves it by at most.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 
+from spikeloom.compiler.errors import CapacityError, FormatError
 from spikeloom.compiler.fixedpoint import (
     BIAS_EXPONENT_MAX,
     BIAS_MANTISSA_MAX,
@@ -30,11 +33,13 @@ from spikeloom.compiler.fixedpoint import (
     reach,
     step_units,
 )
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection, Network, Projection, Sparse
+from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection, Network, Projection, Sparse, depths
 from spikeloom.compiler.passes.calibrate import NUDGES
+from spikeloom.compiler.passes.digest import digests
 from spikeloom.compiler.passes.prune import never_fires
 from spikeloom.compiler.types import BoolArray
 from spikeloom.runtime.machines.integer import IntegerMachine
+from spikeloom.runtime.report.sections import Section, Text
 
 SLACK = 1 + 1e-9
 """Factor by which a value may miss a limit that it meets in real numbers."""
@@ -66,50 +71,65 @@ class LayerRounding:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rounding:
-    """What all layers store, against their checkpoint."""
+    """What all layers store, against their checkpoint.
+
+    `whole` says what is wrong about the netlist as a whole: limits of the chip that it breaks, or why it is no network.
+    """
 
     layers: Mapping[str, LayerRounding]
+    whole: tuple[str, ...] = ()
 
     json_properties = ("holds",)
 
     @property
+    def faults(self) -> tuple[str, ...]:
+        """What is not as rounding the checkpoint gives it."""
+        return (*self.whole, *(fault for layer in self.layers.values() for fault in layer.faults))
+
+    @property
     def holds(self) -> bool:
         """Whether everything is the rounding of the checkpoint."""
-        return not any(layer.faults for layer in self.layers.values())
+        return not self.faults
 
     @property
     def text(self) -> str:
         """One line for people."""
-        faults = [fault for layer in self.layers.values() for fault in layer.faults]
-        if faults:
-            return f"NOT the rounding of this checkpoint: {'; '.join(faults)}"
+        if self.faults:
+            return f"NOT the rounding of this checkpoint: {'; '.join(self.faults)}"
         moved = [
             f"{name} {100 * (1 - layer.nearest / layer.weights):.1f} %"
             for name, layer in self.layers.items()
             if layer.nearest < layer.weights
         ]
-        what = "every weight, bias, threshold and decay is the checkpoint's, rounded"
-        return f"{what}; by compensation not to the nearest: {', '.join(moved)}" if moved else f"{what} to the nearest"
+        what = "every connection, weight, bias, threshold and decay is the checkpoint's, rounded"
+        if not moved:
+            return f"{what} to the nearest"
+        return f"{what}; by compensation, as the netlist records, not to the nearest: {', '.join(moved)}"
 
 
 def check_rounding(machine: IntegerMachine, network: Network, *, fine_tuned: bool = False) -> Rounding:
-    """Hold what a netlist stores against the float network that it should have been compiled from.
+    """Hold what a netlist stores against the float network that it should have been compiled from; simulates nothing.
 
     A network that was `fine_tuned` on the chip's integers compensates nothing. Otherwise the netlist remembers which
-    layers were compensated, or at least whether there were recordings to do it on.
+    layers were compensated, and digests of what came of it: without these every weight has to be the nearest.
     """
-    integer, provenance = machine.integer, machine.netlist.provenance
+    provenance = machine.netlist.provenance
+    try:
+        integer = machine.integer
+    except FormatError as error:
+        return Rounding(layers={}, whole=(str(error),))
     names = [population.name for population in network.populations]
-    calibrated = not fine_tuned and provenance.get("calibrated", True)
-    compensated = provenance.get("compensated", names if calibrated else [])
+    recorded = provenance.get("digests")
+    compensated = [] if fine_tuned or recorded is None else provenance.get("compensated", [])
     absent, pruned = machine.absent, bool(provenance.get("prune_unused", False))
     zeroed = [_may_be_zero(integer, post, mask, pruned) for post, mask in enumerate(never_fires(network))]
     channels = np.zeros(network.input.size, np.bool_)
     if "lean" in provenance:  # input channels that reach no neuron were pruned on evidence
         channels = ~machine.received
-    found = {}
-    for post, population in enumerate(network.populations):
-        found[population.name] = _check_layer(
+    held, found = digests(integer, absent), {}
+    for post, name in enumerate(names):
+        known = held[name] if recorded is None else recorded.get(name, {})
+        found[name] = _check_layer(
             network,
             integer,
             post,
@@ -117,9 +137,44 @@ def check_rounding(machine: IntegerMachine, network: Network, *, fine_tuned: boo
             zeroed=zeroed,
             channels=channels,
             coarsest=max(machine.target.choices["synapse.exponent"]),
-            compensates=population.name in compensated,
+            compensates=name in compensated,
+            faults=list(_other_registers(machine, network, post)),
+            other=[what for what, digest in held[name].items() if known.get(what) != digest],
         )
-    return Rounding(layers=found)
+    whole = [*_broken_limits(machine)]
+    if recorded is None and provenance.get("calibrated") and any(layer.faults for layer in found.values()):
+        whole.append("it does not record how it was rounded on recordings: compile it again")
+    return Rounding(layers=found, whole=tuple(whole))
+
+
+def _broken_limits(machine: IntegerMachine) -> tuple[str, ...]:
+    """Limits of the chip that a netlist breaks."""
+    try:
+        machine.legal()
+    except CapacityError as error:
+        return tuple(map(str, error.violations))
+    return ()
+
+
+def _other_registers(machine: IntegerMachine, network: Network, post: int) -> Iterator[str]:
+    """What is not the checkpoint's of a layer, beside weights and biases: its numbers, its window, its votes."""
+    netlist, chip, wanted = machine.netlist, machine.integer.populations[post], network.populations[post]
+    layer, ids = netlist.layers[post], netlist.compartments_of(post)
+    registers = (f"{u} and {v}" for u, v in ((chip.decay_u, chip.decay_v), decay_registers(wanted.beta, wanted.alpha)))
+    theta = wanted.theta * chip.scale
+    if (bad := ~machine.absent[post] & (np.abs(chip.threshold - theta) > 1e-6 * np.maximum(theta, 1))).any():
+        worst = int(np.argmax(bad))
+        yield f"{wanted.name} neuron {worst} has threshold {chip.threshold[worst]} instead of {theta[worst]:g}"
+    for what, found, due in (
+        ("decay registers", *registers),
+        *((name, getattr(layer, name), getattr(wanted, name)) for name in ("beta", "alpha", "theta")),
+        ("a window from step", layer.depth, depths(network)[post]),
+    ):
+        if found != due:
+            yield f"{wanted.name} has {what} {found} instead of {due}"
+    votes = network.readout.label[netlist.neuron[ids]] if post == network.readout.population else -1
+    if wrong := np.count_nonzero(netlist.readout_class[ids] != votes):
+        yield f"{wanted.name} has {wrong:,} of {len(ids):,} neurons that vote for another class"
 
 
 def _may_be_zero(integer: IntegerNetwork, post: int, silent: BoolArray, pruned: bool) -> BoolArray:
@@ -155,14 +210,17 @@ def _check_layer(
     channels: BoolArray,
     coarsest: int,
     compensates: bool,
+    faults: list[str],
+    other: Sequence[str],
 ) -> LayerRounding:
+    """What one layer stores; `faults` are known, and so is what is `other` than the compiler chose."""
     wanted, chip, held = network.populations[post], integer.populations[post], ~absent[post]
     planes = [p for p in integer.projections if p.post == post]
     bits, exponents = min(p.bits for p in planes), tuple(sorted({p.exponent for p in planes if p.weight.nnz}))
     exponents = exponents or (coarsest,)  # a layer that stores no weight: all of them rounded to zero at some step
     step = step_units(bits, exponents)
     most = reach(bits, exponents) * step
-    weights, wrong, farthest = 0, 0, 0.0
+    weights, wrong, farthest, where = 0, 0, 0.0, ""
     lost = np.zeros((2, wanted.size))  # what each neuron's weights lose to, and gain on, the checkpoint's; weight units
     for pre in sorted({p.pre for stage in (network, integer) for p in stage.projections if p.post == post}):
         real, stored = summed(network, pre, post), summed(integer, pre, post)
@@ -174,20 +232,19 @@ def _check_layer(
         kept = np.asarray(stored[row, column]).ravel()
         sends, silent = (~channels, np.zeros(len(channels), np.bool_)) if pre == INPUT else (~absent[pre], zeroed[pre])
         counts = held[row] & sends[column] & ~((kept == 0) & (zeroed[post][row] | silent[column]))
-        row, off = row[counts], off[counts]
+        row, column, off = row[counts], column[counts], off[counts]
         weights += len(off)
         wrong += int(np.count_nonzero(2 * np.abs(off) > step * SLACK))
-        farthest = max(farthest, float(np.abs(off).max(initial=0)) / step)
+        if (most_off := float(np.abs(off).max(initial=0)) / step) > farthest:
+            worst, farthest = int(np.argmax(np.abs(off))), most_off
+            source = "channel" if pre == INPUT else f"{network.populations[pre].name} neuron"
+            where = f"the farthest, from {source} {column[worst]} to neuron {row[worst]}, by {most_off:.3g} steps"
         lost[0] += np.bincount(row, np.maximum(-off, 0), wanted.size)
         lost[1] += np.bincount(row, np.maximum(off, 0), wanted.size)
 
-    faults = []
     moved = compensates and 0 < wrong <= MOVED * weights
     if wrong and not moved:
-        faults.append(
-            f"{wanted.name} has {wrong:,} of {weights:,} weights that are not the nearest, off by up to "
-            f"{farthest:.3g} steps"
-        )
+        faults.append(f"{wanted.name} has {wrong:,} of {weights:,} weights that are not the nearest, {where}")
     unit = chip.scale * (1 << MEMBRANE_SHIFT)
     bias = np.clip(wanted.bias * unit, -BIAS_LIMIT, BIAS_LIMIT)
     coarse = 0.5 * (1 << np.maximum(encode_bias(bias)[1], chip.bias_exponent)) * SLACK
@@ -198,18 +255,11 @@ def _check_layer(
     off = chip.bias - bias
     bad = held & ((off > more + coarse) | (-off > less + coarse)) & ~(zeroed[post] & (chip.bias == 0))
     if bad.any():
-        faults.append(f"{wanted.name} has {np.count_nonzero(bad):,} of {np.count_nonzero(held):,} biases that are not")
-    theta = wanted.theta * chip.scale
-    bad = held & (np.abs(chip.threshold - theta) > 1e-6 * np.maximum(theta, 1))
-    if bad.any():
-        worst = int(np.argmax(bad))
-        faults.append(f"{wanted.name} neuron {worst} has threshold {chip.threshold[worst]} instead of {theta[worst]:g}")
-    registers = decay_registers(wanted.beta, wanted.alpha)
-    if (chip.decay_u, chip.decay_v) != registers:
-        faults.append(
-            f"{wanted.name} has decay registers {chip.decay_u} and {chip.decay_v} instead of {registers[0]} and "
-            f"{registers[1]}"
-        )
+        share = f"{np.count_nonzero(bad):,} of {np.count_nonzero(held):,}"
+        faults.append(f"{wanted.name} has {share} biases that are not, the first of neuron {np.argmax(bad)}")
+    for what in () if faults else other:
+        told = f"; {where}" if what == "weights" else ""
+        faults.append(f"{wanted.name} has other {what} than the compiler chose, by the netlist's own record{told}")
     return LayerRounding(
         weights=weights,
         nearest=weights - wrong,
@@ -217,3 +267,8 @@ def _check_layer(
         compensated=moved,
         faults=tuple(faults),
     )
+
+
+def sections(found: Rounding) -> list[Section]:
+    """The same for people."""
+    return [Section("Netlist", [Text(f"EN  {found.text}")])]

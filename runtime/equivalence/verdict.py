@@ -1,8 +1,9 @@
-"""What a comparison of float model and chip comes to: four levels of equivalence, and gates that ask for them.
+"""What a comparison of float model and chip comes to: levels of equivalence, and gates that ask for them.
 
-*E0*: specification, engine and the netlist as read from disk agree in every spike, membrane and count. *E1*: a
-quantisation-aware model equals the chip; it applies to fine-tuned checkpoints only. *E2*: spikes against the float
-model, per layer, as ``1 - different / (float + chip)``. *E3*: decisions against the float model.
+*EN*: the netlist is its checkpoint, rounded, see :mod:`equivalence.rounding`. *E0*: specification, engine and the
+netlist as read from disk agree in every spike, membrane and count. *E1*: a quantisation-aware model equals the chip; it
+applies to fine-tuned checkpoints only. *E2*: spikes against the float model, per layer, as ``1 - different / (float +
+chip)``. *E3*: decisions against the float model.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from spikeloom.runtime.report.sections import Block, Section, Table, Text
 if TYPE_CHECKING:
     from spikeloom.runtime.equivalence.certificates import Certificate  # it loads numba
 
-LEVELS = ("E0", "E1", "E2", "E3")
+LEVELS = ("EN", "E0", "E1", "E2", "E3")
 
 SHARES = ("E2", "E3")
 """Levels whose gate needs a share."""
@@ -96,7 +97,7 @@ class Verdict:
     those that are not. `quantised_different` counts spikes in
     which a fine-tuned checkpoint's torch model, on chip integers, and the chip differ. `not_compared` are neurons of
     each layer that the chip omits because their spikes reach no neuron. Of the levels the shares `required` have to be
-    reached, and the weights always have to be the checkpoint's.
+    reached, and EN always.
     """
 
     files: tuple[str, ...] = field(metadata=HIDDEN)
@@ -147,8 +148,7 @@ class Verdict:
     @property
     def missed(self) -> tuple[str, ...]:
         """What was required and is not reached, a line each."""
-        weights = [] if self.weights.holds else [f"weights: {self.weights.text}"]
-        return (*unmet(self.levels, self.required), *weights)
+        return tuple(unmet(self.levels, {"EN": 1.0, **self.required}))
 
 
 def spike_agreement(spikes: LayerSpikes) -> float:
@@ -188,7 +188,7 @@ def mcnemar(labels: IntArray, first: IntArray, second: IntArray) -> tuple[int, i
 
 
 def levels_of(verdict: Verdict) -> tuple[Level, ...]:
-    """Summarise a verdict on the four levels."""
+    """Summarise a verdict on all levels."""
     agreement = {name: spike_agreement(spikes) for name, spikes in verdict.spikes.items()}
     worst = min(agreement, key=lambda name: agreement[name])
     equal = round(verdict.decision_agreement * len(verdict.files))
@@ -203,6 +203,7 @@ def levels_of(verdict: Verdict) -> tuple[Level, ...]:
         spikes = sum(layer.chip for layer in verdict.spikes.values())
         exact = f"fine-tuned model = chip: {tuned:,} differing spikes of {spikes:,} on {len(verdict.files)} recordings"
     return (
+        Level(name="EN", share=float(verdict.weights.holds), text=verdict.weights.text),
         Level(
             name="E0",
             share=float(verdict.spec_equals_engine),
@@ -238,7 +239,7 @@ def parse_requirements(words: str) -> dict[str, float]:
         name, given, number = part.strip().partition("=")
         where = f"--require {words}: {part.strip()!r}"
         if name not in LEVELS or name in required:
-            raise OptionError(f"{where}: give each of E0, E1, E2=SHARE, E3=SHARE once at most, with commas between")
+            raise OptionError(f"{where}: give each of EN, E0, E1, E2=SHARE, E3=SHARE once at most, with commas between")
         if bool(given) != (name in SHARES):
             raise OptionError(f"{where}: {'needs a share, as in ' + name + '=0.98' if not given else 'takes no share'}")
         try:
@@ -256,10 +257,12 @@ def unmet(levels: tuple[Level, ...], required: Mapping[str, float]) -> list[str]
     missed = []
     for level in levels:
         wanted = required.get(level.name)
-        if wanted is not None and level.share is None:
-            missed.append(f"{level.name}: {level.text}")
-        elif wanted is not None and level.share is not None and level.share < wanted:
-            missed.append(f"{level.name}: {level.share:.4f} reached, {wanted:g} required")
+        if wanted is None or (level.share is not None and level.share >= wanted):
+            continue
+        counted = level.name in SHARES and level.share is not None
+        missed.append(
+            f"{level.name}: " + (f"{level.share:.4f} reached, {wanted:g} required" if counted else level.text)
+        )
     return missed
 
 
@@ -288,7 +291,6 @@ def _lines(verdict: Verdict) -> list[str]:
     lines = [
         f"float accuracy:  {percent(right['float'], verdict.samples)}",
         f"chip accuracy:   {percent(right['chip'], verdict.samples)}",
-        f"weights: {verdict.weights.text}",
         *(f"{level.name}  {level.text}" for level in verdict.levels),
         *(f"missed: {line}" for line in verdict.missed),
         *(f"breakdown: {breakdown.text}" for breakdown in verdict.breakdowns),

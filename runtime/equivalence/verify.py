@@ -29,7 +29,7 @@ from spikeloom.runtime.equivalence.reference import (
     rungs,
     taxel_and_feature,
 )
-from spikeloom.runtime.equivalence.rounding import check_rounding
+from spikeloom.runtime.equivalence.rounding import Rounding, check_rounding
 from spikeloom.runtime.equivalence.verdict import Divergence, LayerSpikes, Rung, Verdict
 from spikeloom.runtime.machines.base import ENGINES, machine_of
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
@@ -51,6 +51,7 @@ def verify(
     spec_samples: int = 3,
     engine_name: str = ENGINES[0],
     required: Mapping[str, float] | None = None,
+    rounding: Rounding | None = None,
     progress: Callable[[str, int], None] | None = None,
 ) -> Verdict:
     """Compare float model, chip and specification.
@@ -66,7 +67,9 @@ def verify(
     spec_samples, engine_name
         Recordings on which the specification runs beside the engine; which of ``ENGINES`` runs, too.
     required : mapping of level to share, optional
-        What has to be reached, see :mod:`equivalence.verdict`; the weights always have to be the checkpoint's.
+        What has to be reached, see :mod:`equivalence.verdict`; EN always has to be.
+    rounding : Rounding, optional
+        What is known of EN; by default it is found here.
     progress : callable, optional
         Called with the name of each part as it starts, and the number of recordings that are done.
 
@@ -144,7 +147,7 @@ def verify(
         },
         spec_samples=checked,
         spec_equals_engine=equal and not engine_different,
-        weights=check_rounding(machine, origin, fine_tuned=tuned),
+        weights=rounding or check_rounding(machine, origin, fine_tuned=tuned),
         first_divergence=divergence,
         ladder=tuple(
             Rung(stage=stage, different=dict(zip(names, counts.tolist(), strict=True)))

@@ -9,6 +9,7 @@ from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes import calibrate as calibration
 from spikeloom.compiler.passes import expand, prune
 from spikeloom.compiler.passes.calibrate import Calibration
+from spikeloom.compiler.passes.digest import digests
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.passes.prune import Masks, Removal
 from spikeloom.compiler.passes.range_proof import RangeProof, prove_ranges
@@ -172,6 +173,7 @@ def _emit(done: Compilation) -> Compilation:
     provenance = dict(done.options.provenance)
     if done.choices:
         provenance["compensated"] = [choice.layer for choice in done.choices if choice.compensated]
+    provenance["digests"] = digests(done.integer, prune.either(done.silent, done.unread))
     made = emit(
         done.held,
         done.layout.cores,

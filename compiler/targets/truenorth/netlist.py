@@ -31,7 +31,7 @@ import numpy as np
 from spikeloom.compiler.dynamics import MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.targets import netlist_file
 from spikeloom.compiler.targets.base import CROSSBARS
-from spikeloom.compiler.targets.netlist_file import NetlistFile, column_faults, part_of
+from spikeloom.compiler.targets.netlist_file import COMMON, NetlistFile, column_faults, part_of
 from spikeloom.compiler.types import IntArray
 
 RESET_TO, RESET_LINEAR, RESET_NONE = 0, 1, 2
@@ -225,6 +225,24 @@ def inconsistencies(netlist: CrossbarNetlist) -> list[str]:
         found.append("two cores are at one place")
     if np.any(netlist.axons_at(netlist.core_of_axon(), netlist.axon_line) != np.arange(axons)):
         found.append("two axons are on one line of a core, which has one type")
+    return found
+
+
+def unlike(netlist: CrossbarNetlist, due: CrossbarNetlist) -> list[str]:
+    """Say what in a netlist is not as it is due, an entry for each field; what it remembers aside."""
+    found = []
+    for name in (*COMMON, *FILE.entries, *FILE.arrays):
+        ours, theirs = getattr(netlist, name), getattr(due, name)
+        if name not in FILE.arrays:
+            if name != "provenance" and ours != theirs:
+                found.append(f"{name} is {ours} instead of {theirs}")
+        elif ours.shape != theirs.shape:
+            found.append(f"{name} has {len(ours):,} entries instead of {len(theirs):,}")
+        elif len(other := np.argwhere(ours != theirs)):
+            first, more = tuple(other[0].tolist()), f", and {len(other) - 1:,} more" if len(other) > 1 else ""
+            of = (name in PER_NEURON or name == "weight") and int(netlist.layer[first[0]])
+            owner = "" if of is False else f" of {netlist.layers[of]} neuron {netlist.neuron[first[0]]}"
+            found.append(f"{name}{list(first)}{owner} is {ours[first]} instead of {theirs[first]}{more}")
     return found
 
 

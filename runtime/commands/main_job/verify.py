@@ -1,4 +1,4 @@
-"""The command ``verify``: chip and float model compared, spike for spike."""
+"""The command ``verify``: the netlist held against its checkpoint; on recordings their spikes, too."""
 
 from __future__ import annotations
 
@@ -8,19 +8,32 @@ from dataclasses import replace
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_check, add_netlist_and_model, add_recordings
+from spikeloom.runtime.equivalence.reference import require_match
+from spikeloom.runtime.equivalence.rounding import check_rounding
+from spikeloom.runtime.equivalence.rounding import sections as rounding_sections
 from spikeloom.runtime.equivalence.verdict import parse_requirements, sections
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
+from spikeloom.runtime.inputs.repeat import refuse
 from spikeloom.runtime.machines.base import ENGINES, chip_module, machine_for
+from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.machines.simulated import Account
 from spikeloom.runtime.report.sections import Outcome
+
+NOTES = """\
+Without --data nothing is simulated: only the level EN is asked, whether the netlist is its checkpoint, rounded. EN is
+always required.
+"""
+
+WITH_DATA = ("original", "min_agreement", "require", "limit")
+"""Options that only say something about recordings."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     add_netlist_and_model(parser)
-    add_recordings(parser, window=True)
+    add_recordings(parser, window=True, required=False)
     parser.add_argument(
         "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"
     )
@@ -42,10 +55,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
     )
     add_check(parser)
+    parser.epilog = NOTES
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
+    if arguments.data is None:
+        refuse(arguments, WITH_DATA, "is about recordings, give --data too")
     machine = machine_for(arguments.netlist)
     if (own := chip_module(machine.netlist.target, "commands")) is not None:
         return own.verify(arguments)  # type: ignore[no-any-return]
@@ -59,8 +75,12 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 f"--min-agreement {agreement:g}: --require replaces it; write E3={agreement:g} into that instead"
             )
         required = parse_requirements(arguments.require)
-    netlist = machine.netlist
-    loaded = load_network(arguments.checkpoint, arguments, netlist)
+    netlist, loaded = machine.netlist, load_network(arguments.checkpoint, arguments, machine.netlist)
+    require_match(netlist, loaded.model)
+    tuned = loaded.checkpoint is not None and loaded.checkpoint.forms is not None
+    held = check_rounding(integer_machine(machine), loaded.network, fine_tuned=tuned)
+    if arguments.data is None or not held.layers:
+        return Outcome(held, rounding_sections, 0 if held.holds else 1)
     original = None if arguments.original is None else load_network(arguments.original, arguments)
     data = load_recordings(arguments, netlist, labels_for="verify")
     account = Account(machine, data, checked=arguments.spec_samples)
@@ -75,6 +95,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         engine_name=arguments.engine,
         lengths=data.lengths,
         required=required,
+        rounding=held,
         progress=account.begin,
     )
     if (difference := loaded.differs_from(netlist.provenance, arguments.run)) is not None:

@@ -25,7 +25,7 @@ from spikeloom.compiler.targets.truenorth.codebook import PartialSums, in_levels
 from spikeloom.compiler.targets.truenorth.counting import planned, run_counters
 from spikeloom.compiler.targets.truenorth.in_time import first_spikes
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
-from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, unlike, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Compilation, Options, Source
 from spikeloom.compiler.types import BoolArray, IntArray, JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
@@ -119,6 +119,26 @@ Model = Callable[[npt.NDArray[np.uint8]], Modelled]
 
 
 @dataclass(frozen=True, slots=True)
+class AgainstNetlist:
+    """What in the netlist is not as lowering the network of the file again gives it."""
+
+    faults: tuple[str, ...]
+    json_properties = ("holds",)
+
+    @property
+    def holds(self) -> bool:
+        """Whether all is."""
+        return not self.faults
+
+    @property
+    def text(self) -> str:
+        """One line for people."""
+        if self.faults:
+            return f"EN NOT what the network of the file is lowered to: {'; '.join(self.faults)}"
+        return "EN every neuron, axon, crossing point, wire and register is what the network of the file is lowered to"
+
+
+@dataclass(frozen=True, slots=True)
 class AgainstSpec:
     """Recordings on which both ran; spikes, membranes and counts that differ."""
 
@@ -158,13 +178,14 @@ class AgainstNetwork:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """Chip against definition (E0), model (E1) and, for a counting network, the network of the file (E3).
+    """Netlist against network (EN); chip against definition (E0), model (E1) and, if it counts, that network (E3).
 
     `spec_steps` confines the first to the first data steps of each recording.
     """
 
     target: str
     samples: int
+    netlist: AgainstNetlist = field(metadata=key("EN"))
     spec: AgainstSpec = field(metadata=key("E0"))
     model: AgainstModel = field(metadata=key("E1"))
     membranes_saturated: int
@@ -177,7 +198,8 @@ class Verdict:
     @property
     def exact(self) -> bool:
         """Whether nothing differs, and no membrane left its register."""
-        return not (self.model.differences or self.spec.differences or self.membranes_saturated)
+        differ = self.model.differences or self.spec.differences
+        return self.netlist.holds and not (differ or self.membranes_saturated)
 
 
 def compare(
@@ -189,11 +211,12 @@ def compare(
     spec_samples: int,
     spec_steps: int | None = None,
     network: Network | None = None,
+    held: AgainstNetlist = AgainstNetlist(()),
 ) -> Verdict:
     """Run the chip and the model on recordings, and count every spike that differs, and votes of a float network.
 
     `first` is the tick in which a layer spikes for the first data step. The specification runs on the first
-    recordings, too, and there on the first steps, where `spec_steps` says so.
+    recordings, too, and there on the first steps, where `spec_steps` says so. `held` is what is known of the netlist.
     """
     machine, layers = machine_of(netlist), list(netlist.layers)
     spikes, differences = dict.fromkeys(first, 0), dict.fromkeys(first, 0)
@@ -223,6 +246,7 @@ def compare(
     return Verdict(
         target=netlist.target,
         samples=len(data),
+        netlist=held,
         spec=AgainstSpec(min(spec_samples, len(data)), wrong),
         model=AgainstModel(tuple(LayerSpikes(name, spikes[name], differences[name]) for name in first)),
         membranes_saturated=overflows,
@@ -250,6 +274,7 @@ def sections(found: Verdict) -> list[Section]:
         low, high = wilson(found.correct, found.samples)
         accuracy += f" (95 %: {100 * low:.1f} … {100 * high:.1f}); the model's is the same, vote for vote"
     blocks: list[Text | Table] = [
+        Text(found.netlist.text),
         Text(f"E0 specification = engine: {spec}{part}, membranes and counts too"),
         Text(f"E1 model = chip: {model}, every copy of every neuron"),
         Table(["layer", "spikes of the model", "different"], rows),
@@ -284,11 +309,13 @@ def verify(arguments: argparse.Namespace) -> Outcome:
         raise OptionError(f"--checkpoint {path}: {arguments.netlist} was compiled from another file; give that one")
     compared: Network | None = None
     model: Model
+    source: Source
     if isinstance(network, LoadedNetwork) and counting:
-        plan, compared = planned(read_counters(shipped(path))[0], machine.target), network.network
+        source = read_counters(shipped(path))[0]
+        plan, compared = planned(source, machine.target), network.network
         model, first = (lambda events: (run_counters(plan, events), ())), plan.first
     elif isinstance(network, LoadedNetwork):
-        levels = in_levels(network.network, copies, machine.target)
+        source, levels = network.model, in_levels(network.network, copies, machine.target)
         model, first = (lambda events: run_levels(levels, events.reshape(-1, events.shape[-1]))), first_spikes(levels)
     elif made.get("weights") != network.weights:
         raise OptionError(
@@ -297,13 +324,18 @@ def verify(arguments: argparse.Namespace) -> Outcome:
     else:
         from spikeloom.models.truenorth.network import run_network  # torch, so only here
 
-        trained, first = network.network, {s.name: n for n, s in enumerate(network.network.stages)}
+        source = trained = network.network
+        first = {stage.name: n for n, stage in enumerate(trained.stages)}
 
         def model(events: npt.NDArray[np.uint8]) -> Modelled:
             return {name: held[0] for name, held in run_network(trained, events[None]).items()}, ()
 
+    again = machine.target.compile(source, Options(in_time=copies or None)).netlist
+    held = AgainstNetlist(tuple(unlike(netlist, again)))
+    if arguments.data is None:
+        return Outcome(held, lambda held: [Section("Netlist", [Text(held.text)])], 0 if held.holds else 1)
     data = load_recordings(arguments, netlist, labels_for="verify")
     steps = SPEC_STEPS if copies else None
     checked = arguments.spec_samples
-    verdict = compare(netlist, model, first, data, spec_samples=checked, spec_steps=steps, network=compared)
+    verdict = compare(netlist, model, first, data, spec_samples=checked, spec_steps=steps, network=compared, held=held)
     return Outcome(verdict, sections, 0 if verdict.exact else 1)

@@ -1,0 +1,45 @@
+"""Digests of what a chip holds of each layer: a netlist remembers them from before it was placed.
+
+Neurons that recordings removed, and weights that recordings rounded so that their errors cancel, do not follow from the
+checkpoint. Digests show that they are those that the compiler chose, wherever it put them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from spikeloom.compiler.ir import IntegerNetwork, added_up
+from spikeloom.compiler.passes.prune import Mask, of_source, zeroed
+
+DIGITS = 16
+"""Hexadecimal digits of a digest."""
+
+
+def digests(network: IntegerNetwork, gone: Sequence[Mask]) -> dict[str, dict[str, str]]:
+    """Digests of the neurons of each layer, their thresholds, weights and biases, without those that are `gone`.
+
+    Weights are sums of planes in weight units, so that neither the order of synapses nor zeros count.
+    """
+    found = {}
+    for post, population in enumerate(network.populations):
+        held, synapses = np.flatnonzero(~gone[post]), []
+        into = added_up((p.pre, p.effective()) for p in network.projections if p.post == post)
+        for pre, weight in sorted(into.items()):
+            part = zeroed(weight, gone[post], of_source(gone, pre, weight.shape[1])).copy()
+            part.eliminate_zeros()
+            part.sort_indices()
+            synapses += [np.array(pre), part.indptr, part.indices, part.data] if part.nnz else []
+        parts = {
+            "neurons": [held],
+            "thresholds": [population.threshold[held]],
+            "weights": synapses,
+            "biases": [population.bias[held]],
+        }
+        found[population.name] = {
+            what: hashlib.sha256(b"".join(a.astype("<i4").tobytes() for a in arrays)).hexdigest()[:DIGITS]
+            for what, arrays in parts.items()
+        }
+    return found
