@@ -31,6 +31,7 @@ from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime import machines
 from spikeloom.runtime.inputs.files import shipped
+from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting, by_running
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
 
@@ -276,6 +277,18 @@ class Machine(ABC):
         """
         if engine != ENGINES[0]:
             raise OptionError(f"--engine {engine}: is not for {self.target.title}; omit it")
+        return None
+
+    def votes(self, channels: EventArray) -> IntArray:
+        """Votes (samples, classes) of recordings (samples, channels, steps), clocks among the channels."""
+        return class_counts(self.netlist, self.simulate(channels, None, spikes=False, membranes=False).counts.votes)
+
+    def effects(self, channels: EventArray, changes: Changes) -> Effects:
+        """What changes of a recording (channels, steps) bring about; runs each, unless the chip knows better."""
+        return by_running(self, channels, changes)
+
+    def forgetting(self, channels: EventArray) -> Forgetting | None:  # noqa: ARG002
+        """How soon the chip forgets what it was before a step of a recording (channels, steps); None: not known."""
         return None
 
     def require_sensor(self, events: EventArray) -> None:

@@ -105,7 +105,7 @@ def state_of(netlist: Netlist) -> State:
 
 
 @compiled
-def _kept(x: Any, factor: Any) -> Any:
+def kept(x: Any, factor: Any) -> Any:
     """``x * factor / 4096`` rounded toward zero; all int32."""
     magnitude = np.int32(abs(x))
     high = np.int32(np.int32(magnitude >> DECAY_BITS) * factor)
@@ -154,10 +154,10 @@ def _integrate(tables: Tables, state: State, step: int, length: int) -> bool:
         worked[c] = is_open & (arrived | ((current[c] | membrane[c] | bias[c]) != 0))
         # the current decays, and the sums are added
         positive, negative = sums[2 * c] >> ARRIVAL_BITS, sums[2 * c + 1] >> ARRIVAL_BITS
-        u = np.int32(_kept(current[c], keep_u[c]) + np.int32(np.int32(positive - negative) << MEMBRANE_SHIFT))
+        u = np.int32(kept(current[c], keep_u[c]) + np.int32(np.int32(positive - negative) << MEMBRANE_SHIFT))
         any_overflow |= is_open & ((max(positive, negative) > SUM_MAX) | (abs(u) > CURRENT_MAX))
         # the membrane decays, current and bias are added, it saturates and is compared
-        v = np.int32(np.int32(_kept(membrane[c], keep_v[c]) + u) + bias[c])
+        v = np.int32(np.int32(kept(membrane[c], keep_v[c]) + u) + bias[c])
         compared = np.int32(min(max(v, np.int32(-MEMBRANE_MAX)), np.int32(MEMBRANE_MAX)))
         saturations[c] += is_open & (compared != v)
         flags[c] = is_open & (compared > threshold[c])

@@ -18,6 +18,7 @@ from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.base import Done, EventArray, Price, T
+from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
@@ -27,6 +28,7 @@ from spikeloom.runtime.report.sections import Block, Outcome
 
 if TYPE_CHECKING:
     from spikeloom.runtime.machines.core_map import CoreMap
+    from spikeloom.runtime.machines.loihi1.changes.kernel import Chip
 
 # What only some commands need is imported where it is used: a tenth of a second that `run` need not wait.
 
@@ -119,6 +121,29 @@ class Loihi(IntegerMachine):
         spikes = unpack(trace.packed[:, first:], self.netlist.n_compartments)
         layers = (aligned(self.netlist, spikes, layer) for layer in range(len(self.netlist.layers)))
         return layers, trace.counts.saturations.sum(axis=1)
+
+    @cached_property
+    def _chip(self) -> Chip | None:
+        """For changed runs; None where a register may overflow."""
+        from spikeloom.runtime.machines.loihi1.changes import kernel
+
+        return None if kernel.overflows(self.netlist) else kernel.chip_of(self.netlist)
+
+    def effects(self, channels: EventArray, changes: Changes) -> Effects:
+        """Only what a change reaches is simulated again."""
+        if self._chip is None:
+            return super().effects(channels, changes)
+        from spikeloom.runtime.machines.loihi1.changes import kernel
+
+        return kernel.effects(self._chip, kernel.known_run(self._chip, channels), self.netlist.classes, changes)
+
+    def forgetting(self, channels: EventArray) -> Forgetting | None:
+        """By interval arithmetic on registers."""
+        if self._chip is None:
+            return None
+        from spikeloom.runtime.machines.loihi1.changes import forgetting, kernel
+
+        return forgetting.forgetting(self._chip, kernel.known_run(self._chip, channels), self.netlist.classes)
 
     def core_map(self, events: EventArray, lengths: IntArray, counts: IntArray) -> CoreMap:
         """Cores on the mesh."""

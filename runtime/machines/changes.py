@@ -1,0 +1,85 @@
+"""What changed events bring about: beside the known run of a recording, on any chip."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.types import IntArray
+
+if TYPE_CHECKING:
+    from spikeloom.runtime.machines.base import Machine
+
+PART = 64
+"""Changed recordings that run together."""
+
+
+class Changes(NamedTuple):
+    """Changes of one recording, each of some entries that are flipped: an event comes or goes."""
+
+    cells: IntArray  # (flips, 2) int64; channel and step, by step within each change
+    bounds: IntArray  # (changes + 1,) int64; of each change in the flips
+
+    def of(self, index: int) -> IntArray:
+        """Entries of one change, (flips, 2)."""
+        return self.cells[self.bounds[index] : self.bounds[index + 1]]
+
+
+class Effects(NamedTuple):
+    """What changes bring about."""
+
+    # come, gone: (changes, classes) int64; votes that a changed run has and the known one has not, and the other way
+    come: IntArray
+    gone: IntArray
+    end: IntArray  # (changes,) int64; chip step from which on a changed run is the known one, in every register
+
+    @property
+    def votes(self) -> IntArray:
+        """What is added to the votes, (changes, classes)."""
+        return self.come - self.gone
+
+
+class Forgetting(NamedTuple):
+    """What is open in a recording where nothing was known before a step."""
+
+    lag: int  # Steps from an event to the first vote that it can alter
+    fired: IntArray  # (steps, classes) int64; votes of the known run, by chip step
+    # quiet, back: (steps + 1,) int64; by that step, the first from which on every spike is known, and every register
+    quiet: IntArray
+    back: IntArray
+    # gone, come: (steps + 1, steps, classes) int16; votes that may go, and that may come, by step
+    gone: npt.NDArray[np.int16]
+    come: npt.NDArray[np.int16]
+
+
+def single(cells: IntArray) -> Changes:
+    """Each entry flipped alone."""
+    return Changes(cells, np.arange(len(cells) + 1))
+
+
+def joined(changes: list[IntArray]) -> Changes:
+    """Changes of several entries each, (flips, 2), put in order."""
+    ordered = [each[np.argsort(each[:, 1], kind="stable")] for each in changes]
+    none = np.zeros((0, 2), np.int64)
+    return Changes(np.concatenate([none, *ordered]), np.cumsum([0, *map(len, changes)]))
+
+
+def by_running(machine: Machine, channels: npt.NDArray[Any], changes: Changes) -> Effects:
+    """The definition: each changed recording (channels, steps) is run from its first step to its last."""
+    known = machine.votes(channels[None])[0]
+    votes = []
+    for first in range(0, len(changes.bounds) - 1, PART):
+        part = range(first, min(first + PART, len(changes.bounds) - 1))
+        changed = np.repeat(channels[None], len(part), axis=0)
+        for row, index in zip(changed, part, strict=True):
+            channel, step = changes.of(index).T
+            row[channel, step] ^= 1
+        votes.append(machine.votes(changed))
+    moved = np.concatenate([np.zeros((0, len(known)), np.int64), *votes]) - known
+    return Effects(np.maximum(moved, 0), np.maximum(-moved, 0), np.full(len(moved), channels.shape[1] + LATE))
+
+
+LATE = 1 << 20
+"""Steps after a recording by which every run is over."""

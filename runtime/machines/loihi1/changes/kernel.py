@@ -1,0 +1,318 @@
+"""Runs that differ from a known one by a few events: only what a change reaches is simulated, with numba.
+
+The known run is kept: the registers before each step and the sums within it. Of a changed run only *blocks* of 64
+compartments are held in which some register differs, and a step looks at these and at those that a changed event or
+spike reaches. Where none is left the rest of the run is the known one. All of it is exact, in the integers of
+:mod:`loihi1.spec`; no register may overflow, whatever the input.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
+from spikeloom.compiler.layer_kernel import Synapses, by_source, clear, compiled, compiled_and_cached
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, reach
+from spikeloom.compiler.types import IntArray
+from spikeloom.runtime.machines.changes import Changes, Effects
+from spikeloom.runtime.machines.loihi1.kernel import kept
+
+AnyArray = npt.NDArray[Any]
+
+LANES = 64
+"""Places of a block; each layer begins one."""
+
+NEVER = 2**31 - 1
+"""Threshold of a place without a compartment."""
+
+
+class Chip(NamedTuple):
+    """A netlist as the kernel reads it: places of compartments by layer and neuron, in blocks; none is at some."""
+
+    synapses: Synapses  # Of the input channels, then of each place
+    depth: IntArray  # (blocks,) int64
+    # keep_u, keep_v, threshold, bias, lowest: (places,) int32; decays in 1/4096, then membrane units; no membrane is
+    # below the lowest
+    keep_u: AnyArray
+    keep_v: AnyArray
+    threshold: AnyArray
+    bias: AnyArray
+    lowest: AnyArray
+    label: AnyArray  # (places,) int32; class that a spike votes for, -1 for none
+
+
+class Known(NamedTuple):
+    """A run; of `steps` chip steps."""
+
+    events: AnyArray  # (channels, T) uint8, 0 or 1
+    sums: AnyArray  # (steps, places) int32; net synaptic sums
+    # current, membrane: (steps + 1, places) int32; registers before each step, and after the last
+    current: AnyArray
+    membrane: AnyArray
+    fired: AnyArray  # (steps, places) uint8
+
+
+class _Run(NamedTuple):
+    """A run that goes on."""
+
+    # delta, current, membrane: (places,) int32; what sums have more than the known ones, all zero between two steps;
+    # registers, valid in blocks that are held
+    delta: AnyArray
+    current: AnyArray
+    membrane: AnyArray
+    other: AnyArray  # (places,) uint8; whose spikes differ
+    # held, looked: (blocks,) uint8; whose registers differ, and what a step looks at
+    held: AnyArray
+    looked: AnyArray
+    # moved, sign: int64; sources whose events differ, and whether these come (1) or go (-1)
+    moved: IntArray
+    sign: IntArray
+
+
+def overflows(netlist: Netlist) -> bool:
+    """Whether some input could bring a sum or a current that its register does not hold."""
+    reached = reach(netlist)
+    return bool(np.any(reached.sums > ACCUMULATOR_MAX) or np.any(reached.current > CURRENT_MAX))
+
+
+def chip_of(netlist: Netlist) -> Chip:
+    """Lay a netlist out."""
+    order = np.lexsort((netlist.neuron, netlist.layer))
+    sizes = np.bincount(netlist.layer, minlength=len(netlist.layers))
+    blocks = -(-sizes // LANES)
+    shift = LANES * (np.cumsum(blocks) - blocks) - (np.cumsum(sizes) - sizes)
+    place = order.argsort() + shift[netlist.layer]
+    places = LANES * int(blocks.sum())
+    source = np.append(np.arange(netlist.n_inputs), netlist.n_inputs + place)[netlist.axon_source]
+    pairs = place[netlist.synapse_compartment()], source[netlist.axon_of_synapse()]
+    weight = sparse.csr_array((netlist.effective_weight(), pairs), shape=(places, netlist.n_inputs + places))
+    columns = {
+        "keep_u": (2**DECAY_BITS - 1 - netlist.decay_u, 0),
+        "keep_v": (2**DECAY_BITS - netlist.decay_v, 0),
+        "threshold": (netlist.threshold << MEMBRANE_SHIFT, NEVER),
+        "bias": (netlist.bias_mantissa << netlist.bias_exponent, 0),
+        "lowest": (-np.minimum(reach(netlist).stored, MEMBRANE_MAX), 0),
+        "label": (netlist.readout_class, -1),
+    }
+    laid = {name: np.full(places, missing, np.int32) for name, (_, missing) in columns.items()}
+    for name, (values, _) in columns.items():
+        laid[name][place] = values
+    depth = np.repeat([layer.depth for layer in netlist.layers], blocks)
+    return Chip(by_source([weight], np.int32), depth, **laid)
+
+
+def known_run(chip: Chip, events: AnyArray) -> Known:
+    """Run a recording (channels, T) and keep what changed runs need."""
+    places, steps = len(chip.bias), events.shape[1] + int(chip.depth.max())
+    registers = np.zeros((2, steps + 1, places), np.int32)
+    sums, fired = np.zeros((steps, places), np.int32), np.zeros((steps, places), np.uint8)
+    known = Known(np.ascontiguousarray(events).view(np.uint8), sums, registers[0], registers[1], fired)
+    _record(chip, known, _run_of(chip, known))
+    return known
+
+
+def effects(chip: Chip, known: Known, classes: int, changes: Changes) -> Effects:
+    """What changes of the known recording bring about."""
+    count = len(changes.bounds) - 1
+    come, gone = np.zeros((2, count, classes), np.int64)
+    found = Effects(come, gone, np.zeros(count, np.int64))
+    channel, step = np.ascontiguousarray(changes.cells.T, np.int64)
+    _run(chip, known, _run_of(chip, known), channel, step, changes.bounds, *found)
+    return found
+
+
+def _run_of(chip: Chip, known: Known) -> _Run:
+    places, blocks = len(chip.bias), len(chip.depth)
+    delta, current, membrane = np.zeros((3, places), np.int32)
+    held, looked = np.zeros((2, blocks), np.uint8)
+    moved, sign = np.zeros((2, places + len(known.events) + 1), np.int64)
+    return _Run(delta, current, membrane, np.zeros(places, np.uint8), held, looked, moved, sign)
+
+
+# Each loop is a function of its own that writes one array: only so does the compiler vectorise it.
+
+
+@compiled
+def _charge(current: Any, keep: Any, sums: Any, delta: Any, first: Any, places: Any) -> None:
+    for i in range(first, first + places):
+        arrived = np.int32(np.int32(sums[i] + delta[i]) << np.int32(MEMBRANE_SHIFT))
+        current[i] = np.int32(kept(current[i], keep[i]) + arrived)
+
+
+@compiled
+def _integrate(membrane: Any, keep: Any, current: Any, bias: Any, first: Any, places: Any) -> None:
+    for i in range(first, first + places):
+        v = np.int32(np.int32(kept(membrane[i], keep[i]) + current[i]) + bias[i])
+        membrane[i] = min(max(v, np.int32(-MEMBRANE_MAX)), np.int32(MEMBRANE_MAX))
+
+
+@compiled
+def _compare(other: Any, membrane: Any, threshold: Any, fired: Any, first: Any, places: Any) -> Any:
+    found = np.uint8(0)
+    for i in range(first, first + places):
+        differs = np.uint8(np.uint8(membrane[i] > threshold[i]) ^ fired[i])
+        other[i] = differs
+        found |= differs
+    return found
+
+
+@compiled
+def _reset(membrane: Any, threshold: Any, first: Any, places: Any) -> None:
+    for i in range(first, first + places):
+        membrane[i] = np.int32(0) if membrane[i] > threshold[i] else membrane[i]
+
+
+@compiled
+def _differ(ours: Any, theirs: Any, first: Any, places: Any) -> Any:
+    found = np.int32(0)
+    for i in range(first, first + places):
+        found |= ours[i] ^ theirs[i]
+    return found
+
+
+@compiled
+def _fill(to: Any, values: Any, first: Any, places: Any) -> None:
+    for i in range(first, first + places):
+        to[i] = values[i]
+
+
+@compiled
+def _add(total: Any, weight: Any, sign: Any, first: Any, begin: Any, length: Any) -> None:
+    for i in range(length):
+        total[first + i] += sign * weight[begin + i]
+
+
+@compiled
+def _arrive(chip: Chip, run: Any, moved: Any) -> None:
+    """Let changed sources arrive; marks the blocks that they reach."""
+    begins, target, offset, weight = chip.synapses
+    for k in range(moved):
+        source, sign = run.moved[k], np.int32(run.sign[k])
+        for r in range(begins[source], begins[source + 1]):
+            first, begin, length = target[r], offset[r], offset[r + 1] - offset[r]
+            _add(run.delta, weight, sign, np.uint64(first), np.uint64(begin), np.uint64(length))
+            for block in range(first // LANES, (first + length - 1) // LANES + 1):
+                run.looked[block] = 1
+
+
+@compiled
+def _step(chip: Chip, run: Any, sums: Any, first: Any, places: Any) -> None:
+    """Charge and integrate some places; the sums of `run` are used up."""
+    _charge(run.current, chip.keep_u, sums, run.delta, first, places)
+    clear(run.delta[first : first + places])
+    _integrate(run.membrane, chip.keep_v, run.current, chip.bias, first, places)
+
+
+@compiled_and_cached
+def _record(chip: Chip, known: Known, run: Any) -> None:
+    channels, length = known.events.shape
+    whole = np.uint64(len(chip.bias))
+    for t in range(len(known.sums)):
+        n = 0
+        for channel in range(channels):
+            if t < length and known.events[channel, t]:
+                run.moved[n], run.sign[n] = channel, 1
+                n += 1
+        for c in range(len(chip.bias)):
+            if t and known.fired[t - 1, c]:
+                run.moved[n], run.sign[n] = channels + c, 1
+                n += 1
+        _arrive(chip, run, n)
+        _fill(known.sums[t], run.delta, np.uint64(0), whole)
+        clear(run.delta)
+        for block in range(len(chip.depth)):
+            first, places = np.uint64(block * LANES), np.uint64(LANES)
+            if chip.depth[block] <= t < chip.depth[block] + length:
+                _step(chip, run, known.sums[t], first, places)
+                _compare(run.other, run.membrane, chip.threshold, known.fired[t], first, places)
+                _fill(known.fired[t], run.other, first, places)
+                _reset(run.membrane, chip.threshold, first, places)
+                _fill(known.current[t + 1], run.current, first, places)
+                _fill(known.membrane[t + 1], run.membrane, first, places)
+
+
+@compiled
+def _list_moved(chip: Chip, run: Any, moved: Any, fired: Any, part: Any, channels: Any, come: Any, gone: Any) -> Any:
+    """List whose spikes differ, and let them vote."""
+    for c in range(part[0], part[1]):
+        if run.other[c]:
+            sign = 1 - 2 * np.int64(fired[c])
+            run.moved[moved], run.sign[moved] = channels + c, sign
+            moved += 1
+            if chip.label[c] >= 0:
+                (gone if fired[c] else come)[chip.label[c]] += 1
+    return moved
+
+
+@compiled
+def _span(chip: Chip, known: Known, run: Any, t: Any, begin: Any) -> Any:
+    """End of the neighbouring blocks from `begin` on that are looked at together; their registers are held."""
+    block, places = begin, np.uint64(LANES)
+    while block < len(chip.depth) and run.looked[block] and chip.depth[block] == chip.depth[begin]:
+        if not run.held[block]:
+            _fill(run.current, known.current[t], np.uint64(block * LANES), places)
+            _fill(run.membrane, known.membrane[t], np.uint64(block * LANES), places)
+        block += 1
+    return block
+
+
+@compiled
+def _part(chip: Chip, known: Known, run: Any, t: Any, moved: Any, span: Any, come: Any, gone: Any) -> tuple[Any, Any]:
+    """One step of some blocks; how many sources now differ, and whether a register does."""
+    begin, end = span
+    first, places = np.uint64(begin * LANES), np.uint64((end - begin) * LANES)
+    channels, length = known.events.shape
+    if not chip.depth[begin] <= t < chip.depth[begin] + length:
+        clear(run.delta[first : first + places])
+        clear(run.held[begin:end])
+        return moved, False
+    _step(chip, run, known.sums[t], first, places)
+    if _compare(run.other, run.membrane, chip.threshold, known.fired[t], first, places):
+        part = begin * LANES, end * LANES
+        moved = _list_moved(chip, run, moved, known.fired[t], part, channels, come, gone)
+    _reset(run.membrane, chip.threshold, first, places)
+    any_held = False
+    for block in range(begin, end):
+        at, places = np.uint64(block * LANES), np.uint64(LANES)
+        differs = _differ(run.membrane, known.membrane[t + 1], at, places)
+        run.held[block] = (differs | _differ(run.current, known.current[t + 1], at, places)) != 0
+        any_held |= run.held[block] != 0
+    return moved, any_held
+
+
+@compiled_and_cached
+def _run(
+    chip: Chip, known: Known, run: Any, channel: Any, step: Any, bounds: Any, come: Any, gone: Any, end: Any
+) -> None:
+    steps, blocks = len(known.sums), len(chip.depth)
+    for k in range(len(end)):
+        flip, last, moved, any_held, t = bounds[k], bounds[k + 1], 0, False, np.int64(0)
+        clear(run.held)
+        while True:
+            if moved == 0 and not any_held:
+                end[k] = t
+                if flip == last:
+                    break
+                t = step[flip]
+            if t >= steps:
+                end[k] = steps
+                break
+            while flip < last and step[flip] == t:
+                run.moved[moved] = channel[flip]
+                run.sign[moved] = 1 - 2 * np.int64(known.events[channel[flip], t])
+                moved += 1
+                flip += 1
+            _fill(run.looked, run.held, np.uint64(0), np.uint64(blocks))
+            _arrive(chip, run, moved)
+            moved, any_held, block = 0, False, 0
+            while block < blocks:
+                after = _span(chip, known, run, t, block)
+                if after > block:
+                    moved, held = _part(chip, known, run, t, moved, (block, after), come[k], gone[k])
+                    any_held |= held
+                block = max(after, block + 1)
+            t += 1

@@ -1,0 +1,1 @@
+"""Which decisions no small change of a recording alters, and which change alters the others: proven, not sampled."""

@@ -1,0 +1,126 @@
+"""Verdicts, laid out for terminals, and the picture of a sensor and of what hangs on its taxels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.models.graphs import NEUTOUCH
+from spikeloom.runtime.report.drawing import GREY, Drawing, sheet, styled
+from spikeloom.runtime.report.numbers import percent
+from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.studies.stability.neighbours import KINDS, SIZED
+from spikeloom.runtime.studies.stability.results import PHASES, Stability, Verdict
+
+SHOWN = 20
+"""Recordings and taxels that a terminal shows."""
+
+PANELS = {"dead": "dies", "stuck": "is stuck", "event": "sends one event more or less"}
+
+KEY = (
+    "at least: no change of so many events alters the decision, proven; at most: one of so many does; taxels: on which "
+    "a decision hangs"
+)
+
+
+def sections(result: Stability) -> Iterator[Section]:
+    """How many decisions stand, kind by kind; how many events they bear; what alters the others."""
+    found, count = result.verdicts, len(result.verdicts)
+    lines = [
+        f"right: {percent(sum(verdict.right for verdict in found), count)}",
+        f"no single event alters the decision: {percent(result.certified(1), count)}",
+    ]
+    rows = [
+        [
+            KINDS[name],
+            f"{result.unaltered(name)} of {count}",
+            f"{sum(verdict.kinds[name].tried for verdict in found):,}",
+            f"{sum(verdict.kinds[name].alter for verdict in found):,}",
+            _size([verdict.kinds[name].least for verdict in found]) if name in SIZED else "",
+        ]
+        for name in KINDS
+    ]
+    head = ["change", "decisions that stand", "tried", "alter", "smallest that alters, median"]
+    yield Section("Verdicts", [Text("\n".join(lines)), Table(head, rows)])
+    yield Section("Events", [_radii(result), Text(KEY)])
+    hanging = hanging_on(result)
+    most = np.argsort(-sum(hanging.values()), kind="stable")
+    taxels = [[str(taxel), *(str(each[taxel]) for each in hanging.values())] for taxel in most.tolist()]
+    head = ["taxel", *PANELS.values()]
+    yield Section("Decisions that hang on a taxel", [Table(head, taxels, most=SHOWN)])
+    phases = np.sum([verdict.phases for verdict in found], axis=0)
+    if phases.any():
+        cells = [f"{100 * each / phases.sum():.0f} %" for each in phases]
+        head = ["tenth of the recording", *(str(phase + 1) for phase in range(PHASES))]
+        yield Section("When single events alter", [Table(head, [["of them", *cells]])])
+    fragile = sorted(found, key=lambda verdict: (verdict.at_least, verdict.ahead))
+    head = ["recording", "label", "decided", "ahead", "at least", "at most", "alters"]
+    yield Section("The least stable", [Table(head, [_row(verdict) for verdict in fragile], words=True, most=SHOWN)])
+
+
+def _size(least: list[int | None]) -> str:
+    """Median over all recordings; those in which none alters are beyond every number."""
+    middle = sorted(least, key=lambda size: np.inf if size is None else size)[len(least) // 2]
+    return "none" if middle is None else f"{middle} bins"
+
+
+def _radii(result: Stability) -> Table:
+    """Recordings by how many events they bear."""
+    count, rows = len(result.verdicts), []
+    for events in (1, 2, 3, 4, 6, 8, 12, 16):
+        if events <= result.most:
+            broken = sum(each.at_most is not None and each.at_most <= events for each in result.verdicts)
+            sure = result.certified(events)
+            rows.append([str(events), f"{sure} of {count}", f"{broken}", f"{count - sure - broken}"])
+    return Table(["changed events", "proven to stand", "shown to fall", "open"], rows)
+
+
+def _row(verdict: Verdict) -> list[str]:
+    kinds = [name for name, kind in verdict.kinds.items() if kind.alter]
+    most = "–" if verdict.at_most is None else str(verdict.at_most)
+    words = [verdict.file, verdict.label, verdict.decision, verdict.ahead, verdict.at_least, most]
+    return [*map(str, words), ", ".join(kinds) or "–"]
+
+
+def hanging_on(result: Stability) -> dict[str, IntArray]:
+    """Decisions that hang on each taxel: on its failure, and on any of its events."""
+    single = [set(each.taxels["removed"]) | set(each.taxels["added"]) for each in result.verdicts]
+    events = [sum(taxel in taxels for taxels in single) for taxel in range(result.taxels)]
+    failed = {kind: np.array(result.hanging(kind)) for kind in ("dead", "stuck")}
+    return failed | {"event": np.array(events)}
+
+
+def _places(taxels: int) -> FloatArray:
+    """Where taxels lie: on the sensor that is known, else on a circle."""
+    if taxels == len(NEUTOUCH):
+        return NEUTOUCH[:, :2]
+    turn = 2 * np.pi * np.arange(taxels) / taxels
+    return np.stack([np.cos(turn), np.sin(turn)], axis=1)
+
+
+@styled
+def taxel_map(result: Stability) -> Drawing:
+    """Taxels where they lie, coloured by how many decisions hang on each."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    count = len(result.verdicts)
+    name = "" if result.provenance is None else f"{result.provenance.netlist} on {result.provenance.data}: "
+    title = f"{name}decisions, of {count}, that change if one taxel …"
+    drawing = sheet(title, 4.2)
+    drawing.figure.suptitle(title, fontsize=10)
+    points = _places(result.taxels)
+    for axes, (kind, values) in zip(drawing.figure.subplots(1, len(PANELS)), hanging_on(result).items(), strict=True):
+        colours = ScalarMappable(Normalize(0, max(int(values.max()), 1)), "YlOrRd")
+        axes.scatter(*points.T, s=190, c=colours.to_rgba(values), edgecolors=GREY, linewidths=0.6)
+        for taxel, ((x, y), value) in enumerate(zip(points.tolist(), values.tolist(), strict=True)):
+            dark = value > 0.6 * max(int(values.max()), 1)
+            axes.text(x, y, str(value), ha="center", va="center", fontsize=6, color="white" if dark else "black")
+            drawing.tips.append((axes, x, y, f"taxel {taxel} {PANELS[kind]}: {value} of {count} decisions change"))
+        axes.set(title=f"… {PANELS[kind]}", aspect="equal")
+        axes.margins(0.12)
+        axes.axis("off")
+        drawing.figure.colorbar(colours, ax=axes, orientation="horizontal", shrink=0.8, label="decisions")
+    return drawing

@@ -1,0 +1,152 @@
+"""Verdicts of recordings: every small change is tried, or shown to be as harmless as one that was."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+from itertools import islice
+
+import numpy as np
+from joblib import Parallel, delayed
+
+from spikeloom.compiler.types import IntArray
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.machines.base import Machine
+from spikeloom.runtime.machines.changes import PART, Effects, single
+from spikeloom.runtime.report.console import Progress
+from spikeloom.runtime.studies.stability.attack import attack
+from spikeloom.runtime.studies.stability.bounds import lower_bound, needed
+from spikeloom.runtime.studies.stability.neighbours import (
+    KINDS,
+    SIZED,
+    Cells,
+    Events,
+    Failure,
+    cells_of,
+    channels_of,
+    failures,
+    words_of,
+)
+from spikeloom.runtime.studies.stability.results import PHASES, Found, Stability, Verdict
+
+SHIFT = 25
+"""Bins that a recording is shifted by at most."""
+
+MOST = 16
+"""Changed events up to which a proof is looked for."""
+
+
+def stability(
+    machine: Machine, data: Recordings, *, shift: int = SHIFT, most: int = MOST, jobs: int | None = None
+) -> Stability:
+    """Verdicts of recordings in their own bins; `jobs` of them at a time, one a core by default.
+
+    Raises DataError for another sensor, NumericRangeError where a register overflows.
+    """
+    machine.require_sensor(data.events)
+    work = Parallel(jobs or os.cpu_count(), backend="threading", return_as="generator")
+    lengths, verdicts, progress = data.step_counts.tolist(), [], Progress(len(data))
+    each = (
+        delayed(verdict)(machine, events[..., :length], label, file, shift=shift, most=most)
+        for events, length, label, file in zip(data.events, lengths, data.labels.tolist(), data.files, strict=True)
+    )
+    for done, found in enumerate(work(each), 1):
+        verdicts.append(found)
+        progress(done, "recordings")
+    netlist = machine.netlist
+    return Stability(
+        target=netlist.target,
+        taxels=netlist.taxels,
+        classes=netlist.classes,
+        shift=shift,
+        most=most,
+        verdicts=tuple(verdicts),
+    )
+
+
+def verdict(machine: Machine, events: Events, label: int, file: str, *, shift: int, most: int) -> Verdict:
+    """What is known of one recording (taxels, polarities, bins)."""
+    netlist = machine.netlist
+    channels = channels_of(events[None], netlist)[0]
+    votes = machine.votes(channels[None])[0]
+    decision, gaps = needed(votes)
+    cells = cells_of(events, netlist)
+    effects = machine.effects(channels, single(cells.cells))
+    decided = (effects.votes + votes).argmax(axis=1)
+    altering = (decided != decision) & (cells.cost == 1)
+    kinds, taxels = _failures(machine, events, decision, shift)
+    for kind, there in (("removed", True), ("added", False)):
+        tried = (cells.there == there) & (cells.cost == 1)  # the others change nothing
+        hits = np.flatnonzero(tried & altering)
+        first, to = None, None
+        if len(hits):
+            first, to = words_of(cells.cells[hits[0]], there, netlist), int(decided[hits[0]])
+        kinds[kind] = Found(int(tried.sum()), len(hits), first, to)
+        taxels[kind] = tuple(np.unique(cells.cells[hits, 0] // netlist.polarities).tolist())
+    at_least, at_most, how = _radius(machine, channels, votes, cells, effects, most)
+    phase = cells.cells[altering, 1] * PHASES // max(int(cells.cells[-1, 1]) + 1, 1)
+    return Verdict(
+        file=file,
+        label=label,
+        decision=decision,
+        ahead=int(np.delete(gaps, decision).min(initial=int(votes[decision]))),
+        kinds={kind: kinds[kind] for kind in KINDS},
+        at_least=at_least,
+        at_most=at_most,
+        exact=at_most == at_least + 1,
+        attack=how,
+        taxels=taxels,
+        phases=tuple(np.bincount(phase, minlength=PHASES).tolist()),
+    )
+
+
+def _failures(
+    machine: Machine, events: Events, decision: int, shift: int
+) -> tuple[dict[str, Found], dict[str, tuple[int, ...]]]:
+    """Run all changes that are no single events: what is said of each kind, and taxels of single failures."""
+    tried: Counter[str] = Counter()
+    alter: dict[str, list[tuple[Failure, int]]] = {kind: [] for kind in KINDS}
+    for part in _batched(failures(events, shift)):
+        changed = channels_of(np.stack([each.events for each in part]), machine.netlist)
+        decided = machine.votes(changed).argmax(axis=1).tolist()
+        tried.update(each.kind for each in part)
+        for each, to in zip(part, decided, strict=True):
+            if to != decision:
+                alter[each.kind].append((each, to))
+    found, taxels = {}, {}
+    for kind, altering in alter.items():
+        first, to = altering[0] if altering else (None, None)
+        size = None if first is None or kind not in SIZED else abs(first.numbers[0])
+        found[kind] = Found(tried[kind], len(altering), None if first is None else first.words, to, size)
+        if kind in ("dead", "stuck"):
+            taxels[kind] = tuple(each.numbers[0] for each, _ in altering)
+    return found, taxels
+
+
+def _batched(changes: Iterator[Failure]) -> Iterator[list[Failure]]:
+    """Some at a time."""
+    while part := list(islice(changes, PART)):
+        yield part
+
+
+def _radius(
+    machine: Machine, channels: Events, votes: IntArray, cells: Cells, effects: Effects, most: int
+) -> tuple[int, int | None, tuple[str, ...]]:
+    """Events that no change of so many alters the decision, events of a change that does, and that change."""
+    altered = (effects.votes + votes).argmax(axis=1) != votes.argmax()
+    if np.any(altered & (cells.cost == 1)):
+        first = np.flatnonzero(altered & (cells.cost == 1))[:1]
+        return 0, 1, _words(machine, cells, first)
+    known = machine.forgetting(channels)
+    if known is None or most < 2:
+        return 1, None, ()
+    at_least = max(1, lower_bound(votes, cells, effects, known, most))
+    taken = attack(machine, channels, votes, cells, effects)
+    if taken is None:
+        return at_least, None, ()
+    return at_least, int(cells.cost[taken].sum()), _words(machine, cells, taken)
+
+
+def _words(machine: Machine, cells: Cells, taken: IntArray) -> tuple[str, ...]:
+    return tuple(words_of(cells.cells[each], bool(cells.there[each]), machine.netlist) for each in taken)

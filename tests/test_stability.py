@@ -1,0 +1,266 @@
+"""The command ``certify``: quick runs of changed recordings are the slow ones, and what it proves no attack breaks."""
+
+import json
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from commands import as_json, run
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from made_files import CLASSES, TAXELS, events, recordings_folder
+from numpy.testing import assert_array_equal
+from random_netlists import large_netlist, lively, netlists, recordings, voting
+from random_networks import random_checkpoint, ring
+
+from spikeloom.compiler import compile_network, write_netlist
+from spikeloom.compiler.dynamics import Clocks
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.changes import Changes, by_running, joined, single
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.changes.kernel import overflows
+from spikeloom.runtime.report.encode import decode
+from spikeloom.runtime.studies.stability.bounds import lower_bound, needed
+from spikeloom.runtime.studies.stability.neighbours import KINDS, cells_of, channels_of
+from spikeloom.runtime.studies.stability.results import Stability
+from spikeloom.runtime.studies.stability.study import stability
+
+REPEATABLE = settings(max_examples=40, deadline=None, derandomize=True)
+
+
+def small_netlist(seed, taxels=TAXELS):
+    """A small TactileSGNet on the chip, lively."""
+    made = random_checkpoint(seed=seed, taxels=taxels, features=5, sizes=(9, 8, CLASSES))
+    return compile_network(expand(made, ring(taxels))).netlist
+
+
+def every_cell(channels):
+    step, channel = np.indices(channels.T.shape).reshape(2, -1)
+    return np.stack([channel, step], axis=1)
+
+
+def assert_as_by_running(machine, channels, changes):
+    found, wanted = machine.effects(channels, changes), by_running(machine, channels, changes)
+    assert_array_equal(found.votes, wanted.votes)
+    assert np.all(found.come >= wanted.come)
+    assert np.all(found.gone >= wanted.gone)
+    return found
+
+
+def kept(netlist, recordings):
+    trace = engine.simulate(netlist, recordings, spikes=True, membranes=True)
+    return trace.spikes, trace.membranes
+
+
+# -- what a change brings about ----------------------------------------------------------------------------------------
+@REPEATABLE
+@given(st.data())
+def test_changed_runs_are_whole_runs_on_networks_of_any_kind(data):
+    netlist = voting(data.draw(netlists(weight_exponents=(-1, 0, 1))))
+    assume(not overflows(netlist))
+    channels = data.draw(recordings(netlist))
+    cells = every_cell(channels)
+    assume(len(cells))
+    machine = machine_of(netlist)
+    assert_as_by_running(machine, channels, single(cells))
+    chance = st.lists(st.integers(0, len(cells) - 1), max_size=6, unique=True)
+    several = data.draw(st.lists(chance, min_size=1, max_size=5))
+    assert_as_by_running(machine, channels, joined([cells[each] for each in several]))
+
+
+def test_a_change_ends_where_the_chip_is_in_the_state_that_it_would_be_in_anyway():
+    netlist = lively()
+    channels = (np.random.default_rng(0).random((20, 40)) < 0.2).astype(np.uint8)
+    cells = every_cell(channels)[::7]
+    found = assert_as_by_running(machine_of(netlist), channels, single(cells))
+    changed = np.repeat(channels[None], len(cells), axis=0)
+    changed[np.arange(len(cells)), cells[:, 0], cells[:, 1]] ^= 1
+    (spikes,), (membranes,) = kept(netlist, channels[None])
+    other_spikes, other_membranes = kept(netlist, changed)
+    differ = np.any((other_spikes != spikes) | (other_membranes != membranes), axis=2)
+    last = differ.shape[1] - differ[:, ::-1].argmax(axis=1)
+    assert np.all(np.where(differ.any(axis=1), last, 0) <= found.end)
+    assert len(np.unique(found.end - cells[:, 1])) > 3
+    # a register that differs has its say in the next step, or is currents and membranes that a reset hides
+    assert np.mean(last[differ.any(axis=1)] + 2 >= found.end[differ.any(axis=1)]) > 0.5
+
+
+def test_where_a_register_may_overflow_every_change_is_run():
+    netlist = replace(voting(large_netlist(3, proved=False)), taxels=20)
+    assert overflows(netlist)
+    machine, channels = machine_of(netlist), np.zeros((20, 3), np.uint8)
+    assert machine.forgetting(channels) is None
+    changes = single(every_cell(channels)[:5])
+    assert_array_equal(machine.effects(channels, changes).votes, by_running(machine, channels, changes).votes)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_known_again_is_so_after_any_past(seed):
+    rng = np.random.default_rng(seed)
+    netlist = lively() if seed == 0 else small_netlist(seed)
+    inputs, steps = netlist.n_inputs, 40
+    channels = (rng.random((inputs, steps)) < 0.1).astype(np.uint8)
+    machine = machine_of(netlist)
+    known = machine.forgetting(channels)
+    (spikes,), (membranes,) = kept(netlist, channels[None])
+    classes = netlist.readout_class
+    for start in range(1, steps + 1):
+        pasts = np.repeat(channels[None], 12, axis=0)
+        pasts[:, :, :start] = rng.random((12, inputs, start)) < rng.random((12, 1, 1))
+        other_spikes, other_membranes = kept(netlist, pasts)
+        assert_array_equal(other_spikes[:, known.quiet[start] :], np.tile(spikes[known.quiet[start] :], (12, 1, 1)))
+        after = max(known.back[start], start)
+        assert_array_equal(other_membranes[:, after:], np.tile(membranes[after:], (12, 1, 1)))
+        for each in range(netlist.classes):
+            own = np.flatnonzero(classes == each)
+            ours, theirs = spikes[start:, own].sum(axis=1), other_spikes[:, start:, own].sum(axis=2, dtype=np.int64)
+            assert np.all(theirs <= ours + known.come[start, start:, each])
+            assert np.all(theirs >= ours - known.gone[start, start:, each])
+    assert known.quiet[:20].max() < steps or seed == 0  # it does forget
+
+
+# -- proofs ------------------------------------------------------------------------------------------------------------
+def study_of(netlist, given, **options):
+    count = len(given)
+    data = Recordings(
+        events=given,
+        labels=np.arange(count) % netlist.classes,
+        files=tuple(f"r{i}" for i in range(count)),
+        split="test",
+        source="made",
+    )
+    return stability(machine_of(netlist), data, jobs=1, **options)
+
+
+def decided(netlist, given):
+    return machine_of(netlist).votes(channels_of(given, netlist)).argmax(axis=1)
+
+
+def bounded(machine, one, most=8):
+    """A recording, what flips of its entries do alone, its votes and how many events are proven to be harmless."""
+    channels, cells = channels_of(one[None], machine.netlist)[0], cells_of(one, machine.netlist)
+    votes = machine.votes(channels[None])[0]
+    alone = machine.effects(channels, single(cells.cells))
+    return channels, cells, alone, votes, lower_bound(votes, cells, alone, machine.forgetting(channels), most)
+
+
+def test_none_of_all_pairs_and_triples_breaks_what_is_proven_of_them():
+    proven = []
+    for seed in (1, 4, 6, 11):
+        machine = machine_of(small_netlist(seed, taxels=2))
+        for one in events(seed, samples=2, taxels=2, steps=18, rate=0.15):
+            channels, cells, _, votes, bound = bounded(machine, one)
+            broken = []
+            for count in range(1, min(max(bound, 1), 3) + 1):
+                every = np.array(list(combinations(range(len(cells.cells)), count)))
+                changes = Changes(cells.cells[every.ravel()], np.arange(len(every) + 1) * count)
+                found = machine.effects(channels, changes).votes + votes
+                broken.append(bool(np.any(found.argmax(axis=1) != votes.argmax())))
+            assert broken == ([True] if bound == 0 else [False] * len(broken))  # of one event all is known
+            proven.append(bound)
+    assert {0, 1, 2} <= set(proven)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 4, 6])
+def test_no_attack_breaks_what_is_proven(seed):
+    machine, rng, proven = machine_of(small_netlist(seed)), np.random.default_rng(seed), []
+    for one in events(seed, samples=3, steps=80, rate=0.1):
+        channels, cells, alone, votes, bound = bounded(machine, one)
+        decision, gaps = needed(votes)
+        worst = int(np.argmin(np.where(gaps > 0, gaps, len(one) * 100)))
+        hurts = np.argsort(alone.votes[:, decision] - alone.votes[:, worst], kind="stable")
+        step, attacks = cells.cells[:, 1], []
+        for _ in range(400):  # what does most damage alone, then anything close to each other
+            attacks.append(rng.choice(hurts[:40], bound, replace=False))
+            close = np.flatnonzero(np.abs(step - rng.choice(step)) < 4)
+            attacks.append(rng.choice(close, bound, replace=False))
+        found = machine.effects(channels, joined([cells.cells[each] for each in attacks])).votes + votes
+        assert np.all(found.argmax(axis=1) == decision)
+        proven.append(bound)
+    assert max(proven) >= 2
+
+
+@pytest.mark.parametrize(("bins", "clocks"), [(1, Clocks()), (3, Clocks(length=12))])
+def test_verdicts_are_those_of_plain_runs(bins, clocks):
+    netlist = replace(small_netlist(1), bins=bins, clocks=clocks)
+    given = events(5, samples=2, steps=20, rate=0.1)
+    for one, found in zip(given, study_of(netlist, given, shift=3, most=4).verdicts, strict=True):
+        known = decided(netlist, one[None])[0]
+        assert found.decision == known
+        wanted = dict.fromkeys(KINDS, 0)
+        hanging = {kind: set() for kind in ("removed", "added", "dead", "stuck")}
+
+        def tally(kind, changed, taxel=None, known=known, wanted=wanted, hanging=hanging):
+            if decided(netlist, changed[None])[0] != known:
+                wanted[kind] += 1
+                hanging.get(kind, set()).add(taxel)
+
+        seen = set()
+        for taxel, polarity, step in np.ndindex(one.shape):
+            changed = one.copy()
+            changed[taxel, polarity, step] ^= 1
+            kind = "removed" if one[taxel, polarity, step] else "added"
+            if (place := (kind, taxel, polarity, step // bins)) not in seen:  # events of one step do the same
+                seen.add(place)
+                tally(kind, changed, taxel)
+        for taxel in range(TAXELS):
+            for kind, value in (("dead", 0), ("stuck", 1)):
+                changed = one.copy()
+                changed[taxel] = value
+                tally(kind, changed, taxel)
+        for pair in combinations(range(TAXELS), 2):
+            changed = one.copy()
+            changed[list(pair)] = 0
+            tally("two dead", changed)
+        for by in (-3, -2, -1, 1, 2, 3):
+            changed = np.zeros_like(one)
+            changed[..., max(by, 0) : 20 + min(by, 0)] = one[..., max(-by, 0) : 20 - max(by, 0)]
+            tally("shifted", changed)
+        for cut in range(1, 20):
+            for kind, part in (("start cut", np.s_[..., :cut]), ("end cut", np.s_[..., 20 - cut :])):
+                changed = one.copy()
+                changed[part] = 0
+                tally(kind, changed)
+        assert {kind: each.alter for kind, each in found.kinds.items()} == wanted
+        assert {kind: set(each) for kind, each in found.taxels.items()} == hanging
+        assert (found.at_least >= 1) == (wanted["removed"] + wanted["added"] == 0)
+        assert found.at_most is None or found.at_most > found.at_least
+        assert all((each.alter > 0) == (each.to is not None and each.to != known) for each in found.kinds.values())
+
+
+def test_an_attack_alters_the_decision_with_the_events_that_it_names():
+    netlist, given = small_netlist(0), events(8, samples=4, steps=60, rate=0.1)
+    result = study_of(netlist, given)
+    assert any(each.at_most is not None and each.at_most > 1 for each in result.verdicts)
+    for one, found in zip(given, result.verdicts, strict=True):
+        changed = one.copy()
+        for words in found.attack:
+            taxel, polarity, step = (int(word.strip(",:")) for word in words.split() if word.strip(",:").isdigit())
+            assert words.endswith("removed" if one[taxel, polarity, step] else "added")
+            changed[taxel, polarity, step] ^= 1
+        assert np.count_nonzero(changed != one) == (found.at_most or 0)
+        assert (decided(netlist, changed[None])[0] != found.decision) == (found.at_most is not None)
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+def test_the_command(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_netlist(small_netlist(1), "net.loom")
+    recordings_folder(tmp_path / "data", test=events(3, samples=4))
+    words = ["certify", "net.loom", "--data", "data", "--shift", "2"]
+    found = as_json(*words, "-o", "found.json", "--picture", "map.png")
+    assert json.loads((tmp_path / "found.json").read_text()) == found
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+    result = decode(Stability, found)
+    assert len(result.verdicts) == 4
+    assert result.unaltered("dead") == sum(not each.taxels["dead"] for each in result.verdicts)
+    assert sum(result.hanging("dead")) == sum(each.kinds["dead"].alter for each in result.verdicts)
+    code, out, _ = run(*words)
+    assert code == 0
+    assert f"no single event alters the decision: {25 * result.certified(1):.2f} %" in out
+    assert f"a taxel sends nothing  {'':35}{result.unaltered('dead')} of 4".replace(" ", "") in out.replace(" ", "")
+    for wrong in ("--shift -1", "--most 0", "--jobs 0"):
+        assert run(*words[:-2], *wrong.split())[0] == 2
