@@ -285,7 +285,7 @@ class Machine(ABC):
 
     def effects(self, channels: EventArray, changes: Changes) -> Effects:
         """What changes of a recording (channels, steps) bring about; runs each, unless the chip knows better."""
-        return by_running(self, channels, changes)
+        return by_running(self.votes, channels, changes)
 
     def forgetting(self, channels: EventArray) -> Forgetting | None:  # noqa: ARG002
         """How soon the chip forgets what it was before a step of a recording (channels, steps); None: not known."""

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.types import IntArray
-
-if TYPE_CHECKING:
-    from spikeloom.runtime.machines.base import Machine
 
 PART = 64
 """Changed recordings that run together."""
@@ -66,9 +64,12 @@ def joined(changes: list[IntArray]) -> Changes:
     return Changes(np.concatenate([none, *ordered]), np.cumsum([0, *map(len, changes)]))
 
 
-def by_running(machine: Machine, channels: npt.NDArray[Any], changes: Changes) -> Effects:
-    """The definition: each changed recording (channels, steps) is run from its first step to its last."""
-    known = machine.votes(channels[None])[0]
+def by_running(run: Callable[[Any], IntArray], channels: npt.NDArray[Any], changes: Changes) -> Effects:
+    """The definition: each changed recording (channels, steps) is run from its first step to its last.
+
+    `run` gives votes (samples, classes) of recordings (samples, channels, steps).
+    """
+    known = run(channels[None])[0]
     votes = []
     for first in range(0, len(changes.bounds) - 1, PART):
         part = range(first, min(first + PART, len(changes.bounds) - 1))
@@ -76,7 +77,7 @@ def by_running(machine: Machine, channels: npt.NDArray[Any], changes: Changes) -
         for row, index in zip(changed, part, strict=True):
             channel, step = changes.of(index).T
             row[channel, step] ^= 1
-        votes.append(machine.votes(changed))
+        votes.append(run(changed))
     moved = np.concatenate([np.zeros((0, len(known)), np.int64), *votes]) - known
     return Effects(np.maximum(moved, 0), np.maximum(-moved, 0), np.full(len(moved), channels.shape[1] + LATE))
 
