@@ -42,7 +42,7 @@ def every_cell(channels):
     return np.stack([channel, step], axis=1)
 
 
-def assert_as_by_running(machine.votes, channels, changes):
+def assert_as_by_running(machine, channels, changes):
     found, wanted = machine.effects(channels, changes), by_running(machine.votes, channels, changes)
     assert_array_equal(found.votes, wanted.votes)
     assert np.all(found.come >= wanted.come)
@@ -65,10 +65,10 @@ def test_changed_runs_are_whole_runs_on_networks_of_any_kind(data):
     cells = every_cell(channels)
     assume(len(cells))
     machine = machine_of(netlist)
-    assert_as_by_running(machine.votes, channels, single(cells))
+    assert_as_by_running(machine, channels, single(cells))
     chance = st.lists(st.integers(0, len(cells) - 1), max_size=6, unique=True)
     several = data.draw(st.lists(chance, min_size=1, max_size=5))
-    assert_as_by_running(machine.votes, channels, joined([cells[each] for each in several]))
+    assert_as_by_running(machine, channels, joined([cells[each] for each in several]))
 
 
 def test_a_change_ends_where_the_chip_is_in_the_state_that_it_would_be_in_anyway():
