@@ -42,7 +42,7 @@ RIVALS = {"brian2": (), "nengo": ("layers",), "lava": ()}
 """Those with a script of their own, and its options."""
 
 TOGETHER = 36
-"""Recordings that a process runs."""
+"""Recordings that a process runs; SANA-FE's detailed time is that of the first so many."""
 
 
 def without_windows(netlist: Netlist) -> Netlist:
@@ -57,8 +57,8 @@ def later(events: Any, steps: int, *, first: int) -> Any:
     return padded
 
 
-def compare(name: str, python: str, netlist: Netlist, events: Any, folder: Path) -> dict[str, Any]:
-    """Spikes of a simulator that is handed matrices."""
+def compare(name: str, python: str, netlist: Netlist, events: Any, folder: Path, _first: int) -> dict[str, Any]:
+    """Spikes of a simulator that is handed matrices; CPU seconds of its process, without others that it starts."""
     stages = workload.stages_of(netlist)
     arrays: dict[str, Any] = {"layers": len(stages), "events": events.transpose(0, 2, 1), "few": np.arange(len(events))}
     for index, stage in enumerate(stages):
@@ -102,9 +102,9 @@ def simple_times(chip: timing_oracle.Chip, spikes: Any, updated: Any, events: An
     return sums.max(axis=(0, 2)) + table.barrier(len(set(chip.tile)))
 
 
-def compare_sanafe(_name: str, python: str, netlist: Netlist, events: Any, folder: Path) -> dict[str, Any]:
+def compare_sanafe(_name: str, python: str, netlist: Netlist, events: Any, folder: Path, first: int) -> dict[str, Any]:
     """Spikes, energy and times of SANA-FE for some recordings, by its conventions and as ``estimate`` prints them."""
-    target, models = load_target(netlist.target), ("simple", "detailed")
+    target, models = load_target(netlist.target), ("simple",) if first else ("simple", "detailed")
     version = "from importlib.metadata import version as v; print(v('sanafe'))"
     tool = subprocess.run([python, "-c", version], check=True, capture_output=True, text=True).stdout.strip()
     steps = events.shape[2] + netlist.max_depth + 1
@@ -137,7 +137,8 @@ def compare_sanafe(_name: str, python: str, netlist: Netlist, events: Any, folde
         "energy_off": 0.0,
         "simple_time_off": 0.0,
     }
-    for i, runs in enumerate(zip(theirs[::2], theirs[1::2], strict=True)):
+    for i in range(len(events)):
+        runs = theirs[len(models) * i : len(models) * (i + 1)]
         for run in runs:
             fired = np.zeros_like(trace.spikes[i])
             for step, group, k in run["spikes"]:
@@ -161,7 +162,7 @@ def merged(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
     whole = dict(other)
     for key, value in one.items():
         if key.startswith("printed"):
-            whole[key] = (min(value[0], other[key][0]), max(value[1], other[key][1]))
+            whole[key] = value if key not in other else (min(value[0], other[key][0]), max(value[1], other[key][1]))
         elif key != "tool":
             whole[key] = max(value, other[key]) if key.endswith("off") else value + other[key]
     return whole
@@ -202,7 +203,7 @@ def main() -> None:
             for first in range(facts.get(name, {}).get("recordings", 0), len(events), TOGETHER):
                 part, begun = events[first : first + TOGETHER], time.monotonic()
                 with tempfile.TemporaryDirectory() as folder:
-                    found = {"recordings": len(part)} | run(name, python, netlist, part, Path(folder))
+                    found = {"recordings": len(part)} | run(name, python, netlist, part, Path(folder), first)
                 facts[name] = merged(facts[name], found) if name in facts else found
                 print(f"{path}, {name}, {time.monotonic() - begun:.0f} s: {facts[name]}", file=sys.stderr, flush=True)
                 with write_atomically(output) as file:
