@@ -41,8 +41,8 @@ import timing_oracle
 RIVALS = {"brian2": (), "nengo": ("layers",), "lava": ()}
 """Those with a script of their own, and its options."""
 
-TOGETHER = 36
-"""Recordings that a process runs; SANA-FE's detailed time is that of the first so many."""
+FIRST, TOGETHER = 12, 36
+"""Recordings of the first process, of which SANA-FE's detailed time is taken, and of the others."""
 
 
 def without_windows(netlist: Netlist) -> Netlist:
@@ -200,8 +200,8 @@ def main() -> None:
         }
         for name, python in pythons.items():
             run: Callable[..., dict[str, Any]] = compare if name in RIVALS else compare_sanafe
-            for first in range(facts.get(name, {}).get("recordings", 0), len(events), TOGETHER):
-                part, begun = events[first : first + TOGETHER], time.monotonic()
+            while (first := facts.get(name, {}).get("recordings", 0)) < len(events):
+                part, begun = events[first : first + (TOGETHER if first else FIRST)], time.monotonic()
                 with tempfile.TemporaryDirectory() as folder:
                     found = {"recordings": len(part)} | run(name, python, netlist, part, Path(folder), first)
                 facts[name] = merged(facts[name], found) if name in facts else found
