@@ -188,7 +188,7 @@ def main() -> None:
     networks = json.loads(output.read_text("utf-8"))["networks"] if output.exists() else {}
     for path in asked.netlists:
         netlist = read_netlist(path)
-        shown = of_length(joined_bins(data.part(slice(asked.limit)), netlist.bins), netlist.clocks.length)
+        shown = of_length(joined_bins(data, netlist.bins), netlist.clocks.length)
         events = np.ascontiguousarray(with_clocks(shown.events, netlist.clocks) != 0).view(np.uint8)
         trace = simulate(without_windows(netlist), later(events, events.shape[2] + len(netlist.layers), first=0))
         facts = networks.setdefault(Path(path).stem, {})
@@ -200,7 +200,8 @@ def main() -> None:
         }
         for name, python in pythons.items():
             run: Callable[..., dict[str, Any]] = compare if name in RIVALS else compare_sanafe
-            while (first := facts.get(name, {}).get("recordings", 0)) < len(events):
+            wanted = min(asked.limit or len(events), len(events))
+            while (first := facts.get(name, {}).get("recordings", 0)) < wanted:
                 part, begun = events[first : first + (TOGETHER if first else FIRST)], time.monotonic()
                 with tempfile.TemporaryDirectory() as folder:
                     found = {"recordings": len(part)} | run(name, python, netlist, part, Path(folder), first)
