@@ -166,7 +166,8 @@ def test_a_table_without_a_price_is_left_out(event):
     costs, report = priced_by(table("lacking", **lacking), table("full", **FULL))
     assert set(costs.energy) == {"full"}
     assert costs.unpriced == {"lacking": (event,)}
-    assert report.not_modelled == (f"lacking: no price for {event}",)
+    assert report.not_modelled[0] == f"lacking: no price for {event}"
+    assert "SANA-FE's own runs" in report.not_modelled[1]
     for part in (report.per_inference, report.min, report.max, *(layer.amounts for layer in report.layers)):
         assert set(part.energy_j) == {"full"}
 

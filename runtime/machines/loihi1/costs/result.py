@@ -17,6 +17,12 @@ from spikeloom.runtime.machines.loihi1.costs.estimate import Estimate
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, StepTimes
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 
+INPUTS = (
+    "times: SANA-FE's own runs send input events from a core of their own and take longer, on real recordings by up to "
+    "3 % (simple) or 25 % (detailed)"
+)
+"""Said wherever times are; measured by ``benchmarks/agreement.py``."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Amounts:
@@ -194,6 +200,7 @@ def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: flo
         not_modelled=(
             *(f"{name}: no price for {', '.join(events)}" for name, events in costs.unpriced.items()),
             *_links(chips, costs),
+            *([INPUTS] if found.simple else []),
         ),
     )
 
