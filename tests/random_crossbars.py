@@ -27,6 +27,18 @@ NEURONS = st.builds(
     negative_saturates=st.booleans(),
     initial=st.one_of(st.just(0), st.integers(-(2**19), 2**19 - 1)),
 )
+IN_RANCS_TERMS = st.builds(
+    Neuron,
+    weights=st.tuples(WEIGHTS, WEIGHTS, WEIGHTS, WEIGHTS),
+    leak=st.integers(-5, 5),
+    threshold=st.integers(0, 20),
+    reset_mode=st.integers(0, 2),
+    reset=st.integers(-4, 4),
+    negative_threshold=st.one_of(st.integers(0, 20), st.just(2**18 - 1)),
+    negative_saturates=st.booleans(),
+    initial=st.integers(-9, 9),
+)
+"""Without leak reversal; those that RANC cannot hold above their floor are refused."""
 
 
 def with_limit(rule: str, value: int):

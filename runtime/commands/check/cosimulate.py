@@ -1,0 +1,44 @@
+"""The command ``cosimulate``: a netlist in a hardware description that others wrote, spike by spike."""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.runtime.commands.options import add_netlist, add_recordings, group
+from spikeloom.runtime.inputs.recordings import load_recordings
+from spikeloom.runtime.machines.base import chip_module, machine_for
+from spikeloom.runtime.report.sections import Outcome
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe the options of the command."""
+    add_netlist(parser)
+    add_recordings(parser)
+    options = group(parser, "hardware")
+    options.add_argument("--rtl", required=True, metavar="FOLDER", help="a clone of github.com/UA-RCL/RANC (TrueNorth)")
+    options.add_argument("--simulator", choices=("verilator", "iverilog"), help="default: verilator, if it is there")
+    options.add_argument(
+        "--work", metavar="FOLDER", help="keep what is built and finished, and go on from it (a minute a recording)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> Outcome:
+    """Run the command; exit code 1 where a spike, a membrane or a packet differs."""
+    machine = machine_for(arguments.netlist)
+    chip = chip_module(machine.target.name, "cosimulation")
+    if chip is None:
+        raise OptionError(
+            f"{arguments.netlist}: no hardware description of {machine.target.title} is known; give another netlist"
+        )
+    data = load_recordings(arguments, machine.netlist)
+    machine.require_sensor(data.events)
+    with tempfile.TemporaryDirectory(prefix="spikeloom-") as temporary:
+        folder = Path(arguments.work or temporary)
+        if not folder.is_dir():
+            raise OptionError(f"--work {arguments.work}: is no folder; make it first")
+        options = {"rtl": arguments.rtl, "simulator": arguments.simulator, "bin_s": arguments.bin}
+        outcome: Outcome = chip.cosimulate(machine, data, folder=folder, **options)
+    return outcome

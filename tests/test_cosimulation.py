@@ -1,0 +1,141 @@
+"""Netlists in hardware: in cores of our own writing (``tests/rtl``) where iverilog is installed, and in those of RANC
+where ``SPIKELOOM_RANC`` names a clone of its repository.
+"""
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import as_json, refusal, run
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+from made_files import recordings_folder
+from random_crossbars import IN_RANCS_TERMS, crossbars, events
+from random_netlists import lively
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.targets.loihi1.netlist import write_netlist
+from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron
+from spikeloom.compiler.targets.truenorth.netlist import RESET_NONE, write_crossbars
+from spikeloom.runtime.machines.truenorth import cosimulation
+from spikeloom.runtime.machines.truenorth.machine import machine_of
+
+OURS = Path(__file__).with_name("rtl")
+STEPS = 6
+
+
+@pytest.fixture(params=["ours", "RANC"])
+def rtl(request):
+    if not shutil.which("iverilog"):
+        pytest.skip("iverilog is not installed")
+    if request.param == "RANC" and "SPIKELOOM_RANC" not in os.environ:
+        pytest.skip("RANC's repository is not named by SPIKELOOM_RANC")
+    return OURS if request.param == "ours" else Path(os.environ["SPIKELOOM_RANC"])
+
+
+def chain():
+    """Three places in a row and one above: a neuron that is held at an odd floor, one that two reach late, a voter."""
+    draft = Draft()
+    for place in ((2, 3), (3, 3), (2, 4)):
+        draft.core(*place)
+    draft.neuron(0, Neuron(weights=(3, -4), threshold=3, negative_threshold=5, negative_saturates=True), layer="held")
+    draft.neuron(1, Neuron(weights=(2,), threshold=1, reset_mode=RESET_NONE, negative_threshold=9), layer="kept")
+    draft.neuron(2, Neuron(weights=(1, 1), threshold=2, leak=-1, initial=1), layer="out")
+    draft.neuron(2, Neuron(weights=(1, 1)), layer="lost")
+    draft.axon(0, 0, [0])
+    draft.axon(0, 1, [0])
+    draft.axon(1, 0, [0], line=255)
+    draft.axon(2, 0, [0, 1])
+    draft.axon(2, 1, [0])
+    draft.feed(0, 0, 0)
+    draft.feed(1, 0, 1, tick=1)
+    draft.wire((0, 0), 1, 255, 15)
+    draft.wire((1, 0), 2, 0)
+    draft.clock(2, 1, period=2, phase=1)
+    draft.vote((2, 0), 1, first=17)
+    return draft.netlist(taxels=1, polarities=2, classes=2)
+
+
+@pytest.fixture
+def place(tmp_path):
+    write_crossbars(chain(), tmp_path / "net.loom")
+    recordings = (np.random.default_rng(0).random((2, 1, 2, STEPS)) < 0.6).astype(np.uint8)
+    recordings_folder(tmp_path / "data", train=recordings, test=recordings, classes=2)
+    return tmp_path
+
+
+def test_the_command(place, rtl):
+    (place / "work").mkdir()
+    words = ["cosimulate", place / "net.loom", "--data", place / "data", "--rtl", rtl, "--simulator", "iverilog"]
+    found = as_json(*words, "--work", place / "work")
+    assert found["differences"] == 0
+    assert found["spikes"] > 10
+    assert found["membranes"] == 2 * 4 * (STEPS + 17)
+    assert (found["doubled"], found["ticks_per_step"], found["exact_ticks"]) == (1, 1, None)
+    assert found["clock_hz"] == found["cycles_per_tick"] / 0.02
+    # finished recordings are read, not run again
+    kept = next((place / "work").glob("*.json"))
+    kept.write_text(kept.read_text("utf-8").replace('"packets_lost": 0', '"packets_lost": 3'), "utf-8")
+    code, out, _ = run(*words, "--work", place / "work")
+    assert code == 1
+    assert "lost in cores: 3" in out
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "what"),
+    [
+        ("v >= threshold", "v > threshold", "spikes_different"),
+        ("- floor : -reset", "- floor : reset", "membranes_different"),
+        ("packet_out = scheduler_packet", "packet_out = 0 & scheduler_packet", "outputs_different"),
+        ("token_controller_error = 0", "token_controller_error = scheduler_wen", "error_cycles"),
+        ("scheduler_clr = 0", "scheduler_clr = scheduler_wen", "packets_lost"),
+    ],
+)
+def test_what_hardware_does_wrong_is_counted(place, right, wrong, what):
+    defective(place, right, wrong)
+    words = ["cosimulate", place / "net.loom", "--data", place / "data", "--rtl", place, "--simulator", "iverilog"]
+    found = as_json(*words, codes=(1,))
+    assert sum(each[what] for each in found["recordings"]) > 0
+    assert found["differences"] >= sum(each[what] for each in found["recordings"])
+
+
+def test_mistakes_in_one_line(place, monkeypatch):
+    words = ["cosimulate", place / "net.loom", "--data", place / "data", "--rtl", place]
+    assert "no Core.v in it; give a clone of github.com/UA-RCL/RANC" in refusal(*words)
+    defective(place, "scheduler_wen = here.size() > 0", "scheduler_wen = 0")
+    assert "tick 0 of sample_0" in refusal(*words, "--simulator", "iverilog")
+    defective(place, "module Core", "module Score")
+    assert "iverilog fails" in refusal(*words, "--simulator", "iverilog")
+    assert "missing: is no folder; make it first" in refusal(*words, "--work", place / "missing")
+    monkeypatch.setenv("PATH", str(place))
+    assert "verilator or iverilog: not found" in refusal(*words)
+    write_netlist(lively(), place / "net.loom")
+    assert "no hardware description of Intel Loihi 1 is known" in refusal(*words)
+
+
+def defective(place, right, wrong):
+    """A folder's ``Core.v``: ours with one thing wrong."""
+    if not shutil.which("iverilog"):
+        pytest.skip("iverilog is not installed")
+    text = (OURS / "Core.v").read_text("utf-8")
+    assert right in text
+    (place / "Core.v").write_text(text.replace(right, wrong), "utf-8")
+
+
+def built(netlist, rtl, folder, ticks):
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return cosimulation.build(machine_of(netlist), folder, cosimulation.sources_in(str(rtl)), "iverilog", ticks)
+
+
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(crossbars(IN_RANCS_TERMS), st.integers(0, 2**31))
+def test_any_network(rtl, tmp_path, netlist, seed):
+    recording = events(seed, 3, 12)
+    try:
+        hardware = built(netlist, rtl, tmp_path / "hardware", netlist.ticks(12))
+    except ModelError:
+        assume(False)
+    assert hardware.run("any", recording).differences == 0
