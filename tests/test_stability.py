@@ -16,14 +16,17 @@ from random_networks import random_checkpoint, ring
 
 from spikeloom.compiler import compile_network, write_netlist
 from spikeloom.compiler.dynamics import Clocks
+from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.counters import Plan, counted, counters_of, fit
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.machines.changes import Changes, by_running, joined, single
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.changes.kernel import overflows
 from spikeloom.runtime.report.encode import decode
 from spikeloom.runtime.studies.stability.bounds import lower_bound, needed
+from spikeloom.runtime.studies.stability.counting import least, tally_of
 from spikeloom.runtime.studies.stability.neighbours import KINDS, cells_of, channels_of
 from spikeloom.runtime.studies.stability.results import Stability
 from spikeloom.runtime.studies.stability.study import stability
@@ -181,6 +184,39 @@ def test_no_attack_breaks_what_is_proven(seed):
         assert np.all(found.argmax(axis=1) == decision)
         proven.append(bound)
     assert max(proven) >= 2
+
+
+@pytest.mark.parametrize(
+    "plan", [Plan(thresholds=(1, 2, 4), ramp=40), Plan(thresholds=(1, 3), parts=2, bins=2, ramp=30)], ids=str
+)
+def test_counters_bear_exactly_so_many_events(plan):
+    rng, labels = np.random.default_rng(3), np.arange(24) % 3
+    often = np.random.default_rng(4).random((3, 2, 2, 1))
+    given = (rng.random((24, 2, 2, 16)) < 0.6 * often[labels]).astype(np.uint8)
+    data = Recordings(events=given, labels=labels, files=tuple(map(str, range(24))), split="train", source="made")
+    seen = counted(data, plan)
+    made = counters_of(seen, fit(seen, 3), data, 3)
+    machine = machine_of(compile_network(counting_network(made)).netlist)
+    tally, exact = tally_of(machine), set()
+    for one, found in zip(given[:5], stability(machine, data.part(slice(5)), jobs=1, most=2).verdicts, strict=True):
+        channels, cells = channels_of(one[None], machine.netlist)[0], cells_of(one, machine.netlist)
+        votes, broken = machine.votes(channels[None])[0], 3
+        known = least(tally, channels != 0, votes, cells, 2)
+        for count in (2, 1):
+            every = np.array(list(combinations(range(len(cells.cells)), count)))
+            every = every[cells.cost[every].sum(axis=1) <= 2]
+            changes = Changes(cells.cells[every.ravel()], np.arange(len(every) + 1) * count)
+            decisions = (machine.effects(channels, changes).votes + votes).argmax(axis=1)
+            altering = cells.cost[every].sum(axis=1)[decisions != votes.argmax()]
+            broken = min(broken, int(altering.min(initial=3)))
+            if known is not None and count == 1:
+                assert_array_equal(decisions, known[2][every[:, 0]])
+        assert found.at_least < broken
+        if known is not None:
+            assert found.at_least == broken - 1
+            assert found.at_most == (broken if broken < 3 else None)
+            exact.add(broken)
+    assert {1, 2} <= exact
 
 
 @pytest.mark.parametrize(("bins", "clocks"), [(1, Clocks()), (3, Clocks(length=12))])

@@ -19,8 +19,8 @@ ROUNDS = 6
 
 def attack(
     machine: Machine, channels: npt.NDArray[np.uint8], votes: IntArray, cells: Cells, effects: Effects
-) -> IntArray | None:
-    """Entries whose flips together alter the decision of a recording (channels, steps); None: none were found.
+) -> IntArray:
+    """Entries whose flips together alter the decision of a recording (channels, steps); none if none were found.
 
     Those that cost the decision most votes against one class are taken, none while another still has an effect; then,
     in the changed recording, further ones. Those that turn out not to be needed are dropped. `votes` (classes,) are of
@@ -32,7 +32,7 @@ def attack(
         taken = _against(machine, channels, votes, cells, effects, (decision, other))
         if taken is not None:
             found.append(_without_idle(machine, channels, votes, cells, taken))
-    return min(found, key=lambda taken: int(cells.cost[taken].sum()), default=None)
+    return min(found, key=lambda taken: int(cells.cost[taken].sum()), default=np.zeros(0, np.int64))
 
 
 def _easiest(gaps: IntArray, decision: int, cells: Cells, effects: Effects) -> list[int]:

@@ -13,14 +13,14 @@ from joblib import Parallel, delayed
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import Machine
-from spikeloom.runtime.machines.changes import PART, Effects, single
+from spikeloom.runtime.machines.changes import PART, joined, single
 from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.studies.stability.attack import attack
 from spikeloom.runtime.studies.stability.bounds import lower_bound, needed
+from spikeloom.runtime.studies.stability.counting import Tally, least, tally_of
 from spikeloom.runtime.studies.stability.neighbours import (
     KINDS,
     SIZED,
-    Cells,
     Events,
     Failure,
     cells_of,
@@ -45,10 +45,11 @@ def stability(
     Raises DataError for another sensor, NumericRangeError where a register overflows.
     """
     machine.require_sensor(data.events)
+    tally = tally_of(machine)
     work = Parallel(jobs or os.cpu_count(), backend="threading", return_as="generator")
     lengths, verdicts, progress = data.step_counts.tolist(), [], Progress(len(data))
     each = (
-        delayed(verdict)(machine, events[..., :length], label, file, shift=shift, most=most)
+        delayed(verdict)(machine, events[..., :length], label, file, shift=shift, most=most, tally=tally)
         for events, length, label, file in zip(data.events, lengths, data.labels.tolist(), data.files, strict=True)
     )
     for done, found in enumerate(work(each), 1):
@@ -65,15 +66,22 @@ def stability(
     )
 
 
-def verdict(machine: Machine, events: Events, label: int, file: str, *, shift: int, most: int) -> Verdict:
-    """What is known of one recording (taxels, polarities, bins)."""
+def verdict(
+    machine: Machine, events: Events, label: int, file: str, *, shift: int, most: int, tally: Tally | None = None
+) -> Verdict:
+    """What is known of one recording (taxels, polarities, bins); `tally` is that of a counting network."""
     netlist = machine.netlist
     channels = channels_of(events[None], netlist)[0]
     votes = machine.votes(channels[None])[0]
     decision, gaps = needed(votes)
     cells = cells_of(events, netlist)
-    effects = machine.effects(channels, single(cells.cells))
-    decided = (effects.votes + votes).argmax(axis=1)
+    counted = None if tally is None else least(tally, channels != 0, votes, cells, most)
+    effects = None
+    if counted is None:
+        effects = machine.effects(channels, single(cells.cells))
+        decided = (effects.votes + votes).argmax(axis=1)
+    else:
+        decided = counted[2]
     altering = (decided != decision) & (cells.cost == 1)
     kinds, taxels = _failures(machine, events, decision, shift)
     for kind, there in (("removed", True), ("added", False)):
@@ -84,7 +92,17 @@ def verdict(machine: Machine, events: Events, label: int, file: str, *, shift: i
             first, to = words_of(cells.cells[hits[0]], there, netlist), int(decided[hits[0]])
         kinds[kind] = Found(int(tried.sum()), len(hits), first, to)
         taxels[kind] = tuple(np.unique(cells.cells[hits, 0] // netlist.polarities).tolist())
-    at_least, at_most, how = _radius(machine, channels, votes, cells, effects, most)
+    taken = np.flatnonzero(altering)[:1]
+    at_least = 1 - len(taken)
+    if not len(taken) and counted is not None:
+        at_least, found = counted[:2]
+        taken = taken if found is None else found
+    elif not len(taken) and effects is not None and (known := machine.forgetting(channels)) is not None:
+        at_least = max(1, lower_bound(votes, cells, effects, known, most))
+        taken = attack(machine, channels, votes, cells, effects)
+    if len(taken) and not _alters(machine, channels, votes, cells.cells[taken]):
+        taken = taken[:0]
+    at_most = int(cells.cost[taken].sum()) or None
     phase = cells.cells[altering, 1] * PHASES // max(int(cells.cells[-1, 1]) + 1, 1)
     return Verdict(
         file=file,
@@ -95,7 +113,7 @@ def verdict(machine: Machine, events: Events, label: int, file: str, *, shift: i
         at_least=at_least,
         at_most=at_most,
         exact=at_most == at_least + 1,
-        attack=how,
+        attack=tuple(words_of(cells.cells[each], bool(cells.there[each]), netlist) for each in taken),
         taxels=taxels,
         phases=tuple(np.bincount(phase, minlength=PHASES).tolist()),
     )
@@ -130,23 +148,7 @@ def _batched(changes: Iterator[Failure]) -> Iterator[list[Failure]]:
         yield part
 
 
-def _radius(
-    machine: Machine, channels: Events, votes: IntArray, cells: Cells, effects: Effects, most: int
-) -> tuple[int, int | None, tuple[str, ...]]:
-    """Events that no change of so many alters the decision, events of a change that does, and that change."""
-    altered = (effects.votes + votes).argmax(axis=1) != votes.argmax()
-    if np.any(altered & (cells.cost == 1)):
-        first = np.flatnonzero(altered & (cells.cost == 1))[:1]
-        return 0, 1, _words(machine, cells, first)
-    known = machine.forgetting(channels)
-    if known is None or most < 2:
-        return 1, None, ()
-    at_least = max(1, lower_bound(votes, cells, effects, known, most))
-    taken = attack(machine, channels, votes, cells, effects)
-    if taken is None:
-        return at_least, None, ()
-    return at_least, int(cells.cost[taken].sum()), _words(machine, cells, taken)
-
-
-def _words(machine: Machine, cells: Cells, taken: IntArray) -> tuple[str, ...]:
-    return tuple(words_of(cells.cells[each], bool(cells.there[each]), machine.netlist) for each in taken)
+def _alters(machine: Machine, channels: Events, votes: IntArray, cells: IntArray) -> bool:
+    """Whether flips together alter the decision."""
+    found = machine.effects(channels, joined([cells])).votes[0] + votes
+    return bool(found.argmax() != votes.argmax())
