@@ -27,6 +27,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from made import made
+
+from spikeloom.models.recordings.events import load_data
+
 DEFAULT = Path(__file__).parent / "results" / "commands.json"
 
 MAKE = {
@@ -171,9 +175,11 @@ def main() -> None:
         tree.folder.mkdir(parents=True, exist_ok=True)
         tree.make("objects.loom", tree.folder, values, arguments.core)
     values["wide"] = old.make("wide.pt", folder, values, arguments.core) if "wide" in " ".join(arguments.only) else ""
-    results = json.loads(output.read_text()) if output.exists() else {}
+    results = made(*(load_data(arguments.recordings, each) for each in ("train", "test"))) | {
+        "jobs": json.loads(output.read_text())["jobs"] if output.exists() else {}
+    }
     for job in arguments.only:
-        found = results[job] = measure(job, (old, new), values, arguments)
+        found = results["jobs"][job] = measure(job, (old, new), values, arguments)
         before, after = found["old"], found["new"]
         seconds = f"{before['wall_s']:8.2f} -> {after['wall_s']:7.2f} s, {found['times_faster']:6.1f} times as fast"
         memory = f"{before['peak_gb']:.2f} -> {after['peak_gb']:.2f} GB"

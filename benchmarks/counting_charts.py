@@ -76,7 +76,7 @@ def fewer(results: Sequence[Json]) -> Figure:
             look = {"color": COLOURS[index], "marker": MARKERS[index], "ls": DASHES[index], "ms": 4}
             axes.errorbar(taxels, mean, yerr=[mean - low, high - mean], capsize=2, label=f"{words}, nested", **look)
             axes.plot(taxels, test, "x", color=COLOURS[index], ms=5, label=f"{words}, test split")
-        axes.set(title=result["data"].removesuffix(".zip"), xlabel="taxels that are left", ylim=(0, 100))
+        axes.set(title=result["data"].removesuffix(".zip"), xlabel="taxels that are left", ylim=(25, 100))
         axes.grid(alpha=0.3)
     first = np.atleast_1d(rows)[0]
     first.set_ylabel("accuracy, %")

@@ -3,26 +3,31 @@
     python benchmarks/figures.py FOLDER [STUDY...]
 
 FOLDER holds ``Ev-Objects.zip`` and ``Ev-Containers.zip``, the released ``objects_manual.t7`` and, for the chart of
-Containers, ``containers-knn1.pt`` (docs/chart.md has its command). Each study is a file in benchmarks/results, with the
-commands, the hash of the recordings and the state of the code that made it.
+Containers, ``containers-knn1.pt`` (``spikeloom train --data Ev-Containers.zip --graph knn:1``). Each study is a file in
+benchmarks/results, with the commands, the hash of the recordings and the state of the code that made it.
 """
 
 import argparse
 import json
+import re
+import shlex
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from scipy.stats import ttest_ind
+import numpy as np
+from scipy.stats import binomtest, ttest_ind
 
 import spikeloom
 from spikeloom.compiler.files import write_atomically
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import data_digest
+from spikeloom.runtime.report.drawing import matrices
 from spikeloom.runtime.report.numbers import wilson
 
 Json = dict[str, Any]
@@ -49,8 +54,30 @@ CHARTS = {
 USUAL = ("8b", "cores", 100)
 """Storage, layout and window that others are compared with, of the first network."""
 
-FILLINGS = 5
+FILLINGS, CONTAINER_CLASSES = 5, 20
 """Of each of four containers, classes in order."""
+
+STORAGE = {
+    "8 bits, from the weights": "",
+    "8 bits": "--calibrate DATA",
+    "2 × 8 bits": "--calibrate DATA --planes 2",
+    "2 × 8 bits, 8 scales": "--calibrate DATA --planes 2 --scale-groups 8",
+    "spike-exact": "--calibrate DATA --spike-exact",
+    "6 bits": "--calibrate DATA --weight-bits 6",
+    "4 bits": "--calibrate DATA --weight-bits 4",
+    "4 bits, 8 scales": "--calibrate DATA --weight-bits 4 --scale-groups 8",
+    "ternary, 8 scales": "--calibrate DATA --weight-bits 2 --scale-groups 8",
+}
+"""Options of `compile`."""
+
+NAMED = {"objects": OBJECTS, "containers": CONTAINERS}
+
+ROOT = Path(__file__).parents[1]
+SHOWN = re.compile(r"^\$ (spikeloom .+)\n((?:(?!\$ |```).*\n)*)", re.MULTILINE)
+"""A command in the docs, and what they show of its output."""
+
+PAGES = ("anytime", "chart", "compile", "cost", "counting", "data", "formats", "stress", "truenorth", "verify")
+"""Those that show some."""
 
 POINT = ("number", "network", "storage", "cores", "window", "n_cores", "test")
 
@@ -125,6 +152,35 @@ def shipped(session: Session) -> Json:
     return found
 
 
+def storage(session: Session) -> Json:
+    """What each way to store weights keeps and costs, with p of its right decisions against the float model's."""
+    found: Json = {}
+    for name, data in NAMED.items():
+        rows = {}
+        for row, options in STORAGE.items():
+            words = f"compile pretrained:{name} {options} -o net.loom".replace("DATA", data)
+            session.run(words.replace("  ", " "))
+            rows[row] = stored(session, f"pretrained:{name}", data)
+        found[name] = {"rows": rows}
+    return found
+
+
+def stored(session: Session, network: str, data: str) -> Json:
+    """Decisions, spikes and costs of ``net.loom``."""
+    verdict = session.run(f"verify net.loom --checkpoint {network} --data {data}")
+    moved: Any = re.search(r"float only (\d+), on chip only (\d+)", verdict["levels"][-1]["text"])
+    lost, gained = map(int, moved.groups())
+    return {
+        "float": round(verdict["accuracy"]["float"] * verdict["samples"]),
+        "right": round(verdict["accuracy"]["chip"] * verdict["samples"]),
+        "test_samples": verdict["samples"],
+        "equal": round(verdict["decision_agreement"] * verdict["samples"]),
+        "p": binomtest(lost, lost + gained).pvalue if lost + gained else 1.0,
+        "spikes_moved": sum(each["different"] for each in verdict["spikes"].values()),
+        **session.costs(data),
+    }
+
+
 def layouts(session: Session) -> Json:
     """What more cores cost and bring, message by message."""
     found = {}
@@ -138,6 +194,8 @@ def chart(session: Session, data: str) -> Json:
     """Points of a grid, and the one that was chosen."""
     networks, grid = CHARTS[data]
     found = session.run(f"chart {networks} --data {data} --grid {grid} -o chart", "chart/chart.json")
+    if data == OBJECTS:
+        (RESULTS / "chart-objects.png").write_bytes((session.folder / "chart" / "chart.png").read_bytes())
     points = {str(point["number"]): {key: point[key] for key in POINT} for point in found["points"]}
     usual = next(each for each in points.values() if (each["storage"], each["cores"], each["window"]) == USUAL)
     for point in points.values():
@@ -169,6 +227,68 @@ def lean(session: Session, data: str) -> Json:
     return found
 
 
+def stress(session: Session, network: str, calibrate: str = "") -> Json:
+    """Accuracy of both sides under every perturbation, and where it leaves that of clean recordings."""
+    session.run(f"compile {network} {calibrate}-o net.loom")
+    options = f"--data {OBJECTS} -o stress.json --picture stress.png"
+    result = session.run(f"stress net.loom --checkpoint {network} {options}", "stress.json")
+    if calibrate:
+        (RESULTS / "stress.png").write_bytes((session.folder / "stress.png").read_bytes())
+    found: Json = {"clean": {"right": result["clean"]["right"], "equal": result["clean"]["equal"]}}
+    for name, each in result["perturbations"].items():
+        verdict = {key: each[key] for key in ("verdict", "breaks", "same_place")}
+        levels = {
+            f"{level['level']:g}": {side: level[side]["mean"] for side in ("float", "chip")} | {"equal": level["equal"]}
+            for level in each["levels"]
+        }
+        found[name] = verdict | {"levels": levels}
+    return found
+
+
+def truenorth(session: Session) -> Json:
+    """Counting networks of few bits, and the shipped networks that were trained for the chip."""
+    found: Json = {}
+    for data in (OBJECTS, CONTAINERS):
+        for bits in (8, 5, 4):
+            made = session.run(f"train --data {data} --system counters --weight-bits {bits} -o net.pt")["record"]
+            session.run(f"compile net.pt {'' if bits == 8 else '--target truenorth '}-o net.loom")
+            costs = session.run(f"estimate net.loom --data {data}")
+            found[f"{data}, {bits} bits"] = {
+                "cross_validation": made["validation"]["correct"] / made["validation"]["samples"],
+                "right": made["test_correct"],
+                "cores": costs["cores"] if bits < 8 else len(costs["cores"]),
+                **{key: costs["per_inference"].get(key) for key in ("ticks", "energy_j")},
+            }
+        name = f"{Path(data).stem.removeprefix('Ev-').lower()}-truenorth"
+        session.run(f"compile pretrained:{name} --target truenorth -o net.loom")
+        verdict = session.run(f"verify net.loom --checkpoint pretrained:{name} --data {data}")
+        costs = session.run(f"estimate net.loom --data {data}")
+        kept = {key: costs["per_inference"][key] for key in ("ticks", "time_s", "energy_j")}
+        moved = verdict["E1"]["differences"]
+        found[name] = {"right": verdict["correct"], "spikes_differ": moved, "cores": costs["cores"], **kept}
+    return found
+
+
+def yardsticks(session: Session) -> Json:
+    """NeuroBench's metrics and the arithmetic of the float model."""
+    return session.run(f"yardsticks {MANUAL} --graph manual --data {OBJECTS}")
+
+
+def shown(session: Session, page: str) -> Json:
+    """What the commands print that a page of the docs shows."""
+    found = {}
+    whole = (ROOT / "docs" / f"{page}.md").read_text("utf-8")
+    if "objects.loom" in whole and "-o objects.loom" not in whole:
+        session.run(f"compile {MANUAL} --graph manual --calibrate {OBJECTS} -o objects.loom")
+    for command, text in SHOWN.findall(whole):
+        session.commands.append(command)
+        run = [sys.executable, "-m", *shlex.split(command)]
+        done = subprocess.run(run, cwd=session.folder, capture_output=True, text=True, check=False)
+        if text.strip(" \n…"):
+            found[command] = done.stderr if done.returncode == 2 else done.stdout
+    return found
+
+
 def confusion(session: Session) -> Json:
     """What the chip takes for what on Containers: another container, or another filling of the same."""
     session.run(f"compile pretrained:containers --calibrate {CONTAINERS} -o net.loom")
@@ -177,6 +297,15 @@ def confusion(session: Session) -> Json:
     other = sum(label // FILLINGS != decided // FILLINGS for label, decided in pairs)
     wrong = sum(label != decided for label, decided in pairs)
     near = sum(label // FILLINGS == decided // FILLINGS and abs(label - decided) == 1 for label, decided in pairs)
+    counts = np.zeros((CONTAINER_CLASSES, CONTAINER_CLASSES), np.int64)
+    np.add.at(counts, tuple(np.transpose(pairs)), 1)
+    drawing = matrices("Containers in rows of five fillings", {"Containers, five fillings of each of four": counts})
+    drawing.figure.set_size_inches(4.8, 4.8)
+    for axes in drawing.figure.axes:
+        for edge in range(FILLINGS, CONTAINER_CLASSES, FILLINGS):
+            axes.axhline(edge - 0.5, color="0.6", lw=0.8)
+            axes.axvline(edge - 0.5, color="0.6", lw=0.8)
+    (RESULTS / "confusion-containers.png").write_bytes(drawing.file("png"))
     return {"test_samples": len(pairs), "wrong": wrong, "other_container": other, "next_filling": near, "pairs": pairs}
 
 
@@ -201,6 +330,11 @@ def longer_bins(session: Session) -> Json:
 
 
 STUDIES: dict[str, Callable[[Session], Json]] = {
+    "storage": storage,
+    "stress-objects": lambda session: stress(session, f"{MANUAL} --graph manual", f"--calibrate {OBJECTS} "),
+    "stress-counters": lambda session: stress(session, "pretrained:objects-counters"),
+    "truenorth": truenorth,
+    "yardsticks": yardsticks,
     "confusion-containers": confusion,
     "longer-bins": longer_bins,
     "pretrained": pretrained,
@@ -212,6 +346,7 @@ STUDIES: dict[str, Callable[[Session], Json]] = {
     "lean-containers": lambda session: lean(session, CONTAINERS),
     "anytime-objects": lambda session: anytime(session, OBJECTS),
     "anytime-containers": lambda session: anytime(session, CONTAINERS),
+    **{f"shown/{page}": partial(shown, page=page) for page in PAGES},
 }
 
 
@@ -221,12 +356,15 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("studies", nargs="*", metavar="STUDY", help=", ".join(STUDIES))
     arguments = parser.parse_args()
-    code = subprocess.run(["git", "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True, check=True)
+    code = subprocess.run(
+        ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True, check=True
+    )
     for name in arguments.studies or STUDIES:
         with tempfile.TemporaryDirectory() as folder:
             session = Session(arguments.folder, Path(folder))
             figures = STUDIES[name](session)
             read = [data for data in (OBJECTS, CONTAINERS) if any(data in words for words in session.commands)]
+            read = read or [OBJECTS, CONTAINERS]  # of records
             hashes = {
                 data: data_digest(*(load_data(arguments.folder / data, each) for each in ("train", "test")))
                 for data in read

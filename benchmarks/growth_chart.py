@@ -64,36 +64,27 @@ def draw(result: dict[str, Any], stem: str) -> None:
 
 
 def draw_skins(result: dict[str, Any], stem: str) -> None:
-    """Write STEM.svg and STEM.png: time, and memory per synapse, of the file that skins.py writes."""
+    """Write STEM.svg and STEM.png: times, of the file that skins.py writes."""
     rows = result["skins"]
     synapses = np.array([row["synapses"] for row in rows], np.float64)
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
+    figure, panel = plt.subplots(figsize=(5.2, 3.6), layout="constrained")
     for key, label, colour, mark in (
         ("compile_s", "compile", OURS, "o"),
         ("prepare_s", "prepare the engine", "#3b6fb5", "s"),
-        ("run_s", "run a recording", "#c2571a", "^"),
+        ("run_s", "run a recording of 50 steps", "#c2571a", "^"),
     ):
         cost = np.array([row["run_ms"] / 1e3 if key == "run_s" else row[key] for row in rows])
-        left.loglog(synapses, cost, f"{mark}-", color=colour, label=label)
-        left.loglog(synapses, cost[-1] * synapses / synapses[-1], "--", color=GUIDE, lw=1)
-    left.set_ylabel("seconds (dashed: proportional)", fontsize=9)
-    for key, label, colour, mark in (
-        ("compile_bytes", "compiling", OURS, "o"),
-        ("run_bytes", "running", "#c2571a", "^"),
-    ):
-        right.semilogx(synapses, [row[key] / row["synapses"] for row in rows], f"{mark}-", color=colour, label=label)
-    right.axhline(64, ls="--", color=GUIDE, lw=1)
-    right.set_ylim(0)
-    right.set_ylabel("bytes per synapse, at most (dashed: 64)", fontsize=9)
-    for panel in (left, right):
-        panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1e6:g} M")
-        panel.xaxis.set_minor_formatter(NullFormatter())
-        panel.set_xlabel("synapses", fontsize=9)
-        panel.legend(frameon=False, fontsize=9)
-        panel.grid(which="major", color="#ddd", lw=0.6)
-        panel.set_axisbelow(True)
-        panel.spines[["top", "right"]].set_visible(False)
-    _finish(figure, right, stem)
+        panel.loglog(synapses, cost[-1] * synapses / synapses[-1], "--", color=GUIDE, lw=1)
+        panel.loglog(synapses, cost, f"{mark}-", color=colour)
+        panel.annotate(label, (synapses[1], cost[1]), (6, -12), textcoords="offset points", color=colour, fontsize=9)
+    panel.set(ylabel="seconds (dashed: in proportion)", xlabel="synapses", xticks=[2e6, 5e6, 1e7, 2e7, 3e7])
+    panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1e6:g} M")
+    panel.xaxis.set_minor_formatter(NullFormatter())
+    panel.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    panel.grid(which="major", color="#ddd", lw=0.6)
+    panel.set_axisbelow(True)
+    panel.spines[["top", "right"]].set_visible(False)
+    _finish(figure, panel, stem)
 
 
 if __name__ == "__main__":

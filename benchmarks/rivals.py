@@ -364,7 +364,7 @@ def main() -> None:
     netlists = {} if asked.no_busy else {"busy": workload.place_chain(workload.build_chain(events), taxels=39)}
     if asked.netlist:
         netlists[Path(asked.netlist).name] = read_netlist(asked.netlist)
-    result: dict[str, Any] = made() | {
+    result: dict[str, Any] = made(load_data(asked.recordings, "train", taxels=39), data) | {
         "machine": {"processor": processor_name(), "python": platform.python_version(), "threads": 1},
         "units": "CPU milliseconds per recording; ratios are rival over ours within one round",
         "workloads": {},

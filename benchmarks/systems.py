@@ -21,9 +21,9 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from made import made
 
 import spikeloom
-from spikeloom.compiler import __version__
 from spikeloom.runtime.report.numbers import wilson
 
 RESULTS = Path(__file__).parent / "results"
@@ -49,8 +49,8 @@ def measured(name: str, network: str, data: Any) -> dict[str, Any]:
 
 def draw(place: str, files: list[str]) -> None:
     """One panel for each data set, small labels beside each mark."""
-    figure, panels = plt.subplots(1, len(files), figsize=(4.6 * len(files), 3.6), layout="constrained", squeeze=False)
-    for axes, file in zip(panels[0], files, strict=True):
+    figure, panels = plt.subplots(len(files), figsize=(5.2, 3.2 * len(files)), layout="constrained", squeeze=False)
+    for axes, file in zip(panels[:, 0], files, strict=True):
         found = json.loads(Path(file).read_text())
         title = found["data"].removesuffix(".zip").removeprefix("Ev-")
         machines = json.loads((RESULTS / f"features-{title.lower()}.json").read_text())
@@ -64,7 +64,7 @@ def draw(place: str, files: list[str]) -> None:
             axes.axhline(share, color="0.45", ls=line, lw=1)
             above = one["correct"] == max(each["correct"] for each in best.values())
             aside = {"xytext": (0, 2 if above else -2), "va": "bottom" if above else "top", "ha": "center"}
-            axes.annotate(words, (80, share), textcoords="offset points", fontsize=7, color="0.35", **aside)
+            axes.annotate(words, (80, share), textcoords="offset points", fontsize=8, color="0.35", **aside)
         for each in found["networks"]:
             name, _, label = each["name"].partition(", ")
             marker, colour = STYLES[name]
@@ -74,13 +74,14 @@ def draw(place: str, files: list[str]) -> None:
             span = [[share - low], [high - share]]
             axes.errorbar(energies[0], share, span, color=colour, marker=marker, ms=5, lw=0.8)
             axes.plot(energies, [share] * len(energies), color=colour, lw=2.5, alpha=0.35)
-            beside = {"xytext": (4, -11), "textcoords": "offset points", "fontsize": 7, "color": colour}
+            beside = {"xytext": (4, -11), "textcoords": "offset points", "fontsize": 8, "color": colour}
             axes.annotate(label.replace(", ", "\n"), (energies[0], share), va="top", **beside)
         axes.set_xscale("log")
-        axes.set(xlabel="dynamic energy a decision (µJ)", title=title, xlim=(1, 600), xticks=TICKS, xticklabels=TICKS)
+        axes.set(title=title, xlim=(1, 600), xticks=TICKS, xticklabels=TICKS)
         axes.minorticks_off()
         axes.grid(alpha=0.25)
-    panels[0, 0].set_ylabel("test accuracy (%)")
+    panels[-1, 0].set_xlabel("dynamic energy a decision (µJ); bar: the other price table")
+    figure.supylabel("test accuracy (%)", fontsize=10)
     handles = [plt.Line2D([], [], color=c, marker=m, ls="", label=name) for name, (m, c) in STYLES.items()]
     panels[0, 0].legend(handles=handles, fontsize=8, loc="lower left")
     figure.savefig(place, dpi=130)
@@ -98,10 +99,7 @@ def main() -> None:
     source, output, *networks = arguments.files
     data = spikeloom.recordings(source)
     rows = [measured(*each.split("=", 1), data) for each in networks]
-    command = " ".join(
-        ["python benchmarks/systems.py", Path(source).name, Path(output).name, *(f"'{n}'" for n in networks)]
-    )
-    found = {"data": Path(source).name, "command": command, "spikeloom": __version__, "networks": rows}
+    found = made(data.train, data.test) | {"data": Path(source).name, "networks": rows}
     Path(output).write_text(json.dumps(found, indent=1) + "\n")
 
 

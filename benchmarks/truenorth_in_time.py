@@ -1,6 +1,6 @@
 """What it takes and what it costs to lead the sums of a trained network through 20 ticks a data step.
 
-    python benchmarks/truenorth_in_time.py DATA CHECKPOINT [--graph manual]
+    python benchmarks/truenorth_in_time.py DATA OUT.json CHECKPOINT [--graph manual]
 
 What follows the checkpoint are options of compile that name the network.
 Every layer forgets within a step, whatever the network was trained with. Test accuracy of the float network as it was
@@ -10,13 +10,16 @@ sums that saturate at 19 and with such that do not, the share of those that do b
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import replace
 from functools import reduce
 from operator import add
 
 import numpy as np
+from made import made
 
+from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.interpret import channels_last, run_float, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.targets.base import load_target
@@ -27,7 +30,6 @@ from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.votes import readout_counts
-from spikeloom.runtime.report.sections import Table
 
 ENDLESS = 1 << 30
 """More than any partial sum."""
@@ -57,37 +59,30 @@ def level_right(network: LevelNetwork, data: Recordings, most: int) -> tuple[int
 
 
 def main() -> None:
-    """Print the figures."""
-    data_path, *words = sys.argv[1:]
+    """Measure and write."""
+    data_path, output, *words = sys.argv[1:]
     arguments = build_parser().parse_args(["compile", *words, "-o", "unused.loom"])
     network, chip = load_network(arguments.checkpoint, arguments).network, load_target("truenorth")
     forgetful = replace(network, populations=tuple(replace(p, beta=0.0, alpha=0.0) for p in network.populations))
-    data = recordings(data_path, "test", classes=network.classes, taxels=network.input.taxels)
-
-    def share(right: int) -> str:
-        return f"{right} of {len(data)}, {100 * right / len(data):.2f} %"
-
-    print(f"float as trained: {share(float_right(network, data))}")
-    print(f"float, history-free: {share(float_right(forgetful, data))}")
-    rows = []
+    read = {"classes": network.classes, "taxels": network.input.taxels}
+    training, data = (recordings(data_path, split, **read) for split in ("train", "test"))
+    found = made(training, data) | {"test_samples": len(data)}
+    found |= {"float": float_right(network, data), "history_free": float_right(forgetful, data), "axons": {}}
     for copies in COPIES:
         levels = in_levels(forgetful, copies, chip)
         netlist = lower_in_time(levels, chip)
         right, sums = level_right(levels, data, MOST)
         endless, _ = level_right(levels, data, ENDLESS)
-        rows.append(
-            [
-                str(copies),
-                str(netlist.n_cores),
-                f"{netlist.ticks(data.steps):,}",
-                share(right),
-                share(endless),
-                ", ".join(f"{each.layer} {100 * each.saturated / each.partial:.2g} %" for each in sums),
-                ", ".join(str(each.largest) for each in sums),
-            ]
-        )
-    head = ["axons an input", "cores", "ticks", "saturating at 19", "not saturating", "saturated", "largest"]
-    print(Table(head, rows))
+        found["axons"][copies] = {
+            "cores": netlist.n_cores,
+            "ticks": netlist.ticks(data.steps),
+            "right": right,
+            "right_without_saturation": endless,
+            "saturated": {each.layer: each.saturated / each.partial for each in sums},
+            "largest": max(each.largest for each in sums),
+        }
+    with write_atomically(output) as file:
+        file.write((json.dumps(found, indent=1) + "\n").encode())
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from made import made
 
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.recordings.events import load_data
+from spikeloom.runtime.report.drawing import COLOURS, MARKERS
 from spikeloom.runtime.report.numbers import of_mean
 
 Json = dict[str, Any]
@@ -97,19 +98,19 @@ def _table(found: Json) -> str:
 
 def _draw(found: Json, path: Path) -> None:
     """Each network at its last epoch, and the means."""
-    figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
+    figure, axes = plt.subplots(figsize=(5.2, 3.8), layout="constrained")
     percent = 100 / found["test_samples"]
     for index, (name, variant) in enumerate(found["variants"].items()):
         networks = variant["last"]["networks"]
         operations = [network["synaptic_operations"] / 1e6 for network in networks]
         right = [network["chip"] * percent for network in networks]
-        axes.plot(operations, right, ".", color=f"C{index}", alpha=0.5)
-        axes.plot(statistics.mean(operations), statistics.mean(right), "o", color=f"C{index}", ms=9, label=name)
+        look = {"marker": MARKERS[index], "color": COLOURS[index], "ls": ""}
+        axes.plot(operations, right, ms=4, alpha=0.5, **look)
+        axes.plot(statistics.mean(operations), statistics.mean(right), ms=10, mec="black", label=name, **look)
     axes.set(xlabel="synaptic operations a recording, millions", ylabel="test accuracy on the chip, %")
-    axes.set_title(f"{found['data']}: each network at its last epoch (dots), and means", fontsize=10)
-    axes.set_xlim(left=0)
+    axes.set_title("last epochs: networks (small) and means", fontsize=10)
     axes.grid(alpha=0.3)
-    axes.legend()
+    axes.legend(fontsize=8)
     figure.savefig(path, dpi=150, metadata={"Software": None})
 
 

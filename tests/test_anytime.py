@@ -121,10 +121,22 @@ def test_recordings_of_different_length_end_on_their_own(place, monkeypatch):
         assert_allclose(ran.time["sanafe"][i, -1], alone.simple["sanafe"].duration_ns.sum() * 1e-9)
 
 
+def test_held_out_recordings_calibrate_by_their_decisions(as_json, report, place, monkeypatch):
+    monkeypatch.chdir(place)
+    seen = load_data("data", "train")
+    lengths = np.full(len(seen), STEPS)
+    votes = integer_machine(machine_of(read_netlist("net.loom"))).cumulative(seen.events, lengths).votes
+    held, races = (exits.turning_points(race(votes, lengths)) for race in (exits.standing, exits.races))
+    factors = [rule["factor"] for rule in as_json(*ALL, "--held-out")["rules"][1:]]
+    assert factors == [exits.calibrate(held, allowed).factor for allowed in (0.0, 0.005, 0.01, 0.02, 0.05)]
+    assert report["rules"][1]["factor"] == exits.calibrate(races, 0.0).factor != factors[0]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["--differ", "0.1"], "--differ 0.1: |add --calibrate"),
+        (["--held-out"], "--held-out: |add --calibrate"),
         (["--calibrate", "data", "--differ", "1"], "--differ 1: |from 0 to below 1"),
     ],
 )

@@ -12,8 +12,22 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-CLAIMS = tomllib.loads((ROOT / "benchmarks" / "claims.toml").read_text("utf-8"))["claims"]
+CLAIMS, DEFINITIONS = tomllib.loads((ROOT / "benchmarks" / "claims.toml").read_text("utf-8")).values()
+PAGES = (
+    "README.md",
+    *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")),
+    "models/pretrained/README.md",
+)
 PLACE = re.compile(r"\{([^{}]+)\}")
+FENCED = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+SHOWN = re.compile(r"^\$ (spikeloom .+)\n((?:(?!\$ |```).*\n)*)", re.MULTILINE)
+CODE = re.compile(r"`[^`]*`|\]\([^)]*\)")
+UNITS = r"%|×|[µmnp]?[JWs]\b|[MGk]i?B?\b|(?:points?|times|cores?|operations|spikes|ticks|of \d[\d,]*)\b"
+NUMBER = re.compile(rf"(?<!\w)\d[\d,.]*(?: ?(?:{UNITS})| *(?=\|))")
+"""With a unit, of so many, or alone in a cell of a table."""
+
+DRAWN = {"growth", "skins"}
+"""Results of no recordings, but of random ones."""
 
 
 @cache
@@ -27,13 +41,15 @@ def stored(name):
 
 
 def value_at(content, path):
-    """What is at ``a/b/c``, where keys may hold slashes, ``*`` is every entry and ``key=value`` that of a list."""
+    """What is at ``a/b/c``; keys may hold slashes, ``*`` is every entry, ``key=value`` or a number one of a list."""
     if not path:
         return content
     if path.startswith("*"):
         return [value_at(each, path[2:]) for each in content]
     if isinstance(content, list):
         head, _, rest = path.partition("/")
+        if head.isdigit():
+            return value_at(content[int(head)], rest)
         wanted = dict(each.split("=") for each in head.split(","))
         return value_at(
             next(each for each in content if all(str(each[key]) == value for key, value in wanted.items())), rest
@@ -60,17 +76,52 @@ def plain(text):
     return " ".join(text.split())
 
 
-@pytest.mark.parametrize("claim", CLAIMS, ids=[f"{claim['page']}, {claim['result']}" for claim in CLAIMS])
-def test_texts_are_those_of_the_stored_results(claim):
-    page = plain((ROOT / claim["page"]).read_text("utf-8"))
+def bound(claim):
+    """Texts that a page must have."""
     content = value_at(stored(claim["result"]), claim.get("at", ""))
     for text in claim["texts"]:
         assert PLACE.search(text), f"{text}: binds no number"
-        assert PLACE.sub(lambda place: shown(content, place[1]), text) in page
+        yield PLACE.sub(lambda place: shown(content, place[1]), text)
 
 
-def test_results_say_what_made_them():
-    cells = list(stored("paper/cells.json").values())
-    for made in (*cells, *(stored(claim["result"]) for claim in CLAIMS if claim["result"].endswith(".json"))):
-        assert made["command"]
-        assert made.get("spikeloom") or made["data_sha256"]
+@pytest.mark.parametrize("claim", CLAIMS, ids=[f"{claim['page']}, {claim['result']}" for claim in CLAIMS])
+def test_texts_are_those_of_the_stored_results(claim):
+    page = plain((ROOT / claim["page"]).read_text("utf-8"))
+    for text in bound(claim):
+        assert text in page
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_number_is_that_of_a_result_or_a_definition(page):
+    text = plain(FENCED.sub("", (ROOT / page).read_text("utf-8")))
+    defined = [each for definition in DEFINITIONS if definition["page"] == page for each in definition["texts"]]
+    assert all(each in text for each in defined)
+    said = [*defined, *(each for claim in CLAIMS if claim["page"] == page for each in bound(claim))]
+    places = set()
+    for pattern in (CODE, *map(re.compile, map(re.escape, said))):
+        places.update(place for found in pattern.finditer(text) for place in range(*found.span()))
+    loose = [found for found in NUMBER.finditer(text) if not places.issuperset(range(*found.span()))]
+    assert [text[max(0, found.start() - 40) : found.end()] for found in loose] == []
+
+
+@pytest.mark.parametrize("page", PAGES[1:-1])
+def test_sessions_print_what_the_docs_show(page):
+    for command, text in SHOWN.findall((ROOT / page).read_text("utf-8")):
+        if text.strip(" \n…"):
+            lines = "".join("(.*\n)*" if line == "…" else f"{re.escape(line)}\n" for line in text.rstrip().splitlines())
+            assert re.fullmatch(lines, stored(f"shown/{Path(page).stem}.json")["figures"][command]), command
+
+
+def results():
+    """Name and content of what studies stored; each cell of the paper's tables has its own."""
+    yield from stored("paper/cells.json").items()
+    folder = ROOT / "benchmarks" / "results"
+    for file in sorted({*folder.glob("*.json"), *folder.glob("shown/*.json")} - {folder / "faults.json"}):
+        yield file.stem, stored(str(file.relative_to(folder)))
+
+
+@pytest.mark.parametrize(("name", "made"), [pytest.param(*each, id=each[0]) for each in results()])
+def test_results_say_what_made_them(name, made):
+    assert made["command"]
+    assert made["spikeloom"]
+    assert name in DRAWN or made.get("data_sha256") or made["data"]["sha256"]

@@ -66,7 +66,13 @@ def _titled(lines: Sequence[Line]) -> str:
 
 def _accuracies(by_data: dict[str, list[Line]]) -> Figure:
     """For each row every seed, means with intervals, and the paper's figure."""
-    figure, (panels,) = _panels(by_data, 1, 1.5 + 0.62 * max(map(len, by_data.values())))
+    rows = max(map(len, by_data.values()))
+    figure, panels = _panels(by_data, 1, 1.5 + 0.62 * rows)
+    if rows < 6:  # few enough for one above the other, as a phone shows them best
+        plt.close(figure)
+        size = (0.8 * WIDTH, len(by_data) * (1.2 + 0.5 * rows))
+        figure, panels = plt.subplots(len(by_data), figsize=size, layout="constrained", squeeze=False)
+    panels = panels.ravel()
     for axes, lines in zip(panels, by_data.values(), strict=True):
         values: list[float] = []
         for place, line in enumerate(lines):
@@ -76,12 +82,12 @@ def _accuracies(by_data: dict[str, list[Line]]) -> Figure:
         axes.set_xlim(max(0.0, min(values) - room), min(100.0, max(values) + room))
         axes.set_yticks(range(len(lines)), [line.name for line in lines])
         axes.set_ylim(len(lines) - 0.5, -0.5)
-        axes.set(
-            xlabel="accuracy (%)\nbar: 95 % interval of the mean, cut at the frame; dots: seeds", title=_titled(lines)
-        )
+        axes.set_title(_titled(lines))
         axes.grid(axis="x", alpha=0.3)
         for place in range(1, len(lines)):
             axes.axhline(place - 0.5, color="0.9", linewidth=0.8)
+    for axes in panels[-1:] if rows < 6 else panels:
+        axes.set_xlabel("accuracy (%)\nbar: 95 % interval of the mean, cut at the frame; dots: seeds")
     _legend(figure, panels)
     return figure
 

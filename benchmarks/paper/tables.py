@@ -42,6 +42,7 @@ def files(cells: Mapping[str, Cell], *, drawn: bool = True) -> dict[str, bytes]:
     found: dict[str, bytes] = {}
     summed: dict[str, Any] = {
         "command": "python benchmarks/paper/tables.py",
+        "spikeloom": " ".join(sorted({cell["spikeloom"] for cell in cells.values()})),
         "data_sha256": {
             data: sorted({cell["data_sha256"] for cell in cells.values() if cell["data"] == data}) for data in DATA
         },
@@ -51,7 +52,8 @@ def files(cells: Mapping[str, Cell], *, drawn: bool = True) -> dict[str, bytes]:
         found[f"{table}.csv"] = _csv(_twice(lines), planned(table)).encode()
         found[f"{table}.md"] = _markdown(table, lines, cells).encode()
         found |= pictures(table, lines) if drawn else {}
-        summed[table] = {data: _statistics([line for line in lines if line.row.data == data]) for data in DATA}
+        of = {data: [line for line in lines if line.row.data == data] for data in DATA}
+        summed[table] = {data: _statistics(each) | {"spans": _spans(each)} for data, each in of.items() if each}
     found["statistics.json"] = (json.dumps(summed, indent=1, allow_nan=False) + "\n").encode()
     return found
 
@@ -190,6 +192,29 @@ def _statistics(lines: Sequence[Line]) -> dict[str, Any]:
             found[reading] |= {key: sum(getattr(each, key) for each in against) for key in ("within", "equal")}
         found[reading] |= {key: rank and dict(zip(("rank", "p"), rank, strict=True)) for key, rank in ranks.items()}
     return found
+
+
+def _spans(lines: Sequence[Line]) -> dict[str, Any]:
+    """How far rows lie apart: points of accuracy, factors of costs, shares of silent neurons, and what these save."""
+    costs = {key: [line.mean(key) for line in lines] for key in OPERATIONS}
+    costs["energy"] = [line.mean("energy_j", ENERGIES[0]) for line in lines]
+    papers = [line.paper[0] for line in _twice(lines) if line.paper]
+    means = {reading: [line.accuracy(reading).mean for line in lines] for reading in PROTOCOLS}
+    first = {key: [line.mean("first_layer", key) for line in lines] for key in FIRST_LAYER}
+    silent = [sum(each) for each in zip(first["cannot_fire"], first["quiet_in_training"], strict=True)]
+    left = {"first_layer_operations": ("first_layer_operations",), "energy": ("energy_j", ENERGIES[0])}
+    saved = {key: [1 - line.mean("without_quiet", *at) / line.mean(*at) for line in lines] for key, at in left.items()}
+    return {
+        "paper_points": max(papers) - min(papers) if papers else None,
+        "points": {reading: max(each) - min(each) for reading, each in means.items()},
+        "best_above_last": [a - b for a, b in zip(means["best"], means["last"], strict=True)],
+        "factor": {key: max(each) / min(each) for key, each in costs.items()},
+        "cannot_fire": first["cannot_fire"],
+        "silent": [count / of for count, of in zip(silent, first["neurons"], strict=True)],
+        "saved": {key: max(each) for key, each in saved.items()},
+        "changed": sum(line.changed for line in lines),
+        "decisions": sum(line.samples * len(line.cells) for line in lines),
+    }
 
 
 def _agreement(statistics: Mapping[str, Any]) -> Table:

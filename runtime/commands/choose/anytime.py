@@ -21,14 +21,11 @@ from spikeloom.runtime.studies.anytime.study import study
 NOTES = """\
 By proof: stop once no further spike can change the vote. With --calibrate also: stop once the leader is ahead by a
 times the root of the steps left, where a is the smallest factor that lets no more than --differ of the training split's
-races for second place end otherwise. Figures are of --split; everything comes from one run of the recordings.
+races for second place end otherwise, or of its decisions with --held-out. Figures are of --split.
 """
 
 ALLOWED = (0.0, 0.005, 0.01, 0.02, 0.05)
 """Shares of calibration races that may end otherwise, all of them reported."""
-
-DIFFER = 0.0
-"""By default no calibration race may end otherwise; of real votes a little more do than of races."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,12 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_netlist(parser)
     add_recordings(parser)
     parser.add_argument("--calibrate", metavar="PATH", help="recordings whose train split says when a vote is sure")
-    parser.add_argument(
-        "--differ",
-        type=float,
-        metavar="X",
-        help=f"share of calibration races that may end otherwise (default: {DIFFER:g})",
-    )
+    words = "the network was not trained on --calibrate: its decisions say when, not races for second place"
+    parser.add_argument("--held-out", action="store_true", help=words)
+    words = "share of calibration races that may end otherwise (default: 0)"
+    parser.add_argument("--differ", type=float, metavar="X", help=words)
     parser.add_argument("-o", "--output", metavar="OUT.json", help="write the result with figures of every recording")
     parser.epilog = NOTES
 
@@ -62,6 +57,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         ran,
         () if points is None else [exits.calibrate(points, share) for share in sorted(allowed)],
         calibrated_on=arguments.calibrate,
+        held_out=arguments.held_out,
         chosen=None if points is None else sorted(allowed).index(allowed[0]) + 1,
     )
     write_json(arguments.output, result)
@@ -70,21 +66,22 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
 def _allowed(arguments: argparse.Namespace) -> list[float]:
     """Shares to calibrate for, the chosen one first."""
-    if arguments.differ is not None and arguments.calibrate is None:
-        raise OptionError(f"--differ {arguments.differ:g}: nothing to calibrate on; add --calibrate or omit it")
-    chosen = DIFFER if arguments.differ is None else arguments.differ
+    given = "--held-out" if arguments.held_out else "" if arguments.differ is None else f"--differ {arguments.differ:g}"
+    if given and arguments.calibrate is None:
+        raise OptionError(f"{given}: nothing to calibrate on; add --calibrate or omit it")
+    chosen = arguments.differ or 0.0
     if not 0 <= chosen < 1:
         raise OptionError(f"--differ {chosen:g}: not a share; give a number from 0 to below 1")
     return [chosen, *(share for share in ALLOWED if share != chosen)]
 
 
 def _races(arguments: argparse.Namespace, machine: IntegerMachine) -> FloatArray | None:
-    """Turning points of the races on the training split, if there is something to calibrate on."""
+    """Turning points of races or decisions of the training split, if there is something to calibrate on."""
     if arguments.calibrate is None:
         return None
     named = {"data": arguments.calibrate, "split": "train", "limit": None}
     training = load_recordings(argparse.Namespace(**vars(arguments) | named), machine.netlist)
     machine.require_sensor(training.events)
     progress("calibrating")
-    lengths = training.step_counts
-    return exits.turning_points(exits.races(machine.cumulative(training.events, lengths).votes, lengths))
+    lengths, race = training.step_counts, exits.standing if arguments.held_out else exits.races
+    return exits.turning_points(race(machine.cumulative(training.events, lengths).votes, lengths))

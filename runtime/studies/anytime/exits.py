@@ -9,10 +9,9 @@ twice. A vote ends early
 * *by calibration*, when the leader is ahead by more than ``a * sqrt(steps left)``: the lead of one neuron over another
   strays from its course about as the root of the steps. The factor comes from other recordings.
 
-*Calibration.* A network knows the recordings that it was trained on: their class leads from the start by far, which
-says nothing about others. What remains when the votes of the winner are taken away is a race for second place among
-classes that were not trained to win here, with leads as narrow and as fickle as those of unknown recordings. Its
-outcome must not change in more than a given share of these races.
+*Calibration.* In recordings that the network was trained on, their class leads by far from the start, which says
+nothing of others. Without the winner's votes a race for second place is left, with leads as narrow and as fickle as on
+unknown recordings. Recordings that it was not trained on say it themselves. At most a given share may end otherwise.
 
 References
 ----------
@@ -127,8 +126,8 @@ def live(machine: IntegerMachine, bins: int, factor: float) -> Callable[[int, In
 class Calibrated:
     """A factor, in votes per root of a step left, and what it rests on.
 
-    So many races may end otherwise (`allowed`, a share), and so many `differ`; of other such races at most the share
-    `bound` does, with the confidence of ``CONFIDENCE`` [1]_. The proof alone rests on no races: ``PROOF``.
+    Of so many races, or held-out decisions, the share `allowed` may end otherwise, and so many `differ`; of others at
+    most the share `bound` does, with the confidence of ``CONFIDENCE`` [1]_. The proof rests on none: ``PROOF``.
     """
 
     allowed: float | None

@@ -28,10 +28,11 @@ def _lines(result: Anytime) -> list[str]:
         return [live]
     rule = result.rules[result.chosen].stop
     assert rule.bound is not None, "a chosen rule is calibrated"
+    kind, noun = ("held-out decisions", "decisions") if result.held_out else ("races for second place", "races")
     return [
-        f"calibrated on {rule.races} races for second place of {result.calibrated_on}, split train, which the network "
-        f"may have been trained on: at an allowed {_allowed(rule)} at most {100 * rule.bound:.1f} % of such races end "
-        "otherwise (95 % confidence), of decisions more may",
+        f"calibrated on {rule.races} {kind} of {result.calibrated_on}, split train: of such {noun} at most "
+        f"{100 * rule.bound:.1f} % end otherwise where {_allowed(rule)} did (95 % confidence)"
+        + ("" if result.held_out else "; nothing bounds decisions"),
         f"{live} {math.ceil(1e4 * rule.factor) / 1e4:g}",  # a larger one is as safe
     ]
 
@@ -69,7 +70,8 @@ def rule_table(result: Anytime) -> Table:
     for rule in result.rules:
         name, ahead = "proven", "more than can come"
         if rule.stop.allowed is not None:
-            name, ahead = f"sure, {_allowed(rule.stop)} may differ", f"{rule.stop.factor:.3f}·√left"
+            whose = "held-out decisions" if result.held_out else "training races"
+            name, ahead = f"sure, {_allowed(rule.stop)} of {whose}", f"{rule.stop.factor:.3f}·√left"
         changed = [str(rule.changes.differ), shown(rule.changes.correct)]
         rows.append([name, ahead, *cells(rule.mean), *changed])
     return Table(head, rows)

@@ -106,6 +106,7 @@ class Anytime:
     chip_steps: list[int]
     rules: tuple[Rule, ...]
     calibrated_on: str | None = field(default=None, metadata=OPTIONAL)
+    held_out: bool = False
     chosen: int | None = field(default=None, metadata=OPTIONAL)
 
 
@@ -116,6 +117,7 @@ def study(
     calibrated: Sequence[exits.Calibrated] = (),
     *,
     calibrated_on: str | None = None,
+    held_out: bool = False,
     chosen: int | None = None,
 ) -> Anytime:
     """Apply the proof and calibrated rules to recordings and their run."""
@@ -137,6 +139,7 @@ def study(
         chip_steps=ran.chip_steps.tolist(),
         rules=tuple(_rule(rule, ran, at, sure, data.labels) for rule in (exits.PROOF, *calibrated)),
         calibrated_on=calibrated_on,
+        held_out=held_out,
         chosen=chosen,
     )
 

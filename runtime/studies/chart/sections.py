@@ -148,13 +148,17 @@ def _tip(by: ChosenBy, point: Point) -> str:
 def picture(chart: Chart) -> Drawing:
     """Test accuracy over energy and, where the chip has a time table, over time."""
     by, name = chart.chosen_by, chart.data.path.rstrip("/").rsplit("/", 1)[-1]
-    drawing = sheet(f"{len(chart.points)} configurations, {chart.data.test} test recordings of {name}", 4.6)
-    panels = drawing.figure.subplots(1, len(by.costs()), squeeze=False, sharey=True)[0]
+    drawing = sheet(
+        f"{len(chart.points)} configurations, {chart.data.test} test recordings of {name}",
+        3 * len(by.costs()) + 1,
+        width=6.4,
+    )
+    panels = drawing.figure.subplots(len(by.costs()), squeeze=False, sharey=True)[:, 0]
     for panel, cost in zip(panels, by.costs(), strict=True):
         _scatter(drawing, panel, chart, cost)
-    panels[0].set_ylabel("test accuracy on the chip (%)")
+    drawing.figure.supylabel("test accuracy on the chip (%)", fontsize=9)
     handles, series = panels[0].get_legend_handles_labels()
-    drawing.figure.legend(handles, series, loc="outside lower center", ncols=8, fontsize=8)
+    drawing.figure.legend(handles, series, loc="outside lower center", ncols=5, fontsize=8)
     drawing.figure.suptitle(drawing.title, fontsize=10)
     return drawing
 
@@ -166,7 +170,7 @@ def series_of(points: Sequence[Point]) -> str:
 
 
 def _scatter(drawing: Drawing, panel: Axes, chart: Chart, name: str) -> None:
-    """Points over a cost, the stairs of the front; a ring and an interval around the choice."""
+    """Points over a cost, small but for those on the front; a ring and an interval around the choice."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     by, series = chart.chosen_by, series_of(chart.points)
@@ -176,35 +180,30 @@ def _scatter(drawing: Drawing, panel: Axes, chart: Chart, name: str) -> None:
     for index, value in enumerate(dict.fromkeys(str(getattr(point, series)) for point in chart.points)):
         members = [point for point in points if str(getattr(point, series)) == value]
         colour, hollow = COLOURS[index % len(COLOURS)], index // len(COLOURS) % 2 == 1
-        panel.scatter(
-            [place[point.number][0] for point in members],
-            [place[point.number][1] for point in members],
-            s=[14 + 30 * point.window / 100 for point in members],
-            marker=MARKERS[index % len(MARKERS)],
-            facecolors="none" if hollow else colour,
-            edgecolors=colour,
-            linewidths=0.9,
-            label=value,
-            zorder=3,
-        )
+        for on in (False, True):
+            there = [place[point.number] for point in members if point.front[name] is on]
+            look = {"s": 42, "linewidths": 0.9, "zorder": 4} if on else {"s": 12, "linewidths": 0.5, "alpha": 0.4}
+            look |= {"facecolors": "none" if hollow else colour, "edgecolors": "black" if on else colour}
+            x, y = zip(*there, strict=True) if there else ((), ())
+            panel.scatter(x, y, marker=MARKERS[index % len(MARKERS)], label=value if on else None, **look)
     front = sorted(place[point.number] for point in points if point.front[name])
-    label = "front on the test split"
     if front:
-        panel.step(*zip(*front, strict=True), where="post", color=GREY, lw=1.0, ls=(0, (5, 2)), label=label, zorder=2)
+        panel.step(*zip(*front, strict=True), where="post", color="black", lw=1.2, label="front on the test split")
     chosen = chart.chosen
     x, y = place[chosen.number]
-    panel.plot([x, x], [100 * chosen.test.low, 100 * chosen.test.high], color=GREY, lw=1.0, zorder=2)
-    panel.plot(x, y, "o", ms=12, mfc="none", mec=GREY, mew=1.4, ls="none", label=f"choice, #{chosen.number}", zorder=4)
+    panel.set_xscale("log")
+    panel.autoscale(False)  # the interval may reach far beyond the points
+    panel.plot([x, x], [100 * chosen.test.low, 100 * chosen.test.high], color=GREY, lw=1.0, zorder=1)
+    panel.plot(x, y, "o", ms=12, mfc="none", mec="black", ls="none", label=f"choice, #{chosen.number}", zorder=5)
     drawing.tips += [(panel, *place[point.number], _tip(by, point)) for point in points]
     unit, what = "s", f"time ({by.time})"
     if name == "energy":
         unit, what = "J", f"dynamic energy of a mean inference ({by.energy})"
-    panel.set(xscale="log", xlabel=what)
+    panel.set_xlabel(what)
     panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     panel.xaxis.set_minor_formatter(NullFormatter())
     scale(panel.xaxis, unit)
     panel.grid(True)
-    panel.margins(0.06, 0.08)
 
 
 # -- files -------------------------------------------------------------------------------------------------------------

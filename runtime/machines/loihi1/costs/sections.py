@@ -99,7 +99,7 @@ def _lines(report: CostReport) -> list[str]:
         lines.append(
             f"static, not in the above: {si(static.chip_w, 'W')} a chip ({static.source}), so an inference "
             f"{'' if static.chips == 1 else f'on {static.chips} chips '}takes {si(static.real_time_j, 'J')} at the "
-            "sensor's pace" + (f", at full speed {full}" if full else "")
+            "sensor's pace, more than all else" + (f"; at full speed {full}" if full else "")
         )
     lines += [f"not modelled: {line}" for line in report.not_modelled]
     return [*lines, *(f"not priced: {line}" for line in report.not_priced)]
