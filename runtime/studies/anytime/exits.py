@@ -9,9 +9,8 @@ twice. A vote ends early
 * *by calibration*, when the leader is ahead by more than ``a * sqrt(steps left)``: the lead of one neuron over another
   strays from its course about as the root of the steps. The factor comes from other recordings.
 
-*Calibration.* In recordings that the network was trained on, their class leads by far from the start, which says
-nothing of others. Without the winner's votes a race for second place is left, with leads as narrow and as fickle as on
-unknown recordings. Recordings that it was not trained on say it themselves. At most a given share may end otherwise.
+*Calibration.* In recordings that the network was trained on, their class leads by far. Without the winner's votes a
+race for second place is left, as narrow and fickle as votes on unknown recordings, which can say it themselves.
 
 References
 ----------
@@ -126,8 +125,8 @@ def live(machine: IntegerMachine, bins: int, factor: float) -> Callable[[int, In
 class Calibrated:
     """A factor, in votes per root of a step left, and what it rests on.
 
-    Of so many races, or held-out decisions, the share `allowed` may end otherwise, and so many `differ`; of others at
-    most the share `bound` does, with the confidence of ``CONFIDENCE`` [1]_. The proof rests on none: ``PROOF``.
+    Of `races`, or held-out decisions, the share `allowed` may end otherwise, `differ` do; of others at most the share
+    `bound` does, with the confidence of ``CONFIDENCE`` [1]_. The proof rests on none: ``PROOF``.
     """
 
     allowed: float | None

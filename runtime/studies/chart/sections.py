@@ -6,7 +6,9 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from spikeloom.compiler.files import write_atomically
 from spikeloom.models.recordings.counts import number
@@ -178,14 +180,14 @@ def _scatter(drawing: Drawing, panel: Axes, chart: Chart, name: str) -> None:
     place = {point.number: (cost(point.test), 100 * point.test.accuracy) for point in chart.points}
     points = sorted((point for point in chart.points if cost(point.test) > 0), key=lambda point: place[point.number][0])
     for index, value in enumerate(dict.fromkeys(str(getattr(point, series)) for point in chart.points)):
-        members = [point for point in points if str(getattr(point, series)) == value]
         colour, hollow = COLOURS[index % len(COLOURS)], index // len(COLOURS) % 2 == 1
         for on in (False, True):
-            there = [place[point.number] for point in members if point.front[name] is on]
-            look = {"s": 42, "linewidths": 0.9, "zorder": 4} if on else {"s": 12, "linewidths": 0.5, "alpha": 0.4}
+            there = [place[p.number] for p in points if str(getattr(p, series)) == value and p.front[name] is on]
+            look: dict[str, Any] = {"s": 12, "linewidths": 0.5, "alpha": 0.4}
+            look = {"s": 42, "linewidths": 0.9, "zorder": 4, "label": value} if on else look
             look |= {"facecolors": "none" if hollow else colour, "edgecolors": "black" if on else colour}
-            x, y = zip(*there, strict=True) if there else ((), ())
-            panel.scatter(x, y, marker=MARKERS[index % len(MARKERS)], label=value if on else None, **look)
+            xs, ys = np.reshape(there, (-1, 2)).T
+            panel.scatter(xs, ys, marker=MARKERS[index % len(MARKERS)], **look)
     front = sorted(place[point.number] for point in points if point.front[name])
     if front:
         panel.step(*zip(*front, strict=True), where="post", color="black", lw=1.2, label="front on the test split")
