@@ -33,10 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_netlist(parser)
     add_recordings(parser)
     parser.add_argument("--calibrate", metavar="PATH", help="recordings whose train split says when a vote is sure")
-    words = "the network was not trained on --calibrate: its decisions say when, not races for second place"
+    words = "the network was not trained on --calibrate: its decisions count, not races for second place"
     parser.add_argument("--held-out", action="store_true", help=words)
-    words = "share of calibration races that may end otherwise (default: 0)"
-    parser.add_argument("--differ", type=float, metavar="X", help=words)
+    parser.add_argument("--differ", type=float, metavar="X", help="share of them that may end otherwise (default: 0)")
     parser.add_argument("-o", "--output", metavar="OUT.json", help="write the result with figures of every recording")
     parser.epilog = NOTES
 
