@@ -87,7 +87,7 @@ def _accuracies(by_data: dict[str, list[Line]]) -> Figure:
         for place in range(1, len(lines)):
             axes.axhline(place - 0.5, color="0.9", linewidth=0.8)
     for axes in panels[-1:] if rows < 6 else panels:
-        axes.set_xlabel("accuracy (%)\nbar: 95 % interval of the mean, cut at the frame; dots: seeds")
+        axes.set_xlabel("accuracy (%)\nbar: 95 % interval of the mean,\ncut at the frame; dots: seeds")
     _legend(figure, panels)
     return figure
 
