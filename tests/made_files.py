@@ -99,3 +99,14 @@ def recordings_folder(
         for i, recording in enumerate(made if made is not None else events(2)):
             np.save(folder / split / f"sample_{i}_label_{i % classes}.npy", recording.astype(np.float32))
     return folder
+
+
+def csv_folder(folder: Path, *, taxels: int = TAXELS, samples: int = 8, classes: int = CLASSES) -> Path:
+    """Write event files of about a second, each class with a taxel that it likes."""
+    folder.mkdir(parents=True)
+    for i in range(samples):
+        rng = np.random.default_rng(i)
+        taxel = np.where(rng.random(90) < 0.5, i % classes, np.arange(90)) % taxels
+        lines = [f"{0.011 * k:.3f},{taxel[k]},{rng.integers(0, 2)}" for k in range(90)]
+        (folder / f"tap_{i}_label_{i % classes}.csv").write_text("\n".join(["time_s,taxel,polarity", *lines]))
+    return folder

@@ -5,8 +5,9 @@ import re
 
 import numpy as np
 import pytest
+import torch
 from commands import as_json, run
-from made_files import events
+from made_files import csv_folder, events, own_file, state_dict, weights
 from random_networks import random_checkpoint, ring
 from test_truenorth_counting import random_counters
 from timed_networks import events_of, written
@@ -168,3 +169,58 @@ def test_every_damage_to_a_crossbar_has_a_name(tmp_path):
         code, out, _ = run("verify", path, *words)
         assert code == 1
         assert re.search(f"EN NOT what the network of the file is lowered to: {named}", out)
+
+
+# -- what need not be said again ---------------------------------------------------------------------------------------
+def test_a_netlist_remembers_bins_and_data(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for split in ("train", "test"):
+        csv_folder(tmp_path / "taps" / split, samples=24)
+    words = ("--system", "counters", "--weight-bits", "4", "--data", "taps", "--bin", "0.1")
+    assert run("train", *words, "-o", "c.pt")[0] == 0
+    own_file(tmp_path / "net.pt", training={"data": "taps", "bin_s": 0.1})
+    for words in (["c.pt"], ["c.pt", "--target", "truenorth"], ["net.pt", "--calibrate", "taps"]):
+        made = as_json("compile", *words, "-o", "x.loom")
+        assert {name: made["provenance"][name] for name in ("data", "bin_s")} == {"data": "taps", "bin_s": 0.1}
+        assert run("run", "x.loom", "--data", "taps") == run("run", "x.loom", "--data", "taps", "--bin", "0.1")
+    assert run("estimate", "x.loom", "--data", "taps")[1].startswith("per inference of 13 chip steps")
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (
+            "compile net.pt -o x.loom --calibrate few",
+            "few: the network was trained on taps; calibrate on what it knows",
+        ),
+        ("run net.loom --data few", "few: the network was trained on taps; their classes are 0..1, the network's 0..3"),
+        (
+            "run net.loom --data four",
+            "four: has events of taxels 0..3 only, the network has 6; are they of its sensor?",
+        ),
+    ],
+)
+def test_recordings_that_look_like_others_are_warned_of(tmp_path, monkeypatch, words, why):
+    monkeypatch.chdir(tmp_path)
+    csv_folder(tmp_path / "few", classes=2 if words.startswith("run") else 4)
+    csv_folder(tmp_path / "four", taxels=4)
+    own_file(tmp_path / "net.pt", training={"data": "taps"})
+    assert run("compile", "net.pt", "-o", "net.loom")[0] == 0
+    code, _, err = run(*words.split())
+    assert (code, err.count(f"spikeloom: warning: {why}")) == (0, 1)
+
+
+def test_graph_time_step_and_names_are_the_netlists(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    torch.save(state_dict(weights(taxels=39)), "bare.pt")
+    assert run("compile", "bare.pt", "--graph", "knn:1", "-o", "net.loom")[0] == 0
+    assert run("verify", "net.loom", "--checkpoint", "bare.pt")[0] == 0
+    assert run("export", "net.loom", "--to", "nir", "-o", "net.nir")[0] == 0
+    assert run("compile", "net.nir", "--dt", "0.01", "-o", "back.loom")[0] == 0
+    netlist = read_netlist("back.loom")
+    layers = tuple(dataclasses.replace(layer, name=f"l{k}") for k, layer in enumerate(netlist.layers))
+    digests = dict(zip((layer.name for layer in layers), netlist.provenance["digests"].values(), strict=True))
+    netlist = dataclasses.replace(netlist, layers=layers, provenance={**netlist.provenance, "digests": digests})
+    write_netlist(netlist, "named.loom")
+    assert run("verify", "named.loom", "--checkpoint", "net.nir")[0] == 0
+    assert run("verify", "named.loom", "--checkpoint", "net.nir", "--dt", "0.02")[0] == 1

@@ -16,13 +16,16 @@ import commands
 import numpy as np
 import pytest
 import torch
-from made_files import CLASSES, TAXELS, events, own_file, recordings_folder, released, state_dict
+from made_files import CLASSES, TAXELS, csv_folder, events, own_file, recordings_folder, released, state_dict
 from made_files import weights as made_weights
 
 from spikeloom.compiler import read_netlist, write_netlist
 from spikeloom.runtime import cli
 
 GOOD = events(2)[0].astype(np.float32)
+
+
+FLAT = "flat: has no train/ and test/, so that the same recordings would train and test"
 
 
 class Evil:
@@ -66,10 +69,22 @@ def place(tmp_path_factory):
     np.save(at / "lengths" / "test" / "sample_1_label_1.npy", GOOD[:, :, :20])
     recordings_folder(at / "five", train=events(taxels=5), test=events(taxels=5))
     (at / "half.loom").write_bytes((at / "net.loom").read_bytes()[:900])
+    csv_folder(at / "flat", taxels=6)
+    for split in ("train", "test"):
+        csv_folder(at / "square" / split, taxels=4)
+    torch.save(torch.nn.Linear(2, 3).state_dict(), at / "linear.pt")
+    own_file(at / "binned.pt", training={"data": "taps", "bin_s": 0.05})
+    assert cli.main(["compile", f"{at}/binned.pt", "-o", f"{at}/binned.loom"]) == 0
     return at
 
 
 COMPILE = "compile {} -o out.loom"
+NETLISTS = (
+    "run --data data",
+    "verify --checkpoint net.pt",
+    "export --to onnx -o x.onnx",
+    "stress --checkpoint net.pt --data data",
+)
 RUN = "run net.loom --data {}"
 EXPLAIN = "explain net.loom --checkpoint net.pt --data data {}"
 REPORT = "report net.loom --checkpoint net.pt --data data -o x.html {}"
@@ -105,6 +120,17 @@ TABLE = [
     *((f"inspect net.t7 --beta {text}", f"beta {text}|0 <= beta < 1") for text in ("1", "nan")),
     *((f"inspect net.t7 --theta {text}", f"theta {text}|above 0") for text in ("0", "inf")),
     ("inspect pretrained:nope", "pretrained:nope: no such shipped|pretrained:grasps"),
+    *(
+        (COMPILE.format(name), "NIR, or in Python as spikeloom.compile(module, ex")
+        for name in ("linear.pt", "evil0.t7")
+    ),
+    *((f"{command} net.t7", "net.t7: is a trained network; compile it first") for command in NETLISTS),
+    *(
+        (f"{command} grasp_label_1.npz", "grasp_label_1.npz: holds recordings; give the netlist")
+        for command in NETLISTS
+    ),
+    ("run pretrained:grasps --data data", "compile it first: spikeloom compile pretrained:grasps -o NET.loom"),
+    (COMPILE.format("grasp_label_1.npz"), "grasp_label_1.npz: holds recordings; give the network here|--calibrate"),
     # graphs, targets, storage
     (COMPILE.format("bare.pt"), "bare.pt: the graph is not in this file|--graph: manual"),
     (COMPILE.format("bare.pt --graph manual"), f"the graph has 39 taxels, fc1 was trained on {TAXELS}"),
@@ -153,6 +179,8 @@ TABLE = [
     ("verify net.loom --data data --checkpoint bare.pt", "bare.pt: the graph is not in this file"),
     ("verify net.loom --data data --checkpoint other.pt", "the netlist has taxels 6|fc2 8|fc2 7"),
     (VERIFY.format("--graph manual"), "trained on ring, --graph says manual"),
+    ("verify finger.loom --checkpoint finger.pt --graph manual", "compiled for graph knn:1, this is manual"),
+    ("verify net.loom --checkpoint net.pt --require E0", "--require E0: is about recordings, give --data too"),
     ("explain net.loom --checkpoint other.pt --data data", "netlist and checkpoint disagree|fc2 8|fc2 7"),
     ("report net.loom --checkpoint same.pt --data data -o x.html", "compiled from a checkpoint of sha256"),
     ("lean net.pt --data data --differ 1.5", "--differ 1.5: not a share; give a number from 0 to below 1"),
@@ -162,6 +190,17 @@ TABLE = [
     (EXPLAIN.format("--sample sample_5_label_1.npy --limit 1"), "among 1 of split test|near are sample_0_label_0"),
     (REPORT.format("--recording 6"), "--recording 6|0 to 5"),
     # recordings
+    *(
+        (f"{command} --data flat", FLAT)
+        for command in ("train --graph manual -o x.pt", "smallest -o x.loom", "lean net.pt")
+    ),
+    ("finetune net.pt --weight-bits 4 --data flat -o x.pt", FLAT),
+    (
+        "train --data square --graph manual -o x.pt",
+        "square: has events of taxels 0..3 only, the network has 39; |--taxels",
+    ),
+    (COMPILE.format("net.pt --calibrate square"), "square: has events of taxels 0..3 only, the network has 6; "),
+    ("run binned.loom --data flat --bin 0.1", "--bin 0.1: the network was trained on bins of 0.05 s; omit --bin"),
     (RUN.format("pressures"), "pressures: test/sample_0_label_0.npy: |value 0.5 at taxel 0|allowed are 0 and 1"),
     (COMPILE.format("net.pt --calibrate five"), "five: train/sample_0_label_0.npy: has 5 taxels, the network has 6"),
     ("estimate net.loom --data lengths", "test/sample_1_label_1.npy: shape (6, 2, 20)|(6, 2, 24)"),
@@ -178,7 +217,6 @@ TABLE = [
     ("run data --data data", "data: is not a file|spikeloom compile"),
     ("run --data data nowhere.loom", "nowhere.loom: no such file; write one with spikeloom compile"),
     ("run --data data half.loom", "half.loom: is truncated or not a netlist"),
-    ("run net.t7 --data data", "net.t7: "),
 ]
 
 

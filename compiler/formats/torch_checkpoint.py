@@ -41,6 +41,12 @@ BETA, THETA = 0.2, 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""
 
 
+OTHERS = (
+    "another network comes as ONNX or NIR, or in Python as spikeloom.compile(module, example=…), see docs/formats.md"
+)
+"""What to do with a file of torch that holds no network of ours."""
+
+
 def read_torch(content: bytes, run: int) -> Checkpoint:
     """Read the content of a torch file; raises as :func:`read_checkpoint`."""
     loaded = _load(content)
@@ -79,7 +85,7 @@ def _load(content: bytes) -> Any:
         if isinstance(error, pickle.UnpicklingError) and (named := re.search(r"GLOBAL ([\w.]+)", str(error))):
             raise ModelError(
                 f"is a pickle that calls {named[1]}, allowed are tensors alone, since code in a file could "
-                "do anything; save the state_dict and nothing else"
+                f"do anything; save the state_dict of a TactileSGNet and nothing else; {OTHERS}"
             ) from error
         if re.search(r"Unsupported operand 1(4\d|5[0-2])\b", str(error)):  # what protocol 4 added
             raise ModelError(
@@ -96,8 +102,7 @@ def _arrays(state: Any, file_size: int) -> Arrays:
     if not isinstance(state, Mapping) or not any(re.match(r"(conv|fc)\d", str(key)) for key in state):
         keys = [printable(str(key)) for key in state] if isinstance(state, Mapping) else [type(state).__name__]
         raise ModelError(
-            f"holds neither net_list nor weights of a TactileSGNet, but {', '.join(keys[:5]) or 'nothing'}; "
-            "give its state_dict"
+            f"holds neither net_list nor weights of a TactileSGNet, but {', '.join(keys[:5]) or 'nothing'}; {OTHERS}"
         )
     checked = ((printable(str(name)), _tensor_fault(value, file_size)) for name, value in state.items())
     faults = [f"{name} {fault}" for name, fault in checked if fault]

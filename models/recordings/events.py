@@ -44,6 +44,9 @@ MAX_STEPS = 1_000_000
 UNIT_SPAN_S = 60.0
 """Up to this length of a recording no unit is doubted."""
 
+SEVERAL = 8
+"""Recordings from which on a taxel without any event tells something."""
+
 # Times typed in decimals fall on edges, and 0.58 / 0.02 is 28.999999999999996. Of a bin; three roundings of a
 # quotient below MAX_STEPS are off by a third of it at most.
 _EDGE = 1e-9
@@ -128,6 +131,7 @@ def load_data(
         source=source,
         lengths=None if steps.min() == steps.max() else steps,
         counts=None if released else counts,
+        bin_s=None if all(file.suffix.lower() == ".npy" for file in files) else bin_s,
     )
 
 
@@ -283,6 +287,14 @@ def _unit_notes(read: Sequence[_Recording]) -> list[str]:
     odd = [(each.where, note) for each in read for note in each.counts.notes]
     others = f" (and {len(odd) - 1} more)" if len(odd) > 1 else ""
     return [f"{place}{others}: {note}" for place, note in odd[:1]]
+
+
+def other_sensor(recordings: Recordings) -> str | None:
+    """What says that events are of a smaller sensor: in many recordings none of the last quarter of the taxels."""
+    last = int(np.flatnonzero(recordings.events.any(axis=(0, 2, 3))).max(initial=-1))
+    if recordings.bin_s is None or len(recordings) < SEVERAL or 4 * (recordings.taxels - 1 - last) <= recordings.taxels:
+        return None
+    return f"{recordings.source}: has events of taxels 0..{last} only, the network has {recordings.taxels}"
 
 
 def _taxel_notes(source: str, events: NDArray[np.uint8]) -> list[str]:

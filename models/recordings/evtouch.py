@@ -56,6 +56,7 @@ class Recordings:
     # released layout.
     lengths: NDArray[np.int64] | None = None
     counts: EventCounts | None = None  # What was odd about their events; None where they had bins already
+    bin_s: float | None = None  # Seconds of a bin, where they were events; of those before any were joined
 
     def __post_init__(self) -> None:
         for name in ("events", "labels", "lengths"):

@@ -42,7 +42,7 @@ class TrainingRecord:
     """Everything needed to repeat a training, and what it reached; the fields are the keys in the checkpoint.
 
     `history` has training loss, test loss and correct test recordings of each epoch; `recipe` is missing where it is
-    the released one.
+    the released one, and `bin_s`, the seconds of a bin, where the recordings had bins already.
     """
 
     command: str
@@ -61,6 +61,7 @@ class TrainingRecord:
     spikeloom: str
     device: str = "cpu"
     recipe: Mapping[str, Any] | None = field(default=None, metadata={"optional": True})
+    bin_s: float | None = field(default=None, metadata={"optional": True})
 
     def to_json(self) -> JsonObject:
         """JSON values."""
@@ -118,4 +119,5 @@ def training_record(
         numpy=np.__version__,
         spikeloom=__version__,
         recipe=recipe,
+        bin_s=training.bin_s,
     )

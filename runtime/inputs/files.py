@@ -7,11 +7,16 @@ import zipfile
 from importlib import resources
 from pathlib import Path
 
+from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import OptionError
+from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name
 
 _RECORDINGS = "recordings are shown by spikeloom data describe"
 
 PRETRAINED = "pretrained:"
+
+NETWORK_ENDINGS = (".pt", ".pth", ".t7", ".onnx", ".nir", ".net")
+"""Of files of trained networks."""
 
 
 def shipped(path: str) -> str:
@@ -59,6 +64,24 @@ def require_place(path: str | None, option: str, arguments: argparse.Namespace |
         for each in given if isinstance(given, list) else [given]:
             if isinstance(each, str) and Path(shipped(each)).exists() and place.samefile(shipped(each)):
                 raise OptionError(f"{option} {path}: is an input of this command ({each}); give another name")
+
+
+def is_recordings(path: str) -> bool:
+    """Whether a file holds recordings, by its name and by those of its members."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (zipfile.BadZipFile, OSError, ValueError):
+        names = [path] if path.endswith(".csv") and Path(path).is_file() else []
+    return any(name.endswith(".csv") or name == "time_s.npy" or label_in_name(name) != UNLABELLED for name in names)
+
+
+def require_netlist(path: str) -> None:
+    """Refuse what is to be a netlist and is a trained network, or recordings; OptionError."""
+    if path.startswith(PRETRAINED) or (path.endswith(NETWORK_ENDINGS) and stated(Path(path), "target") is None):
+        raise OptionError(f"{path}: is a trained network; compile it first: spikeloom compile {path} -o NET.loom")
+    if is_recordings(path):
+        raise OptionError(f"{path}: holds recordings; give the netlist here, and these as --data")
 
 
 def require_inspectable(path: str) -> None:

@@ -6,7 +6,7 @@ import argparse
 import hashlib
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from spikeloom.compiler.archive import COUNTERS, FORMATS, TRAINED, is_netlist, stated
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.errors import ModelError, OptionError, SpikeloomError
 from spikeloom.compiler.formats import NETX, NIR, ONNX
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.text import text
@@ -26,7 +26,7 @@ from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.graphs import CHOICES, NEUTOUCH, Graph
 from spikeloom.models.sensors import read_layout, sensor_graph
 from spikeloom.models.systems import NO_GRAPH, propagation_of
-from spikeloom.runtime.inputs.files import shipped
+from spikeloom.runtime.inputs.files import is_recordings, shipped
 from spikeloom.runtime.inputs.repeat import NETWORK, refuse
 from spikeloom.runtime.report.console import progress
 
@@ -47,6 +47,7 @@ class LoadedNetwork:
     facts: tuple[str, ...] = ()  # What was read from an ONNX or NIR file and what was assumed
     format: str = "checkpoint"  # or ``onnx``, ``nir``, ``module``
     read_as: Mapping[str, Any] = field(default_factory=dict)  # Beyond what the file says: the time step of a NIR file
+    training: Mapping[str, Any] | None = None  # How it was made, where the file says so
 
     def origin(self, run: int) -> JsonObject:
         """What a netlist remembers of the file; `run` is which of a released file's runs was asked for."""
@@ -55,7 +56,10 @@ class LoadedNetwork:
         return {"run": run, "weights": self.checkpoint.weights, "graph": self.graph}
 
     def differs_from(self, made: Mapping[str, Any], run: int) -> str | None:
-        """How it is not what a netlist of this provenance was compiled from; `run` is which of a file's runs it is."""
+        """How it is not what a netlist of this provenance was compiled from; `run` is which of a file's runs it is.
+
+        ModelError if it is the same file on another graph: what differs then is not the chip's doing.
+        """
         if (sha256 := made.get("checkpoint_sha256", self.sha256)) != self.sha256:
             return (
                 f"compiled from a checkpoint of sha256 {sha256[:12]}…, this one has {self.sha256[:12]}…; "
@@ -63,7 +67,10 @@ class LoadedNetwork:
             )
         for name, value in self.origin(run).items():
             if made.get(name, value) != value:
-                return f"compiled for {name} {made[name]}, this is {value}; give --{name} {made[name]}"
+                why = f"compiled for {name} {made[name]}, this is {value}; give --{name} {made[name]}"
+                if name == "graph":
+                    raise ModelError(f"the netlist was {why}")
+                return why
         return None
 
     @property
@@ -75,9 +82,10 @@ class LoadedNetwork:
 
 
 def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Netlist | None = None) -> LoadedNetwork:
-    """Read what a command is given.
+    """Read what a command is given; beside a `netlist` as that was, where the options say nothing.
 
-    Of a checkpoint that holds several epochs, the one that `netlist` was compiled from where the options name none.
+    That are the epoch and the graph of a checkpoint that does not say which, the time step of a NIR file, and the names
+    of the layers of a network.
 
     Raises OptionError or ModelError if it is not there, not as the options say, or an option is for the other kind of
     file.
@@ -88,25 +96,28 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
         return LoadedNetwork(network=path, sha256=sha256, format="module")
     kind = network_kind(path)
     _require_fit(path, kind, arguments)
+    made = {} if netlist is None else netlist.provenance
     if kind is None:
         checkpoint = load_checkpoint(path, arguments)
         if netlist is not None and arguments.weights is None and _from_file(netlist, checkpoint):
             made = netlist.provenance["weights"]
             checkpoint = load_checkpoint(path, argparse.Namespace(**(vars(arguments) | {"weights": made})))
-        graph, adjacency = propagation(checkpoint, load_graph(arguments, checkpoint.system), path)
+        graph, adjacency = propagation(checkpoint, _graph_of(checkpoint, arguments, made), path)
         return LoadedNetwork(
             network=expand(checkpoint, adjacency),
             sha256=checkpoint.sha256,
             checkpoint=checkpoint,
             adjacency=adjacency,
             graph=graph,
+            training=checkpoint.training,
         )
     progress("reading the network")
+    training = None
     layout = {"polarities": arguments.polarities, "polarities_first": arguments.polarities_first}
     if kind == COUNTERS:
-        from spikeloom.compiler.formats.counters import read_network
+        from spikeloom.compiler.formats.counters import read_counters, read_network
 
-        found = read_network(shipped(path))
+        found, training = read_network(shipped(path)), read_counters(shipped(path))[0].training
     elif kind == ONNX:
         from spikeloom.compiler.formats.onnx.reader import read_onnx
 
@@ -114,14 +125,36 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
     else:
         from spikeloom.compiler.formats.nir.reader import read_nir
 
-        found = read_nir(path, dt=arguments.dt, convention=arguments.convention, **layout)
+        steps = {name: getattr(arguments, name) or made.get(name) for name in ("dt", "convention")}
+        found = read_nir(path, **steps, **layout)
     return LoadedNetwork(
-        network=found.network,
+        network=found.network if netlist is None else _named_alike(found.network, netlist),
         sha256=found.sha256,
         facts=found.facts,
         format=NETWORKS[kind].lower(),
         read_as=found.read_as,
+        training=training,
     )
+
+
+def _graph_of(checkpoint: Checkpoint, arguments: argparse.Namespace, made: Mapping[str, Any]) -> Graph | None:
+    """Graph that the options name, or the one that a netlist was compiled for, if it is built in; None for neither."""
+    asked = load_graph(arguments, checkpoint.system)
+    if asked is not None or checkpoint.edges is not None or not isinstance(made.get("graph"), str):
+        return asked
+    try:
+        return load_graph(argparse.Namespace(**vars(arguments) | {"graph": made["graph"]}), checkpoint.system)
+    except SpikeloomError:
+        return None  # one of the user's own
+
+
+def _named_alike(network: Network, netlist: Any) -> Network:
+    """The network with the names that layers have in a netlist, if these are as many and as large."""
+    layers = [(layer.name, layer.neurons) for layer in netlist.layers if not isinstance(layer, str)]
+    if [population.size for population in network.populations] != [neurons for _, neurons in layers]:
+        return network
+    pairs = zip(network.populations, layers, strict=True)
+    return replace(network, populations=tuple(replace(population, name=name) for population, (name, _) in pairs))
 
 
 def network_kind(path: str) -> str | None:
@@ -213,6 +246,8 @@ def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
         raise ModelError(f"{path}: is {FORMATS[kind]}; compile, verify and inspect take it, this is for others")
     if Path(shipped(path)).is_file() and is_netlist(shipped(path)):
         raise ModelError(f"{path}: is a netlist, its weights are rounded; give the checkpoint that it was made from")
+    if is_recordings(path):
+        raise ModelError(f"{path}: holds recordings; give the network here, and these as --calibrate or --data")
     return read_checkpoint(
         shipped(path),
         run=arguments.run,

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Mapping
 from difflib import get_close_matches
+from typing import Any
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.targets.netlist_file import Netlist
+from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.counts import show_counts
 from spikeloom.models.recordings.events import (
     BIN_S,
     MAX_STEPS,
+    data_splits,
     joined_bins,
     load_data,
     need_labels,
     of_length,
+    other_sensor,
     require_events,
 )
-from spikeloom.models.recordings.evtouch import Recordings, first_part, parse_window
+from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings, first_part, parse_window
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
 from spikeloom.runtime.report.console import progress
 
@@ -32,11 +38,13 @@ def recordings(
     bin_s: float = BIN_S,
     bins: int = 1,
     labels_for: str | None = None,
+    trained: Mapping[str, Any] | None = None,
 ) -> Recordings:
     """Read recordings of any form, or make the package's own synthetic ones; hold both against the network.
 
     Counts of disorder in event files go to stderr. `bins` of them make a step of the network. `labels_for` names what
-    needs the label of every recording.
+    needs the label of every recording. `trained` is what is known of the recordings that the network was trained on,
+    see :func:`origin_of`: events come in its bins, and what looks like other recordings is warned of.
 
     Raises DataError or OptionError if they cannot be used, or do not suit the network.
     """
@@ -47,15 +55,55 @@ def recordings(
         data = path.part(slice(limit))
         return joined_bins(data if labels_for is None else need_labels(data, labels_for), bins)
     if path != SYNTHETIC:
-        data = load_data(path, split, bin_s=bin_s, limit=limit, classes=classes, taxels=taxels)
+        shared: dict[str, Any] = {"limit": limit, "classes": classes, "taxels": taxels}
+        data, own = load_data(path, split, bin_s=bin_s, **shared), (trained or {}).get("bin_s")
+        if own is not None and data.bin_s not in (None, own):
+            if bin_s != BIN_S:
+                raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {own:g} s; omit --bin")
+            data = load_data(path, split, bin_s=own, **shared)
+        _require_sensor(data, split, taxels)
         show_counts(data.source, data.counts)
         if labels_for is not None:
             need_labels(data, labels_for)
-        return joined_bins(data, bins)
-    require_events(SYNTHETIC, bin_s)
-    grasps = synthetic_split(split, limit=limit)
-    require_suited(grasps, classes=classes, taxels=taxels)
-    return joined_bins(grasps, bins)
+    else:
+        require_events(SYNTHETIC, bin_s)
+        data = synthetic_split(split, limit=limit)
+        require_suited(data, classes=classes, taxels=taxels)
+    if trained and classes is not None and limit is None:
+        _warn_of_others(data, trained, classes)
+    return joined_bins(data, bins)
+
+
+def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
+    """What a netlist remembers of the recordings behind a network: their name, and their bins if they were events."""
+    kinds = {"data": str, "bin_s": float}
+    return {name: training[name] for name, kind in kinds.items() if training and isinstance(training.get(name), kind)}
+
+
+def _require_sensor(data: Recordings, split: str, taxels: int | None) -> None:
+    """Refuse training recordings that look like another sensor's, warn of others."""
+    if taxels is not None and (why := other_sensor(data)) is not None:
+        if split == "train":
+            raise DataError(f"{why}; give the graph of their sensor (--taxels), or recordings of the network's")
+        sys.stderr.write(f"spikeloom: warning: {why}; are they of its sensor?\n")
+
+
+def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int) -> None:
+    """Say on stderr where recordings look like other ones than a network was trained on."""
+    name, known = trained.get("data", data.source), int(data.labels.max(initial=UNLABELLED))
+    fewer = len(data) >= classes and UNLABELLED < known < classes - 1
+    if name != data.source and (data.split == "train" or fewer):
+        why = f"their classes are 0..{known}, the network's 0..{classes - 1}" if fewer else "calibrate on what it knows"
+        sys.stderr.write(f"spikeloom: warning: {data.source}: the network was trained on {name}; {why}\n")
+
+
+def require_splits(path: str | Recordings) -> None:
+    """Refuse recordings without a test split for what trains and tests: a DataError."""
+    if isinstance(path, str) and path != SYNTHETIC and not data_splits(path):
+        raise DataError(
+            f"{path}: has no train/ and test/, so that the same recordings would train and test; make these two "
+            "folders, with some of each class in either"
+        )
 
 
 def require_suited(data: Recordings, *, classes: int | None, taxels: int | None) -> None:
@@ -100,7 +148,9 @@ def load_recordings(
         bin_s=arguments.bin,
         bins=netlist.bins if joined else 1,
         labels_for=labels_for,
+        trained=origin_of(netlist.provenance),
     )
+    arguments.bin = data.bin_s or arguments.bin  # what the command goes on with
     return of_length(first_part(data, window), netlist.clocks.length) if joined else data
 
 

@@ -30,7 +30,7 @@ from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime import machines
-from spikeloom.runtime.inputs.files import shipped
+from spikeloom.runtime.inputs.files import require_netlist, shipped
 from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting, by_running
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
@@ -399,6 +399,7 @@ def _chip_of(path: str | os.PathLike[str]) -> str:
 
 def machine_for(path: str | os.PathLike[str]) -> Machine:
     """Read a netlist file, whatever chip it is for; SpikeloomError if it is none."""
+    require_netlist(os.fspath(path))
     machine: Machine = _module(_chip_of(path)).load(path)
     return machine
 

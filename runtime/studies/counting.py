@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from spikeloom.models.training.counters import Plan, counted, counters_of, fit
 from spikeloom.models.training.record import Held
 from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Section, Table, Text
 
@@ -41,6 +42,7 @@ class CountersRecord:
     validation: Held  # What cross-validation decided rightly, at this strength
     test_correct: int
     test_samples: int
+    bin_s: float | None = field(default=None, metadata=OPTIONAL)  # Seconds of a bin, where the recordings were events
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,8 +86,10 @@ def train_counters(plan: Plan, training: Recordings, test: Recordings, command: 
         validation=Held(correct=round(fitted.accuracy[fitted.strength] * len(training)), samples=len(training)),
         test_correct=int(np.sum(decisions_of(made, test) == test.labels)),
         test_samples=len(test),
+        bin_s=training.bin_s,
     )
-    sha256 = write_counters(output, made.trained(asdict(record)))
+    known = {name: value for name, value in asdict(record).items() if value is not None}
+    sha256 = write_counters(output, made.trained(known))
     return CountersReport(file=Path(output).name, sha256=sha256, record=record)
 
 

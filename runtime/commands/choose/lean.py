@@ -13,7 +13,7 @@ from spikeloom.runtime.commands.options import NETWORK_FILES, add_network, add_r
 from spikeloom.runtime.inputs.compilation import storage
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
-from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.inputs.recordings import recordings, require_splits
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import encode, write_json
 from spikeloom.runtime.report.sections import Outcome
@@ -53,6 +53,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_place(arguments.output, "-o", arguments)
     require_place(arguments.report, "--report", arguments)
     loaded = load_network(arguments.checkpoint, arguments)
+    require_splits(arguments.data)
     training = _read(arguments, loaded.network, "train", None)
     test = _read(arguments, loaded.network, arguments.split, arguments.limit)
     result, netlist = study(loaded, training, test, arguments.differ, arguments.output)
@@ -61,7 +62,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         made = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256, **loaded.origin(arguments.run)}
         made |= storage(None, loaded.checkpoint)
         made |= {"keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True, "lean": lean}
-        write_netlist(replace(netlist, provenance=made), arguments.output)
+        write_netlist(replace(netlist, provenance={**netlist.provenance, **made}), arguments.output)
     write_json(arguments.report, result)
     return Outcome(result, sections)
 

@@ -13,7 +13,7 @@ from spikeloom.compiler.formats.onnx.writer import FORMS
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option
-from spikeloom.runtime.inputs.files import require_place
+from spikeloom.runtime.inputs.files import require_netlist, require_place
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.inputs.repeat import refuse
 from spikeloom.runtime.machines.base import Request, export_formats
@@ -76,6 +76,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Write the file."""
     _require_fit(arguments)
     require_place(arguments.output, "-o", arguments)
+    require_netlist(arguments.source)
 
     def read(classes: int, taxels: int, bins: int) -> Recordings:
         asked = {"limit": arguments.limit, "bin_s": arguments.bin}

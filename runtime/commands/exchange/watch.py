@@ -188,6 +188,8 @@ class Watch:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; its result is the summary, everything else was printed before."""
+    from spikeloom.models.recordings.events import BIN_S
+    from spikeloom.runtime.inputs.recordings import origin_of
     from spikeloom.runtime.machines.base import machine_for
     from spikeloom.runtime.machines.integer import integer_machine
     from spikeloom.runtime.studies.anytime import exits
@@ -204,6 +206,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
             "it, or none for the proof alone"
         )
     machine = machine_for(arguments.netlist)
+    if bin_s == BIN_S:
+        bin_s = origin_of(machine.netlist.provenance).get("bin_s", bin_s)
     netlist = machine.netlist
     bin_s *= netlist.bins
     if netlist.polarities != 2:

@@ -28,7 +28,7 @@ from spikeloom.runtime.commands.options import NETWORK_FILES, add_bin_option, ad
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
-from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.inputs.recordings import origin_of, recordings
 from spikeloom.runtime.inputs.repeat import NETWORK, ROUNDING, refuse
 from spikeloom.runtime.machines.base import chip_module, describe, trained_for
 from spikeloom.runtime.report.console import progress
@@ -117,7 +117,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     )
     options.require_consistent(calibrated=arguments.calibrate is not None)
     asked = load_network(arguments.checkpoint, arguments)
-    checkpoint, training = asked.checkpoint, None
+    checkpoint, training, known = asked.checkpoint, None, origin_of(asked.training)
     if arguments.calibrate is not None:
         progress("reading the recordings")
         found = recordings(
@@ -127,7 +127,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
             taxels=asked.network.input.taxels,
             bin_s=arguments.bin,
             bins=asked.network.input.bins,
+            trained=known,
         )
+        known = known or origin_of({"data": found.source, "bin_s": found.bin_s})
         training = of_length(found, asked.network.input.clocks.length).events
     progress("compiling")
 
@@ -141,7 +143,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             options,
             forms=None if checkpoint is None else checkpoint.forms,
             training_events=training,
-            provenance=provenance(arguments, asked, calibrated=training is not None),
+            provenance={**provenance(arguments, asked, calibrated=training is not None), **known},
         ),
         target=arguments.target,
         after=dump,

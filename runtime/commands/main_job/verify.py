@@ -77,6 +77,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
         required = parse_requirements(arguments.require)
     netlist, loaded = machine.netlist, load_network(arguments.checkpoint, arguments, machine.netlist)
     require_match(netlist, loaded.model)
+    if (difference := loaded.differs_from(netlist.provenance, arguments.run)) is not None:
+        sys.stderr.write(f"spikeloom: warning: {arguments.netlist}: {difference}\n")
     tuned = loaded.checkpoint is not None and loaded.checkpoint.forms is not None
     held = check_rounding(integer_machine(machine), loaded.network, fine_tuned=tuned)
     if arguments.data is None or not held.layers:
@@ -98,8 +100,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
         rounding=held,
         progress=account.begin,
     )
-    if (difference := loaded.differs_from(netlist.provenance, arguments.run)) is not None:
-        sys.stderr.write(f"spikeloom: warning: {arguments.netlist}: {difference}\n")
     explained = account.explained(arguments.explain_cost)
     verdict = replace(verdict, same_checkpoint=difference is None, explained_cost=explained)
     return Outcome(verdict, sections, 1 if verdict.missed else 0)

@@ -22,7 +22,7 @@ from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
-from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
 from spikeloom.runtime.report.encode import INLINE
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
@@ -133,6 +133,7 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
         )
     asked = load_graph(arguments, checkpoint.system)
     name, adjacency = propagation(checkpoint, asked, arguments.checkpoint)
+    require_splits(arguments.data)
     found = [
         recordings(
             arguments.data,
@@ -141,6 +142,7 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
             taxels=checkpoint.taxels,
             bin_s=arguments.bin,
             labels_for="fine-tuning",
+            trained=origin_of(checkpoint.training),
         )
         for split in ("train", "test")
     ]

@@ -33,7 +33,7 @@ from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_graph, sensor_places
-from spikeloom.runtime.inputs.recordings import recordings, require_bins
+from spikeloom.runtime.inputs.recordings import recordings, require_bins, require_splits
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.training import (
@@ -194,6 +194,7 @@ def _count(arguments: argparse.Namespace) -> Outcome:
 def both_splits(data: str, taxels: int | None, bin_s: float) -> tuple[Recordings, Recordings]:
     """Training and test recordings of a sensor, every one with its label."""
     progress("reading the recordings")
+    require_splits(data)
     shared: dict[str, Any] = {"taxels": taxels, "bin_s": bin_s, "labels_for": "training", "classes": None}
     training, test = (recordings(data, split, **shared) for split in ("train", "test"))
     progress("")

@@ -31,7 +31,7 @@ from spikeloom.compiler.types import BoolArray, IntArray, JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import NETWORKS, LoadedNetwork, load_network
-from spikeloom.runtime.inputs.recordings import load_recordings
+from spikeloom.runtime.inputs.recordings import load_recordings, origin_of
 from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
 from spikeloom.runtime.machines.truenorth.description import describe, describe_trained
 from spikeloom.runtime.machines.truenorth.machine import load, machine_of
@@ -85,7 +85,7 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
         loaded = load_network(path, arguments)
         source = read_counters(shipped(path))[0] if loaded.format == COUNTING else loaded.model
         origin = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256}
-        origin |= loaded.origin(arguments.run) | {"in_time": arguments.in_time}
+        origin |= loaded.origin(arguments.run) | {"in_time": arguments.in_time} | origin_of(loaded.training)
     progress("compiling")
 
     def dump(name: str, done: Compilation) -> None:
@@ -108,6 +108,7 @@ def provenance(trained: Trained) -> JsonObject:
         "graph": trained.graph,
         "copies": trained.network.copies,
         "towers": 1,
+        **origin_of(trained.training),
     }
 
 

@@ -26,7 +26,7 @@ from spikeloom.runtime.equivalence.reference import votes_so_far
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
-from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.inputs.recordings import recordings, require_splits
 from spikeloom.runtime.machines.base import DEFAULT, Machine, Price, machine_of
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.studies.chart.grid import Grid
@@ -110,6 +110,7 @@ def commands(work: Measurement, layout: str, window: int) -> tuple[str, str]:
 def read_splits(path: str, bin_s: float, network: NetworkFile) -> dict[str, Recordings]:
     """Training and test recordings by split, in bins."""
     shared: dict[str, Any] = {"classes": network.classes, "taxels": network.taxels, "labels_for": "chart"}
+    require_splits(path)
     return {split: recordings(path, split, bin_s=bin_s, **shared) for split in SPLITS}
 
 

@@ -17,6 +17,7 @@ from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import fitted, join_bins
 from spikeloom.models.sensors import read_layout
 from spikeloom.runtime.equivalence.reference import require_match
+from spikeloom.runtime.inputs.files import require_netlist
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_graph, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.studies.stress import damages, disturbances
@@ -118,6 +119,7 @@ NAMES = {each.name: each for each in _ALL if isinstance(each, Perturbation)}
 
 def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
     """Everything that is stressed, the float network, and a hash of the recordings."""
+    require_netlist(arguments.netlist)
     netlist = read_netlist(arguments.netlist)
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, loaded.model)
