@@ -9,22 +9,28 @@ from typing import Any
 from spikeloom.compiler import Packing, __version__
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
+from spikeloom.runtime.inputs.recordings import origin_of
 
 
-def provenance(arguments: argparse.Namespace, asked: LoadedNetwork, *, calibrated: bool) -> Mapping[str, Any]:
-    """What a netlist remembers of its compilation; `calibrated` if recordings chose its scales."""
+def provenance(
+    arguments: argparse.Namespace, asked: LoadedNetwork, *, calibrated: Recordings | None
+) -> Mapping[str, Any]:
+    """What a netlist remembers of its compilation, whose scales the recordings `calibrated` chose, if any did."""
+    seen = {} if calibrated is None else {"data": calibrated.source, "bin_s": calibrated.bin_s}
     checkpoint, cores_for = asked.checkpoint, parse_cores(arguments.cores_for)
     return {
         "spikeloom": __version__,
         "checkpoint_sha256": asked.sha256,
         **asked.origin(arguments.run),
+        **(origin_of(asked.training) or origin_of(seen)),
         **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
         **storage(parse_packings(arguments), checkpoint),
         "spike_exact": arguments.spike_exact,
         "keep_all": arguments.keep_all,
         "prune_unused": arguments.prune_unused,
-        "calibrated": calibrated,
+        "calibrated": calibrated is not None,
         **({"cores_for": cores_for} if cores_for else {}),
         **({"chips": arguments.chips} if arguments.chips != 1 else {}),
         **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),

@@ -117,7 +117,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     )
     options.require_consistent(calibrated=arguments.calibrate is not None)
     asked = load_network(arguments.checkpoint, arguments)
-    checkpoint, training, known = asked.checkpoint, None, origin_of(asked.training)
+    checkpoint, training, found = asked.checkpoint, None, None
     if arguments.calibrate is not None:
         progress("reading the recordings")
         found = recordings(
@@ -127,9 +127,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
             taxels=asked.network.input.taxels,
             bin_s=arguments.bin,
             bins=asked.network.input.bins,
-            trained=known,
+            trained=origin_of(asked.training),
         )
-        known = known or origin_of({"data": found.source, "bin_s": found.bin_s})
         training = of_length(found, asked.network.input.clocks.length).events
     progress("compiling")
 
@@ -143,7 +142,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             options,
             forms=None if checkpoint is None else checkpoint.forms,
             training_events=training,
-            provenance={**provenance(arguments, asked, calibrated=training is not None), **known},
+            provenance=provenance(arguments, asked, calibrated=found),
         ),
         target=arguments.target,
         after=dump,

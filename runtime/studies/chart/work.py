@@ -173,7 +173,7 @@ def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
     placing = Options(
         cores_for=parse_cores(asked.cores_for),
         optimize=asked.optimize,
-        provenance=provenance(asked, _loaded(work.network), calibrated=True),
+        provenance=provenance(asked, _loaded(work.network), calibrated=_in_steps(work.data, work.network)["train"]),
     )
     try:
         netlist = lay_out_again(stored, placing).netlist

@@ -80,7 +80,7 @@ def arguments(target: Target) -> argparse.Namespace:
 
 def compiled(loaded: LoadedNetwork, target: Target, training: Recordings | None) -> Any:
     """The netlist that ``compile`` makes of a network, calibrated on `training`, in its steps, if there is any."""
-    made = provenance(arguments(target), loaded, calibrated=training is not None)
+    made = provenance(arguments(target), loaded, calibrated=training)
     events = None if training is None else np.ascontiguousarray(training.events)
     options = target.module.Options(training_events=events, provenance=made)
     return compile_network(loaded.model, options, target=target.name).netlist
