@@ -11,7 +11,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from spikeloom.compiler.formats.ranc import EventArray, Mesh, Terms, aims_of, crossbar, mesh_of, packets_of
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.ranc import EventArray, Terms, aims_of, crossbar, mesh_of, packets_of
 from spikeloom.compiler.targets.base import Target
 
 WIDTHS = {"OFFSET_BITS": 9, "MEMBRANE_BITS": 22, "WEIGHT_BITS": 11, "LEAK_BITS": 11, "THRESHOLD_BITS": 22}
@@ -19,72 +20,68 @@ WIDTHS = {"OFFSET_BITS": 9, "MEMBRANE_BITS": 22, "WEIGHT_BITS": 11, "LEAK_BITS":
 
 
 def sizes(terms: Terms, chip: Target) -> dict[str, int]:
-    """All parameters of the description; its cores have as many neurons as the fullest."""
-    netlist, mesh = terms.netlist, mesh_of(terms.netlist)
+    """All parameters of the description, by name; its cores have as many neurons as the fullest.
+
+    ModelError for more classes than its output bus has numbers.
+    """
+    netlist, mesh, axons = terms.netlist, mesh_of(terms.netlist), chip.limit("core.axons")
+    if netlist.classes >= axons:
+        raise ModelError(f"{netlist.classes} classes, {axons - 1} allowed on RANC's output bus; give a smaller network")
     return WIDTHS | {
         "WIDTH": mesh.width,
         "HEIGHT": mesh.height,
         "BUS_X": mesh.bus[0],
         "BUS_Y": mesh.bus[1],
-        "OUTPUTS": netlist.classes + 1,
+        "OUTPUTS": axons,
         "NEURONS": max(int(np.diff(netlist.core_neurons).max()), 2),
-        "AXONS": chip.limit("core.axons"),
+        "AXONS": axons,
         "WEIGHTS": chip.limit("core.axon_types"),
         "DELAYS": chip.limit("neuron.delay") + 1,
     }
 
 
 def memories(terms: Terms, found: dict[str, int]) -> Iterator[tuple[str, str]]:
-    """Name and content of each memory file; neurons leave on the output of their class, all others on the last."""
-    netlist, mesh = terms.netlist, mesh_of(terms.netlist)
+    """Name and content of each memory file; neurons leave on the output of their class, all others on the next."""
+    netlist, mesh, axons = terms.netlist, mesh_of(terms.netlist), found["AXONS"]
+    places = (mesh.x + mesh.width * mesh.y).tolist()
     outputs = np.where(netlist.readout_class < 0, netlist.classes, netlist.readout_class)
-    aims = aims_of(netlist, mesh, outputs)
-    core_at = {(int(x), int(y)): core for core, (x, y) in enumerate(zip(mesh.x, mesh.y, strict=True))}
-    axons, kind_bits, axon_bits, delay_bits = (
-        found["AXONS"],
-        *((found[name] - 1).bit_length() for name in ("WEIGHTS", "AXONS", "DELAYS")),
-    )
-    membrane, weight, leak, threshold = (WIDTHS[f"{name}_BITS"] for name in ("MEMBRANE", "WEIGHT", "LEAK", "THRESHOLD"))
-    silent = _bits((0, axons + 2 * membrane + found["WEIGHTS"] * weight + leak), (1, threshold), (0, threshold), (0, 1))
-    silent += _bits((0, 2 * WIDTHS["OFFSET_BITS"] + axon_bits + delay_bits))
+    limits = (netlist.threshold, -netlist.negative_threshold, netlist.reset_mode)
+    columns = (netlist.initial, netlist.reset, netlist.weight, netlist.leak, *limits, aims_of(netlist, mesh, outputs))
+    registers = np.column_stack(columns).tolist()
+    membrane, weight, leak, threshold = (found[f"{name}_BITS"] for name in ("MEMBRANE", "WEIGHT", "LEAK", "THRESHOLD"))
+    kind_bits, *way = _bits_of(found, "WEIGHTS", "AXONS", "DELAYS")
+    widths = [membrane] * 2 + [weight] * found["WEIGHTS"] + [leak, threshold, threshold, 1]
+    widths += [found["OFFSET_BITS"]] * 2 + way
+    silent = "0" * axons + _joined([*[0] * 7, 1, *[0] * 6], widths)  # a threshold of 1
     for place in range(mesh.width * mesh.height):
-        if (core := core_at.get(divmod(place, mesh.width)[::-1])) is None:
-            kinds, rows = np.zeros(0, np.int64), []
-        else:
+        kinds, rows = np.zeros(0, np.int64), list[str]()
+        if place in places:
+            core = places.index(place)
             kinds, points = crossbar(netlist, core)
-            first = int(netlist.core_neurons[core])
-            rows = [
-                "".join(map(str, row[::-1].tolist())).zfill(axons)
-                + _bits(
-                    (int(netlist.initial[n]), membrane),
-                    (int(netlist.reset[n]), membrane),
-                    *((each, weight) for each in netlist.weight[n].tolist()),
-                    (int(netlist.leak[n]), leak),
-                    (int(netlist.threshold[n]), threshold),
-                    (-int(netlist.negative_threshold[n]), threshold),
-                    (int(netlist.reset_mode[n]), 1),
-                    *zip(aims[n], (WIDTHS["OFFSET_BITS"], WIDTHS["OFFSET_BITS"], axon_bits, delay_bits), strict=True),
-                )
-                for n, row in enumerate(points, first)
-            ]
+            for point, row in zip(points[:, ::-1].tolist(), registers[netlist.core_neurons[core] :], strict=False):
+                rows.append("".join(map(str, point)).zfill(axons) + _joined(row, widths))
         rows += [silent] * (found["NEURONS"] - len(rows))
         yield f"csram_{place:03d}.mem", "\n".join(rows) + "\n"
         types = np.pad(kinds, (0, axons - len(kinds))).tolist()
-        yield f"tc_{place:03d}.mem", "".join(_bits((kind, kind_bits)) + "\n" for kind in types)
+        yield f"tc_{place:03d}.mem", "".join(f"{kind:0{kind_bits}b}\n" for kind in types)
 
 
-def _bits(*fields: tuple[int, int]) -> str:
+def _bits_of(found: dict[str, int], *names: str) -> list[int]:
+    """Bits of a number below each size."""
+    return [(found[name] - 1).bit_length() for name in names]
+
+
+def _joined(values: list[int], widths: list[int]) -> str:
     """Numbers of so many bits each, side by side; those below zero as two's complement."""
-    return "".join(f"{value & ((1 << width) - 1):0{width}b}" for value, width in fields)
+    return "".join(f"{value & ((1 << width) - 1):0{width}b}" for value, width in zip(values, widths, strict=True))
 
 
 def packet_lines(terms: Terms, found: dict[str, int], events: EventArray) -> Iterator[str]:
     """Ticks of a recording (n_inputs, T); then, for each and one more, how many packets are due, and these in hex."""
-    mesh: Mesh = mesh_of(terms.netlist)
-    axon_bits, delay_bits = ((found[name] - 1).bit_length() for name in ("AXONS", "DELAYS"))
-    ticks = packets_of(terms.netlist, events, mesh)
+    axon_bits, delay_bits = _bits_of(found, "AXONS", "DELAYS")
+    ticks = packets_of(terms.netlist, events, mesh_of(terms.netlist))
     yield str(len(ticks))
     for tick in [*ticks, []]:
         yield str(len(tick))
         for x, y, line in tick:
-            yield f"{((x << WIDTHS['OFFSET_BITS'] | y) << axon_bits | line) << delay_bits:x}"
+            yield f"{((x << found['OFFSET_BITS'] | y) << axon_bits | line) << delay_bits:x}"

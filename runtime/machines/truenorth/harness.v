@@ -113,6 +113,7 @@ module harness;
 
         left = waiting;
         change = 0;
+        // in even cycles: cores clear what they have done in odd ones, and lose what comes just then
         if (since == 16) got = $fscanf(input_file, "%d", left);
         else if (taken) begin
             got = $fscanf(input_file, "%h", packet);
