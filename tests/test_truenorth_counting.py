@@ -1,5 +1,6 @@
 """Counting networks on crossbar cores: every spike is the model's, and the votes are the file's."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from commands import as_json, run
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_files import recordings_folder
 from random_crossbars import CHIP, both, with_limit
 
 from spikeloom.compiler import compile_network
@@ -16,6 +18,7 @@ from spikeloom.compiler.errors import CapacityError, ModelError, OptionError
 from spikeloom.compiler.formats.counters import counting_network, write_counters
 from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.compiler.targets.truenorth.counting import LARGEST, planned, run_counters
+from spikeloom.compiler.targets.truenorth.netlist import write_crossbars
 from spikeloom.models.training.counters import rounded
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.machines.votes import class_counts
@@ -103,6 +106,18 @@ def test_counters_spike_again_as_on_other_chips():
     spikes = run_counters(planned(counters, CHIP), events)["counters"]
     assert np.flatnonzero(spikes[:, 0]).tolist() == [2 + again * (3 + BLOCK) for again in range(4)]
     assert_exact(replace(counters, weight=np.abs(counters.weight) % 2, threshold=3000.5), events)
+
+
+def test_it_leaves_for_ranc_with_joined_bins_and_its_ramp(tmp_path):
+    netlist = CHIP.compile(replace(random_counters(3, taxels=2), bins=2)).netlist
+    write_crossbars(netlist, tmp_path / "net.loom")
+    touches = np.ones((1, 2, 2, 40), np.uint8)
+    recordings_folder(tmp_path / "data", train=touches, test=touches)
+    words = ["export", tmp_path / "net.loom", "--to", "ranc", "-o", tmp_path / "net.json", "--data", tmp_path / "data"]
+    assert as_json(*words)["ticks"] == netlist.ticks(20 + 12) + 1
+    written = json.loads((tmp_path / "net.json").read_text("utf-8"))
+    assert [bool(tick) for tick in written["packets"]] == [True] * 20 + [False] * (12 + netlist.drain)
+    assert written["exact_ticks"] is None
 
 
 def test_what_the_chip_cannot_hold_is_refused(tmp_path):
