@@ -72,7 +72,7 @@ def layer_with(**changes):
     return lambda net: dataclasses.replace(net, layers=(dataclasses.replace(net.layers[0], **changes), *net.layers[1:]))
 
 
-WEIGHTS, BIASES = "weights .*from .* to neuron", "bias"
+WEIGHTS = "weights (that are not the nearest,|than the compiler chose.*;) the farthest, from .* to neuron"
 DAMAGES = {
     "sign": (lambda net: put(net, "synapse_weight", largest(net), -net.synapse_weight[largest(net)]), WEIGHTS),
     "sign of the least": (
@@ -84,10 +84,13 @@ DAMAGES = {
     "axon of another source": (exchanged("axon_source", lambda _: np.array([0, 1])), WEIGHTS),
     "targets": (exchanged("synapse_target", unlike_targets), WEIGHTS),
     "exponent": (added("format_exponent"), "limit|weights"),
-    "threshold": (added("threshold"), "conv1 neuron 0 has threshold"),
-    "decay of a layer": (lambda net: added("decay_v", net.compartments_of(2))(net), "fc2 has decay registers"),
+    "threshold": (added("threshold"), r"conv1 neuron 0 has threshold (\d+) instead of \d+$"),
+    "decay of a layer": (
+        lambda net: added("decay_v", net.compartments_of(2))(net),
+        "fc2 has decay registers 4095 and 3278 instead of 4095 and 3277",
+    ),
     "decay of a neuron": (added("decay_u", by=-1), "layer conv1: has 2 values of decay_u"),
-    "bias zeroed": (lambda net: put(net, "bias_mantissa", net.compartments_of(1)[0], 0), BIASES),
+    "bias zeroed": (lambda net: put(net, "bias_mantissa", net.compartments_of(1)[0], 0), "fc1 has .*biases"),
     "neurons": (exchanged("neuron", of_layer(1)), WEIGHTS),
     "votes": (exchanged("readout_class", of_layer(3)), "fc3 has 2 of 4 neurons that vote for another class"),
     "window": (layer_with(depth=1), "conv1 has a window from step 1 instead of 0"),
@@ -113,7 +116,7 @@ def test_verify_names_every_damage_and_fails(place, netlists, tmp_path, name, ro
     words = ("--checkpoint", place / "net.pt", *(["--data", place / "data"] if name == "sign of the least" else []))
     code, out, _ = run("verify", tmp_path / "x.loom", *words)
     assert code == 1
-    assert re.search(f"EN  NOT the rounding of this checkpoint: .*{named}", out)
+    assert re.search(f"EN  NOT the rounding of this checkpoint: .*({named})", out, re.MULTILINE)
     assert run("verify", place / f"{rounded}.loom", *words)[0] == 0
 
 

@@ -263,29 +263,6 @@ def test_every_single_change_is_found(netlist, network, data):
     assert not checked(change(netlist, field, place, by), network).holds
 
 
-def test_words(network):
-    netlist = compiled(network, packings=(Packing(bits=8),), keep_all=True)
-
-    def faults(changed):
-        found = checked(changed, network)
-        assert found.text.startswith("NOT the rounding of this checkpoint: ")
-        return [fault for layer in found.layers.values() for fault in layer.faults]
-
-    first = netlist.compartments_of(1)[0]
-    (fault,) = faults(change(netlist, "threshold", first, 3))
-    assert fault.startswith(f"fc1 neuron {netlist.neuron[first]} has threshold {netlist.threshold[first] + 3} instead")
-    (fault,) = faults(change(netlist, "decay_v", netlist.compartments_of(2), -5))
-    assert fault == "fc2 has decay registers 4095 and 3272 instead of 4095 and 3277"
-    (fault,) = faults(change(netlist, "decay_u", netlist.compartments_of(1), -5))
-    assert fault == "fc1 has decay registers 4090 and 3277 instead of 4095 and 3277"
-    (fault,) = faults(change(netlist, "bias_mantissa", first, 40))
-    assert fault == f"fc1 has 1 of 9 biases that are not, the first of neuron {netlist.neuron[first]}"
-    largest = int(np.argmax(np.abs(netlist.synapse_weight)))
-    (fault,) = faults(change(netlist, "synapse_weight", largest, -6 * np.sign(netlist.synapse_weight[largest])))
-    assert "1 of " in fault
-    assert "weights that are not the nearest, the farthest, from " in fault
-
-
 def test_in_a_compensated_layer_biases_make_up_for_no_more_than_the_weights_lose(network):
     netlist = compiled(network, training_events=events(1, samples=40), keep_all=True)
     layers = checked(netlist, network).layers

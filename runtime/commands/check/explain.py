@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         steps=data.steps_of(index),
         graph=loaded.graph,
         explanation=explanation,
-        faults=tuple(fault for layer in rounding.layers.values() for fault in layer.faults),
+        faults=rounding.faults,
         top=explanation.found[: arguments.top],
     )
     return Outcome(result, sections)
