@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
 CLAIMS, DEFINITIONS = tomllib.loads((ROOT / "benchmarks" / "claims.toml").read_text("utf-8")).values()
 PAGES = (
     "README.md",
@@ -26,14 +27,13 @@ UNITS = r"%|×|[µmnp]?[JWs]\b|[MGk]i?B?\b|(?:points?|times|cores?|operations|sp
 NUMBER = re.compile(rf"(?<!\w)\d[\d,.]*(?: ?(?:{UNITS})| *(?=\|))")
 """With a unit, of so many, or alone in a cell of a table."""
 
-DRAWN = {"growth", "skins"}
-"""Results of no recordings, but of random ones."""
+DRAWN = {"growth", "skins"}  # results of random recordings
 
 
 @cache
 def stored(name):
     """Content of a results file; rows of a CSV file by data, system and graph."""
-    text = (ROOT / "benchmarks" / "results" / name).read_text("utf-8")
+    text = (RESULTS / name).read_text("utf-8")
     if name.endswith(".json"):
         return json.loads(text)
     rows = csv.DictReader(text.splitlines())
@@ -87,8 +87,7 @@ def bound(claim):
 @pytest.mark.parametrize("claim", CLAIMS, ids=[f"{claim['page']}, {claim['result']}" for claim in CLAIMS])
 def test_texts_are_those_of_the_stored_results(claim):
     page = plain((ROOT / claim["page"]).read_text("utf-8"))
-    for text in bound(claim):
-        assert text in page
+    assert [text for text in bound(claim) if text not in page] == []
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -97,9 +96,8 @@ def test_every_number_is_that_of_a_result_or_a_definition(page):
     defined = [each for definition in DEFINITIONS if definition["page"] == page for each in definition["texts"]]
     assert all(each in text for each in defined)
     said = [*defined, *(each for claim in CLAIMS if claim["page"] == page for each in bound(claim))]
-    places = set()
-    for pattern in (CODE, *map(re.compile, map(re.escape, said))):
-        places.update(place for found in pattern.finditer(text) for place in range(*found.span()))
+    known = [found.span() for each in (CODE.pattern, *map(re.escape, said)) for found in re.finditer(each, text)]
+    places = {place for span in known for place in range(*span)}
     loose = [found for found in NUMBER.finditer(text) if not places.issuperset(range(*found.span()))]
     assert [text[max(0, found.start() - 40) : found.end()] for found in loose] == []
 
@@ -115,9 +113,8 @@ def test_sessions_print_what_the_docs_show(page):
 def results():
     """Name and content of what studies stored; each cell of the paper's tables has its own."""
     yield from stored("paper/cells.json").items()
-    folder = ROOT / "benchmarks" / "results"
-    for file in sorted({*folder.glob("*.json"), *folder.glob("shown/*.json")} - {folder / "faults.json"}):
-        yield file.stem, stored(str(file.relative_to(folder)))
+    for file in sorted({*RESULTS.glob("*.json"), *RESULTS.glob("shown/*.json")} - {RESULTS / "faults.json"}):
+        yield file.stem, stored(str(file.relative_to(RESULTS)))
 
 
 @pytest.mark.parametrize(("name", "made"), [pytest.param(*each, id=each[0]) for each in results()])
