@@ -76,6 +76,9 @@ ROOT = Path(__file__).parents[1]
 SHOWN = re.compile(r"^\$ (spikeloom .+)\n((?:(?!\$ |```).*\n)*)", re.MULTILINE)
 """A command in the docs, and what they show of its output."""
 
+IN_HARDWARE = {"counters": 20, "native": 20}
+"""First test recordings that run in RANC's hardware, by kind of network."""
+
 PAGES = ("anytime", "chart", "compile", "cost", "counting", "data", "formats", "stress", "truenorth", "verify")
 """Those that show some."""
 
@@ -269,6 +272,21 @@ def truenorth(session: Session) -> Json:
     return found
 
 
+def hardware(session: Session, kind: str) -> Json:
+    """Networks of a kind in RANC's hardware; FOLDER holds a clone, RANC, and gets what is finished, in ``work``."""
+    found: Json = {}
+    for name, data in NAMED.items():
+        network = f"pretrained:{name}-truenorth"
+        if kind == "counters":
+            network = "net.pt"
+            session.run(f"train --data {data} --system counters --weight-bits 5 -o net.pt")
+        session.run(f"compile {network} --target truenorth -o net.loom")
+        work = f"work/{name if kind == 'counters' else kind}"
+        result = session.run(f"cosimulate net.loom --data {data} --rtl RANC --limit {IN_HARDWARE[kind]} --work {work}")
+        found[name] = result | {"recordings": len(result["recordings"])}
+    return found
+
+
 def yardsticks(session: Session) -> Json:
     """NeuroBench's metrics and the arithmetic of the float model."""
     return session.run(f"yardsticks {MANUAL} --graph manual --data {OBJECTS}")
@@ -334,6 +352,8 @@ STUDIES: dict[str, Callable[[Session], Json]] = {
     "stress-objects": lambda session: stress(session, f"{MANUAL} --graph manual", f"--calibrate {OBJECTS} "),
     "stress-counters": lambda session: stress(session, "pretrained:objects-counters"),
     "truenorth": truenorth,
+    "rtl-counters": lambda session: hardware(session, "counters"),
+    "rtl-native": lambda session: hardware(session, "native"),
     "yardsticks": yardsticks,
     "confusion-containers": confusion,
     "longer-bins": longer_bins,

@@ -71,7 +71,6 @@ def wrong(found) -> int:
 
 
 def test_the_command(place, rtl):
-    (place / "work").mkdir()
     words = ["cosimulate", place / "net.loom", "--data", place / "data", "--rtl", rtl, "--simulator", "iverilog"]
     found = as_json(*words, "--work", place / "work")
     assert wrong(found) == 0
@@ -111,7 +110,7 @@ def test_mistakes_in_one_line(place, monkeypatch):
     assert "tick 0 does not end" in refusal(*words, "--simulator", "iverilog")
     defective(place, "module Core", "module Score")
     assert "iverilog fails" in refusal(*words, "--simulator", "iverilog")
-    assert "missing: is no folder; make it first" in refusal(*words, "--work", place / "missing")
+    assert "net.loom: File exists" in refusal(*words, "--work", place / "net.loom")
     monkeypatch.setenv("PATH", str(place))
     assert "verilator or iverilog: not found" in refusal(*words)
     write_netlist(lively(), place / "net.loom")

@@ -37,8 +37,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     machine.require_sensor(data.events)
     with tempfile.TemporaryDirectory(prefix="spikeloom-") as temporary:
         folder = Path(arguments.work or temporary)
-        if not folder.is_dir():
-            raise OptionError(f"--work {arguments.work}: is no folder; make it first")
+        folder.mkdir(parents=True, exist_ok=True)
         options = {"rtl": arguments.rtl, "simulator": arguments.simulator, "bin_s": arguments.bin}
         outcome: Outcome = chip.cosimulate(machine, data, folder=folder, **options)
     return outcome
