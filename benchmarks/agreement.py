@@ -179,6 +179,12 @@ def options() -> argparse.Namespace:
     return parser.parse_args()
 
 
+def write(path: Path, result: dict[str, Any]) -> None:
+    """All that is known so far."""
+    with write_atomically(path) as file:
+        file.write((json.dumps(result, indent=1) + "\n").encode())
+
+
 def main() -> None:
     """Compare, write after each simulator."""
     asked = options()
@@ -207,8 +213,8 @@ def main() -> None:
                     found = {"recordings": len(part)} | run(name, python, netlist, part, Path(folder), first)
                 facts[name] = merged(facts[name], found) if name in facts else found
                 print(f"{path}, {name}, {time.monotonic() - begun:.0f} s: {facts[name]}", file=sys.stderr, flush=True)
-                with write_atomically(output) as file:
-                    file.write((json.dumps(made(train, data) | {"networks": networks}, indent=1) + "\n").encode())
+                write(output, made(train, data) | {"networks": networks})
+    write(output, made(train, data) | {"networks": networks})
 
 
 if __name__ == "__main__":
