@@ -208,7 +208,8 @@ def main() -> None:
             run: Callable[..., dict[str, Any]] = compare if name in RIVALS else compare_sanafe
             wanted = min(asked.limit or len(events), len(events))
             while (first := facts.get(name, {}).get("recordings", 0)) < wanted:
-                part, begun = events[first : first + (TOGETHER if first else FIRST)], time.monotonic()
+                last, begun = min(wanted, first + (TOGETHER if first else FIRST)), time.monotonic()
+                part = events[first:last]
                 with tempfile.TemporaryDirectory() as folder:
                     found = {"recordings": len(part)} | run(name, python, netlist, part, Path(folder), first)
                 facts[name] = merged(facts[name], found) if name in facts else found
