@@ -18,8 +18,8 @@ from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, StepTimes
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 
 INPUTS = (
-    "times: SANA-FE's own runs send input events from a core of their own and take longer, on real recordings by up to "
-    "3 % (simple) or 25 % (detailed)"
+    "times: SANA-FE's own runs send input events from a core; those of a TactileSGNet take up to 3 % (simple) or 25 % "
+    "(detailed) longer"
 )
 """Said wherever times are; measured by ``benchmarks/agreement.py``."""
 
