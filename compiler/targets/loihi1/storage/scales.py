@@ -268,10 +268,16 @@ def group_by_fineness(finest: IntArray, groups: int) -> IntArray:
 def grouped(layer: FloatLayer, uniform: Rounded, groups: int) -> Rounded | None:
     """Population with up to `groups` thresholds, each as fine as its neurons allow, stored as a `uniform` one.
 
+    Sums of several planes may be larger at a smaller threshold. A group in which one is too large is made coarser, step
+    by step, down to the threshold of the `uniform` one, whose sums hold.
+
     None where some neurons relay clocks: these bind the threshold of all.
     """
     if layer.population.relays:
         return None
     finest = finest_thresholds(layer, uniform.form.bits, uniform.form.exponents)
     threshold = group_by_fineness(np.maximum(finest, uniform.form.threshold), groups)
-    return rounded(layer, replace(uniform.form, threshold=threshold))
+    while (found := rounded(layer, replace(uniform.form, threshold=threshold))) and found.reached > ONE_STEP_SUM_MAX:
+        over = loads(found.population, found.projections) > ONE_STEP_SUM_MAX
+        threshold = threshold - np.isin(threshold, threshold[over])
+    return found
