@@ -9,13 +9,17 @@ import re
 import shutil
 import subprocess
 from dataclasses import dataclass, field
+from functools import partial
 from html import unescape
 
+import nir
 import numpy as np
 import pytest
-from commands import as_json
+from commands import as_json, run
 from made_chart import made_chart
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_folder, weights
+from made_nir import affine, chain, lif
+from matplotlib import rc_context
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import refused
 from zoo import specimen
@@ -37,7 +41,8 @@ from spikeloom.runtime.studies.chart.sections import page, picture, printed, ser
 REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data", "-o", "out.html")
 HEADINGS = ["Verdict", "Decisions", "Cores", "Taxels", "One recording", "Energy and time", "Provenance"]
 LAYERS = ("conv1", "fc1", "fc2", "fc3")
-FIGURES = {"raster-input", *(f"raster-{name}" for name in LAYERS)}
+RASTERS = [f"raster-{place}" for place in range(1 + len(LAYERS))]  # of the input and of the layers
+FIGURES = {*RASTERS}
 FIGURES |= {"confusion", "cores-map", "taxels-map", "membranes", "energy-layers", "energy-parts", "time-cores"}
 
 
@@ -81,7 +86,7 @@ def test_every_chapter_and_figure_is_there_captioned_and_in_numbers(made):
         assert re.search("<figcaption>.+</figcaption>", figure)
         assert re.search('role="img" aria-label=".+"', figure)
         assert len(re.findall("<(?:path|use|g)[ >]", figure)) >= 5
-        assert "<table" in figure or 'id="raster-input"' in figure, "whose spikes cannot differ"
+        assert "<table" in figure or 'id="raster-0"' in figure, "whose spikes cannot differ"
 
 
 def test_the_page_needs_nothing_else_and_is_the_same_each_time(spikeloom, made, place):
@@ -95,7 +100,7 @@ def test_the_page_needs_nothing_else_and_is_the_same_each_time(spikeloom, made, 
 
 def test_the_raster_marks_every_difference(made):
     for layer in made[1]["recording"]["layers"]:
-        held = values(made[0], f"raster-{layer['name']}")
+        held = values(made[0], f"raster-{1 + LAYERS.index(layer['name'])}")
         assert held["cells"]["columns"] == STEPS
         assert held["cells"]["rows"] == [f"neuron {neuron}" for neuron in layer["active"]]
         wanted = [
@@ -202,7 +207,7 @@ def test_networks_without_a_graph_show_their_taxels(tmp_path):
     assert (taxels["graph"], taxels["spikes"], taxels["edges"]) == (None, None, [])
     assert (taxels["sensor"], len(taxels["positions_mm"] or ())) == (("NeuTouch", 39) if sensor == 39 else (None, 0))
     assert len(values(text, "taxels-map")["tips"]) == sensor
-    assert drawings(text) >= FIGURES - {f"raster-{name}" for name in LAYERS} - {"time-cores"}
+    assert drawings(text) >= FIGURES - {*RASTERS[1:]} - {"time-cores"}
 
 
 def test_clocks_and_lasting_currents_have_their_page(tmp_path):
@@ -283,12 +288,12 @@ def test_a_browser_shows_every_figure_and_unfolds_one_raster_at_a_time(made, pla
     [...document.querySelectorAll("summary")].find((s) => s.textContent == "fc1").parentElement.open = true;
     return [before, shown()];"""
     before, after = browsed(place / "out.html", script)
-    assert set(before) == FIGURES - {f"raster-{name}" for name in ("input", *LAYERS[1:])}
-    assert set(after) == set(before) - {"raster-conv1"} | {"raster-fc1"}
+    assert set(before) == FIGURES - {*RASTERS} | {"raster-1"}
+    assert set(after) == set(before) - {"raster-1"} | {"raster-2"}
 
 
 def test_arrow_keys_walk_through_the_differences_and_the_pointer_reads_cells(made, place):
-    held, layer = values(made[0], "raster-conv1"), made[1]["recording"]["layers"][0]
+    held, layer = values(made[0], "raster-1"), made[1]["recording"]["layers"][0]
     tips, cells = held["tips"], held["cells"]
     different = {tuple(pair) for side in ("float", "chip") for pair in layer[f"{side}_only"]}
     row, step = next(
@@ -301,8 +306,8 @@ def test_arrow_keys_walk_through_the_differences_and_the_pointer_reads_cells(mad
     x = cells["from"][0] + (step + 0.5) * (cells["to"][0] - cells["from"][0]) / STEPS
     y = cells["from"][1] + (row + 0.5) * (cells["to"][1] - cells["from"][1]) / len(cells["rows"])
     script = f"""
-    const walked = ["Right", "Right", "Left", "Left"].map((way) => press("raster-conv1", `Arrow${{way}}`));
-    return [walked, point("raster-conv1", {x}, {y}), press("energy-layers", "ArrowRight")];"""
+    const walked = ["Right", "Right", "Left", "Left"].map((way) => press("raster-1", `Arrow${{way}}`));
+    return [walked, point("raster-1", {x}, {y}), press("energy-layers", "ArrowRight")];"""
     walked, pointed, energy = browsed(place / "out.html", script)
     assert walked == [tips[index][2] for index in (0, 1, 0, -1)]
     assert pointed.startswith(f"neuron {layer['active'][row]}, step {step}")
@@ -332,6 +337,40 @@ def test_text_shows_all_but_what_is_folded_or_for_the_eye():
         "$ spikeloom run 'a b'\n\n"
         "  layer  spikes\n  conv1      12\n  fc1     3 < 4"
     )
+
+
+def test_names_from_a_file_run_no_script_and_tear_no_drawing(tmp_path, monkeypatch):
+    """The network of a NIR file whose nodes have names that a page must not take for its own."""
+    monkeypatch.chdir(tmp_path)
+    names = ['x"onload="alert(1)', "<img src=x onerror=alert(1)>", r"$\frac{<script>alert(1)</script>"[:39]]
+    rng, nodes, before = np.random.default_rng(0), [], TAXELS * 2
+    for size in (9, 8, CLASSES):
+        nodes += [affine(rng, size, before), lif(size)]
+        before = size
+    graph = chain(*nodes)
+    called = {f"n{2 * place + 1}": name.replace("/", "") for place, name in enumerate(names)}
+    graph.nodes = {called.get(name, name): node for name, node in graph.nodes.items()}
+    graph.edges = [tuple(called.get(name, name) for name in edge) for edge in graph.edges]
+    nir.write("net.nir", graph)
+    recordings_folder(tmp_path / "data")
+    assert run("compile", "net.nir", "--dt", "0.02", "-o", "net.loom")[0] == 0
+    words = ["report", "net.loom", "--checkpoint", "net.nir", "--dt", "0.02", "--data", "data", "-o", "out.html"]
+    code, out, err = run(*words)
+    assert (code, err) == (0, "")
+    assert names[1] in out
+    text = (tmp_path / "out.html").read_text("utf-8")
+    assert drawings(text) >= {*RASTERS[: 1 + len(names)]}
+    assert "<img" not in text
+    assert "<script>alert" not in text
+    script = "return [document.images.length, document.querySelectorAll('[onload], [onerror]').length]"
+    assert browsed(tmp_path / "out.html", script) == [0, 0]
+
+
+def test_pictures_are_the_same_whatever_the_users_style():
+    figure = partial(drawing.bars, "bars", {"a": [1.0], "b": [2.0]}, ["n"])
+    before = figure().file("svg")
+    with rc_context({"figure.facecolor": "red", "font.size": 30, "axes.grid": True, "lines.linewidth": 9}):
+        assert figure().file("svg") == before
 
 
 def test_a_page_is_whole_escaped_and_the_same_each_time():

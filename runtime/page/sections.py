@@ -195,7 +195,8 @@ def _recording(found: Recording) -> list[Block]:
     sent = LayerRaster(name="input", neurons=0, both=found.input, float_only=nothing, chip_only=nothing)
     shown = next((layer for layer in found.layers if layer.different), found.layers[0])
     rasters = [
-        Details(layer.name, [_raster(layer, found.steps)], "raster", layer is shown) for layer in (sent, *found.layers)
+        Details(layer.name, [_raster(layer, found.steps, place)], "raster", layer is shown)
+        for place, layer in enumerate((sent, *found.layers))
     ]
     head = ["layer", "neurons that fire", "float spikes", "chip spikes", "different"]
     decided = f"decided {found.decision['float']} by the float model and {found.decision['chip']} by the chip"
@@ -229,8 +230,8 @@ def _membrane_table(trace: Trace) -> Table:
     return Table(["step", "float membrane", "chip membrane", "fires"], rows, title, most=0)
 
 
-def _raster(layer: LayerRaster, steps: int) -> Figure:
-    kind = "channel" if layer.name == "input" else "neuron"
+def _raster(layer: LayerRaster, steps: int, place: int) -> Figure:
+    kind = "neuron" if place else "channel"
     active = layer.active.tolist()
     rows = [active[i * len(active) // ROWS] for i in range(ROWS)] if len(active) > ROWS else active
     what = "channels with an event" if kind == "channel" else "neurons that fire on either side"
@@ -242,7 +243,7 @@ def _raster(layer: LayerRaster, steps: int) -> Figure:
     numbers = [Table(["step", kind, "fires"], listed, f"Spikes of one side only{more}", most=0)] if listed else []
     title = f"Spikes of {layer.name}, float model and chip"
     return Figure(
-        f"raster-{layer.name}",
+        f"raster-{place}",
         partial(drawing.raster, title, rows, steps, spikes, kind),
         f"{layer.name}: rows are {some}the {len(active):,} {what}, in order.",
         numbers,

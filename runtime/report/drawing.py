@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import wraps
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec
@@ -48,6 +49,7 @@ STYLE = {
     "ytick.labelcolor": "black",
     "legend.frameon": False,
     "svg.fonttype": "none",
+    "text.parse_math": False,  # names may hold a dollar
     "svg.hashsalt": "spikeloom",
 }
 
@@ -73,6 +75,7 @@ class Drawing:
         text = text[text.index("<svg") :]
         for index, colour in enumerate(COLOURS):
             text = text.replace(colour, f"var(--c{index})")
+        assert re.fullmatch(r"[a-z0-9-]+", name), "names are ours: nothing from a file becomes a part of the page"
         return re.sub(r'(id="|href="#|url\(#)', rf"\1{name}-", text)
 
     def values(self) -> JsonObject:
@@ -96,11 +99,9 @@ class Drawing:
 
     def file(self, kind: str, **options: Any) -> bytes:
         """As PNG, SVG or PDF; the same bytes for the same drawing."""
-        from matplotlib import rc_context
-
         content = io.BytesIO()
         none = {"svg": ("Creator", "Date", "Format", "Type"), "pdf": ("CreationDate",), "png": ("Software",)}[kind]
-        with rc_context(STYLE):  # type: ignore[arg-type]
+        with _in_style():
             self.figure.savefig(content, format=kind, dpi=150, metadata=dict.fromkeys(none), **options)
         return content.getvalue()
 
@@ -110,12 +111,21 @@ def styled(draw: Callable[Options, Drawing]) -> Callable[Options, Drawing]:
 
     @wraps(draw)
     def in_style(*args: Options.args, **kwargs: Options.kwargs) -> Drawing:
-        from matplotlib import rc_context
-
-        with rc_context(STYLE):  # type: ignore[arg-type]
+        with _in_style():
             return draw(*args, **kwargs)
 
     return in_style
+
+
+@contextmanager
+def _in_style() -> Iterator[None]:
+    """The common style, whatever the user's matplotlibrc says."""
+    from matplotlib import rc_context, rcdefaults, rcParams
+
+    with rc_context():
+        rcdefaults()
+        rcParams.update(STYLE)  # type: ignore[arg-type]
+        yield
 
 
 def sheet(title: str, height: float, *, width: float = WIDTH) -> Drawing:
