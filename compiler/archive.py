@@ -11,16 +11,16 @@ import io
 import json
 import math
 import os
+import struct
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS
-from spikeloom.compiler.errors import FormatError, ModelError
-from spikeloom.compiler.files import write_atomically
+from spikeloom.compiler.files import FileFault, read_whole, write_atomically
 
 Array = np.ndarray[Any, Any]
 
@@ -39,12 +39,19 @@ FORMATS = {
 """What a manifest may say that an archive is."""
 
 AGAIN = "copy or train it again"
+"""What to do about a network that is not compiled."""
 
 SIZE_LIMIT = 2**32
 """Bytes that a netlist file may have, 4 GiB: some hundred times the synapses of a whole chip."""
 
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 """Of every member of a zip, so that equal content gives equal bytes."""
+
+LOCAL = b"PK\x03\x04"
+"""With what a member of a zip begins."""
+
+UTF8 = 0x800
+"""Flag of a member whose name is not in code page 437."""
 
 
 def narrow(array: Array) -> Array:
@@ -103,47 +110,63 @@ def write_archive(content: bytes, path: str | os.PathLike[str]) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
+def opened_zip(file: IO[bytes]) -> zipfile.ZipFile:
+    """A zip that checks CRCs as it is read; FileFault where its directory has lost a member or its name."""
+    opened, end = zipfile.ZipFile(file), 0
+    for info in sorted(opened.infolist(), key=lambda info: info.header_offset):
+        _require_no_member(file, end, info.header_offset)
+        file.seek(info.header_offset + 26)
+        name, more = struct.unpack("<HH", file.read(4))
+        if file.read(name).decode("utf-8" if info.flag_bits & UTF8 else "cp437") != info.orig_filename:
+            raise FileFault(f"has another name for {info.filename} than its directory")
+        end = info.header_offset + 30 + name + more + info.compress_size
+    _require_no_member(file, end, opened.start_dir)
+    return opened
+
+
+def _require_no_member(file: IO[bytes], begin: int, end: int) -> None:
+    """Refuse a gap of a zip in which a member lies."""
+    file.seek(begin)
+    if LOCAL in file.read(max(end - begin, 0)):
+        raise FileFault("holds members that its directory does not list")
+
+
 def stored_members(content: bytes) -> dict[str, bytes]:
-    """Members of a zip that stores them plainly and claims no more bytes than it has, else ValueError."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            infos = archive.infolist()
-            declared = sum(info.file_size for info in infos)
-            if declared > len(content) or any(info.compress_type != zipfile.ZIP_STORED for info in infos):
-                raise ValueError(f"has compressed members, {len(content)} bytes claim to hold {declared}")
-            return {info.filename: archive.read(info) for info in infos}
-    except Exception as error:
-        raise ValueError(str(error)) from error
+    """Members of a zip that stores them plainly and claims no more bytes than it has, else FileFault or of zipfile."""
+    with opened_zip(io.BytesIO(content)) as opened:
+        infos = opened.infolist()
+        declared = sum(info.file_size for info in infos)
+        if declared > len(content) or any(info.compress_type != zipfile.ZIP_STORED for info in infos):
+            raise FileFault(f"has compressed members, {len(content)} bytes claim to hold {declared}")
+        return {info.filename: opened.read(info) for info in infos}
 
 
 def read_npy(content: bytes) -> Array:
-    """An array of plain numbers or text from an npy file, whose size is checked against its header, else ValueError."""
+    """An array of plain numbers or text from an npy file, whose size is checked against its header.
+
+    FileFault, or what numpy raises, which parses the header as Python, if it is none.
+    """
     file = io.BytesIO(content)
-    try:
-        version = np.lib.format.read_magic(file)
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    except Exception as error:  # numpy parses the header as Python and raises whatever that does
-        raise ValueError(f"no array: {error}") from error
+    headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    shape, fortran, dtype = headers[np.lib.format.read_magic(file)](file)
     held, wanted = len(content) - file.tell(), math.prod(shape) * dtype.itemsize
-    if version != (1, 0) or dtype.hasobject or fortran or min(shape, default=1) < 0 or held != wanted:
-        raise ValueError(f"an array of objects, not in C order, or of {wanted} bytes in {held}")
-    return np.frombuffer(content, dtype, offset=file.tell()).reshape(shape) if wanted else np.zeros(shape, dtype)
+    if dtype.hasobject or min(shape, default=1) < 0 or held != wanted:
+        raise FileFault(f"holds an array of objects, or one of {wanted} bytes in {held}")
+    values = np.frombuffer(content, dtype, offset=file.tell()) if wanted else np.zeros(0, dtype)
+    return values.reshape(shape, order="F" if fortran else "C")
 
 
 def read_members(path: Path) -> dict[str, Array]:
-    """All members of an archive by name; FormatError if it is too large, truncated, compressed or no such archive."""
-    if path.stat().st_size > SIZE_LIMIT:
-        raise FormatError(f"{path}: {path.stat().st_size} bytes, {SIZE_LIMIT} allowed; this is no netlist of one chip")
-    try:
-        members = stored_members(path.read_bytes())
-        return {name.removesuffix(".npy"): read_npy(content) for name, content in members.items()}
-    except ValueError as error:
-        raise FormatError(f"{path}: is truncated or not a netlist ({error}); compile it again") from error
+    """All members of an archive by name; raises as what it calls."""
+    members = stored_members(read_whole(path, "netlist of one chip", SIZE_LIMIT))
+    return {name.removesuffix(".npy"): read_npy(content) for name, content in members.items()}
 
 
 def stated(path: Path, name: str) -> str | None:
     """What the manifest of an archive says of `name`, None where there is no such thing; nothing else is read."""
     try:
+        if not path.is_file():  # a pipe would wait for ever
+            return None
         with zipfile.ZipFile(path) as archive, archive.open("manifest.npy") as member:
             manifest = json.loads(str(np.lib.format.read_array(member, allow_pickle=False)))
     except Exception:  # zipfile and numpy raise whatever they meet; a header may announce more than the memory holds
@@ -156,6 +179,9 @@ def is_netlist(path: str | os.PathLike[str]) -> bool:
     """Whether a file claims to be a netlist: an archive with a manifest, or a name that ends in ``.loom``."""
     return str(path).endswith(".loom") or stated(Path(path), "format") not in (None, COUNTERS)
 
+
+LETTERS = 1000
+"""That a word of a manifest may have, the name of a layer, say."""
 
 Kind = type | tuple[int, int] | frozenset[str] | dict[str, Any] | list[Any]
 """What an entry of a manifest must be: of a type (``float``: from 0, finite), a whole number within bounds (both
@@ -173,9 +199,10 @@ def entry_faults(manifest: Mapping[str, Any], kinds: Mapping[str, Kind]) -> list
     Examples
     --------
     >>> entry_faults({"taxels": 0, "layers": ["fc1"]}, {"taxels": (1, 9), "layers": [str], "target": str})
-    ['the manifest has no usable taxels', 'the manifest has no usable target']
+    ['the manifest has no usable taxels, target']
     """
-    return [f"the manifest has no usable {name}" for name, kind in kinds.items() if not _is(manifest.get(name), kind)]
+    odd = [name for name, kind in kinds.items() if not _is(manifest.get(name), kind)]
+    return [f"the manifest has no usable {', '.join(odd)}"] if odd else []
 
 
 def array_faults(arrays: Mapping[str, Array], axes: Mapping[str, int], floats: Iterable[str] = ()) -> list[str]:
@@ -189,12 +216,12 @@ def array_faults(arrays: Mapping[str, Array], axes: Mapping[str, int], floats: I
     return found
 
 
-def _is(value: Any, kind: Kind) -> bool:
+def _is(value: Any, kind: Kind) -> bool:  # noqa: PLR0911 - one for each kind
     match kind:
+        case type() if kind is float:
+            return type(value) in (int, float) and 0 <= value < math.inf
         case type():
-            return (
-                isinstance(value, kind) if kind is not float else type(value) in (int, float) and 0 <= value < math.inf
-            )
+            return isinstance(value, kind) and not (isinstance(value, str) and len(value) > LETTERS)
         case tuple():
             return type(value) is int and kind[0] <= value <= kind[1]
         case frozenset():
@@ -210,63 +237,39 @@ def _is(value: Any, kind: Kind) -> bool:
 
 
 def read_archive(
-    path: Path, wanted: str, version: int, names: Callable[[Mapping[str, Any]], Iterable[str]]
-) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Manifest and arrays of a file of a format, one of ``FORMATS``, that matches its hash.
-
-    `names` gives from the manifest the names of all arrays, in their order. FormatError if the file is missing,
-    truncated, altered, or of another format or version.
-    """
-    if not path.is_file():
-        found = "is not a file" if path.exists() else "no such file"
-        raise FormatError(f"{path}: {found}; write one with spikeloom compile")
-    members = read_members(path)
-    if missing := sorted({"manifest", "sha256"} - set(members)):
-        raise FormatError(f"{path}: is not a netlist (no {' and no '.join(missing)}); write one with spikeloom compile")
-    text, written = members.pop("manifest"), str(members.pop("sha256"))
-    try:
-        manifest = json.loads(str(text))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{path}: has an unreadable manifest; compile it again") from error
-    kind = manifest.get("format") if isinstance(manifest, dict) else None
-    if isinstance(kind, str) and kind in FORMATS and kind != wanted:
-        raise FormatError(f"{path}: holds {FORMATS[kind]}, this is for {FORMATS[wanted]}; give such a file")
-    if kind != wanted:
-        raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
-    if manifest.get("version") != version:
-        raise FormatError(
-            f"{path}: has format version {manifest.get('version')}, this program reads {version}; compile it again or "
-            "update spikeloom"
-        )
-    expected = tuple(names(manifest))
-    if odd := sorted(set(expected) ^ set(members)):
-        raise FormatError(f"{path}: has missing or unknown members ({', '.join(odd)}); compile it again")
-    if digest({"manifest": text, **{name: members[name] for name in expected}}) != written:
-        raise FormatError(f"{path}: its content does not match its hash, so it was altered; compile it again")
-    return manifest, members
-
-
-def read_trained_archive(
     path: Path,
     wanted: str,
     version: int,
     kinds: Mapping[str, Kind],
     names: Callable[[Mapping[str, Any]], Iterable[str]],
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """The same of a network that is not compiled, whose entries are of these kinds; ModelError instead."""
+    """Manifest and arrays of a file of a format, one of ``FORMATS``, that matches its hash.
 
-    def checked(manifest: Mapping[str, Any]) -> Iterable[str]:
-        require_none(path, entry_faults(manifest, kinds))
-        return names(manifest)
+    Entries of the manifest are of these `kinds`; `names` gives from it the names of all arrays, in their order.
+    FileFault, or what parsing raises, if the file is missing, damaged, altered, or of another format or version.
+    """
+    members, what = read_members(path), "network" if wanted in (TRAINED, COUNTERS) else "netlist"
+    if missing := sorted({"manifest", "sha256"} - set(members)):
+        raise FileFault(f"is not a {what} (no {' and no '.join(missing)})")
+    text, written = members.pop("manifest"), str(members.pop("sha256"))
+    manifest = json.loads(str(text))
+    kind = manifest.get("format") if isinstance(manifest, dict) else None
+    if isinstance(kind, str) and kind in FORMATS and kind != wanted:
+        raise FileFault(f"holds {FORMATS[kind]}, this is for {FORMATS[wanted]}")
+    if kind != wanted:
+        raise FileFault(f"is not a {what}")
+    if (found := manifest.get("version")) != version:
+        raise FileFault(f"has format version {found!r:.40}, this program reads {version}: another spikeloom wrote it")
+    require_none(entry_faults(manifest, kinds))
+    expected = tuple(names(manifest))
+    if odd := sorted(set(expected) ^ set(members)):
+        raise FileFault(f"has missing or unknown members ({', '.join(odd)})")
+    if digest({"manifest": text, **{name: members[name] for name in expected}}) != written:
+        raise FileFault("its content does not match its hash, so it was altered")
+    return manifest, members
 
-    try:
-        return read_archive(path, wanted, version, checked)
-    except FormatError as error:
-        said = str(error).rpartition("; ")[0].replace("netlist", "network")  # without the remedy, which is a netlist's
-        raise ModelError(f"{said}; {AGAIN}") from error
 
-
-def require_none(path: Path, faults: Iterable[str]) -> None:
-    """Refuse a network that is not compiled for what is wrong in its file."""
+def require_none(faults: Iterable[str]) -> None:
+    """Refuse a file for what is wrong in it: FileFault."""
     if faults := list(faults):
-        raise ModelError(f"{path}: {'; '.join(faults)}; {AGAIN}")
+        raise FileFault("; ".join(faults))

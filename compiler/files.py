@@ -1,4 +1,4 @@
-"""Write a file whole or not at all, read one of a network within limits, and know it again by its hash."""
+"""Write a file whole or not at all, read one within limits, say in one line what is wrong about it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from glob import escape
 from pathlib import Path
 from typing import BinaryIO
 
-from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.errors import OptionError, SpikeloomError
 
 SIZE_LIMIT = 2**28
 """Bytes that the file of a trained network may have: 256 MiB, a hundred times the released ones."""
+
+MOST_SAID = 300
+"""Letters of a message about a file, folders before its name not counted."""
 
 RANDOM = 8
 """Letters that are drawn for a name."""
@@ -48,9 +51,10 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def remove_leftovers(path: str | os.PathLike[str]) -> None:
-    """Remove what a killed process left half-written beside `path`; for a `path` that nobody else is writing."""
+    """Remove what a killed process left half-written beside `path`, or in a folder; for what nobody else is writing."""
     path = Path(path).resolve()
-    for file in path.parent.glob(f".{escape(path.name)}.{'?' * RANDOM}.part"):
+    folder, name = (path, "*") if path.is_dir() else (path.parent, escape(path.name))
+    for file in folder.glob(f".{name}.{'?' * RANDOM}.part"):
         file.unlink(missing_ok=True)
 
 
@@ -65,23 +69,62 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def read_whole(path: Path, what: str, remedy: str) -> bytes:
-    """Content of the file of a network; ModelError, without the path, if it is missing, unreadable or too large.
+class FileFault(SpikeloomError):  # noqa: N818 - the file's, no error of the program
+    """What is wrong about a file; :func:`reading` adds its name and the remedy."""
 
-    Messages say `what` it should be, and the `remedy`.
+
+@contextmanager
+def reading(where: object, error: type[SpikeloomError], remedy: str) -> Iterator[None]:
+    """Let whatever is raised while a file is read be one line of `MOST_SAID` letters: name, what was found, remedy.
+
+    A :class:`FileFault`, and all that parsing libraries raise, becomes an `error`; other errors of ours keep their kind
+    and words, those about options pass.
     """
-    if not path.is_file():
-        raise ModelError(f"{'is not a file' if path.exists() else 'no such file'}; {remedy}")
     try:
-        with path.open("rb") as file:
-            content = file.read(SIZE_LIMIT + 1)
-    except OSError as error:
-        raise ModelError(f"cannot be read ({error.strerror or error}); check its permissions") from error
-    require_size(len(content), what, remedy)
+        yield
+    except (MemoryError, OptionError):
+        raise
+    except Exception as found:
+        kind, said = error, f"is truncated or damaged, or something else ({type(found).__name__}: {found}); {remedy}"
+        if isinstance(found, FileFault):
+            said = f"{found}; {remedy}"
+        elif isinstance(found, SpikeloomError):
+            kind, said = type(found), str(found)
+        elif isinstance(found, OSError) and found.strerror:
+            said = f"cannot be read ({found.strerror}); check its permissions"
+        raise kind(f"{where}: {_shortened(said, MOST_SAID - 2 - len(Path(str(where)).name))}") from found
+
+
+def _shortened(said: str, room: int) -> str:
+    """A message in one line, its middle left out where it is long: the end is the remedy."""
+    said = plain(" ".join(said.split()))
+    return said if len(said) <= room else f"{said[: max(room // 2, 60)]} … {said[-max(room // 2 - 3, 60) :]}"
+
+
+def plain(text: str) -> str:
+    r"""Text that a terminal only shows: control characters of a name, say, are escaped, line breaks stay.
+
+    Examples
+    --------
+    >>> print(plain("\x1b[2Jgrasp ä.csv"))
+    \x1b[2Jgrasp ä.csv
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+
+
+def read_whole(path: Path, what: str, limit: int | None = None) -> bytes:
+    """Content of a file; FileFault, with `what` it should be, if it is missing, no file or too large."""
+    if not path.is_file():
+        raise FileFault("is not a file" if path.exists() else "no such file")
+    with path.open("rb") as file:
+        content = file.read((limit or SIZE_LIMIT) + 1)
+    require_size(len(content), what, limit)
     return content
 
 
-def require_size(size: int, what: str, remedy: str) -> None:
-    """Refuse more bytes than the file of a network may have: ModelError, without the path."""
-    if size > SIZE_LIMIT:
-        raise ModelError(f"more than {SIZE_LIMIT} bytes, the limit of a {what}; {remedy}")
+def require_size(size: int, what: str, limit: int | None = None) -> None:
+    """Refuse more bytes than a file may have, by default one of a network: FileFault."""
+    if size > (limit or SIZE_LIMIT):
+        raise FileFault(f"more than {limit or SIZE_LIMIT} bytes, the limit of a {what}")

@@ -158,7 +158,7 @@ def _mistake(error: Exception) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
-    from spikeloom.runtime.report.console import progress, show
+    from spikeloom.runtime.report.console import progress, show, tell
     from spikeloom.runtime.report.sections import terminal
 
     words = sys.argv[1:] if argv is None else argv
@@ -177,13 +177,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         progress("")
         if "--debug" in words:
             raise
-        sys.stderr.writelines(f"spikeloom: {line}\n" for line in _mistake(error).splitlines())
+        tell(_mistake(error))
         if isinstance(error, UnfinishedError):
-            again = shlex.join(["spikeloom", *(word for word in words if word != "--fresh")])
-            sys.stderr.write(f"spikeloom: go on with: {again}\n")
+            tell(f"go on with: {shlex.join(['spikeloom', *(word for word in words if word != '--fresh')])}")
             return 1
         return 2
     except KeyboardInterrupt as interrupt:
         progress("")
-        sys.stderr.write(f"spikeloom: interrupted; {str(interrupt) or 'nothing was written'}\n")
+        tell(f"interrupted; {str(interrupt) or 'nothing was written'}")
         return 2

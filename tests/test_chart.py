@@ -115,8 +115,12 @@ def test_once_more_nothing_is_measured_and_one_more_width_nothing_else(made, spi
     monkeypatch.setattr(chart_work, "measure", lambda work: worked.append(work) or measure(work))
     shutil.copytree(place / "out", place / "again")
     before = {file.name: file.read_bytes() for file in (place / "out").glob("chart.*")}
+    left = [place / "out" / name for name in (".chart.json.0123abcd.part", "netlists/.x.loom.0123abcd.part")]
+    for part in left:
+        part.touch()
     assert spikeloom(*CHART, "-o", "out", "--json")[0] == 0
     assert worked == []
+    assert not any(part.exists() for part in left), "what a killed one has left stays"
     assert {file.name: file.read_bytes() for file in (place / "out").glob("chart.*")} == before
     words = [word.replace("bits=4,8", "bits=4,6,8") for word in CHART]
     assert spikeloom(*words, "-o", "again", "--json")[0] == 0

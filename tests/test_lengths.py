@@ -170,7 +170,12 @@ def test_the_netlist_is_that_one_but_for_the_bins(place):
 @pytest.mark.parametrize("bins", [0, True, "3", 2**20 + 1])
 def test_unusable_bins_are_refused(place, tmp_path, bins):
     write_netlist(replace(read_netlist(place / "x.loom"), bins=bins), tmp_path / "y.loom")
-    refused(FormatError, "the manifest has no usable bins; compile it again", read_netlist, tmp_path / "y.loom")
+    refused(
+        FormatError,
+        "the manifest has no usable bins; write it with spikeloom compile",
+        read_netlist,
+        tmp_path / "y.loom",
+    )
     content = rebuilt((place / "x.pt").read_bytes(), lambda manifest, _: manifest.update(bins=bins))
     (tmp_path / "y.pt").write_bytes(content)
     refused(ModelError, "the manifest has no usable bins", read_checkpoint, tmp_path / "y.pt")

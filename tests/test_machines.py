@@ -230,7 +230,7 @@ WRONG = [
     ("link_buffer = {", "#", "time.sanafe: lacks link_buffer"),
     ("barrier.1 = {", "barrier.3 = {", "time.sanafe: lacks barrier.1"),
     ("barrier.2 = {", "barrier.two = {", "time.sanafe: lacks barrier.1, and others with a number"),
-    ("name = ", "name = \n", "is not TOML"),
+    ("name = ", "name = \n", "(TOMLDecodeError: "),
     ('title = "SANA-FE\'s fit to a Nahuku board"\nneuron', "neuron", "time.sanafe: lacks its title"),
 ]
 
@@ -243,7 +243,7 @@ def test_a_wrong_entry_is_named(tmp_path, old, new, words):
 
 
 def test_a_file_that_is_not_there(tmp_path):
-    refused(OptionError, "cannot be read", base.read_target, tmp_path / "no.toml")
+    refused(OptionError, "no such file", base.read_target, tmp_path / "no.toml")
 
 
 # -- tables of one's own -----------------------------------------------------------------------------------------------
@@ -268,7 +268,7 @@ def test_tables_by_name_or_from_a_file(tmp_path):
 def test_tables_that_are_not_there_or_wrong(tmp_path):
     chip, path = base.load_target("loihi1"), tmp_path / "mine.toml"
     refused(OptionError, "--table davis: unknown|davies2018, sanafe|.toml", base.with_tables, chip, "davis")
-    refused(OptionError, f"{path}: cannot be read", base.with_tables, chip, str(path))
+    refused(OptionError, f"{path}: no such file", base.with_tables, chip, str(path))
     path.write_text("limits = 3")
     refused(OptionError, "holds limits|[energy.NAME]|[time.NAME]", base.with_tables, chip, str(path))
     path.write_text("")

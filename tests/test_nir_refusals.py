@@ -172,7 +172,7 @@ def nested(file):
             "announces more than 268435456",
             lambda f: f.create_dataset("a", (1,), "f8", maxshape=(None,), chunks=(2**28,)),
         ),
-        ("(RecursionError)", nested),
+        ("(RecursionError: ", nested),
         ("has 0 nodes of type Input", lambda f: f.create_group("node").__setitem__("type", np.bytes_(b"\xff\xfe"))),
     ],
 )
@@ -189,9 +189,9 @@ def test_what_is_no_nir_file(tmp_path, monkeypatch):
     assert "no such file" in refused(read_nir, other, dt=1.0)
     assert "is not a file" in refused(read_nir, tmp_path, dt=1.0)
     other.write_bytes(b"text")
-    assert "is no HDF5 file" in refused(read_nir, other, dt=1.0)
+    assert "(OSError: Unable" in refused(read_nir, other, dt=1.0)
     for length in (100, 10_000):
         other.write_bytes(GOOD.read_bytes()[:length])
-        assert "truncated or damaged (OSError)" in refused(read_nir, other, dt=1.0)
+        assert "or something else (OSError: " in refused(read_nir, other, dt=1.0)
     monkeypatch.setattr(files, "SIZE_LIMIT", 1000)
     assert "more than 1000 bytes, the limit of a NIR file" in refused(read_nir, GOOD, dt=1.0)

@@ -215,8 +215,9 @@ TABLE = [
     ("run finger.loom --data synthetic --limit 4", "synthetic|label 3, the network has 3 classes"),
     # netlists
     ("run data --data data", "data: is not a file|spikeloom compile"),
-    ("run --data data nowhere.loom", "nowhere.loom: no such file; write one with spikeloom compile"),
-    ("run --data data half.loom", "half.loom: is truncated or not a netlist"),
+    ("run --data data '\x1b[2J.loom'", r"\x1b[2J.loom: no such file"),
+    ("run --data data nowhere.loom", "nowhere.loom: no such file; write it with spikeloom compile"),
+    ("run --data data half.loom", "half.loom: is truncated or damaged"),
 ]
 
 
@@ -289,7 +290,7 @@ def test_unreadable_files(refusal, monkeypatch):
 
     monkeypatch.setattr(Path, "open", denied)
     assert "net.pt: cannot be read (Permission denied)" in refusal("inspect", "net.pt")
-    assert "secret: Permission denied" in refusal("run", "net.loom", "--data", "data")
+    assert "net.loom: cannot be read (Permission denied)" in refusal("run", "net.loom", "--data", "data")
 
 
 class FullDisk(io.FileIO):

@@ -23,6 +23,7 @@ from test_timing import DETAILED, ENERGY_PJ, LOIHI, PICO, SANAFE, SIMPLE, six_st
 
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import sanafe
+from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, write_netlist
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost
@@ -142,12 +143,12 @@ network:
       neurons:
         - 0: {soma_hw_name: 'loihi_inputs[0]'}
         - 1: {soma_hw_name: 'loihi_inputs[1]'}
-    - name: layer0
+    - name: 'layer0'
       attributes: {soma_hw_name: loihi_lif, reset: 0.0, input_decay: 0.0, log_spikes: true}
       neurons:
         - 0: {threshold: 80.0, leak_decay: 0.199951171875, bias: 0.0, synapse_hw_name: loihi_dense_synapse}
         - 1: {threshold: 80.0, leak_decay: 0.199951171875, bias: 0.0, synapse_hw_name: loihi_dense_synapse}
-    - name: layer1
+    - name: 'layer1'
       attributes: {soma_hw_name: loihi_lif, reset: 0.0, input_decay: 0.0, log_spikes: true}
       neurons:
         - 0: {threshold: 80.0, leak_decay: 0.199951171875, bias: 0.0, synapse_hw_name: loihi_dense_synapse}
@@ -223,6 +224,10 @@ def test_names_are_such_that_the_format_can_hold_them():
     assert sanafe.group_names(replace(netlist, layers=layers)) == ("a_b_c", "input_1")
     layers = tuple(replace(layer, name="fc") for layer in netlist.layers)
     assert sanafe.group_names(replace(netlist, layers=layers)) == ("fc_0", "fc_1")
+    assert plain_names(["a_1", "a.b", "a_b", "a_b_1"]) == ("a_1", "a_b_1_", "a_b_2", "a_b_1")
+    layers = [replace(layer, name=name) for layer, name in zip(netlist.layers, ("1", "null"), strict=False)]
+    named = [line.strip() for line in lines(replace(netlist, layers=tuple(layers))) if "- name: '" in line]
+    assert named == ["- name: '1'", "- name: 'null'"], "quoted, or they are no words"
 
 
 def test_channels_fill_cores_of_their_own():

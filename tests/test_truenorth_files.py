@@ -15,7 +15,7 @@ from commands import as_json, refusal, run
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from made_files import recordings_folder
-from random_crossbars import CHIP, IN_RANCS_TERMS, alone, crossbars, events
+from random_crossbars import IN_RANCS_TERMS, alone, crossbars, events
 
 from spikeloom.compiler import archive
 from spikeloom.compiler.archive import is_netlist
@@ -24,7 +24,6 @@ from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import ranc
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
-from spikeloom.compiler.targets.truenorth.legalize import faults
 from spikeloom.compiler.targets.truenorth.netlist import (
     FILE,
     RESET_LINEAR,
@@ -35,7 +34,7 @@ from spikeloom.compiler.targets.truenorth.netlist import (
     read_crossbars,
     write_crossbars,
 )
-from spikeloom.runtime.machines.truenorth import engine, spec
+from spikeloom.runtime.machines.truenorth import spec
 
 ARRAYS = FILE.arrays
 
@@ -105,27 +104,8 @@ def test_files_that_mean_nothing(path, changes, line):
     members = archive.read_members(path)
     manifest = json.loads(str(members["manifest"])) | changes.get("manifest", {})
     path.write_bytes(archive.archive_bytes(manifest, {name: changes.get(name, members[name]) for name in ARRAYS}))
-    with pytest.raises(FormatError, match=f"{re.escape(line)}; (compile it again|update spikeloom)"):
+    with pytest.raises(FormatError, match=re.escape(line)):
         read_crossbars(path)
-
-
-@settings(max_examples=30, deadline=None)
-@given(crossbars(), st.sampled_from(ARRAYS), st.randoms(use_true_random=False))
-def test_any_numbers_are_refused_or_run(tmp_path_factory, netlist, name, random):
-    array = np.array(getattr(netlist, name))
-    if array.size:
-        array.flat[random.randrange(array.size)] = random.choice(
-            [-(2**31), -300, -2, -1, 0, 1, 2, 5, 20, 300, 2**31 - 1]
-        )
-    path = tmp_path_factory.mktemp("any") / "x.loom"
-    write_crossbars(replace(netlist, **{name: array}), path)
-    try:
-        found = read_crossbars(path)
-    except FormatError:
-        return
-    if not faults(found, CHIP):
-        assert found.drain < 2**20
-        engine.simulate(replace(found, readout_first=np.minimum(found.readout_first, 9)), np.ones((1, 3, 4), np.uint8))
 
 
 # -- commands ----------------------------------------------------------------------------------------------------------

@@ -47,14 +47,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.archive import AGAIN, CLOCKS, GRAPH, Kind, arrays_digest, entry_faults, read_npy, stored_members
+from spikeloom.compiler.archive import (
+    AGAIN,
+    CLOCKS,
+    GRAPH,
+    Kind,
+    arrays_digest,
+    entry_faults,
+    read_npy,
+    stored_members,
+)
 from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, constant_faults, layers_of
 from spikeloom.compiler.dynamics import MOST_STEPS, PLAIN, Clocks, Dynamics, dynamics_faults
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.files import read_whole
+from spikeloom.compiler.files import FileFault, read_whole, reading
 from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, plane_distance, read_only
 from spikeloom.compiler.formats.tensors import Arrays, apart, faults_of, taxel_faults, tower_faults, wanted_dense
-from spikeloom.compiler.formats.torch_checkpoint import DAMAGED, GIVE, NOT_A_CHECKPOINT, read_torch
+from spikeloom.compiler.formats.torch_checkpoint import NOT_A_CHECKPOINT, read_torch
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SMALL_GRID, SYSTEMS, TITLES, Grid, shape_faults
 
@@ -106,10 +115,8 @@ def read_checkpoint(
         raise OptionError(f"--weights {weights}: unknown; choose from {', '.join(WEIGHTS)}")
     if faults := constant_faults(beta, theta):
         raise OptionError(faults[0])
-    try:
-        found = _read(read_whole(Path(path), "checkpoint", GIVE), run, weights)
-    except ModelError as error:
-        raise ModelError(f"{path}: {error}") from error
+    with reading(path, ModelError, AGAIN):
+        found = _read(read_whole(Path(path), "checkpoint"), run, weights)
     _require_fit(str(path), found, beta, theta)
     given = [name for name, value in (("beta", beta), ("theta", theta)) if value is not None]
     return replace(
@@ -137,11 +144,8 @@ def content_digest(manifest: Mapping[str, Any], arrays: Mapping[str, npt.NDArray
 
 
 def _read(content: bytes, run: int, weights: str | None) -> Checkpoint:
-    """Checkpoint of any layout; no zip may claim more than it has. Messages lack the path."""
-    try:
-        members = stored_members(content) if content[:2] == b"PK" else {}
-    except ValueError as error:
-        raise ModelError(f"is truncated or damaged ({error}); copy it again") from error
+    """Checkpoint of any layout; no zip may claim more than it has."""
+    members = stored_members(content) if content[:2] == b"PK" else {}
     if "manifest.json" in members:
         if run != 0:
             raise ModelError(f"--run {run}: the file holds only run 0; omit --run")
@@ -157,7 +161,7 @@ def _read_own(content: bytes, members: dict[str, bytes], weights: str | None) ->
     manifest, arrays = _signed_content(members)
     kinds = ENTRIES | {name: kind for name, kind in MORE.items() if name in manifest}
     if faults := entry_faults(manifest, kinds) or constant_faults(manifest["beta"], manifest["theta"]):
-        raise ModelError(f"{'; '.join(faults)}; {AGAIN}")
+        raise FileFault("; ".join(faults))
     sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
     weights = sets[0] if weights is None else weights
     if weights not in sets:
@@ -182,7 +186,7 @@ def _read_own(content: bytes, members: dict[str, bytes], weights: str | None) ->
     if edges.size and edges.max() >= manifest["taxels"]:
         faults.append(f"the graph joins taxels outside 0..{manifest['taxels'] - 1}")
     if faults:
-        raise ModelError(f"{'; '.join(faults)}; {AGAIN}")
+        raise FileFault("; ".join(faults))
     found = Checkpoint(
         **layers_of(chosen),
         beta=float(manifest["beta"]),
@@ -205,20 +209,17 @@ def _read_own(content: bytes, members: dict[str, bytes], weights: str | None) ->
 
 def _signed_content(members: Mapping[str, bytes]) -> tuple[dict[str, Any], Arrays]:
     """Manifest and arrays that match the hash which the manifest states."""
-    try:
-        manifest = json.loads(members["manifest.json"])
-        arrays = {name.removesuffix(".npy"): read_npy(data) for name, data in members.items() if name.endswith(".npy")}
-        if len(arrays) + 1 != len(members) or any(array.dtype != "<f4" for array in arrays.values()):
-            raise ValueError("members that are no arrays of float32")
-    except (ValueError, RecursionError) as error:
-        raise ModelError(DAMAGED) from error
+    manifest = json.loads(members["manifest.json"])
+    arrays = {name.removesuffix(".npy"): read_npy(data) for name, data in members.items() if name.endswith(".npy")}
+    if len(arrays) + 1 != len(members) or any(array.dtype != "<f4" for array in arrays.values()):
+        raise FileFault("has members that are no arrays of float32")
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ModelError(NOT_A_CHECKPOINT)
     version = manifest.get("version")
     if type(version) is not int or not 1 <= version <= VERSION:
-        raise ModelError(f"has format version {version!r}, this program reads up to {VERSION}; update spikeloom")
+        raise ModelError(f"has format version {version!r:.40}, this program reads up to {VERSION}; update spikeloom")
     if content_digest(manifest, arrays) != manifest.get("sha256"):
-        raise ModelError(f"its content does not match its hash, so it was altered; {AGAIN}")
+        raise FileFault("its content does not match its hash, so it was altered")
     return manifest, arrays
 
 
@@ -227,7 +228,7 @@ def _forms(entries: list[dict[str, Any]], checkpoint: Checkpoint) -> tuple[Form,
     fits = [(entry["layer"], len(entry["threshold"])) for entry in entries] == [*checkpoint.neurons.items()]
     gaps = [(entry["bits"], b - a) for entry in entries for a, b in pairwise(entry["exponents"])]
     if not fits or not all(0 < gap <= plane_distance(bits) for bits, gap in gaps):
-        raise ModelError(f"the manifest has no usable forms; {AGAIN}")
+        raise FileFault("the manifest has no usable forms")
     return tuple(
         Form(bits=entry["bits"], exponents=tuple(entry["exponents"]), threshold=read_only(entry["threshold"]))
         for entry in entries

@@ -23,17 +23,19 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.archive import (
+    AGAIN,
     COUNTERS,
     Array,
     Kind,
     archive_bytes,
-    read_trained_archive,
+    read_archive,
     require_none,
     write_archive,
 )
 from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS
-from spikeloom.compiler.files import sha256_of
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.files import reading, sha256_of
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble
 from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
@@ -100,8 +102,9 @@ def write_counters(path: str | os.PathLike[str], counters: Counters) -> str:
 def read_counters(path: str | os.PathLike[str]) -> tuple[Counters, str]:
     """Read and check a file; also its sha256. ModelError if it is damaged, altered, newer or inconsistent."""
     path = Path(path)
-    manifest, members = read_trained_archive(path, COUNTERS, VERSION, KINDS, lambda _: ("counter", "weight"))
-    require_none(path, _array_faults(manifest, members["counter"], members["weight"]))
+    with reading(path, ModelError, AGAIN):
+        manifest, members = read_archive(path, COUNTERS, VERSION, KINDS, lambda _: ("counter", "weight"))
+        require_none(_array_faults(manifest, members["counter"], members["weight"]))
     counters = Counters(
         **{name: manifest[name] for name in (*SIZES, *CONSTANTS, "training")},
         counter=read_only(members["counter"]),

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
+import resource
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,7 +16,7 @@ import numpy.typing as npt
 
 from spikeloom.compiler import files
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.files import read_whole
+from spikeloom.compiler.files import FileFault, read_whole
 from spikeloom.compiler.types import FloatArray, IntArray
 
 Array = npt.NDArray[Any]
@@ -24,6 +27,9 @@ Tree = dict[str, Any]
 E = TypeVar("E")
 
 AGAIN = "export it again"
+
+MOST_SECONDS = 3
+"""Of processor time for a file; 256 MiB of numbers take one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,23 +83,38 @@ def entry_of(group: Tree, key: str, kind: type[E]) -> E:
 def read_hdf5(path: Path, what: str) -> tuple[Tree, str]:
     """Content of a whole file, and its sha256; messages say `what` it should be.
 
-    Raises ModelError, without the path, if it is missing, too large, no HDF5 file, or holds what may not be read.
+    FileFault, ModelError, or what h5py raises, if it is missing, too large, damaged, or holds what may not be read.
     """
-    content = read_whole(path, what, f"give a {what} of one chip")
+    content = read_whole(path, what)
     return tree_of(content), hashlib.sha256(content).hexdigest()
 
 
 def tree_of(content: bytes) -> Tree:
-    """Content of a file as a tree; ModelError if it is damaged, or holds what may not be read."""
+    """Content of a file as a tree; raises as :func:`read_hdf5`."""
     import h5py  # slow to load, so only where it is used
 
-    try:
-        with h5py.File(io.BytesIO(content), "r") as file:
-            return _group(file, [files.SIZE_LIMIT])
-    except ModelError:
-        raise
-    except Exception as error:  # h5py raises nearly anything on damaged files
-        raise ModelError(f"is no HDF5 file, truncated or damaged ({type(error).__name__}); {AGAIN}") from error
+    _require_end(content)
+    with h5py.File(io.BytesIO(content), "r") as file:
+        return _group(file, [files.SIZE_LIMIT])
+
+
+def _require_end(content: bytes) -> None:
+    """Refuse a file on which the HDF5 library spins or dies: a forked process tries first, with so much time."""
+    import h5py
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # threads, say of torch: the child uses nothing of theirs
+        child = os.fork()
+    if child == 0:
+        try:
+            resource.setrlimit(resource.RLIMIT_CPU, (MOST_SECONDS, MOST_SECONDS))
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            with h5py.File(io.BytesIO(content), "r") as file:
+                _group(file, [files.SIZE_LIMIT])
+        finally:
+            os._exit(0)
+    if os.WIFSIGNALED(os.waitpid(child, 0)[1]):
+        raise FileFault(f"the HDF5 library dies on it, or takes more than {MOST_SECONDS} s, so it is damaged")
 
 
 def _group(group: Any, room: list[int]) -> Tree:

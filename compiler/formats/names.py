@@ -6,27 +6,26 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 
-from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.files import FileFault
 
 
 @contextmanager
 def named(where: object) -> Iterator[None]:
-    """Let a ModelError of what is done say where: of which file, or which part of it."""
+    """Let an error of what is done say where: in which part of a file; what libraries raise becomes a FileFault."""
     try:
         yield
-    except ModelError as error:
-        raise ModelError(f"{where}: {error}") from error
+    except (MemoryError, OptionError):
+        raise
+    except (ModelError, FileFault) as error:
+        raise type(error)(f"{where}: {error}") from error
+    except Exception as error:
+        raise FileFault(f"{where}: cannot be used ({type(error).__name__}: {error})") from error
 
 
 def printable(name: str) -> str:
     """Name as a message can show it: quoted and escaped where it holds more than letters."""
     return name if name.isprintable() and len(name) < 100 else repr(name[:100])
-
-
-def one_line(error: Exception) -> str:
-    """What another program said of a file, as a message can show it."""
-    said = " ".join(str(error).split())[:240] or type(error).__name__
-    return said if said.isprintable() else repr(said)
 
 
 def plain_names(names: Sequence[str], taken: Collection[str] = ()) -> tuple[str, ...]:
@@ -37,10 +36,13 @@ def plain_names(names: Sequence[str], taken: Collection[str] = ()) -> tuple[str,
     >>> plain_names(["a.b", "input", "fc", "fc"], taken=["input"])
     ('a_b', 'input_1', 'fc_2', 'fc_3')
     """
-    plain = [re.sub(r"\W", "_", name, flags=re.ASCII) for name in names]
-    return tuple(
-        name if plain.count(name) == 1 and name not in taken else f"{name}_{place}" for place, name in enumerate(plain)
-    )
+    plain, found = [re.sub(r"\W", "_", name, flags=re.ASCII) for name in names], list[str]()
+    for place, name in enumerate(plain):
+        free = name if plain.count(name) == 1 and name not in taken else f"{name}_{place}"
+        while free in {*taken, *found, *plain[place + 1 :]}:
+            free += "_"
+        found.append(free)
+    return tuple(found)
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:

@@ -131,7 +131,7 @@ def _groups(netlist: Netlist, names: tuple[str, ...]) -> Iterator[str]:
     bias = netlist.bias_mantissa * 2.0**netlist.bias_exponent / 2**MEMBRANE_SHIFT
     kept, leak = kept_shares(netlist.decay_u, netlist.decay_v)
     for layer, name in enumerate(names):
-        yield f"    - name: {name}"
+        yield f"    - name: '{name}'"  # else 1, null and yes are no words
         yield "      attributes: {soma_hw_name: loihi_lif, reset: 0.0, input_decay: 0.0, log_spikes: true}"
         yield "      neurons:"
         for k, c in enumerate(netlist.compartments_of(layer).tolist()):

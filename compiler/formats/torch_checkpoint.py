@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.archive import stored_members, zip_bytes
 from spikeloom.compiler.checkpoint import Checkpoint, layers_of
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
@@ -35,7 +36,6 @@ DENSE_STAGES = 3
 GIVE = "give a file of spikeloom train or of the released layout"
 GIVE_WEIGHTS = "give the weights of a TactileSGNet"
 NOT_A_CHECKPOINT = f"is not a checkpoint; {GIVE}"
-DAMAGED = "is truncated or damaged; copy it again"
 
 BETA, THETA = 0.2, 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""
@@ -49,7 +49,7 @@ OTHERS = (
 
 def read_torch(content: bytes, run: int) -> Checkpoint:
     """Read the content of a torch file; raises as :func:`read_checkpoint`."""
-    loaded = _load(content)
+    loaded = load_torch(content)
     if isinstance(loaded, dict) and "net_list" in loaded:
         states, layout = loaded["net_list"], "released"
         if not isinstance(states, list | tuple) or not states:
@@ -71,11 +71,18 @@ def read_torch(content: bytes, run: int) -> Checkpoint:
     )
 
 
-def _load(content: bytes) -> Any:
-    """Let torch read the content if it looks like a zip or a pickle."""
+def load_torch(content: bytes) -> Any:
+    """Let torch read the content if it looks like a zip or a pickle.
+
+    The CRCs of a zip are checked here, for torch does not. The format before it has no checksum: a bit of a weight that
+    is flipped goes unnoticed.
+    """
     if content[:2] != b"PK" and content[:1] != b"\x80":
         raise ModelError(NOT_A_CHECKPOINT)
     import torch
+
+    if content[:2] == b"PK":
+        content = zip_bytes(stored_members(content))
 
     try:
         with warnings.catch_warnings():
@@ -92,7 +99,7 @@ def _load(content: bytes) -> Any:
                 "is pickled with protocol 4 or newer, which torch does not read without running it; "
                 "save it with torch.save as it is by default"
             ) from error
-        raise ModelError(f"is truncated or damaged, or no file of torch.save; {GIVE}") from error
+        raise
 
 
 def _arrays(state: Any, file_size: int) -> Arrays:

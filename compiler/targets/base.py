@@ -19,8 +19,11 @@ from typing import Any
 
 from spikeloom.compiler import targets
 from spikeloom.compiler.errors import OptionError, Violation
+from spikeloom.compiler.files import FileFault, read_whole, reading
 from spikeloom.compiler.pipeline import run
 from spikeloom.compiler.types import JsonObject
+
+MEND = "mend it"
 
 COMPARTMENTS, CROSSBARS = "compartments", "crossbars"
 """What cores are made of: lists of weighted synapses onto compartments (Loihi), or a binary crossbar (TrueNorth)."""
@@ -143,21 +146,22 @@ class Target:
 
 def read_target(path: str | os.PathLike[str]) -> Target:
     """Read a target file; OptionError if it cannot be read or an entry is wrong."""
-    raw = _toml(path, "a target file")
-    if missing := {"name", "title", "limits", "energy"} - raw.keys():
-        raise OptionError(f"{path}: {', '.join(sorted(missing))}: missing; give name, title, limits and energy")
-    cores = raw.get("cores", COMPARTMENTS)
-    energy, time = _cost_tables(path, raw, cores)
-    return Target(
-        name=raw["name"],
-        title=raw["title"],
-        cores=cores,
-        limits=_quantities(f"{path}: limits", raw["limits"]),
-        choices={rule: tuple(entry["values"]) for rule, entry in _entries(raw.get("choices", {}))},
-        energy=energy,
-        time=time,
-        static=_quantities(f"{path}: static", raw.get("static", {})),
-    )
+    with reading(path, OptionError, MEND):
+        raw = tomllib.loads(read_whole(Path(path), "target file").decode())
+        if missing := {"name", "title", "limits", "energy"} - raw.keys():
+            raise FileFault(f"{', '.join(sorted(missing))}: missing")
+        cores = raw.get("cores", COMPARTMENTS)
+        energy, time = _cost_tables(raw, cores)
+        return Target(
+            name=raw["name"],
+            title=raw["title"],
+            cores=cores,
+            limits=_quantities("limits", raw["limits"]),
+            choices={rule: tuple(entry["values"]) for rule, entry in _entries(raw.get("choices", {}))},
+            energy=energy,
+            time=time,
+            static=_quantities("static", raw.get("static", {})),
+        )
 
 
 def with_tables(target: Target, name: str) -> Target:
@@ -172,10 +176,11 @@ def with_tables(target: Target, name: str) -> Target:
         if not name.endswith(".toml"):
             names = sorted({table.name for table in target.energy} | {table.name for table in target.time})
             raise OptionError(f"--table {name}: unknown; allowed: {', '.join(names)}, or a file that ends in .toml")
-        raw = _toml(name, "a file of tables")
-        if not raw or raw.keys() - {"energy", "time"}:
-            raise OptionError(f"{name}: holds {', '.join(raw) or 'nothing'}; give [energy.NAME] or [time.NAME] alone")
-        energy, time = _cost_tables(name, raw, target.cores)
+        with reading(name, OptionError, MEND):
+            raw = tomllib.loads(read_whole(Path(name), "file of tables").decode())
+            if not raw or raw.keys() - {"energy", "time"}:
+                raise FileFault(f"holds {', '.join(raw) or 'nothing'}, wanted is [energy.NAME] or [time.NAME] alone")
+            energy, time = _cost_tables(raw, target.cores)
     return replace(target, energy=energy or target.energy, time=time or target.time)
 
 
@@ -209,15 +214,6 @@ def load_target(name: str, cores: str | None = None) -> Target:
     return found
 
 
-def _toml(path: str | os.PathLike[str], what: str) -> JsonObject:
-    try:
-        return tomllib.loads(Path(path).read_text("utf-8"))
-    except OSError as error:
-        raise OptionError(f"{path}: cannot be read ({error.strerror or error}); give {what}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise OptionError(f"{path}: is not TOML ({error}); mend it") from error
-
-
 def _entries(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """What is said of each dotted name."""
     for key, entry in table.items():
@@ -232,11 +228,11 @@ def _quantity(where: str, entry: Any, unit: str = "") -> Quantity:
     try:
         found = Quantity(**entry)
     except TypeError:
-        raise OptionError(f"{where}: is {entry!r}, not an entry of value, unit and source") from None
+        raise FileFault(f"{where}: is {entry!r}, not an entry of value, unit and source") from None
     if type(found.value) not in (int, float) or not 0 <= found.value < math.inf:
-        raise OptionError(f"{where}: value is {found.value!r}, a finite number from 0 is needed")
+        raise FileFault(f"{where}: value is {found.value!r}, a finite number from 0 is needed")
     if unit and found.unit != unit:
-        raise OptionError(f"{where}: unit is {found.unit!r}, allowed is {unit!r}")
+        raise FileFault(f"{where}: unit is {found.unit!r}, allowed is {unit!r}")
     return found
 
 
@@ -245,41 +241,37 @@ def _quantities(where: str, table: Mapping[str, Any], units: Mapping[str, str] |
     found = {}
     for name, entry in _entries(table):
         if units is not None and name not in units:
-            raise OptionError(f"{where}.{name}: unknown, allowed are {', '.join(units)}")
+            raise FileFault(f"{where}.{name}: unknown, allowed are {', '.join(units)}")
         found[name] = _quantity(f"{where}.{name}", entry, units[name] if units else "")
     return found
 
 
-def _cost_tables(
-    path: str | os.PathLike[str], raw: Mapping[str, Any], cores: str
-) -> tuple[tuple[EnergyTable, ...], tuple[TimeTable, ...]]:
+def _cost_tables(raw: Mapping[str, Any], cores: str) -> tuple[tuple[EnergyTable, ...], tuple[TimeTable, ...]]:
     """Energy tables and time tables of a file."""
     events = CROSSBAR_EVENTS if cores == CROSSBARS else EVENTS
     units = {event: POWER_UNIT if event == FLOOR else PRICE_UNIT for event in events}
     energy = [
         EnergyTable(name=name, title=title, prices=_quantities(where, table, units))
-        for name, where, title, table in _tables(path, raw, "energy")
+        for name, where, title, table in _tables(raw, "energy")
     ]
     time = []
-    for name, where, title, table in _tables(path, raw, "time"):
+    for name, where, title, table in _tables(raw, "time"):
         barriers = table.pop("barrier", {})
         latencies = _quantities(where, table, dict.fromkeys(LATENCIES, TIME_UNIT) | {LINK_BUFFER: ""})
         missing = [event for event in (*LATENCIES, LINK_BUFFER) if event not in latencies]
         if missing or not isinstance(barriers, dict) or "1" not in barriers or not all(map(str.isdecimal, barriers)):
             wanted = ", ".join(missing) or "barrier.1, and others with a number of tiles"
-            raise OptionError(f"{where}: lacks {wanted}; a time table is whole")
+            raise FileFault(f"{where}: lacks {wanted}, which a time table has")
         least = {int(tiles): _quantity(f"{where}.barrier.{tiles}", barriers[tiles], TIME_UNIT) for tiles in barriers}
         buffer = latencies.pop(LINK_BUFFER)
         time.append(TimeTable(name=name, title=title, latencies=latencies, barriers=least, link_buffer=buffer))
     return tuple(energy), tuple(time)
 
 
-def _tables(
-    path: str | os.PathLike[str], raw: Mapping[str, Any], kind: str
-) -> Iterator[tuple[str, str, str, JsonObject]]:
+def _tables(raw: Mapping[str, Any], kind: str) -> Iterator[tuple[str, str, str, JsonObject]]:
     """Name, place in the file, title and entries of each table of a kind."""
     sections = raw.get(kind, {})
     for name, table in sections.items() if isinstance(sections, dict) else [("NAME", None)]:
         if not isinstance(table, dict) or not isinstance(table.get("title"), str):
-            raise OptionError(f"{path}: {kind}.{name}: lacks its title; give title and entries")
-        yield name, f"{path}: {kind}.{name}", table["title"], {k: v for k, v in table.items() if k != "title"}
+            raise FileFault(f"{kind}.{name}: lacks its title")
+        yield name, f"{kind}.{name}", table["title"], {k: v for k, v in table.items() if k != "title"}

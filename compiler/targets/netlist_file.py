@@ -23,6 +23,7 @@ import numpy as np
 from spikeloom.compiler import archive, invariants
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import FormatError, VerifyError
+from spikeloom.compiler.files import FileFault, reading
 from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.targets.base import known_targets
@@ -30,11 +31,14 @@ from spikeloom.compiler.types import IntArray
 
 N = TypeVar("N")
 
+MOST = 2**20
+"""Input channels, classes, neurons of a layer: hundreds of times what a chip holds."""
+
 COMMON: dict[str, archive.Kind] = {
     "target": str,
     "provenance": dict,
     "clocks": archive.CLOCKS,
-    **dict.fromkeys(("taxels", "polarities", "classes"), (1, 2**31)),
+    **dict.fromkeys(("taxels", "polarities", "classes"), (1, MOST)),
 }
 """Entries of every manifest."""
 
@@ -130,24 +134,21 @@ class NetlistFile(Generic[N]):
     def read(self, path: str | os.PathLike[str]) -> N:
         """Read and check a netlist file.
 
-        FormatError if it is missing, truncated, altered, of another version or inconsistent; OSError if it cannot be
-        read.
+        FormatError if it is missing, unreadable, damaged, altered, of another version or inconsistent.
         """
         path = Path(path)
-        manifest, members = archive.read_archive(path, self.format, self.version, lambda _: self.arrays)
-        faults = archive.entry_faults(manifest, COMMON | self.entries)
-        faults += archive.array_faults(members, dict.fromkeys(self.tables, 2), self.floats)
-        if faults:
-            raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
-        if manifest["target"] not in (known := known_targets(self.cores)):
-            raise FormatError(
-                f"{path}: is for {manifest['target']!r}, this program knows {', '.join(known)}; update spikeloom"
-            )
-        values = {name: manifest[name] for name in COMMON | self.entries}
-        values |= {"clocks": Clocks(**values["clocks"]), "layers": tuple(map(self.layer, values["layers"]))}
-        netlist = self.netlist(**values, **{name: self._held(name, members[name]) for name in self.arrays})
-        if faults := self.inconsistencies(netlist):
-            raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
+        with reading(path, FormatError, "write it with spikeloom compile"):
+            kinds = COMMON | self.entries
+            manifest, members = archive.read_archive(path, self.format, self.version, kinds, lambda _: self.arrays)
+            if manifest["taxels"] * manifest["polarities"] > MOST:
+                raise FileFault(f"has more than {MOST} input channels")
+            archive.require_none(archive.array_faults(members, dict.fromkeys(self.tables, 2), self.floats))
+            if manifest["target"] not in (known := known_targets(self.cores)):
+                raise FileFault(f"is for {manifest['target'][:40]!r}, this program knows {', '.join(known)}")
+            values = {name: manifest[name] for name in kinds}
+            values |= {"clocks": Clocks(**values["clocks"]), "layers": tuple(map(self.layer, values["layers"]))}
+            netlist = self.netlist(**values, **{name: self._held(name, members[name]) for name in self.arrays})
+            archive.require_none(self.inconsistencies(netlist))
         return netlist
 
     def _held(self, name: str, array: archive.Array) -> archive.Array:

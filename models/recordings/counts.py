@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 
+from spikeloom.compiler.files import plain
+
 GAP_S = 0.5
 """A silence longer than this, between two events, counts as a gap; seconds."""
 
@@ -35,14 +37,14 @@ class EventCounts:
 def show_counts(source: str, counts: EventCounts | None) -> None:
     """Say on stderr what was counted and is worth a second look; the released layout has nothing to say."""
     if counts is not None:
-        sys.stderr.write(f"{source}: {counts}\n")
+        sys.stderr.write(plain(f"{source}: {counts}\n"))
         show_notes(counts)
 
 
 def show_notes(counts: EventCounts | None) -> None:
     """Say on stderr what is worth a second look."""
     if counts is not None:
-        sys.stderr.writelines(f"spikeloom: warning: {note}\n" for note in counts.notes)
+        sys.stderr.writelines(plain(f"spikeloom: warning: {note}\n") for note in counts.notes)
 
 
 def number(count: int, noun: str) -> str:

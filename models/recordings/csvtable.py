@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from spikeloom.compiler.errors import DataError
+from spikeloom.compiler.files import plain, read_whole, reading
 from spikeloom.compiler.types import FloatArray
 from spikeloom.models.recordings.counts import number
 
@@ -59,7 +60,8 @@ def read_table(
     if names and not any(map(_is_number, names)):
         if not (set(required) <= set(names) <= set(known) and len(set(names)) == len(names)):
             raise DataError(
-                f"{where}: line {lines[0]}: columns {', '.join(names)}, expected are {expected}; name them so"
+                f"{where}: line {lines[0]}: columns {plain(', '.join(names)[:99])}, expected are {expected}; "
+                "name them so"
             )
         del lines[0], rows[0]
     elif rows and not len(required) <= len(names) <= len(known):
@@ -82,17 +84,8 @@ def read_table(
 
 def read_text(path: Path, where: str) -> str:
     """A file of at most `MAX_TABLE_BYTES` as text, without a byte order mark; DataError if it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_TABLE_BYTES + 1)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror or error}); check the path and the disk") from error
-    if len(data) > MAX_TABLE_BYTES:
-        raise DataError(f"{where}: more than {MAX_TABLE_BYTES} bytes, the limit of a table; split it")
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{where}: not text in UTF-8 (byte {error.start}); save it as CSV") from error
+    with reading(where, DataError, "save it as CSV in UTF-8"):
+        return read_whole(path, "table", MAX_TABLE_BYTES).decode("utf-8-sig")
 
 
 def _rows(text: str, known: tuple[str, ...]) -> tuple[list[int], list[str]]:

@@ -7,9 +7,7 @@ contact).
 
 from __future__ import annotations
 
-import io
 import re
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -20,8 +18,9 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spikeloom.compiler.archive import arrays_digest
+from spikeloom.compiler.archive import arrays_digest, opened_zip, read_npy
 from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.files import reading
 from spikeloom.models.recordings.counts import EventCounts
 
 MAX_POLARITIES = 8
@@ -120,12 +119,10 @@ def opened(path: Path) -> Iterator[Members]:
         return
     if not path.is_file():
         raise DataError(f"{path}: no such folder or file; {_GIVE}")
-    try:
-        archive = zipfile.ZipFile(path)
-    except Exception as error:  # zipfile answers damage with errors of many kinds
-        raise DataError(f"{path}: neither a folder nor a whole zip ({error}); {_GIVE}, or copy it again") from error
-    with archive:
-        infos = [info for info in archive.infolist() if info.filename.endswith(".npy")]
+    with path.open("rb") as file:
+        with reading(path.name, DataError, f"{_GIVE}, or copy it again"):
+            archive = opened_zip(file)
+            infos = [info for info in archive.infolist() if info.filename.endswith(".npy")]
         require_memory(path.name, sum(info.file_size for info in infos))  # no more than that is ever decompressed
         yield {info.filename: partial(archive.open, info) for info in infos}
 
@@ -159,18 +156,12 @@ def label_in_name(name: str) -> int:
 
 def parse_npy(where: str, opener: Callable[[], IO[Any]]) -> NDArray[Any]:
     """Numbers or truth values of an npy file of at most `MAX_FILE_BYTES`; DataError if it is none."""
-    try:
+    with reading(where, DataError, "copy or download it again"):
         with opener() as file:
             data = file.read(MAX_FILE_BYTES + 1)
-    except Exception as error:  # zipfile answers damage with errors of many kinds
-        reason = getattr(error, "strerror", None) or error
-        raise DataError(f"{where}: cannot be read ({reason}); copy or download it again") from error
-    if len(data) > MAX_FILE_BYTES:
-        raise DataError(f"{where}: more than {MAX_FILE_BYTES} bytes, the limit of a recording; split it")
-    try:
-        values: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-    except Exception as error:  # numpy answers a damaged header with errors of many kinds
-        raise DataError(f"{where}: not an npy file of numbers, or a damaged one; copy it again") from error
+        if len(data) > MAX_FILE_BYTES:
+            raise DataError(f"more than {MAX_FILE_BYTES} bytes, the limit of a recording; split it")
+        values: NDArray[Any] = read_npy(data)
     if values.dtype.kind not in "biuf":
         raise DataError(f"{where}: dtype {values.dtype.str!r}, allowed are numbers; convert it")
     return values

@@ -61,7 +61,7 @@ def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings]) -
 
 
 def _members(splits: Sequence[Recordings]) -> Iterator[tuple[str, bytes]]:
-    """Name and content of every file."""
+    """Name and content of every file; in the table nothing begins as a formula."""
     for recordings in splits:
         for index, events in enumerate(recordings.events):
             yield f"{recordings.split}/{_name(recordings, index)}", npy_bytes(events.astype(np.float32))
@@ -70,7 +70,8 @@ def _members(splits: Sequence[Recordings]) -> Iterator[tuple[str, bytes]]:
     writer.writerow(["split", "file", "source"])
     for recordings in splits:
         for index, file in enumerate(recordings.files):
-            writer.writerow([recordings.split, _name(recordings, index), file])
+            safe = f"'{file}" if file[:1] in "=+-@\t\r" else file
+            writer.writerow([recordings.split, _name(recordings, index), safe])
     yield SOURCES, text.getvalue().encode()
 
 

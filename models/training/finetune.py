@@ -140,8 +140,7 @@ def finetune(
         optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE, amsgrad=True)
         _, before = evaluate(model, test)
         if resume and state is not None and state.exists():
-            epochs_before, _ = restore(state, options, model, optimizer, order)
-            history = [TunedEpoch(**epoch) for epoch in epochs_before]
+            history, _ = restore(state, options, model, optimizer, order, TunedEpoch)
             model.round()
         with tqdm(total=epochs, initial=len(history), desc="finetune", unit="epoch", disable=None) as bar:
             for index in range(len(history), epochs):

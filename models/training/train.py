@@ -124,8 +124,12 @@ def train(
         network = architecture.network(propagation, seed=seed, surrogate=recipe.surrogate)
         optimizer = _optimizer_of(recipe, network)
         if resume and state is not None and state.exists():
-            epochs_before, weights = restore(state, options, network, optimizer, order)
-            history = [Epoch(**epoch) for epoch in epochs_before]
+            start = network.export_weights()
+            first = {"best": 1, "kept": epochs + 1 if keep_epoch is None else keep_epoch}
+            history, weights = restore(
+                *(state, options, network, optimizer, order, Epoch),
+                keeps=lambda done: {which: start for which, epoch in first.items() if epoch <= done},
+            )
         bar = tqdm(total=epochs, initial=len(history), desc=label, unit="epoch", position=position, disable=None)
         with bar as progress:
             for index in range(len(history), epochs):

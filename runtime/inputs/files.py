@@ -92,6 +92,8 @@ def require_inspectable(path: str) -> None:
     if Path(path).is_dir():
         raise OptionError(f"{path}: is a folder, not a netlist or a checkpoint; {_RECORDINGS}")
     try:
+        if not Path(path).is_file():  # a pipe would wait for ever
+            return
         with zipfile.ZipFile(path) as archive:
             names = {Path(name) for name in archive.namelist()}
     except (zipfile.BadZipFile, OSError, ValueError):

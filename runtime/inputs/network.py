@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,7 +27,7 @@ from spikeloom.models.sensors import read_layout, sensor_graph
 from spikeloom.models.systems import NO_GRAPH, propagation_of
 from spikeloom.runtime.inputs.files import is_recordings, shipped
 from spikeloom.runtime.inputs.repeat import NETWORK, refuse
-from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.console import progress, tell
 
 NETWORKS = {ONNX: "ONNX", NIR: "NIR", COUNTERS: "counting"}
 """Networks that a file holds whole, by its ending, or by what it says of itself."""
@@ -200,7 +199,7 @@ def load_graph(arguments: argparse.Namespace, system: str = TACTILESGNET) -> Gra
         graph=arguments.graph, taxels=arguments.taxels, edges=arguments.edges, directed=arguments.directed
     )
     if warning is not None:
-        sys.stderr.write(f"spikeloom: warning: {warning}\n")
+        tell(f"warning: {warning}")
     return graph
 
 

@@ -5,14 +5,13 @@ A command names each part as it begins; what is known about parts stands here, o
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import Machine
-from spikeloom.runtime.report.console import Progress, progress
+from spikeloom.runtime.report.console import Progress, progress, tell
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 
 CHIP = "chip integers"
@@ -119,7 +118,7 @@ class Account:
         self.begin(self._now)
         parts = tuple(self._part(name, seconds) for name, seconds in self._seconds.items())
         progress("")
-        sys.stderr.writelines(f"spikeloom: {part}\n" for part in parts)
+        tell("\n".join(map(str, parts)))
         return parts
 
     def _part(self, name: str, seconds: float) -> Part:

@@ -6,12 +6,19 @@ import os
 import sys
 import time
 
+from spikeloom.compiler.files import plain
+
 
 def progress(label: str) -> None:
     """Say on a terminal what is being done; an empty label wipes the line."""
     if sys.stderr.isatty():
-        sys.stderr.write(f"\r\x1b[K{label} …" if label else "\r\x1b[K")
+        sys.stderr.write(f"\r\x1b[K{plain(label)} …" if label else "\r\x1b[K")
         sys.stderr.flush()
+
+
+def tell(text: str) -> None:
+    """Say something to people, line by line on standard error."""
+    sys.stderr.writelines(f"spikeloom: {line}\n" for line in plain(text).splitlines())
 
 
 class Progress:
@@ -31,12 +38,12 @@ class Progress:
 def show(text: str) -> None:
     """Write a result to standard output; a reader that goes away early (``| head``) is no mistake.
 
-    Letters that the terminal's encoding lacks become question marks. Raises OSError if the output cannot take the text,
-    for example on a full disk.
+    Control characters are escaped, letters that the terminal's encoding lacks become question marks. Raises OSError if
+    the output cannot take the text, for example on a full disk.
     """
     encoding = sys.stdout.encoding or "utf-8"
     try:
-        sys.stdout.write(text.encode(encoding, "replace").decode(encoding) + "\n")
+        sys.stdout.write(plain(text).encode(encoding, "replace").decode(encoding) + "\n")
         sys.stdout.flush()
     except OSError as error:
         # Python flushes again when it ends, and would complain again: let that go nowhere.

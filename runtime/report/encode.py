@@ -14,7 +14,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.files import write_atomically
+from spikeloom.compiler.files import read_whole, reading, write_atomically
 
 Result = TypeVar("Result")
 
@@ -70,19 +70,42 @@ def encode(value: Any) -> Any:
     return entries | {name: encode(getattr(value, name)) for name in getattr(value, "json_properties", ())}
 
 
-def decode(kind: type[Result], value: Any) -> Result:
-    """A dataclass from what :func:`encode` made of it; keys without a field are passed over.
+def decode(kind: Any, value: Any) -> Any:  # noqa: PLR0911 - one for each kind
+    """A value of a type hint from what :func:`encode` made of it; keys without a field are passed over.
 
-    Fields hold dataclasses, tuples, sequences, mappings, plain values, or one of these or None. Raises TypeError,
+    Hints are dataclasses, tuples, sequences, mappings, plain types, one of these or None, or Any. Raises TypeError,
     ValueError or KeyError if the value is not of this kind, for instance since another version wrote it.
     """
-    if not isinstance(value, Mapping):
-        raise TypeError(f"{type(value).__name__}: is no {kind.__name__}")
+    origin, inner = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return value
+    if origin in (Union, UnionType):
+        one = type(value) if type(value) in inner else next(each for each in inner if each is not NoneType)
+        return None if one is NoneType else decode(one, value)
+    if is_dataclass(kind):
+        return _dataclass(kind, value)
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return {inner[0](name): decode(inner[1], each) for name, each in _plain(dict, value).items()}
+    if isinstance(origin, type) and issubclass(origin, Sequence):
+        kinds = inner[:1] * len(_plain(list, value)) if origin is not tuple or inner[-1] is Ellipsis else inner
+        return tuple(decode(each, part) for each, part in zip(kinds, value, strict=True))
+    if kind is float and type(value) in (int, float) and math.isfinite(number := float(value)):
+        return number
+    return _plain(kind, value)
+
+
+def _plain(kind: Any, value: Any) -> Any:
+    if type(value) is not kind:
+        raise TypeError(f"{value!r} is no {kind.__name__}")
+    return value
+
+
+def _dataclass(kind: Any, value: Any) -> Any:
     entries, hints = {}, get_type_hints(kind)
-    for field in fields(kind):  # type: ignore[arg-type]
+    for field in fields(kind):
         name = field.metadata.get("key", field.name)
-        if name in value:
-            entries[field.name] = _decoded(hints[field.name], value[name])
+        if name in _plain(dict, value):
+            entries[field.name] = decode(hints[field.name], value[name])
         elif field.default is MISSING and field.default_factory is MISSING:
             raise KeyError(name)
     return kind(**entries)
@@ -100,28 +123,6 @@ def read_json(kind: type[Result], path: Path, option: str, command: str) -> Resu
 
     Raises DataError if it is not there, something else, or of another version.
     """
-    if not path.is_file():
-        raise DataError(f"{option} {path}: no such file; write it with {command}")
-    try:
-        return decode(kind, json.loads(path.read_bytes()))
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise DataError(f"{option} {path}: is not what {command} writes; give such a file") from error
-
-
-def _decoded(kind: Any, value: Any) -> Any:
-    origin, inner = get_origin(kind), get_args(kind)
-    if origin in (Union, UnionType):
-        known = value is None or type(value) in inner
-        return value if known else _decoded(next(each for each in inner if each is not NoneType), value)
-    if is_dataclass(kind):
-        return decode(kind, value)  # type: ignore[arg-type]
-    if isinstance(origin, type) and issubclass(origin, Mapping):
-        return {inner[0](name): _decoded(inner[1], each) for name, each in value.items()}
-    if isinstance(origin, type) and issubclass(origin, Sequence):
-        kinds = inner[:1] * len(value) if origin is not tuple or inner[-1] is Ellipsis else inner
-        return tuple(_decoded(each, part) for each, part in zip(kinds, value, strict=True))
-    if kind is float and isinstance(value, int):
-        return float(value)
-    if isinstance(kind, type) and not isinstance(value, kind):
-        raise TypeError(f"{value!r}: is no {kind.__name__}")
-    return value
+    with reading(f"{option} {path}", DataError, f"write it with {command}"):
+        found: Result = decode(kind, json.loads(read_whole(path, "result")))
+    return found

@@ -17,19 +17,26 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, partial
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
 
 from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, UnfinishedError
-from spikeloom.compiler.types import JsonObject
-from spikeloom.runtime.report.console import Progress
+from spikeloom.compiler.files import FileFault, reading, remove_leftovers
+from spikeloom.models.recordings.counts import number
+from spikeloom.runtime.report.console import Progress, progress, tell
+from spikeloom.runtime.report.encode import decode
 
 APayload = TypeVar("APayload")
 AResult = TypeVar("AResult")
 AJob = TypeVar("AJob", bound="Job")
+
+
+STILL_S = 120.0
+"""For so long processes may use no processor before they are given up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,20 +69,30 @@ def sweep(
     jobs: int | None = None,
     fresh: bool = False,
     label: str,
-) -> JsonObject:
-    """Measure jobs, as far as the store does not know them; their results by key, as JSON gives them back.
+    kind: Any = Any,
+    own: Sequence[Path] = (),
+) -> dict[str, Any]:
+    """Measure jobs, as far as the store does not know them; their results by key, of a `kind` that is decoded.
 
     They are begun in this order; of those with equal keys the first is measured. `measure` makes JSON values of a job,
     a function of a module, since it crosses process borders. `store` is an SQLite file in a folder that exists; with
     `fresh` what it holds is forgotten. `jobs` are processes at a time (one a core), whose libraries use one thread
-    each; `label` says what is done.
+    each; `label` says what is done; half-written files are
+    removed from folders that are its `own`.
 
     What a measurement raises is raised with notes that name it and say what is kept, as does the text of a
     KeyboardInterrupt; UnfinishedError, if a process died.
     """
     keys = list(dict.fromkeys(point.key for point in points))
     with only_one(store), closing(_opened(store, fresh=fresh)) as kept:
-        results = {key: json.loads(result) for key, result in kept.execute("SELECT key, result FROM results")}
+        for folder in own:
+            remove_leftovers(folder)
+        with reading(store, DataError, "give another output, or delete it"):
+            kept.execute("CREATE TABLE IF NOT EXISTS results (key TEXT PRIMARY KEY, result TEXT)")
+            if (said := kept.execute("PRAGMA quick_check").fetchone()) != ("ok",):
+                raise FileFault(f"is damaged ({said})")
+            rows = dict(kept.execute("SELECT key, result FROM results"))
+            results = {key: decode(kind, _unsealed(key, rows[key])) for key in keys if key in rows}
         first = {point.key: point for point in reversed(points)}
         waiting = [first[key] for key in keys if key not in results]
 
@@ -87,10 +104,10 @@ def sweep(
             try:
                 progress(0, label)
                 for done, (index, found) in enumerate(side_by_side(waiting, partial(_named, measure), jobs=jobs), 1):
-                    text = json.dumps(found, allow_nan=False)
+                    key, text = waiting[index].key, json.dumps(found, allow_nan=False)
                     with kept:
-                        kept.execute("INSERT INTO results VALUES (?, ?)", (waiting[index].key, text))
-                    results[waiting[index].key] = json.loads(text)
+                        kept.execute("INSERT INTO results VALUES (?, ?)", (key, sealed(key, text)))
+                    results[key] = decode(kind, json.loads(text))
                     progress(done, label)
             except KeyboardInterrupt as interrupt:
                 raise KeyboardInterrupt(f"{standing()}; go on with the same command") from interrupt
@@ -115,13 +132,22 @@ def _opened(store: Path, *, fresh: bool) -> sqlite3.Connection:
     """A store, made where there is none."""
     if fresh:
         store.unlink(missing_ok=True)
-    database = sqlite3.connect(store)
-    try:
-        database.execute("CREATE TABLE IF NOT EXISTS results (key TEXT PRIMARY KEY, result TEXT)")
-    except sqlite3.Error as error:
-        database.close()
-        raise DataError(f"{store}: is no store of results ({error}); give another output, or delete it") from error
-    return database
+    if store.exists() and not store.is_file():
+        raise DataError(f"{store}: is not a file; give another output")
+    return sqlite3.connect(store)
+
+
+def sealed(key: str, text: str) -> str:
+    """A result as a store holds it: with a hash, for SQLite has none."""
+    return f"{content_key({key: text})} {text}"
+
+
+def _unsealed(key: str, row: str) -> Any:
+    """A result from a store; FileFault if it was altered."""
+    text = row.partition(" ")[2]
+    if sealed(key, text) != row:
+        raise FileFault(f"its result {key} does not match its hash, so it was altered")
+    return json.loads(text)
 
 
 def side_by_side(
@@ -130,7 +156,8 @@ def side_by_side(
     """Work on payloads, begun in this order, in processes of their own in this folder; on a single one here.
 
     Yields the place of a payload and what `run`, a function of a module, made of it, as they come. Raises what `run`
-    raised; UnfinishedError, if a process ended while it worked, and with it what the others had not finished.
+    raised; UnfinishedError, if a process ended while it worked, and with it what the others had not finished. If all
+    stand still what they had not finished is begun once more.
     """
     if jobs is not None and jobs < 1:
         raise OptionError(f"--jobs {jobs}: allowed are 1 or more; choose another")
@@ -140,16 +167,52 @@ def side_by_side(
             yield from ((index, run(payload)) for index, payload in enumerate(payloads))
         return
     from joblib import Parallel, delayed, parallel_config
+    from joblib.externals.loky.backend import resource_tracker as trackers_of_joblib
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    attempt = delayed(partial(_in_child, os.getpid(), Path.cwd(), run))
+    for tracker in (resource_tracker, trackers_of_joblib):
+        tracker.ensure_running()  # which makes later processes hear signals, so it comes first
+    attempt, left, stood = delayed(partial(_in_child, os.getpid(), Path.cwd(), run)), dict(enumerate(payloads)), False
     with parallel_config("loky", n_jobs=processes, inner_max_num_threads=1), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "A worker stopped")  # one that has grown is replaced, and nothing lost
-        work = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
-        try:
-            yield from work(attempt(index, payload) for index, payload in enumerate(payloads))
-        except TerminatedWorkerError as error:
-            raise UnfinishedError("a process ended early, perhaps for lack of memory; use fewer --jobs") from error
+        while left:
+            ended = threading.Event()
+            watch = threading.Thread(target=_killed_when_still, args=[ended], daemon=True)
+            watch.start()
+            work = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # of new processes, until they work
+            try:
+                found = work(attempt(index, payload) for index, payload in left.items())
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+                for index, result in found:
+                    yield index, result
+                    del left[index]
+            except TerminatedWorkerError as error:
+                if stood or watch.is_alive():
+                    why = f"a process {'stood still twice' if stood else 'ended early'}, perhaps for lack of memory"
+                    raise UnfinishedError(f"{why}; use fewer --jobs") from error
+                stood = True
+                progress("")
+                tell(f"{number(len(left), 'point')} stood still for {STILL_S:g} s: given up, and begun once more")
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+                ended.set()
+
+
+def _killed_when_still(ended: threading.Event) -> None:
+    """Kill joblib's processes once none has used its processor for `STILL_S`, as after a stop signal; needs /proc."""
+    used: dict[int, list[str]] = {}
+    while not ended.wait(STILL_S):
+        before, used = used, {}
+        with suppress(OSError):  # of a process that has ended
+            for children in Path(f"/proc/{os.getpid()}/task").glob("*/children"):
+                for child in children.read_text().split():
+                    if b"popen_loky" in Path(f"/proc/{child}/cmdline").read_bytes():
+                        used[int(child)] = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[11:13]
+            if used and used == before:
+                for process in used:
+                    os.kill(process, signal.SIGKILL)
+                return
 
 
 @contextmanager
@@ -172,12 +235,17 @@ def _in_child(
     """Work on a payload in a process that does not outlive the one that started it, even where that is killed."""
     _end_with(parent)
     os.chdir(folder)  # the process may be left from earlier work in another one
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # forgets what came before the work
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         return index, run(payload)
     except KeyboardInterrupt:
         if os.getppid() != parent:  # tidy by now, and nobody waits for a result
             os._exit(1)
         raise
+    finally:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
 @cache
@@ -191,7 +259,6 @@ def _end_with(parent: int) -> None:
         time.sleep(20)
         os._exit(1)  # whatever it was that did not let itself be interrupted
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     threading.Thread(target=watch, daemon=True).start()
 
 

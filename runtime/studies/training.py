@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import statistics
-import sys
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
@@ -21,6 +20,7 @@ from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.models.training.kinds import Plan, kind_of, seen_by
 from spikeloom.models.training.recipes import MSE, RELEASED
 from spikeloom.models.training.record import Reached, TrainingRecord
+from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.drawing import COLOURS, Drawing, sheet, styled
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.sections import Section, Table, Text
@@ -182,9 +182,9 @@ def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
         for job in jobs:
             clear(job)
             if job in results:
-                sys.stderr.write(f"spikeloom: {job.output}: is finished, not trained again\n")
+                tell(f"{job.output}: is finished, not trained again")
             elif resume and not states(job):
-                sys.stderr.write(f"spikeloom: {job.output}: was not begun, trained from the start\n")
+                tell(f"{job.output}: was not begun, trained from the start")
         waiting = [job for job in jobs if job not in results]
         try:
             with ended_by_signal():

@@ -22,6 +22,7 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.files import reading
 from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, kept_shares
 from spikeloom.compiler.formats.affine import convolution
 from spikeloom.compiler.formats.assemble import ReadNetwork
@@ -102,7 +103,7 @@ def read_netx(
     Raises ModelError if the file cannot be read, or holds what the chip's neurons here do not do, naming the layer;
     OptionError if there are no such polarities.
     """
-    with named(path):
+    with reading(path, ModelError, AGAIN):
         tree, sha256 = read_hdf5(Path(path), "netx file")
         network, facts = integers_of(tree, polarities, polarities_first)
     return ReadNetwork(network=network, facts=tuple(facts), sha256=sha256)

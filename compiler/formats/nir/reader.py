@@ -13,10 +13,11 @@ from scipy import sparse
 
 from spikeloom.compiler.dynamics import MOST_STEPS, RELAY_WEIGHT, Clocks
 from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.files import reading
 from spikeloom.compiler.fixedpoint import decay_registers, kept_shares
 from spikeloom.compiler.formats.affine import scaled, shifted
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble, by_depth, class_of_each
-from spikeloom.compiler.formats.hdf5 import read_hdf5
+from spikeloom.compiler.formats.hdf5 import AGAIN, read_hdf5
 from spikeloom.compiler.formats.names import named, printable, unique_names
 from spikeloom.compiler.formats.nir import CONVENTIONS
 from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, graph_of, loops, only
@@ -63,7 +64,7 @@ def read_nir(
     Raises ModelError if the file cannot be read, or holds something else than a network that spikes, feed-forward but
     for recurrent layers, naming the node; OptionError if there is no time step, or an option has no such value.
     """
-    with named(path):
+    with reading(path, ModelError, AGAIN):
         graph = graph_of(*read_hdf5(Path(path), "NIR file"))
         dt = stated_step(graph) if dt is None else dt
         if dt is None:

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.files import read_whole, require_size
-from spikeloom.compiler.formats.names import named, one_line, printable
+from spikeloom.compiler.files import FileFault, read_whole, require_size
+from spikeloom.compiler.formats.names import named, printable
 
 Array = npt.NDArray[Any]
 """float64, int64 or bool."""
@@ -94,15 +94,11 @@ def read_graph(path: Path) -> Graph:
     Raises ModelError if it is no ONNX file, or names, sizes, types or places in it cannot be right; the message lacks
     the path.
     """
-    from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
     from onnx import ModelProto
 
-    content = read_whole(path, "network", "give a file of torch.onnx.export")
+    content = read_whole(path, "network")
     proto = ModelProto()
-    try:
-        proto.ParseFromString(content)
-    except (DecodeError, ValueError) as error:
-        raise ModelError(f"is not an ONNX file, or {DAMAGED}") from error
+    proto.ParseFromString(content)
     if not proto.HasField("graph"):
         raise ModelError("holds no graph, so it is not an ONNX file; give a file of torch.onnx.export")
     versions = [entry.version for entry in proto.opset_import if _text(entry.domain) in ("", "ai.onnx")]
@@ -140,17 +136,12 @@ def _bring_data(graph: Any, folder: Path, digest: Any) -> None:
         if tensor.data_location != tensor.EXTERNAL:
             continue
         location = next((entry.value for entry in tensor.external_data if entry.key == "location"), "")
-        try:
-            total += (folder / _text(location)).stat().st_size
-            require_size(total, "network", "export a smaller one")
+        with named(f"tensor {printable(_text(tensor.name))} in {printable(_text(location))!r} beside the file"):
+            if not (place := folder / _text(location)).is_file():  # onnx would wait for a pipe
+                raise FileFault("no such file")
+            total += place.stat().st_size
+            require_size(total, "network")
             load_external_data_for_tensor(tensor, str(folder))
-        except ModelError:
-            raise
-        except Exception as error:  # nearly anything, as of the checker
-            raise ModelError(
-                f"tensor {printable(_text(tensor.name))}: its data in {printable(_text(location))!r} beside the file "
-                f"cannot be had ({one_line(error)}); copy both files again"
-            ) from error
         digest.update(tensor.raw_data)
 
 
@@ -160,10 +151,7 @@ def _check(proto: Any) -> None:
 
     for output in proto.graph.output:  # their shapes may be unknown
         output.type.tensor_type.shape.SetInParent()
-    try:
-        checker.check_model(proto)
-    except Exception as error:
-        raise ModelError(f"is no graph as ONNX defines it ({one_line(error)}); export it again") from error
+    checker.check_model(proto)
 
 
 def _declared(proto: Any) -> Declared:
@@ -217,10 +205,8 @@ def _array(proto: Any) -> Array:
     from onnx import numpy_helper
 
     what = f"tensor {printable(_text(proto.name)) or '(no name)'}"
-    try:
+    with named(what):
         array = numpy_helper.to_array(proto)
-    except Exception as error:  # nearly anything, as of the checker
-        raise ModelError(f"{what}: cannot be read ({one_line(error)}); {DAMAGED}") from error
     if array.dtype.kind not in "bfiu":
         raise ModelError(f"{what}: has element type {proto.data_type}, allowed are numbers and truth values; {DAMAGED}")
     if array.dtype.kind == "f":

@@ -16,7 +16,7 @@ from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.affine import Affine, added, diagonal, picked_of_all, scaled, shifted, spread, through
-from spikeloom.compiler.formats.names import one_line, printable
+from spikeloom.compiler.formats.names import named, printable
 from spikeloom.compiler.formats.onnx.atoms import (
     INPUT_ATOM,
     MEMBRANE,
@@ -51,14 +51,10 @@ def run(graph: Graph, given: Mapping[str, Value], table: Table) -> list[Value]:
     held = membranes(order, graph.outputs, set(given))
     last = {name: index for index, node in enumerate(order) for name in reads(node)}
     for index, node in enumerate(order):
-        try:
+        with named(node):
             results = apply(node, table, [values[name] if name else None for name in node.inputs])
             for name, result in zip(node.outputs, results, strict=False):
                 values[name] = _set_apart(node, name, result, table) if name in held else result
-        except ModelError as error:
-            raise ModelError(f"{node}: {error}") from error
-        except Exception as error:  # onnx, numpy and scipy raise nearly anything on operands that do not fit each other
-            raise ModelError(f"{node}: cannot be evaluated ({one_line(error)}); export it again") from error
         for name in reads(node):
             if last[name] == index and name not in graph.outputs:
                 values.pop(name, None)

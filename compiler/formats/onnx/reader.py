@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.files import reading
 from spikeloom.compiler.formats.affine import Affine
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble
-from spikeloom.compiler.formats.names import named, printable, unique_names
+from spikeloom.compiler.formats.names import printable, unique_names
 from spikeloom.compiler.formats.onnx.atoms import INPUT_ATOM, Table, as_affine, require_finite
 from spikeloom.compiler.formats.onnx.file import BOOL, DOUBLE, Declared, Graph, read_graph
 from spikeloom.compiler.formats.onnx.lif import Neurons, Unrolled, group, is_output, neurons_of, readout
@@ -38,7 +39,7 @@ def read_onnx(
     integrate-and-fire neurons with affine stages, naming the operator; OptionError if there are no such polarities.
     """
     # A constant may divide by zero on its way, as degrees of lonely taxels do; what counts is checked at the end.
-    with named(path), np.errstate(all="ignore"):
+    with reading(path, ModelError, "export it again"), np.errstate(all="ignore"):
         return _network(read_graph(Path(path)), polarities, polarities_first)
 
 

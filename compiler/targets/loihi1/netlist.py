@@ -35,7 +35,7 @@ from spikeloom.compiler.dynamics import MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, in_units, largest_current
 from spikeloom.compiler.targets import netlist_file
 from spikeloom.compiler.targets.base import COMPARTMENTS
-from spikeloom.compiler.targets.netlist_file import NetlistFile, column_faults, is_outside, part_of
+from spikeloom.compiler.targets.netlist_file import MOST, NetlistFile, column_faults, is_outside, part_of
 from spikeloom.compiler.types import FloatArray, IntArray
 
 PER_COMPARTMENT = (
@@ -204,8 +204,10 @@ def reach(netlist: Netlist) -> Reach:
 
 LAYER: Kind = {
     "name": str,
-    "unread": [(0, 2**31)],
-    **dict.fromkeys(("neurons", "depth", "weight_bits", "synapses", "max_fan_in"), (0, 2**62)),
+    "unread": [(0, MOST)],
+    **dict.fromkeys(("neurons", "depth", "max_fan_in"), (0, MOST)),
+    "weight_bits": (1, 8),
+    "synapses": (0, MOST**2),
     **dict.fromkeys(("beta", "theta", "alpha"), float),
 }
 """Entries of :class:`Layer` in a file."""
@@ -236,7 +238,7 @@ def inconsistencies(netlist: Netlist) -> list[str]:
         "format_weight_bits": (1, 9),
         "format_exponent": (-1, 8),
         "format_index_bits": (0, 13),
-        "core_tile": (0, 2**31),
+        "core_tile": (0, 2**16),
     }
     if found := column_faults(netlist, bounds, lengths, ranges):
         return found
@@ -246,6 +248,8 @@ def inconsistencies(netlist: Netlist) -> list[str]:
     if is_outside(netlist.synapse_target, 0, 2**31) or np.any(netlist.synapse_target >= on_core):
         found.append("synapse_target points beyond its core")
     for index, layer in enumerate(netlist.layers):
+        if layer.depth >= len(netlist.layers):
+            found.append(f"layer {layer.name} lags {layer.depth} steps behind, with {len(netlist.layers)} layers")
         neurons = np.sort(netlist.neuron[netlist.layer == index])
         if np.intersect1d(neurons, layer.unread).size or max(layer.unread, default=0) >= layer.neurons:
             found.append(f"layer {layer.name} holds neurons that it leaves out, or leaves out some that are not there")

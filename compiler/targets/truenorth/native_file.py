@@ -19,13 +19,14 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.archive import (
+    AGAIN,
     CLOCKS,
     GRAPH,
     TRAINED,
     Kind,
     archive_bytes,
     array_faults,
-    read_trained_archive,
+    read_archive,
     require_none,
     stated,
     write_archive,
@@ -33,7 +34,7 @@ from spikeloom.compiler.archive import (
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.files import sha256_of
+from spikeloom.compiler.files import reading, sha256_of
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.truenorth.native import NativeNetwork, Stage, faults
 from spikeloom.compiler.types import IntArray
@@ -119,28 +120,29 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
         members = product(manifest["weights"], manifest["layers"], PARTS)
         return [f"{which}/0/{layer}/{part}" for which, layer, part in members]
 
-    manifest, members = read_trained_archive(path, TRAINED, VERSION, KINDS, names)
-    sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
-    chosen = sets[0] if weights is None else weights
-    if chosen not in sets:
-        raise ModelError(f"{path}: --weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
-    stages: dict[str, dict[str, Any]] = {
-        layer: {part: members[f"{chosen}/0/{layer}/{part}"] for part in PARTS} for layer in manifest["layers"]
-    }
-    require_none(path, (f"{name}: {fault}" for name, parts in stages.items() for fault in array_faults(parts, PARTS)))
-    network = NativeNetwork(
-        **{name: manifest[name] for name in ("taxels", "polarities", "classes", "copies")},
-        clocks=Clocks(**manifest["clocks"]),
-        stages=tuple(
-            Stage(name=layer, **{part: read_only(array.astype(np.int64)) for part, array in parts.items()})
-            for layer, parts in stages.items()
-        ),
-    )
-    wrong = faults(network)
-    edges = np.array(manifest["graph"]["edges"], np.int64).reshape(-1, 2)
-    if edges.max(initial=0) >= network.taxels:
-        wrong.append(f"the graph joins taxels outside 0..{network.taxels - 1}")
-    require_none(path, wrong)
+    with reading(path, ModelError, AGAIN):
+        manifest, members = read_archive(path, TRAINED, VERSION, KINDS, names)
+        sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
+        chosen = sets[0] if weights is None else weights
+        if chosen not in sets:
+            raise ModelError(f"--weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
+        stages: dict[str, dict[str, Any]] = {
+            layer: {part: members[f"{chosen}/0/{layer}/{part}"] for part in PARTS} for layer in manifest["layers"]
+        }
+        require_none(f"{name}: {fault}" for name, parts in stages.items() for fault in array_faults(parts, PARTS))
+        network = NativeNetwork(
+            **{name: manifest[name] for name in ("taxels", "polarities", "classes", "copies")},
+            clocks=Clocks(**manifest["clocks"]),
+            stages=tuple(
+                Stage(name=layer, **{part: read_only(array.astype(np.int64)) for part, array in parts.items()})
+                for layer, parts in stages.items()
+            ),
+        )
+        wrong = faults(network)
+        edges = np.array(manifest["graph"]["edges"], np.int64).reshape(-1, 2)
+        if edges.max(initial=0) >= network.taxels:
+            wrong.append(f"the graph joins taxels outside 0..{network.taxels - 1}")
+        require_none(wrong)
     return Trained(
         network=network,
         weights=chosen,

@@ -7,7 +7,6 @@ float32, as the model was trained.
 from __future__ import annotations
 
 import argparse
-import sys
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.interpret import channels_last
@@ -20,6 +19,7 @@ from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
 from spikeloom.runtime.machines.base import machine_for
 from spikeloom.runtime.machines.integer import integer_machine
+from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.sections import Outcome
 
 NOTES = """\
@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, loaded.model)
     if (difference := loaded.differs_from(netlist.provenance, arguments.run)) is not None:
-        sys.stderr.write(f"spikeloom: warning: {arguments.netlist}: {difference}\n")
+        tell(f"warning: {arguments.netlist}: {difference}")
     if arguments.limit is None and arguments.sample is None:
         arguments.limit = LIMIT
     data = load_recordings(arguments, netlist)

@@ -21,7 +21,8 @@ from spikeloom.runtime.page.results import Decisions, Report, provenance, taxels
 from spikeloom.runtime.page.sections import about, sections
 from spikeloom.runtime.report import html
 from spikeloom.runtime.report.sections import Outcome, Section, Text
-from spikeloom.runtime.studies.stress.results import Stress, read_stress
+from spikeloom.runtime.studies.stress.results import Stress
+from spikeloom.runtime.studies.stress.sections import read_stress
 
 NOTES = """\
 The page opens from disk and loads nothing; its figures are inline SVG, each with its numbers as a table. What is

@@ -6,7 +6,7 @@ split: they describe.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ from typing import Any
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
-from spikeloom.runtime.report.encode import decode
 from spikeloom.runtime.studies.chart import work
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile
@@ -53,12 +52,13 @@ def chart(
         for network in networks
         for storage in network.storages(grid)
     ]
-    found = sweep(works, work.measure, folder / STORE, jobs=jobs, fresh=fresh, label="measuring")
+    kind = Mapping[str, work.Built]
+    own = (folder, folder / "netlists")
+    found = sweep(works, work.measure, folder / STORE, jobs=jobs, fresh=fresh, label="measuring", kind=kind, own=own)
     points: list[Point] = []
     refused: list[Refused] = []
     for each in works:
-        for layout, measured in found[each.key].items():
-            built = decode(work.Built, measured)
+        for layout, built in found[each.key].items():
             axes: dict[str, Any] = {"network": each.network.name, "stored": each.storage, "cores": layout}
             if built.refused:
                 refused.append(Refused(**axes, why=built.refused))

@@ -22,7 +22,6 @@ from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.report.console import progress
-from spikeloom.runtime.report.encode import decode
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.chart.results import ChosenBy, Data, share
 from spikeloom.runtime.studies.counting import train_counters
@@ -98,9 +97,10 @@ def search(
             trial(each, rung, None if old is None else old.setting) for each, old in zip(alive, before, strict=True)
         ]
         label = f"rung {rung} of {RUNGS}"
-        found = sweep(works, work.measure, store, jobs=jobs, fresh=fresh and rung == 1, label=label)
+        anew = fresh and rung == 1
+        found = sweep(works, work.measure, store, jobs=jobs, fresh=anew, label=label, kind=work.Measured)
         for candidate, old, each in zip(alive, before, works, strict=True):
-            measured = decode(work.Measured, found[each.key])
+            measured = found[each.key]
             if old is not None and measured.costs is None:
                 measured = replace(measured, costs=old.costs, refused=old.refused)
             number = len(known) + 1 if old is None else old.number

@@ -1,13 +1,11 @@
-"""What ``stress`` returns, and how it is read back."""
+"""What ``stress`` returns."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
-from spikeloom.compiler.errors import DataError
-from spikeloom.runtime.report.encode import OPTIONAL, key, read_json
+from spikeloom.runtime.report.encode import OPTIONAL, key
 from spikeloom.runtime.studies.stress.pair import Level
 
 
@@ -123,15 +121,3 @@ def shown(level: Level) -> str:
     ('3', '0.25', '0.0001')
     """
     return f"{level:g}"
-
-
-def read_stress(path: str, netlist: str, sha256: str) -> Stress:
-    """Read what ``stress -o`` wrote about a netlist of this name and hash; refused if it is about another one."""
-    result = read_json(Stress, Path(path), "--stress", "spikeloom stress -o")
-    about = result.provenance.netlist_sha256
-    if about != sha256:
-        raise DataError(
-            f"--stress {path}: is about a netlist of sha256 {about[:12]}…, {netlist} has {sha256[:12]}…; "
-            "stress that one, or report the other"
-        )
-    return result

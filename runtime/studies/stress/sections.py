@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.errors import DataError
+from spikeloom.compiler.files import reading
 from spikeloom.runtime.report.drawing import CHIP, FLOAT, GREY, WIDTH, Drawing, sheet, styled
+from spikeloom.runtime.report.encode import read_json
 from spikeloom.runtime.report.numbers import percent, wilson
-from spikeloom.runtime.report.sections import Figure, Section, Table, Text
+from spikeloom.runtime.report.sections import Figure, Section, Table, Text, terminal
 from spikeloom.runtime.studies.stress.pair import SIDES
 from spikeloom.runtime.studies.stress.results import Curve, Spread, Stress, shown
 
@@ -165,3 +169,18 @@ def _accuracy(spread: Spread) -> str:
     if len(spread.values) == 1:
         return mean
     return f"{mean}±{100 * max(spread.high - spread.mean, spread.mean - spread.low):.0f}"
+
+
+def read_stress(path: str, netlist: str, sha256: str) -> Stress:
+    """Read what ``stress -o`` wrote about a netlist of this name and hash; refused if it cannot be shown, or is not."""
+    result = read_json(Stress, Path(path), "--stress", "spikeloom stress -o")
+    about = result.provenance.netlist_sha256
+    if about != sha256:
+        raise DataError(
+            f"--stress {path}: is about a netlist of sha256 {about[:12]}…, {netlist} has {sha256[:12]}…; "
+            "stress that one, or report the other"
+        )
+    with reading(f"--stress {path}", DataError, "write it with spikeloom stress -o"):
+        terminal(stability(result))
+        figure(result).file("svg")
+    return result
