@@ -6,6 +6,7 @@ import os
 import sys
 import tempfile
 import warnings
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -21,31 +22,39 @@ ROUNDS = 20
 """After each of which the output is written."""
 
 
-def run(name: str, seeds: range, row: dict[str, Any]) -> None:
-    """Add outcomes of a reader to its row, and the first inputs that should not be."""
-    for seed in tqdm(seeds, name, disable=None):
+def run(name: str, seeds: range) -> dict[str, Any]:
+    """Outcomes of a reader, and the first inputs that should not be."""
+    row: dict[str, Any] = dict.fromkeys(KEYS, 0) | {"first": {}}
+    for seed in seeds:
         said = readers.outcome(name, *readers.damaged(name, seed))
         row["tried"] += 1
-        row[said if said in row else "did_not"] += 1
-        if said not in row and len(row.setdefault("first", {})) < 5:
-            row["first"][seed] = said
+        row[said if said in KEYS else "did_not"] += 1
+        if said not in KEYS:
+            row["first"][f"{name} {seed}"] = said
+    return row
+
+
+def in_a_folder() -> None:
+    """Work in a folder of one's own."""
+    warnings.simplefilter("ignore")
+    os.chdir(tempfile.mkdtemp())
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("output", type=Path)
     parser.add_argument("--inputs", type=int, default=100_000, help="of all readers together")
+    parser.add_argument("--jobs", type=int, default=1)
     arguments = parser.parse_args()
-    output, facts, shares = arguments.output.absolute(), made(), sum(each.share for each in readers.READERS.values())
-    warnings.simplefilter("ignore")
-    table = {name: dict.fromkeys(KEYS, 0) for name in readers.READERS}
-    with tempfile.TemporaryDirectory() as folder:
-        os.chdir(folder)
-        for name in readers.READERS:  # kernels compile
-            readers.meant(name, 0)
-        for turn in range(ROUNDS):
-            for name, reader in readers.READERS.items():
-                each = int(arguments.inputs * reader.share / shares / ROUNDS) + 1
-                run(name, range(turn * each, (turn + 1) * each), table[name])
+    output, facts, names = arguments.output.absolute(), made(), list(readers.READERS)
+    table = {name: dict.fromkeys(KEYS, 0) for name in names}
+    whole = sum(each.share for each in readers.READERS.values())
+    each = [int(arguments.inputs * reader.share / whole / ROUNDS) + 1 for reader in readers.READERS.values()]
+    with ProcessPoolExecutor(arguments.jobs, initializer=in_a_folder) as pool:
+        for turn in tqdm(range(ROUNDS), disable=None):
+            seeds = [range(turn * count, (turn + 1) * count) for count in each]
+            for name, row in zip(names, pool.map(run, names, seeds), strict=True):
+                table[name] = {key: table[name][key] + row[key] for key in KEYS}
+                facts.setdefault("first", {}).update(row["first"])
             sums = {key: sum(row[key] for row in table.values()) for key in KEYS}
             output.write_text(json.dumps(facts | sums | {"readers": table}, indent=1) + "\n")
