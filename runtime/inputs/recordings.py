@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping
 from difflib import get_close_matches
 from typing import Any
@@ -25,7 +24,7 @@ from spikeloom.models.recordings.events import (
 )
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings, first_part, parse_window
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
-from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.console import progress, tell
 
 
 def recordings(
@@ -85,7 +84,7 @@ def _require_sensor(data: Recordings, split: str, taxels: int | None) -> None:
     if taxels is not None and (why := other_sensor(data)) is not None:
         if split == "train":
             raise DataError(f"{why}; give the graph of their sensor (--taxels), or recordings of the network's")
-        sys.stderr.write(f"spikeloom: warning: {why}; are they of its sensor?\n")
+        tell(f"warning: {why}; are they of its sensor?")
 
 
 def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int) -> None:
@@ -94,7 +93,7 @@ def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int) 
     fewer = len(data) >= classes and UNLABELLED < known < classes - 1
     if name != data.source and (data.split == "train" or fewer):
         why = f"their classes are 0..{known}, the network's 0..{classes - 1}" if fewer else "calibrate on what it knows"
-        sys.stderr.write(f"spikeloom: warning: {data.source}: the network was trained on {name}; {why}\n")
+        tell(f"warning: {data.source}: the network was trained on {name}; {why}")
 
 
 def require_splits(path: str | Recordings) -> None:

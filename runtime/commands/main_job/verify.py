@@ -18,6 +18,7 @@ from spikeloom.runtime.inputs.repeat import refuse
 from spikeloom.runtime.machines.base import ENGINES, chip_module, machine_for
 from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.machines.simulated import Account
+from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.sections import Outcome
 
 NOTES = """\
@@ -77,7 +78,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     netlist, loaded = machine.netlist, load_network(arguments.checkpoint, arguments, machine.netlist)
     require_match(netlist, loaded.model)
     if (difference := loaded.differs_from(netlist.provenance, arguments.run)) is not None:
-        sys.stderr.write(f"spikeloom: warning: {arguments.netlist}: {difference}\n")
+        tell(f"warning: {arguments.netlist}: {difference}")
     tuned = loaded.checkpoint is not None and loaded.checkpoint.forms is not None
     held = check_rounding(integer_machine(machine), loaded.network, fine_tuned=tuned)
     if arguments.data is None or not held.layers:
