@@ -12,6 +12,8 @@ from random_netlists import Axon, Neuron, build
 
 from spikeloom.compiler import Options, compile_network, lift
 from spikeloom.compiler.fixedpoint import read_only
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import without_channels
@@ -193,3 +195,29 @@ def place(tmp_path_factory):
     recordings_folder(folder / "data", train=made(1, 24), test=made(2, 12))
     own_file(folder / "net.pt", last=weights(3, gain=2.5))
     return folder
+
+
+def test_what_is_pruned_can_be_trained_on(compiled, as_json, refusal):
+    loaded, _, seen = compiled
+    checkpoint, gone = loaded.checkpoint, {"fc1": np.array([0, 4]), "fc2": np.array([1])}
+    narrow = trials.narrowed(checkpoint, gone)
+    first, second, last = checkpoint.dense
+    silent = [w.weight.copy() for w in (second, last)]
+    for weight, numbers in zip(silent, gone.values(), strict=True):
+        weight[:, numbers] = 0
+    dense = (first, *(replace(each, weight=weight) for each, weight in zip((second, last), silent, strict=True)))
+    ran = [
+        float_simulation(expand(each, loaded.adjacency)).run(channels_last(seen.events)).spikes[3]
+        for each in (narrow, replace(checkpoint, dense=dense))
+    ]
+    assert ran[0].any()
+    assert_array_equal(*ran)
+
+    report = as_json(*LEAN, "--differ", "0.2", "--network", "narrow.pt")
+    gone = next(row for row in report["rows"] if row["name"] == "neurons")["removed"]["neurons"]
+    made, whole = read_checkpoint("narrow.pt"), read_checkpoint("net.pt")
+    assert made.neurons == {name: n - gone.get(name, 0) * (name != "conv1") for name, n in whole.neurons.items()}
+    assert made.neurons != whole.neurons
+    found = as_json("finetune", "narrow.pt", "--data", "data", "--weight-bits", "4", "--epochs", "1", "-o", "tuned.pt")
+    assert (found["fine_tuned_from"], read_checkpoint("tuned.pt").neurons) == (made.sha256, made.neurons)
+    assert "is no single checkpoint in floats" in refusal("lean", "tuned.pt", "--data", "data", "--network", "n.pt")

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from pathlib import Path
 
 from spikeloom.compiler import __version__, write_netlist
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import Network
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_network, add_recordings
+from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import storage
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.network import load_network
+from spikeloom.runtime.inputs.network import load_graph, load_network
 from spikeloom.runtime.inputs.recordings import recordings, require_splits
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import encode, write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.pruning.results import sections
 from spikeloom.runtime.studies.pruning.study import study
+from spikeloom.runtime.studies.pruning.trials import narrowed
 
 NOTES = """\
 Everything is chosen on the training split and reported on --split: how many decisions change, what is right,
@@ -42,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"share of training decisions that the netlist may change (default: {DIFFER:g})",
     )
     parser.add_argument("-o", "--output", metavar="OUT.loom", help="write the netlist without what may go")
+    parser.add_argument("--network", metavar="OUT.pt", help="write the float network without dense neurons that may go")
     parser.add_argument("--report", metavar="OUT.json", help="write the result")
     parser.epilog = NOTES
 
@@ -52,17 +56,33 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise OptionError(f"--differ {arguments.differ:g}: not a share; give a number from 0 to below 1")
     require_place(arguments.output, "-o", arguments)
     require_place(arguments.report, "--report", arguments)
+    require_place(arguments.network, "--network", arguments)
     loaded = load_network(arguments.checkpoint, arguments)
+    plain = loaded.checkpoint is not None and loaded.checkpoint.forms is None and loaded.checkpoint.towers == 1
+    if arguments.network is not None and not plain:
+        raise OptionError(
+            f"--network {arguments.network}: {arguments.checkpoint} is no single checkpoint in floats; omit it, or "
+            "give what that was fine-tuned or joined from"
+        )
     require_splits(arguments.data)
     training = _read(arguments, loaded.network, "train", None)
     test = _read(arguments, loaded.network, arguments.split, arguments.limit)
-    result, netlist = study(loaded, training, test, arguments.differ, arguments.output)
+    result, netlist, spared = study(loaded, training, test, arguments.differ, arguments.output)
     if arguments.output is not None:
         lean = {"differ": result.differ} | encode(result.rows[result.taken].removed)
         made = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256, **loaded.origin(arguments.run)}
         made |= storage(None, loaded.checkpoint)
         made |= {"keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True, "lean": lean}
         write_netlist(replace(netlist, provenance={**netlist.provenance, **made}), arguments.output)
+    if arguments.network is not None and loaded.checkpoint is not None:
+        from spikeloom.models.networks.checkpoint import save_again
+
+        asked, given = load_graph(arguments, loaded.checkpoint.system), loaded.checkpoint
+        edges = asked.edges if given.edges is None and asked is not None else given.edges
+        typed = repeat.words({"data": test.source, "differ": result.differ})
+        made = {"command": repeat.command("lean", Path(arguments.checkpoint).name, *typed)}
+        less = narrowed(replace(given, graph=loaded.graph, edges=edges), spared)
+        save_again(arguments.network, less, training=made | {"pruned_from": loaded.sha256})
     write_json(arguments.report, result)
     return Outcome(result, sections)
 

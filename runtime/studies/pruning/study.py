@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -28,10 +28,11 @@ from spikeloom.runtime.studies.pruning.trials import (
 
 def study(
     loaded: LoadedNetwork, training: Recordings, test: Recordings, differ: float, output: str | None
-) -> tuple[Lean, Netlist]:
+) -> tuple[Lean, Netlist, Mapping[str, IntArray]]:
     """Take from a network what the training split does not need: the share `differ` of its decisions may change.
 
-    Hands back the network without what is taken, too, which will be written to `output`.
+    Hands back the network without what is taken, too, which will be written to `output`, and the numbers of the neurons
+    that may go, by layer.
     """
     progress("compiling")
     forms = None if loaded.checkpoint is None else loaded.checkpoint.forms
@@ -47,7 +48,9 @@ def study(
     def tried() -> Iterator[tuple[str, Removed, Netlist]]:
         yield "nothing", Removed(), whole
         neurons = spared_neurons(whole, spikes, fits)
-        yield "neurons", Removed(neurons=_by_layer(whole, neurons)), laid_out(compilation, neurons)
+        spared.update(_by_layer(whole, neurons))
+        counts = {name: len(numbers) for name, numbers in spared.items()}
+        yield "neurons", Removed(neurons=counts), laid_out(compilation, neurons)
         taxels = spared_taxels(whole, training, alone, fits)
         deaf = without_taxels(compilation, taxels)
         yield "taxels", Removed(taxels=tuple(sorted(taxels.tolist()))), laid_out(deaf)
@@ -56,7 +59,7 @@ def study(
             if (fewer := without_hops(compilation, loaded, hops)) is not None:
                 yield name, Removed(hops=hops), laid_out(fewer)
 
-    rows, spent, netlists = [], [], []
+    rows, spent, netlists, spared = [], [], [], dict[str, IntArray]()
     for name, removed, netlist in tried():
         progress(f"without {name}")
         trained, training_costs = priced(netlist, training)
@@ -68,28 +71,32 @@ def study(
         netlists.append(netlist)
     taken = int(np.argmin(spent))
     events = training.events.sum(axis=(0, 2, 3), dtype=np.int64)
-    return Lean(
-        taken=taken,
-        samples={"training": len(training), "test": len(test)},
-        layers=tuple(
-            LayerUse(
-                name=layer.name,
-                neurons=layer.neurons,
-                on_chip=len(ids),
-                never_fired=int(np.count_nonzero(spikes[ids] == 0)),
-            )
-            for layer, ids in zip(whole.layers, map(whole.compartments_of, range(len(whole.layers))), strict=True)
+    return (
+        Lean(
+            taken=taken,
+            samples={"training": len(training), "test": len(test)},
+            layers=tuple(
+                LayerUse(
+                    name=layer.name,
+                    neurons=layer.neurons,
+                    on_chip=len(ids),
+                    never_fired=int(np.count_nonzero(spikes[ids] == 0)),
+                )
+                for layer, ids in zip(whole.layers, map(whole.compartments_of, range(len(whole.layers))), strict=True)
+            ),
+            taxels=tuple(
+                TaxelUse(events=sent, training_differ=differing)
+                for sent, differing in zip(events.tolist(), alone.tolist(), strict=True)
+            ),
+            rows=tuple(rows),
+            source=test.source,
+            split=test.split,
+            differ=differ,
+            output=output,
         ),
-        taxels=tuple(
-            TaxelUse(events=sent, training_differ=differing)
-            for sent, differing in zip(events.tolist(), alone.tolist(), strict=True)
-        ),
-        rows=tuple(rows),
-        source=test.source,
-        split=test.split,
-        differ=differ,
-        output=output,
-    ), netlists[taken]
+        netlists[taken],
+        spared,
+    )
 
 
 def _hops(loaded: LoadedNetwork) -> list[tuple[int, ...]]:
@@ -111,7 +118,7 @@ def _changed(whole: IntArray, less: IntArray, labels: IntArray) -> Changed:
     )
 
 
-def _by_layer(netlist: Netlist, gone: IntArray) -> dict[str, int]:
-    """How many neurons of each layer."""
-    counts = np.bincount(netlist.layer[gone], minlength=len(netlist.layers)).tolist()
-    return {layer.name: count for layer, count in zip(netlist.layers, counts, strict=True) if count}
+def _by_layer(netlist: Netlist, gone: IntArray) -> dict[str, IntArray]:
+    """Numbers of these neurons in each layer that has any."""
+    held = {layer.name: gone[netlist.layer[gone] == index] for index, layer in enumerate(netlist.layers)}
+    return {name: netlist.neuron[ids] for name, ids in held.items() if len(ids)}

@@ -7,13 +7,14 @@ largest that changes no more training decisions than allowed. Nothing is chosen 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from spikeloom.compiler import Compilation, Netlist, layer_of, rounded, without
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
+from spikeloom.compiler.checkpoint import Checkpoint, Dense
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, frozen
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import without_channels
@@ -38,7 +39,7 @@ def priced(netlist: Netlist, of: Recordings) -> tuple[IntArray, Costs]:
         energy_j={name: float(each.mean()) for name, each in price.energy_j.items()},
         time_s={name: float(each.mean()) for name, each in price.time_s.items()},
         cores=netlist.n_cores,
-        neurons=netlist.n_compartments,
+        neurons=len(netlist.readout_class),
         synapses=netlist.n_synapses,
     )
 
@@ -128,6 +129,21 @@ def laid_out(compilation: Compilation, unused: IntArray | None = None) -> Netlis
         if len(ids) and gone[ids].all():
             mask[netlist.neuron[ids[0]]] = False
     return without(compilation, masks)
+
+
+def narrowed(checkpoint: Checkpoint, gone: Mapping[str, IntArray]) -> Checkpoint:
+    """A float network without some neurons of its dense layers, by their numbers; a layer keeps one neuron.
+
+    Neurons of the first layer share their weights, so they stay.
+    """
+    dense: list[Dense] = []
+    kept = np.arange(checkpoint.dense[0].weight.shape[1])
+    for stage in checkpoint.dense:
+        columns, kept = kept, np.setdiff1d(np.arange(len(stage.bias)), gone.get(stage.name, ()))
+        kept = kept if len(kept) else np.arange(1)
+        weight = np.ascontiguousarray(stage.weight[np.ix_(kept, columns)])
+        dense.append(Dense(name=stage.name, weight=frozen(weight), bias=frozen(stage.bias[kept])))
+    return replace(checkpoint, dense=tuple(dense))
 
 
 def changed_alone(netlist: Netlist, of: Recordings, wanted: IntArray) -> IntArray:
