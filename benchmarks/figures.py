@@ -3,8 +3,10 @@
     python benchmarks/figures.py FOLDER [STUDY...]
 
 FOLDER holds ``Ev-Objects.zip`` and ``Ev-Containers.zip``, the released ``objects_manual.t7`` and, for the chart of
-Containers, ``containers-knn1.pt`` (``spikeloom train --data Ev-Containers.zip --graph knn:1``). Each study is a file in
-benchmarks/results, with the commands, the hash of the recordings and the state of the code that made it.
+Containers, ``containers-knn1.pt`` (``spikeloom train --data Ev-Containers.zip --graph knn:1``), for its processor
+``containers-200ms.pt``: ``spikeloom train --data Ev-Containers.zip --join 10 --graph manual --recipe timed --keep last
+--current-decay fc1=0.6,fc2=0.6,fc3=0.6``. Each study is a file in benchmarks/results, with the commands, the hash of the
+recordings and the state of the code that made it.
 """
 
 import argparse
@@ -46,6 +48,18 @@ SHIPPED = {  # Row: network with its options, recordings, options of `compile`
     "grasps": ("pretrained:grasps", "synthetic", ""),
 }
 NETWORKS = ("objects", "objects-200ms", "objects-truenorth", "containers", "containers-truenorth", "grasps")
+PROCESSOR = {
+    OBJECTS: {
+        "TactileSGNet": f"{MANUAL} --graph manual",
+        "200 ms": "pretrained:objects-200ms",
+        "counters": "pretrained:objects-counters",
+    },
+    CONTAINERS: {
+        "TactileSGNet": "pretrained:containers",
+        "200 ms": "containers-200ms.pt",
+        "counters": "pretrained:containers-counters",
+    },
+}
 LAYOUTS = ("", *(f"--cores-for {each}" for each in ("fc1=4", "fc1=6", "fc1=8", "conv1=6,fc1=6,fc2=3")))
 CHARTS = {
     OBJECTS: ("pretrained:objects", "bits=3,4,8,window=10%,20%,100%,cores=cores/latency"),
@@ -347,6 +361,15 @@ def longer_bins(session: Session) -> Json:
     return found
 
 
+def processor(session: Session, data: str) -> Json:
+    """Three networks against a rule on a processor."""
+    found = {}
+    for name, network in PROCESSOR[data].items():
+        session.run(f"compile {network} --calibrate {data} -o net.loom")
+        found[name] = session.run(f"estimate net.loom --data {data} --against-processor")["against_processor"]
+    return found
+
+
 STUDIES: dict[str, Callable[[Session], Json]] = {
     "storage": storage,
     "stress-objects": lambda session: stress(session, f"{MANUAL} --graph manual", f"--calibrate {OBJECTS} "),
@@ -364,6 +387,8 @@ STUDIES: dict[str, Callable[[Session], Json]] = {
     "chart-containers": lambda session: chart(session, CONTAINERS),
     "lean-objects": lambda session: lean(session, OBJECTS),
     "lean-containers": lambda session: lean(session, CONTAINERS),
+    "processor-objects": lambda session: processor(session, OBJECTS),
+    "processor-containers": lambda session: processor(session, CONTAINERS),
     "anytime-objects": lambda session: anytime(session, OBJECTS),
     "anytime-containers": lambda session: anytime(session, CONTAINERS),
     **{f"shown/{page}": partial(shown, page=page) for page in PAGES},

@@ -11,13 +11,17 @@ from made_files import events, own_file, recordings_folder, weights
 from numpy.testing import assert_allclose, assert_array_equal
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
 
+from spikeloom.compiler import compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.fixedpoint import read_only
+from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
-from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.events import load_data, of_length
+from spikeloom.models.recordings.grasps import synthetic_split
+from spikeloom.models.training.counters import Plan, counted, counters_of, fit
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.machines.integer import LONGEST, integer_machine
@@ -269,8 +273,9 @@ def test_no_output_neuron_spikes_more_often(data):
         return
     voters = np.flatnonzero(netlist.readout_class >= 0)
     machine = integer_machine(machine_of(netlist))
-    for voter, interval in zip(voters, machine.least_intervals, strict=True):
+    for voter, interval, steady in zip(voters, machine.least_intervals, machine.steady, strict=True):
         times = np.flatnonzero(spikes[:, voter])
+        assert not steady or len(times) == (len(spikes) - times[0] if len(times) else 0)
         assert interval or not len(times)
         assert np.all(np.diff(times) >= interval)
     length = events.shape[1]
@@ -279,6 +284,24 @@ def test_no_output_neuron_spikes_more_often(data):
         at = exits.standing(counted, np.array([length]))
         sure = exits.proven(counted, at, exits.most_votes(machine, length))
         assert np.all(at.leader[sure] == at.decision[0])
+
+
+def test_a_vote_that_never_ceases_is_a_proof():
+    training, seen = (synthetic_split(split, limit=48) for split in ("train", "test"))
+    data = counted(training, Plan())
+    made = counters_of(data, fit(data, 6), training, 6)
+    machine = integer_machine(machine_of(compile_network(counting_network(made)).netlist))
+    steps = of_length(seen, made.clocks.length)
+    ran = machine.cumulative(steps.events, steps.step_counts)
+    at = exits.standing(ran.votes, steps.step_counts)
+    most, steady = exits.most_votes(machine, steps.steps), exits.steady_classes(machine)
+    assert steady.all()
+    ends = exits.exits(exits.proven(ran.votes, at, most, steady), at)
+    assert_array_equal(ends, (ran.votes > 0).any(axis=2).argmax(axis=1))  # with the first vote
+    assert_array_equal(at.leader[np.arange(48), ends], at.decision)
+    assert np.all(ends < exits.exits(exits.proven(ran.votes, at, most), at))
+    netlist = large_netlist(10, proved=True)
+    assert not integer_machine(machine_of(netlist)).steady.any()
 
 
 def test_live_and_recorded_votes_end_alike():

@@ -187,7 +187,7 @@ def test_limits_are_the_published_ones():
     assert {rule: entry.value for rule, entry in target.limits.items()} == LIMITS
     assert [target.limit(rule) for rule in LIMITS] == list(LIMITS.values())
     assert dict(target.choices) == CHOICES
-    assert {name: power.value for name, power in target.static.items()} == {"frady2020": 104.4}
+    assert {name: power.value for name, power in target.static.items()} == {"frady2020": 104.4, "blouw2019": 29.0}
     assert LIMITS["mesh.width"] * LIMITS["mesh.height"] * LIMITS["mesh.tile_cores"] == LIMITS["chip.cores"]
     assert set(REMEDIES) == {rule for rule in LIMITS if rule.startswith(("core.", "chip."))}
 

@@ -114,7 +114,9 @@ def test_who_goes_on():
     dominated = tried(6, 20, 20 * UJ)
     assert choice.going_on([dominated, *POOL], 1)[-1] == dominated
     assert choice.going_on([replace(dominated, costs=None)], 2) == []
-    assert len(choice.going_on([dominated] * 30, 2)) == 24
+    assert len(choice.going_on([dominated] * 30, 2)) == choice.KEPT[2]
+    for words, on in (("energy=8.5uJ", [2, 4]), ("cores=1", [2, 3, 4]), ("energy=1nJ", [1, 2, 3, 4])):
+        assert sorted(each.number for each in choice.going_on(POOL[:4], 1, budgets(words))) == on
 
 
 @pytest.mark.parametrize(
@@ -133,7 +135,12 @@ def test_candidates_can_all_be_trained():
     assert 60 <= len(every) == len({each.name for each in every}) <= 140
     for each in every:
         each.plan().require_possible()
-    assert [each.words[-2:] for each in space.variants(every[0])] == [["--ramp", "16"], ["--ramp", "64"]]
+    assert [each.words[-2:] for each in space.variants(every[0], 1)] == [["--ramp", "16"], ["--ramp", "64"]]
+    few = next(space.counting(250, bits=5))
+    for each, bits in ((every[0], (8, 5, 4)), (few, (5, 4, 3))):
+        assert tuple(other.plan().bits for other in (each, *space.variants(each, 2))) == bits
+    (trained,) = space.variants(next(space.networks(250, ["mlp"])), 2)
+    assert (trained.storage, "weight" in " ".join(trained.words)) == (4, False)
 
 
 @pytest.fixture
@@ -148,20 +155,26 @@ def few(monkeypatch, tmp_path):
     return tmp_path
 
 
-def test_the_command(few, monkeypatch):
-    words = ["smallest", "--data", "synthetic", "--jobs", "1", "-o", "a.loom"]
+@pytest.mark.parametrize(("target", "table"), [("loihi1", "davies2018"), ("truenorth", "all_in")])
+def test_the_command(few, monkeypatch, target, table):
+    words = ["smallest", "--data", "synthetic", "--target", target, "--jobs", "1", "-o", "a.loom"]
     found = as_json(*words)
     names = [each["name"] for each in found["tried"]]
-    assert "counters 1 join=5" in names
-    assert "counters 1 ramp=16 join=5" in names
-    chosen = found["tried"][found["choice"]["cheapest"]["davies2018"] - 1]
+    bits = "" if target == "loihi1" else " weight_bits=5"
+    for name in ("counters 1 join=5", "counters 1 ramp=16 join=5"):
+        assert f"{name}{bits}" in names
+    assert any("weight_bits=4" in name for name in names)
+    chosen = found["tried"][found["choice"]["cheapest"][table] - 1]
     best = found["tried"][found["choice"]["best"] - 1]
     assert best["behind"] == 0
     assert chosen["rung"] == 3
-    assert chosen["costs"]["energy_j"]["davies2018"] <= best["costs"]["energy_j"]["davies2018"]
+    assert chosen["costs"]["energy_j"][table] <= best["costs"]["energy_j"][table]
+    assert ("whole" in chosen) == (target == "loihi1")  # the other runs whole recordings
+    assert all(each["whole"]["operations"] > each["costs"]["operations"] for each in found["tried"] if "whole" in each)
     assert chosen["behind"] <= chosen["behind_error"]
     assert found["checked"]["equal"] == {"train": 360, "test": 144}
-    assert found["checked"]["different"] == 0
+    assert found["checked"]["different"] == {"train": 0, "test": 0}
+    assert "static power dominates" in found["checked"]["pace"]
 
     # once more from the store alone, and the same by hand
     files = {name: (few / name).read_bytes() for name in ("a.pt", "a.loom")}
@@ -179,8 +192,9 @@ def test_a_network_that_is_trained_by_gradients(few, monkeypatch):
     monkeypatch.setattr(space, "NETWORKS", (("mlp", 10, 4, "8,8"),))
     monkeypatch.setattr(space, "EPOCHS", 2)
     found = as_json("smallest", "--data", "synthetic", "--jobs", "1", "-o", "a.loom", "--html", "a.html")
-    (network,) = found["tried"]
-    assert (network["system"], network["rung"]) == ("mlp", 3)
+    network, stored = found["tried"]
+    assert (network["system"], network["rung"], "storage" in network, stored["storage"]) == ("mlp", 3, False, 4)
+    assert network["costs"]["operations"] <= network["whole"]["operations"]
     assert len(found["baselines"]) in (0, 4)
     netlist = (few / "a.loom").read_bytes()
     assert run(*shlex.split(found["commands"][1])[1:])[0] == 0

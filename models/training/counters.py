@@ -280,6 +280,12 @@ def rounded(weight: FloatArray, spikes: FloatArray, most: int) -> FloatArray:
     return whole
 
 
+def spikes_of(made: Counters, data: Counted) -> NDArray[np.int8]:
+    """How often each counter of a network has spiked in the end; (samples, counters)."""
+    place = {tuple(each): index for index, each in enumerate(data.counter.tolist())}
+    return data.spikes[:, [place[tuple(each)] for each in made.counter.tolist()]]
+
+
 def counters_of(data: Counted, fitted: Fitted, recordings: Recordings, classes: int) -> Counters:
     """The network of a rule in whole weights; counters whose weights are all zero are left out.
 

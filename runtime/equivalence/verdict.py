@@ -130,6 +130,16 @@ class Verdict:
         return len(self.files)
 
     @property
+    def different(self) -> int:
+        """Spikes that are not the float model's."""
+        return sum(layer.different for layer in self.spikes.values())
+
+    @property
+    def equal(self) -> int:
+        """Decisions that are the float model's."""
+        return int(np.sum(self.float_predictions == self.chip_predictions))
+
+    @property
     def accuracy(self) -> Mapping[str, float]:
         """Shares of recordings that each side, ``float`` and ``chip``, gets right."""
         sides = {"float": self.float_predictions, "chip": self.chip_predictions}

@@ -81,6 +81,8 @@ class Price:
     energy_j: Mapping[str, FloatArray]  # By table, of each recording
     time_s: Mapping[str, FloatArray]
     step_s: Mapping[str, float]  # Seconds of the longest data step
+    dynamic_j: Mapping[str, FloatArray]  # The same as energy_j, but for power that flows whatever happens
+    static_w: Mapping[str, float]  # That power, of all chips, by source
     outcome: Outcome  # All that the chip's own price model knows, with its layout
 
 
@@ -182,6 +184,11 @@ class Machine(ABC):
     @abstractmethod
     def kernel(self) -> str:
         """How the simulator goes through a recording, in a few words."""
+
+    @property
+    @abstractmethod
+    def weight_bits(self) -> int:
+        """Bits of the widest weight that a synapse has, or an input of a crossbar on all its axons."""
 
     @abstractmethod
     def legal(self) -> None:
@@ -410,6 +417,8 @@ def chip_module(name: str, part: str) -> Any:
     - ``description``: ``inspect(path)``, what a netlist file holds; it loads no simulator.
     - ``commands``: ``compile_network(arguments)`` and ``verify(arguments)`` for all networks; for checkpoints that were
       trained for the chip, which ``takes(path)`` knows, ``inspect(arguments)``.
+    - ``machine``: ``machine_of`` and ``load``; of networks that count the widest weight, ``COUNTING_BITS``, and what of
+      one is compiled, ``counting_source(counters)``.
     - ``compiled``: ``outcome(compilation, sha256, facts)``, what the target's ``compile`` chose, proved and removed;
       `sha256` is of the netlist's file, `facts` are what was read from a file of another format.
     - ``exports``: ``FORMATS`` of other programs that can be written.

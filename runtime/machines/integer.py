@@ -63,6 +63,11 @@ class IntegerMachine(Machine):
         In the order of ``readout_class``; after :data:`LONGEST` steps nothing is looked for any more.
         """
 
+    @property
+    @abstractmethod
+    def steady(self) -> BoolArray:
+        """Which neurons that vote spike in every step after their first spike, in the order of ``readout_class``."""
+
     @abstractmethod
     def on_a_thread(self, channels: EventArray, lengths: IntArray, first: int) -> tuple[Iterable[BoolArray], IntArray]:
         """Spikes of each layer from the step `first` on, (samples, steps, neurons), and clipped membranes, (samples,).

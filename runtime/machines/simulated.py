@@ -85,9 +85,10 @@ class Part:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accounted:
-    """A result, and the parts behind it where they are wanted."""
+    """A result, a comparison and the parts behind it where they are wanted."""
 
     result: Any = field(metadata=INLINE)
+    against_processor: Any = field(default=None, metadata=OPTIONAL)
     explained_cost: tuple[Part, ...] | None = field(default=None, metadata=OPTIONAL)
 
 

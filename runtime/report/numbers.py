@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 
 def percent(right: int, total: int) -> str:
@@ -31,6 +31,21 @@ def si(value: float, unit: str) -> str:
         if abs(value) >= 0.9995 * factor:  # what three digits round up to the next prefix
             return f"{value / factor:.3g} {prefix}{unit}"
     return f"{value:.3g} {unit}"
+
+
+def dominant(static_j: Iterable[float], dynamic_j: Iterable[float]) -> str:
+    """Which term of a decision is the larger at the pace of a sensor, by any source.
+
+    Examples
+    --------
+    >>> dominant([0.145, 0.52], [8e-6])
+    "at the sensor's pace static power dominates: 145 mJ to 520 mJ, 18,125 times what events take or more"
+    """
+    (least, *_, most), high = sorted([*static_j] * 2), max(dynamic_j)
+    if least <= high:
+        return f"at the sensor's pace events take {si(high, 'J')}, static power {si(least, 'J')} to {si(most, 'J')}"
+    more = f"{si(least, 'J')} to {si(most, 'J')}, {least / high:,.0f} times what events take or more"
+    return f"at the sensor's pace static power dominates: {more}"
 
 
 def counted(value: float) -> str:

@@ -3,28 +3,38 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.files import write_atomically
+from spikeloom.compiler.files import sha256_of, write_atomically
+from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.systems import MLP, SYSTEMS
-from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.base import COMPARTMENTS, Target, load_target
 from spikeloom.models.graphs import NEUTOUCH
-from spikeloom.models.recordings.evtouch import data_digest
+from spikeloom.models.recordings.events import joined_bins, of_length
+from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.models.systems import taxels_alone
 from spikeloom.runtime.commands.options import add_data, add_graph_options
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_graph, sensor_places
+from spikeloom.runtime.machines.base import chip_module, machine_for
+from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.numbers import dominant
 from spikeloom.runtime.report.sections import Outcome
-from spikeloom.runtime.studies.chart.results import Data
+from spikeloom.runtime.studies.chart.results import Data, share
 from spikeloom.runtime.studies.fronts import parse_budgets
 from spikeloom.runtime.studies.smallest.choice import LIMITS
-from spikeloom.runtime.studies.smallest.space import counting, networks
+from spikeloom.runtime.studies.smallest.results import Checked
+from spikeloom.runtime.studies.smallest.space import Candidate, counting, networks
 from spikeloom.runtime.studies.smallest.trained import Sensor
+from spikeloom.runtime.studies.smallest.work import costs_of, some
 
 SENSOR = ("graph", "taxels", "edges", "directed")
 
@@ -46,6 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
     add_data(parser)
     add_graph_options(parser, f"of the built-in sensor (default: {GRAPH})")
+    parser.add_argument("--target", default=DEFAULT_TARGET, help=f"chip (default: {DEFAULT_TARGET})")
     parser.add_argument("--levels", type=int, metavar="N", help=LEVELS)
     parser.add_argument(
         "--budget",
@@ -89,15 +100,16 @@ def run(arguments: argparse.Namespace) -> Outcome:
         test=len(test),
         steps=training.steps,
     )
-    systems = SYSTEMS if len(sensor.graph.edges) else (MLP,)
+    target = load_target(arguments.target)
+    bits = chip_module(target.name, "machine").COUNTING_BITS
+    systems = () if target.cores != COMPARTMENTS else SYSTEMS if len(sensor.graph.edges) else (MLP,)
     found = smallest(
-        [*counting(training.steps, arguments.levels or 1), *networks(training.steps, systems)],
-        (training, test),
+        [*counting(training.steps, arguments.levels or 1, bits), *networks(training.steps, systems)],
         data,
-        load_target(DEFAULT_TARGET),
+        target,
         budgets,
         store,
-        str(output),
+        partial(_made, sensor=sensor, training=training, test=test, target=target, arguments=arguments),
         sensor=sensor,
         command=_command(arguments),
         jobs=arguments.jobs,
@@ -107,6 +119,63 @@ def run(arguments: argparse.Namespace) -> Outcome:
         with write_atomically(arguments.html) as file:
             file.write(page(found).encode())
     return Outcome(found, sections, 0 if found.choice.fits else 1)
+
+
+def _made(
+    candidate: Candidate,
+    *,
+    sensor: Sensor,
+    training: Recordings,
+    test: Recordings,
+    target: Target,
+    arguments: argparse.Namespace,
+) -> tuple[Checked, tuple[str, ...]]:
+    """Train a candidate on the whole training split, compile and verify it, then read the test split; the commands."""
+    netlist, data = arguments.output, arguments.data
+    network, counts = str(Path(netlist).with_suffix(".pt")), candidate.system == COUNTING
+    read = repeat.words({"data": data, "bin": arguments.bin})
+    trained = [*read, *repeat.words(sensor.options_of(candidate.system)), *candidate.words]
+    trained += [*([] if counts else ["--keep", "last"]), "-o", network]
+    made = repeat.words(
+        {"target": target.name, "weight_bits": candidate.storage, "calibrate": None if counts else data}
+    )
+    made += [] if counts else repeat.words({"bin": arguments.bin})
+    words = {"train": trained, "compile": [network, *made, "-o", netlist]}
+    words |= {"verify": [netlist, "--checkpoint", network, *read], "estimate": [netlist, *read]}
+    for name in ("train", "compile"):
+        _typed(name, words[name])
+    machine, verdicts = machine_for(netlist), {}
+    for split in ("train", "test"):
+        progress(f"verifying, {split}")
+        verdicts[split] = _typed("verify", [*words["verify"], "--split", split])
+    form = machine.netlist.bins, machine.netlist.clocks.length
+    seen, held = (of_length(joined_bins(each, form[0]), form[1]) for each in (some(training), test))
+    right = int(np.count_nonzero(machine.run(held.events, lengths=held.lengths).decisions == held.labels))
+    costs, stopped = costs_of(machine.netlist, seen)
+    price = machine.price(seen.events, bin_s=arguments.bin, lengths=seen.lengths)[1]
+    seconds = float(seen.step_counts.mean()) * form[0] * arguments.bin
+    dynamic = [float(each.mean()) for each in price.dynamic_j.values()]
+    words |= {} if stopped is None else {"anytime": [netlist, *read]}
+    return Checked(
+        network=network,
+        network_sha256=sha256_of(Path(network)),
+        netlist=netlist,
+        netlist_sha256=sha256_of(Path(netlist)),
+        different={split: verdict.different for split, verdict in verdicts.items()},
+        equal={split: verdict.equal for split, verdict in verdicts.items()},
+        right=share(right, len(held)),
+        costs=costs,
+        stopped=stopped,
+        pace=dominant([watts * seconds for watts in price.static_w.values()], dynamic),
+    ), tuple(repeat.command(name, *typed) for name, typed in words.items())
+
+
+def _typed(name: str, words: list[str]) -> Any:
+    """What another command finds, as it is typed."""
+    group = {"train": "training"}.get(name, "main_job")
+    module, parser = import_module(f"spikeloom.runtime.commands.{group}.{name}"), argparse.ArgumentParser()
+    module.add_arguments(parser)
+    return module.run(parser.parse_args(words)).result
 
 
 def _sensor(arguments: argparse.Namespace, taxels: int) -> Sensor:
@@ -120,6 +189,6 @@ def _sensor(arguments: argparse.Namespace, taxels: int) -> Sensor:
 
 def _command(arguments: argparse.Namespace) -> str:
     """The words that ask for the same search."""
-    words = repeat.words(repeat.given(arguments, ("data", "bin", *SENSOR, "levels", "store")))
+    words = repeat.words(repeat.given(arguments, ("data", "bin", *SENSOR, "target", "levels", "store")))
     budgets = [word for budget in arguments.budget for word in ("--budget", budget)]
     return repeat.command("smallest", *words, *budgets, "-o", arguments.output)

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
@@ -67,6 +68,11 @@ class Loihi(IntegerMachine):
         """As the float model counts time."""
         return aligned(self.netlist, array, index)
 
+    @property
+    def weight_bits(self) -> int:
+        """As the layers store them."""
+        return max(layer.weight_bits for layer in self.netlist.layers)
+
     def legal(self) -> None:
         """Refuse a netlist that uses too much of a limit."""
         require_legal(self.netlist, self.target)
@@ -113,6 +119,13 @@ class Loihi(IntegerMachine):
         from spikeloom.runtime.machines.loihi1.costs import cumulative
 
         return cumulative.least_intervals(self.netlist)
+
+    @property
+    def steady(self) -> BoolArray:
+        """From the synapse of each compartment that votes onto itself."""
+        from spikeloom.runtime.machines.loihi1.costs import cumulative
+
+        return cumulative.steady(self.netlist)
 
     def on_a_thread(self, channels: EventArray, lengths: IntArray, first: int) -> tuple[Iterable[BoolArray], IntArray]:
         """Spikes by layer, as the float model counts time; at a bit each until they are looked at."""
@@ -169,11 +182,14 @@ class Loihi(IntegerMachine):
 
         trace, found = estimate(self._engine, chip, channels, lengths=lengths, detail=detail, progress=progress)
         report = cost_report(self.netlist, chip, found, bin_s=bin_s * self.netlist.bins)
+        energy = {name: each.sum(axis=1) for name, each in found.costs.energy.items()}
         return trace, Price(
             synaptic_operations=found.costs.synaptic_operations.sum(axis=1),
-            energy_j={name: each.sum(axis=1) for name, each in found.costs.energy.items()},
+            energy_j=energy,
             time_s={name: times.seconds for name, times in found.simple.items()},
             step_s={name: float(times.duration_ns.max() * 1e-9) for name, times in found.simple.items()},
+            dynamic_j=energy,
+            static_w={each.source: each.chips * each.chip_w for each in report.static},
             outcome=Outcome(report, sections),
         )
 
@@ -188,6 +204,12 @@ class Loihi(IntegerMachine):
 
 
 machine_of = Loihi
+
+COUNTING_BITS = 8
+"""Widest weights of a counting network."""
+
+counting_source = counting_network
+"""What of a counting network is compiled."""
 
 
 def load(path: str | os.PathLike[str]) -> Loihi:

@@ -20,7 +20,7 @@ from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.machines.base import Price
 from spikeloom.runtime.machines.truenorth.spec import Counts
-from spikeloom.runtime.report.numbers import si
+from spikeloom.runtime.report.numbers import dominant, si
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 
 NOT_PRICED = (
@@ -117,10 +117,11 @@ def price(netlist: CrossbarNetlist, chip: Target, counts: Counts, bin_s: float) 
     tick_s = chip.limit("tick.length") * 1e-6
     time_s: FloatArray = counts.ticks.astype(np.float64) * tick_s
     step_s = netlist.bin_ticks * tick_s
-    energy, readings = {}, []
+    energy, dynamic, readings = {}, {}, []
     for table in chip.energy:
         events_j, floor_j = joules(table, counted["synaptic_events"], time_s)
         energy[table.name] = events_j if floor_j is None else events_j + floor_j
+        dynamic[table.name] = events_j
         floor = None if floor_j is None else float(floor_j.mean())
         readings.append(
             Reading(
@@ -158,6 +159,8 @@ def price(netlist: CrossbarNetlist, chip: Target, counts: Counts, bin_s: float) 
         energy_j=energy,
         time_s={TICK: time_s},
         step_s={TICK: step_s},
+        dynamic_j=dynamic,
+        static_w=result.static_w,
         outcome=Outcome(result, sections),
     )
 
@@ -190,11 +193,15 @@ def sections(found: Estimate) -> list[Section]:
     layers = [[layer.name, f"{layer.synaptic_events:,.0f}", f"{layer.spikes:,.0f}"] for layer in found.layers]
     head = f"per inference on {found.cores:,} of {found.cores_of_chip:,} cores, over {found.samples} recordings:"
     pace = found.pace
+    seconds = found.per_inference.time_s / pace.step_s * pace.bin_s
     lines = [
         *map(_reading_line, found.energy),
         "two readings of one measurement: take one, never their sum",
         f"a data step takes {si(pace.step_s, 's')}: {'keeps' if pace.real_time else 'does not keep'} the sensor's pace "
         f"of {1000 * pace.bin_s:g} ms a step",
+        dominant(
+            [watts * seconds for watts in found.static_w.values()], [reading.events_j for reading in found.energy]
+        ),
         *(f"not priced: {line}" for line in found.not_priced),
     ]
     return [

@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NoReturn
 
+import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.truenorth.counting import LARGEST
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars
 from spikeloom.compiler.types import IntArray
@@ -41,6 +44,11 @@ class TrueNorth(Machine):
         of_layer: npt.NDArray[T] = array[:, :, self.netlist.layer == index]
         return of_layer
 
+    @property
+    def weight_bits(self) -> int:
+        """Axons of all types add up."""
+        return 1 + int(np.abs(self.netlist.weight).sum(axis=1).max()).bit_length()
+
     def legal(self) -> None:
         """Refuse a netlist that breaks a rule."""
         require_legal(self.netlist, self.target)
@@ -61,7 +69,7 @@ class TrueNorth(Machine):
     ) -> tuple[Trace, Price]:
         """By synaptic events and ticks."""
         trace = self.simulate(channels, lengths, spikes=False)
-        return trace, cost.price(self.netlist, chip, trace.counts, bin_s)
+        return trace, cost.price(self.netlist, chip, trace.counts, bin_s * self.netlist.bins)
 
     def batch(self, steps: int) -> int:
         """Recordings whose counts are held at a time."""
@@ -75,6 +83,14 @@ class TrueNorth(Machine):
 
 
 machine_of = TrueNorth
+
+COUNTING_BITS = 1 + LARGEST.bit_length()
+"""Widest weights of a counting network."""
+
+
+def counting_source(counters: Counters) -> Counters:
+    """What of a counting network is compiled: it itself."""
+    return counters
 
 
 def load(path: str | os.PathLike[str]) -> TrueNorth:

@@ -5,7 +5,8 @@ twice. A vote ends early
 
 * *by proof*, when no spikes whatever can change it: every rival is behind by more than it can still gain while the
   leader gets nothing more. An output neuron gains at most one vote a step, or fewer where even its largest input takes
-  several steps to lift it over its threshold (:func:`most_votes`);
+  several steps to lift it over its threshold (:func:`most_votes`), and exactly one where its own spike lifts it over
+  it again (:func:`steady_classes`);
 * *by calibration*, when the leader is ahead by more than ``a * sqrt(steps left)``: the lead of one neuron over another
   strays from its course about as the root of the steps. The factor comes from other recordings.
 
@@ -83,14 +84,24 @@ def most_votes(machine: IntegerMachine, steps: int) -> IntArray:
     return most
 
 
-def proven(votes: IntArray, at: Standing, most: IntArray) -> BoolArray:
+def steady_classes(machine: IntegerMachine) -> BoolArray:
+    """Classes that get a vote in every step after their first one; shape (classes,)."""
+    classes, voters = machine.netlist.classes, machine.netlist.readout_class
+    counts = [
+        np.bincount(each, minlength=classes) for each in (voters[voters >= 0], voters[voters >= 0][machine.steady])
+    ]
+    return np.asarray((counts[0] == 1) & (counts[1] == 1))
+
+
+def proven(votes: IntArray, at: Standing, most: IntArray, steady: BoolArray | None = None) -> BoolArray:
     """Whether the decision after each step is the last word, whatever follows; shape (samples, steps).
 
-    `most` (classes, longest + 1) is that of :func:`most_votes`.
+    `most` (classes, longest + 1) is that of :func:`most_votes`, `steady` (classes,) that of :func:`steady_classes`.
     """
     classes = votes.shape[2]
     reach = votes + most.T[at.left]
-    sure = wins(at.leader.reshape(-1), votes.reshape(-1, classes), reach.reshape(-1, classes))
+    least = votes if steady is None else votes + at.left[..., None] * (steady & (votes > 0))
+    sure = wins(at.leader.reshape(-1), least.reshape(-1, classes), reach.reshape(-1, classes))
     return sure.reshape(at.leader.shape)
 
 
@@ -108,7 +119,7 @@ def live(machine: IntegerMachine, bins: int, factor: float) -> Callable[[int, In
 
     It takes a chip step, from 0, and the votes (classes,) after it, and says whether the grasp may end.
     """
-    most, depth = most_votes(machine, bins), machine.read_out_lag
+    most, steady, depth = most_votes(machine, bins), steady_classes(machine), machine.read_out_lag
 
     def may_end(chip_step: int, counts: IntArray) -> bool:
         seen = chip_step + 1 - depth
@@ -116,7 +127,7 @@ def live(machine: IntegerMachine, bins: int, factor: float) -> Callable[[int, In
             return False
         votes = counts[None, None]
         now = standing(votes, np.array([bins - seen + 1]))
-        return bool(proven(votes, now, most)[0, 0] or now.confidence[0, 0] > factor)
+        return bool(proven(votes, now, most, steady)[0, 0] or now.confidence[0, 0] > factor)
 
     return may_end
 

@@ -122,7 +122,7 @@ def study(
 ) -> Anytime:
     """Apply the proof and calibrated rules to recordings and their run."""
     at = exits.standing(ran.votes, ran.lengths)
-    sure = exits.proven(ran.votes, at, exits.most_votes(machine, data.steps))
+    sure = exits.proven(ran.votes, at, exits.most_votes(machine, data.steps), exits.steady_classes(machine))
     labelled = int(np.count_nonzero(data.labels != UNLABELLED))
     return Anytime(
         samples=len(data),

@@ -1,19 +1,11 @@
 """Support vector machines on event counts: what no spiking network is needed for, and what they cost on a processor.
 
-Prices are of operations in 45 nm at 0.9 V [1]_. At least, an inference takes its arithmetic (8-bit weights, 32-bit
-sums) and its memory accesses; at most, every operation also takes instructions of a simple core, without SIMD, at the
-published 70 pJ. A small processor lies between. Sleep, leakage and the sensor's interface are left out, as they are for
-the chip; that 8 bits are enough is assumed.
-
-References
-----------
-.. [1] M. Horowitz, "Computing's energy problem (and what we can do about it)", ISSCC 2014, figure 1.1.9.
+Prices are those of :mod:`studies.processor`; that weights of 8 bits are enough is assumed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
@@ -21,8 +13,8 @@ import numpy as np
 
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.studies.processor import Processor, processor
 from spikeloom.runtime.studies.smallest.space import Candidate
-from spikeloom.runtime.studies.yardsticks import HOROWITZ
 
 LINEAR, RBF = "linear-svm", "rbf-svm"
 
@@ -31,32 +23,10 @@ STRENGTHS = {LINEAR: (0.1, 0.01, 1.0), RBF: (10.0, 1.0, 3.0, 30.0)}
 
 PARTS = (1, 5, 10)
 
-SOURCE = "Horowitz, ISSCC 2014, figure 1.1.9 (45 nm, 0.9 V): arithmetic, memory accesses, 70 pJ an instruction"
-
 MISSING = "no baselines: support vector machines need scikit-learn; install it with pip install 'spikeloom[study]'"
 
-SRAM = {8 << 10: 10.0, 32 << 10: 20.0, 1 << 20: 100.0}
-"""pJ of an access to 64 bits in a memory of so many bytes."""
-
-WORD = 8
-"""Bytes of an access."""
-
-INSTRUCTION = 70.0
-"""pJ, fetched, decoded and carried out."""
-
-# Instructions: for an event load, add, store and its address; for a product two loads and a multiply-accumulate
-EVENT_INSTRUCTIONS, PRODUCT_INSTRUCTIONS = 4, 3
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Processor:
-    """An inference of a baseline on a small processor: operations, bytes of its model, joules at least and at most."""
-
-    events: float
-    products: int
-    size: int
-    least_j: float
-    most_j: float
+# For an event load, add and store a count; for a product two loads and a multiply-accumulate; two loads of a table
+EVENT_CYCLES, PRODUCT_CYCLES, LOOKUP_CYCLES = 6, 5, 4
 
 
 def baselines() -> Iterator[Candidate]:
@@ -96,8 +66,8 @@ def decided(system: str, strength: float, seen: FloatArray, labels: IntArray, fo
     return found
 
 
-def processor(system: str, strength: float, data: Recordings, candidate: Candidate) -> Processor:
-    """What an inference costs, fitted on all recordings."""
+def priced(system: str, strength: float, data: Recordings, candidate: Candidate) -> Processor:
+    """What an inference costs on a processor, fitted on all recordings."""
     seen = features(data, candidate)
     fitted = machine(system, strength).fit(seen, data.labels)[-1]
     if system == LINEAR:
@@ -107,14 +77,9 @@ def processor(system: str, strength: float, data: Recordings, candidate: Candida
         products, lookups = vectors * (seen.shape[1] + classes - 1), vectors
     lookups += seen.shape[1] if candidate.options["counts"] == "log" else 0
     events = float(data.events.sum()) / len(data)
-    counting, model = (_access(each) for each in (seen.shape[1], products))
-    add, multiply = HOROWITZ["int32_add"], HOROWITZ["int8_multiply"]
-    least = events * (add + 2 * counting) + products * (add + multiply + model / WORD) + lookups * counting
-    instructions = EVENT_INSTRUCTIONS * events + PRODUCT_INSTRUCTIONS * products + 2 * lookups
-    most = least + INSTRUCTION * instructions
-    return Processor(events=events, products=products, size=products, least_j=1e-12 * least, most_j=1e-12 * most)
-
-
-def _access(size: int) -> float:
-    """PJ of an access to the smallest memory that holds so many bytes, or the largest."""
-    return next((price for most, price in SRAM.items() if size <= most), max(SRAM.values()))
+    return processor(
+        adds=events + products,
+        multiplies=products,
+        accesses={seen.shape[1]: 2 * events + lookups, products: products / 8},
+        cycles=EVENT_CYCLES * events + PRODUCT_CYCLES * products + LOOKUP_CYCLES * lookups,
+    )

@@ -46,17 +46,27 @@ def gap(best: Measured, other: Measured) -> tuple[float, float]:
     return float(ahead.mean()), float(error)
 
 
-KEPT = {1: 24, 2: 24}
+KEPT = {1: 20, 2: 14}
 """Candidates that go on from a rung."""
 
+VARIED = {1: 12, 2: 4}
+"""Those of them, the first, of which variants go on, too."""
 
 BEST = 50
 """How much more it weighs to be behind a cheaper one than behind the best: the front goes on, down to cheap ones."""
 
+SLACK = 1.25
+"""Factor by which a candidate may miss a budget on an early rung: a variant may fit."""
 
-def going_on(tried: Iterable[Tried], rung: int) -> list[Tried]:
-    """Those that may still be chosen: least behind a cheaper one, or, which weighs less, behind the best."""
-    able = [each for each in tried if each.costs is not None]
+
+def going_on(tried: Iterable[Tried], rung: int, budgets: Sequence[Budget] = ()) -> list[Tried]:
+    """Those that may still be chosen: least behind a cheaper one, or, which weighs less, behind the best.
+
+    Where budgets are nearly met by any, those alone go on.
+    """
+    priced = [each for each in tried if each.costs is not None]
+    limits = [budget for budget in budgets if budget.what != "accuracy"]
+    able = [each for each in priced if all(excess(each, budget) <= SLACK for budget in limits)] or priced
     top = max((each.accuracy for each in able), default=0.0)
 
     def lag(each: Tried) -> float:

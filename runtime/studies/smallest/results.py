@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from spikeloom.runtime.equivalence.verdict import Level
 from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL
 from spikeloom.runtime.studies.chart.results import ChosenBy, Data, Share
+from spikeloom.runtime.studies.processor import Processor
 from spikeloom.runtime.studies.pruning.results import Costs
-from spikeloom.runtime.studies.smallest.baselines import Processor
 from spikeloom.runtime.studies.smallest.space import Candidate
 from spikeloom.runtime.studies.smallest.work import Measured
 
@@ -20,6 +19,8 @@ RUNGS = 3
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tried:
     """A candidate as far as it came: its accuracy by cross-validation with the Wilson interval, and its costs.
+
+    Costs are those until the decision is proven; `whole` are those to the end, where they are others.
 
     `behind` is what the best has ahead of it on the same recordings, with its standard error. It is on the `front` if
     no other one that came as far is cheaper and as accurate.
@@ -33,6 +34,7 @@ class Tried:
     high: float
     setting: float
     costs: Costs | None = field(default=None, metadata=OPTIONAL)
+    whole: Costs | None = field(default=None, metadata=OPTIONAL)
     refused: str | None = field(default=None, metadata=OPTIONAL)
     processor: Processor | None = field(default=None, metadata=OPTIONAL)
     behind: float = 0.0
@@ -61,19 +63,20 @@ class Choice:
 class Checked:
     """The choice, trained on the whole training split: its files, and float model beside chip on both splits.
 
-    `different` are spikes in training recordings, `equal` decisions of `training` and `test`; `right` is the chip's on
-    the test split, which nothing else has looked at.
+    `different` are spikes and `equal` decisions of ``train`` and ``test``; `right` is the chip's on the test split,
+    which nothing else has looked at. `pace` says which term of the energy is the larger at the pace of the sensor.
     """
 
     network: str
     network_sha256: str
     netlist: str
     netlist_sha256: str
-    different: int
-    levels: tuple[Level, ...]
+    different: Mapping[str, int]
     equal: Mapping[str, int]
     right: Share
     costs: Costs
+    stopped: Costs | None
+    pace: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

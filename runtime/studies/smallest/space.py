@@ -4,27 +4,39 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
-from spikeloom.compiler.systems import MLP, TACTILESGNET
+from spikeloom.compiler.systems import MLP, SYSTEMS, TACTILESGNET
 from spikeloom.models.recordings.evtouch import WHOLE
 from spikeloom.models.training.counters import STRENGTHS, Plan
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import whole_numbers
+from spikeloom.runtime.report.encode import OPTIONAL
 
 JOINS = (1, 2, 5, 10, 25)
-PARTS = (1, 2, 5, 10)
+PARTS = (1, 2, 3, 5, 10)
 WINDOWS = (100, 50)
-THRESHOLDS = ((1,), (1, 4, 16, 64), (1, 2, 4, 8, 16, 32, 64), (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 130))
+THRESHOLDS = (
+    (1,),
+    (1, 4, 16, 64),
+    (1, 3, 8, 20, 50),
+    (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 130),
+)
 """Of counting networks."""
 
 RAMPS = (16, 64)
-"""Steps of the read-out that those which go on are tried with, too: half and twice the usual ones."""
+"""Steps of the read-out that those which go on are tried with, too."""
 
-MOST_COUNTERS = {100: 80, 50: 20}
+BITS = (5, 4, 3)
+"""Of their weights; the two next to those of the chip."""
+
+STORAGE = 4
+"""Bits in which networks that are trained by gradients are stored, too."""
+
+MOST_COUNTERS = {100: 50, 50: 20}
 """Counters of a channel at most, by window: what is larger gains little and takes minutes."""
 
 
@@ -45,6 +57,7 @@ class Candidate:
 
     system: str
     options: Mapping[str, Any]
+    storage: int | None = field(default=None, metadata=OPTIONAL)  # Bits of a weight, where not those of `compile`
 
     json_properties = ("name",)
 
@@ -53,6 +66,7 @@ class Candidate:
         """For tables."""
         options = dict(self.options)
         thresholds = [str(options.pop("thresholds"))] if "thresholds" in options else []
+        options |= {} if self.storage is None else {"stored": self.storage}
         return " ".join([self.system, *thresholds, *(f"{name}={value}" for name, value in options.items())])
 
     @property
@@ -64,11 +78,12 @@ class Candidate:
         """Of a counting network."""
         about = dict(self.options)
         thresholds = tuple(whole_numbers(about.pop("thresholds"), "--thresholds"))
-        return Plan(thresholds=thresholds, bins=about.pop("join", 1), strengths=strengths, **about)
+        about["bins"], about["bits"] = about.pop("join", 1), about.pop("weight_bits", 8)
+        return Plan(thresholds=thresholds, strengths=strengths, **about)
 
 
-def counting(steps: int, levels: int = 1) -> Iterator[Candidate]:
-    """Counting networks for recordings of so many bins; options that are usual are left out.
+def counting(steps: int, levels: int = 1, bits: int = 8) -> Iterator[Candidate]:
+    """Counting networks for recordings of so many bins, in weights of some bits; usual options are left out.
 
     A counter sees one event a step at most, so thresholds above the steps of a part are omitted.
 
@@ -87,7 +102,8 @@ def counting(steps: int, levels: int = 1) -> Iterator[Candidate]:
         if whole and closed and len(able) * parts <= MOST_COUNTERS[window]:
             known[join, window, parts, able] = None
     for join, window, parts, able in known:
-        yield _counters(thresholds=",".join(map(str, able)), parts=parts, levels=levels, window=window, join=join)
+        about = {"parts": parts, "levels": levels, "window": window, "join": join, "weight_bits": bits}
+        yield _counters(thresholds=",".join(map(str, able)), **about)
 
 
 def networks(steps: int, systems: Collection[str]) -> Iterator[Candidate]:
@@ -100,12 +116,17 @@ def networks(steps: int, systems: Collection[str]) -> Iterator[Candidate]:
 
 def _counters(**options: Any) -> Candidate:
     """Options that are usual are omitted."""
-    usual = {"thresholds": None, "parts": 1, "ramp": 32, "levels": 1, "window": 100, "join": 1}
+    usual = {"thresholds": None, "parts": 1, "ramp": 32, "levels": 1, "window": 100, "join": 1, "weight_bits": 8}
     given = {name: options.get(name, value) for name, value in usual.items()}
     return Candidate(system=COUNTING, options={name: each for name, each in given.items() if each != usual[name]})
 
 
-def variants(candidate: Candidate) -> list[Candidate]:
-    """The same with other lengths of the read-out, where it has one."""
-    known = candidate.options if candidate.system == COUNTING else {}
-    return [_counters(**{**known, "ramp": ramp}) for ramp in RAMPS if known]
+def variants(candidate: Candidate, rung: int) -> list[Candidate]:
+    """What goes on from a rung beside a candidate: first other lengths of the read-out, then fewer bits of a weight."""
+    known = candidate.options
+    if candidate.system != COUNTING:
+        return [replace(candidate, storage=STORAGE)] if rung > 1 and candidate.system in SYSTEMS else []
+    if rung == 1:
+        return [_counters(**{**known, "ramp": ramp}) for ramp in RAMPS]
+    fewer = [bits for bits in BITS if bits < known.get("weight_bits", 8)]
+    return [_counters(**{**known, "weight_bits": bits}) for bits in fewer[:2]]

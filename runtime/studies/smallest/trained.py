@@ -24,8 +24,8 @@ from spikeloom.models.systems import taxels_alone
 from spikeloom.models.training.kinds import Plan, kind_of, seen_by
 from spikeloom.models.training.recipes import RECIPES
 from spikeloom.runtime.inputs import repeat
-from spikeloom.runtime.inputs.compilation import provenance, whole_numbers
-from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.compilation import parse_packings, whole_numbers
+from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.studies.smallest.space import Candidate
 
 
@@ -58,7 +58,7 @@ def plan_of(candidate: Candidate, sensor: Sensor, training: Recordings) -> Plan:
     )
 
 
-def without(plan: Plan, training: Recordings, held: IntArray, epochs: int, target: Target) -> Any:
+def without(plan: Plan, training: Recordings, held: IntArray, epochs: int, target: Target, storage: int | None) -> Any:
     """The netlist of a network that some recordings are left out of."""
     from spikeloom.models.training.train import train
 
@@ -69,18 +69,14 @@ def without(plan: Plan, training: Recordings, held: IntArray, epochs: int, targe
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "network.pt")
         kind.save(file, {"last": made.last}, plan, {})
-        return compiled(load_network(str(file), arguments(target)), target, seen)
+        asked = arguments(target)
+        asked.weight_bits = None if storage is None else str(storage)
+        loaded, events = load_network(str(file), asked), np.ascontiguousarray(seen.events)
+        options = target.module.Options(training_events=events, packings=parse_packings(asked))
+        return compile_network(loaded.model, options, target=target.name).netlist
 
 
 def arguments(target: Target) -> argparse.Namespace:
     """What the command ``compile`` would have parsed, without options."""
     names = (*repeat.NETWORK, *repeat.ROUNDING, *repeat.PLACING, "polarities", "polarities_first", "dt", "convention")
     return argparse.Namespace(**{name: repeat.USUAL.get(name) for name in names}, target=target.name)
-
-
-def compiled(loaded: LoadedNetwork, target: Target, training: Recordings | None) -> Any:
-    """The netlist that ``compile`` makes of a network, calibrated on `training`, in its steps, if there is any."""
-    made = provenance(arguments(target), loaded, calibrated=training)
-    events = None if training is None else np.ascontiguousarray(training.events)
-    options = target.module.Options(training_events=events, provenance=made)
-    return compile_network(loaded.model, options, target=target.name).netlist

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
 from typing import Any
@@ -15,7 +14,6 @@ from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import CapacityError, DataError, ModelError
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
-from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.systems import SYSTEMS
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
@@ -30,20 +28,25 @@ from spikeloom.models.training.counters import (
     counters_of,
     folds,
     linear_rules,
+    spikes_of,
 )
 from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.machines.base import chip_module, machine_of
+from spikeloom.runtime.machines.integer import IntegerMachine
 from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.studies.anytime.study import study
 from spikeloom.runtime.studies.chart.results import Data
 from spikeloom.runtime.studies.jobs import Job, content_key
+from spikeloom.runtime.studies.processor import Processor
 from spikeloom.runtime.studies.pruning.results import Costs
 from spikeloom.runtime.studies.pruning.trials import decisions as decisions_on_chip
 from spikeloom.runtime.studies.pruning.trials import priced
 from spikeloom.runtime.studies.smallest import baselines
-from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF, Processor
+from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF
 from spikeloom.runtime.studies.smallest.space import Candidate
 from spikeloom.runtime.studies.smallest.trained import Sensor, plan_of, without
 
-FORMAT = 1
+FORMAT = 2
 """Of what is measured; goes up when a figure means something else."""
 
 PRICED = 48
@@ -73,6 +76,7 @@ class Measured:
     tried: tuple[int, ...]
     setting: float  # Strength of the rule
     costs: Costs | None = None
+    stopped: Costs | None = None  # Until the decision is proven
     refused: str | None = None  # Why the chip does not hold it
     processor: Processor | None = None  # Costs of a baseline
 
@@ -80,7 +84,13 @@ class Measured:
 def trial(candidate: Candidate, rung: int, setting: float | None, data: Data, sensor: Sensor, target: str) -> Trial:
     """Work whose key is of everything that decides the result."""
     about = {"format": FORMAT, "spikeloom": __version__, "data": data.sha256, "bin_s": data.bin_s, "target": target}
-    about |= {"system": candidate.system, "options": dict(candidate.options), "rung": rung, "setting": setting}
+    about |= {
+        "system": candidate.system,
+        "options": dict(candidate.options),
+        "stored": candidate.storage,
+        "rung": rung,
+        "setting": setting,
+    }
     if candidate.system in SYSTEMS:
         graph = sensor.graph
         about["graph"] = arrays_digest({"edges": graph.edges, "coordinates": graph.coordinates})
@@ -123,13 +133,11 @@ def _counting(work: Trial, training: Recordings) -> Measured:
     for seed in range(1, ROUNDS + 1) if last else (0,):
         decided, strength, lowest = cross_validated(data, classes, training, seed)
         right += decided == training.labels
-    costs, refused = None, None
-    if not last:
-        rule = linear_rules(data, classes, [strength])[strength]
-        made = counters_of(data, Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest), training, classes)
-        costs, refused = costs_of(made, training, work.target)
+    rule = linear_rules(data, classes, [strength])[strength]
+    made = counters_of(data, Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest), training, classes)
     rounds = (ROUNDS if last else 1,) * len(training)
-    return Measured(right=tuple(right.tolist()), tried=rounds, setting=strength, costs=costs, refused=refused)
+    costs = _counting_costs(made, training, work.target)
+    return Measured(right=tuple(right.tolist()), tried=rounds, setting=strength, **costs)
 
 
 def _network(work: Trial, training: Recordings) -> Measured:
@@ -137,18 +145,22 @@ def _network(work: Trial, training: Recordings) -> Measured:
     plan, target = plan_of(work.candidate, work.sensor, training), load_target(work.target)
     epochs = work.candidate.options["epochs"] // (2 if work.rung == 1 else 1)
     fold = folds(training.labels, FOLDS, np.random.default_rng(0))
-    right, tried, costs = *np.zeros((2, len(training)), np.int64), None
+    right, tried = np.zeros((2, len(training)), np.int64)
+    costs: tuple[Costs | None, Costs | None] = None, None
     steps = joined_bins(training, plan.bins)
     for part in range(FOLDS if work.rung == 3 else 1):
         held = fold == part
         try:
-            netlist = without(plan, training, held, epochs, target)
+            netlist = without(plan, training, held, epochs, target, work.candidate.storage)
         except (CapacityError, ModelError) as error:
             none = (0,) * len(training)
             return Measured(right=none, tried=none, setting=epochs, refused=str(error).splitlines()[0])
-        costs = costs or priced(netlist, some(steps))[1]
+        costs = costs if part else costs_of(netlist, some(steps))
         right[held], tried[held] = decisions_on_chip(netlist, steps.part(held)) == training.labels[held], 1
-    return Measured(right=tuple(right.tolist()), tried=tuple(tried.tolist()), setting=epochs, costs=costs)
+    made, stopped = costs
+    return Measured(
+        right=tuple(right.tolist()), tried=tuple(tried.tolist()), setting=epochs, costs=made, stopped=stopped
+    )
 
 
 def _baseline(work: Trial, training: Recordings) -> Measured:
@@ -165,7 +177,7 @@ def _baseline(work: Trial, training: Recordings) -> Measured:
         right=tuple(right[best].tolist()),
         tried=(ROUNDS if last else 1,) * len(training),
         setting=best,
-        processor=baselines.processor(system, best, training, work.candidate),
+        processor=baselines.priced(system, best, training, work.candidate),
     )
 
 
@@ -194,20 +206,27 @@ def decisions(made: Counters, data: Counted) -> IntArray:
 
     That is exact but for a sum that exceeds all training sums before the recording ends.
     """
-    place: Mapping[tuple[int, ...], int] = {tuple(each): index for index, each in enumerate(data.counter.tolist())}
-    spikes = data.spikes[:, [place[tuple(each)] for each in made.counter.tolist()]]
-    sums: FloatArray = spikes.astype(np.float64) @ made.weight.T
+    sums: FloatArray = spikes_of(made, data).astype(np.float64) @ made.weight.T
     crossing = np.floor((made.threshold - made.slope * made.steps - sums) / made.slope) + 1
     found: IntArray = np.where(crossing > made.ramp, np.inf, crossing).argmin(axis=1)
     return found
 
 
-def costs_of(made: Counters, training: Recordings, target: str) -> tuple[Costs | None, str | None]:
-    """What an inference of a counting network costs on the chip, or why the chip does not hold it."""
-    options: Any = load_target(target).module.Options()
+def costs_of(netlist: Any, of: Recordings) -> tuple[Costs, Costs | None]:
+    """What a mean inference costs to its end, and until its decision is proven, where the chip can be stopped there."""
+    machine, costs = machine_of(netlist), priced(netlist, of)[1]
+    if not isinstance(machine, IntegerMachine):
+        return costs, None
+    proven = study(machine, of, machine.cumulative(of.events, of.step_counts)).rules[0].mean
+    return costs, replace(costs, operations=proven.operations, energy_j=proven.energy_j, time_s=proven.time_s)
+
+
+def _counting_costs(made: Counters, training: Recordings, target: str) -> JsonObject:
+    """Costs of a counting network on a chip, or why that does not hold it."""
+    chip = chip_module(target, "machine")
     try:
-        netlist = compile_network(counting_network(made), options, target=target).netlist
+        netlist = compile_network(chip.counting_source(made), target=target).netlist
     except (CapacityError, ModelError, DataError) as error:
-        return None, str(error).splitlines()[0]
-    steps = of_length(joined_bins(some(training), made.bins), made.clocks.length)
-    return priced(netlist, steps)[1], None
+        return {"refused": str(error).splitlines()[0]}
+    costs, stopped = costs_of(netlist, of_length(joined_bins(some(training), made.bins), made.clocks.length))
+    return {"costs": costs, "stopped": stopped}

@@ -40,6 +40,15 @@ def least_intervals(netlist: Netlist) -> IntArray:
     return interval
 
 
+def steady(netlist: Netlist) -> BoolArray:
+    """See :attr:`IntegerMachine.steady`: what nothing lowers, and its own spike alone lifts over the threshold."""
+    voters = np.flatnonzero(netlist.readout_class >= 0)
+    sender, receiver = netlist.axon_source[netlist.axon_of_synapse()] - netlist.n_inputs, netlist.synapse_compartment()
+    own = np.bincount(receiver, np.where(sender == receiver, netlist.effective_weight(), 0), netlist.n_compartments)
+    lifted = (own > netlist.threshold) & (netlist.bias_mantissa >= 0) & (one_step_bounds(netlist)[1] == 0)
+    return np.asarray(lifted[voters])
+
+
 def vote_charges(netlist: Netlist) -> Charges:
     """What a spike adds to the votes of each class."""
     sources = np.zeros((netlist.n_inputs + netlist.n_compartments, netlist.classes), np.int64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from spikeloom.runtime.machines.loihi1.costs.result import Amounts, CostReport
-from spikeloom.runtime.report.numbers import si
+from spikeloom.runtime.report.numbers import dominant, si
 from spikeloom.runtime.report.sections import Section, Table, Text
 
 DYNAMIC = "dynamic energy, "
@@ -101,5 +101,7 @@ def _lines(report: CostReport) -> list[str]:
             f"{'' if static.chips == 1 else f'on {static.chips} chips '}takes {si(static.real_time_j, 'J')} at the "
             "sensor's pace, more than all else" + (f"; at full speed {full}" if full else "")
         )
+    if report.static and report.per_inference.energy_j:
+        lines.append(dominant([each.real_time_j for each in report.static], report.per_inference.energy_j.values()))
     lines += [f"not modelled: {line}" for line in report.not_modelled]
     return [*lines, *(f"not priced: {line}" for line in report.not_priced)]

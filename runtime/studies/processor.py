@@ -1,0 +1,224 @@
+"""The same decision on a small processor: a linear rule in whole numbers, trained on the same recordings.
+
+A program raises the count of an event's channel; where that reaches a threshold, it adds a row of whole weights, as
+wide as the netlist's, to the sums of the classes, of which the largest decides: a counting network that reads its sums
+exactly. Thresholds and parts of the recording are chosen by cross-validation in the training split, the fewest
+additions that are not shown to be worse than the best.
+
+A decision takes at least its arithmetic and memory accesses [1]_, at most the cycles of a simple program [2]_ on a
+microcontroller that one can buy. In between it sleeps, or idles with all clocks running.
+
+References
+----------
+.. [1] M. Horowitz, "Computing's energy problem (and what we can do about it)", ISSCC 2014, figure 1.1.9.
+.. [2] Arm, "Cortex-M4 Technical Reference Manual", table 3-1: a load takes two cycles, arithmetic and stores one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import compress, product
+
+import numpy as np
+
+from spikeloom.compiler.counters import Counters
+from spikeloom.compiler.targets.base import Quantity
+from spikeloom.compiler.types import BoolArray
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.counters import Plan, counted, counters_of, fit, held_out, spikes_of
+from spikeloom.runtime.machines.base import Price
+from spikeloom.runtime.report.console import Progress
+from spikeloom.runtime.report.numbers import percent, si
+from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.studies.yardsticks import HOROWITZ
+
+ARITHMETIC = "Horowitz, ISSCC 2014, figure 1.1.9 (45 nm, 0.9 V)"
+SOLD = "STM32L4R5 (Cortex-M4), data sheet DS12023, typical at 3 V: "
+
+PRICES = {
+    "add": Quantity(value=HOROWITZ["int32_add"], unit="pJ of 32 bits", source=ARITHMETIC),
+    "multiply": Quantity(value=HOROWITZ["int8_multiply"], unit="pJ of 8 bits", source=ARITHMETIC),
+    "access_8": Quantity(value=10.0, unit="pJ of 64 bits in 8 KiB", source=ARITHMETIC),
+    "access_32": Quantity(value=20.0, unit="pJ of 64 bits in 32 KiB", source=ARITHMETIC),
+    "access_1024": Quantity(value=100.0, unit="pJ of 64 bits in 1 MiB", source=ARITHMETIC),
+    "cycle": Quantity(value=300.0, unit="pJ", source=f"{SOLD}100 µA/MHz", confidence="secondary"),
+    "asleep": Quantity(value=3.6e-3, unit="mW", source=f"{SOLD}1.2 µA, memory kept (Stop 2)", confidence="secondary"),
+    "idle": Quantity(value=7.2, unit="mW", source=f"{SOLD}30 µA/MHz at 80 MHz (Sleep)", confidence="secondary"),
+}
+"""Of a processor: events in pJ, static power in mW."""
+
+CLOCK_HZ = 80e6
+
+# Load, raise and store a count, load its threshold, compare, branch; load a weight and a sum, add, store, count on
+EVENT_CYCLES, ADD_CYCLES = 12, 8
+
+PLANS = tuple(product(((1, 4, 16, 64), (1, 2, 4, 8, 16, 32, 64)), (1, 5, 10)))
+"""Thresholds and parts that are tried."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Processor:
+    """An inference on a small processor: accesses to 64 bits, the model in bytes, joules at least and at most."""
+
+    operations: float
+    accesses: float
+    size: int
+    cycles: float
+    least_j: float
+    most_j: float
+
+
+def processor(*, adds: float, multiplies: float = 0.0, accesses: Mapping[int, float], cycles: float) -> Processor:
+    """Price an inference; `accesses` are those to 64 bits, by the bytes of a memory, the model's the last."""
+    least = adds * PRICES["add"].value + multiplies * PRICES["multiply"].value
+    for held, count in accesses.items():
+        memory = next((size for size in (8, 32) if held <= size << 10), 1024)
+        least += count * PRICES[f"access_{memory}"].value
+    return Processor(
+        operations=adds + multiplies,
+        accesses=sum(accesses.values()),
+        size=list(accesses)[-1],
+        cycles=cycles,
+        least_j=1e-12 * least,
+        most_j=1e-12 * cycles * PRICES["cycle"].value,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Side:
+    """Of a mean inference, at least and at most: what events take, static power, and both at the sensor's pace."""
+
+    correct: int
+    dynamic_j: tuple[float, float]
+    static_w: tuple[float, float]
+    pace_j: tuple[float, float]
+    events_per_s: float  # At full speed; infinite where nothing says how long events take
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison:
+    """A netlist and the rule of a processor on the same recordings, of mean `events` and `seconds`.
+
+    `break_even` are the events a second from which on the chip takes less, where every price favours it; None where no
+    rate is enough.
+    """
+
+    plan: Plan
+    counters: int
+    cross_validation: float
+    samples: int
+    events: float
+    seconds: float
+    work: Processor
+    chip: Side
+    processor: Side
+    break_even: float | None
+    verdict: str
+    prices: Mapping[str, Quantity] = field(default_factory=PRICES.copy)
+    not_priced: tuple[str, ...] = ("on both sides the sensor's interface, and waking up",)
+
+
+def against_processor(
+    training: Recordings, test: Recordings, bits: int, bin_s: float, price: Price, right: BoolArray
+) -> Comparison:
+    """Train a rule on the training recordings, in their own bins, and hold a netlist against it.
+
+    The netlist's weights have so many `bits`; `price` and `right` (samples,) are of its run of the `test` recordings.
+    """
+    rule, plan, validation = _rule(training, bits)
+    spikes = spikes_of(rule, counted(test, plan, rule.steps)).astype(np.int64)
+    ours = (spikes @ rule.weight.T).argmax(axis=1) == test.labels
+    events, seconds = float(test.events.sum()) / len(test), float(test.step_counts.mean()) * bin_s
+    channels, added = rule.taxels * rule.polarities, float(spikes.sum()) / len(test) * rule.classes
+    work = processor(
+        adds=2 * events + added + rule.classes,
+        # of a sum 32 bits, there and back
+        accesses={2 * channels: 3 * events + added, len(rule.counter) * rule.classes * bits // 8: added * bits / 64},
+        cycles=EVENT_CYCLES * events + ADD_CYCLES * (added + rule.classes),
+    )
+
+    def side(correct: BoolArray, dynamic: Iterable[float], static: Iterable[float], fastest_s: float) -> Side:
+        joules, watts = ((min(each), max(each)) for each in map(list, (dynamic, static)))
+        low, high = (each + power * seconds for each, power in zip(joules, watts, strict=True))
+        speed, count = events / fastest_s if fastest_s else math.inf, int(correct.sum())
+        return Side(correct=count, dynamic_j=joules, static_w=watts, pace_j=(low, high), events_per_s=speed)
+
+    fastest = next((float(each.mean()) for each in price.time_s.values()), 0.0)
+    chip = side(right, (float(each.mean()) for each in price.dynamic_j.values()), price.static_w.values(), fastest)
+    static = (1e-3 * PRICES[name].value for name in ("asleep", "idle"))
+    small = side(ours, (work.least_j, work.most_j), static, work.cycles / CLOCK_HZ)
+    gain = (small.dynamic_j[1] - chip.dynamic_j[0]) / events
+    return Comparison(
+        plan=plan,
+        counters=len(rule.counter),
+        cross_validation=validation,
+        samples=len(test),
+        events=events,
+        seconds=seconds,
+        work=work,
+        chip=chip,
+        processor=small,
+        break_even=max(0.0, chip.static_w[0] - small.static_w[1]) / gain if gain > 0 else None,
+        verdict=_verdict(chip, small),
+    )
+
+
+def _rule(training: Recordings, bits: int) -> tuple[Counters, Plan, float]:
+    """The cheapest rule that is not shown to be worse than the best, its plan, and its accuracy in cross-validation."""
+    classes, found, progress = int(training.labels.max()) + 1, [], Progress(len(PLANS))
+    for done, (thresholds, parts) in enumerate(PLANS):
+        progress(done, "training rules for a processor")
+        plan = Plan(thresholds=thresholds, parts=min(parts, training.steps), bits=bits)
+        data = counted(training, plan)
+        fitted = fit(data, classes)
+        right = held_out(data, classes)[fitted.strength].argmax(axis=1) == data.labels
+        rule = counters_of(data, fitted, training, classes)
+        found.append((rule, plan, right.astype(float), int(spikes_of(rule, data).sum(dtype=np.int64))))
+    best = max((right for _, _, right, _ in found), key=np.mean)
+    behind = [best - right for _, _, right, _ in found]
+    near = [each.mean() <= each.std(ddof=1) / np.sqrt(len(each)) for each in behind]
+    rule, plan, right, _ = min(compress(found, near), key=lambda each: each[3])
+    return rule, plan, float(right.mean())
+
+
+def _verdict(chip: Side, small: Side) -> str:
+    """Who takes less at the sensor's pace."""
+    if small.pace_j[1] < chip.pace_j[0]:
+        least, most = chip.pace_j[0] / small.pace_j[1], chip.pace_j[1] / small.pace_j[0]
+        return f"a microcontroller is cheaper at the sensor's pace: {least:,.0f} to {most:,.0f} times"
+    if chip.pace_j[1] < small.pace_j[0]:
+        return "the chip is cheaper than a microcontroller at the sensor's pace"
+    return "whether the chip or a microcontroller is cheaper at the sensor's pace depends on the prices"
+
+
+def sections(found: Comparison) -> Iterator[Section]:
+    """The comparison for people."""
+    plan, work, rows = found.plan, found.work, []
+    about = (
+        f"on a processor: {found.counters} counters of {', '.join(map(str, plan.thresholds))} events in "
+        f"{plan.parts} parts, {plan.bits}-bit weights; {work.operations:,.0f} operations, "
+        f"{work.accesses:,.0f} memory accesses, {work.cycles:,.0f} cycles"
+    )
+    for name, side in (("chip", found.chip), ("processor", found.processor)):
+        ends = ((side.dynamic_j, "J"), (side.static_w, "W"), (side.pace_j, "J"))
+        cells = [f"{si(low, unit)} … {si(high, unit)}" for (low, high), unit in ends]
+        rows.append([name, percent(side.correct, found.samples), *cells])
+    table = Table(["", "right", "dynamic energy", "static power", f"a decision in {found.seconds:.3g} s"], rows)
+    even = "break-even: at no event rate, an event takes more on the chip by any price"
+    if found.break_even is not None:
+        fastest = min(found.chip.events_per_s, found.processor.events_per_s)
+        beyond = f", more than the {fastest:,.0f} that both can take" if found.break_even > fastest else ""
+        even = (
+            f"break-even: {found.break_even:,.0f} events/s where every price favours the chip, the sensor has "
+            f"{found.events / found.seconds:,.0f}{beyond}"
+        )
+    lines = [found.verdict, even, *(f"not priced: {line}" for line in found.not_priced)]
+    yield Section("Against a processor", [Text(about), table, Text("\n".join(lines)), price_table()])
+
+
+def price_table() -> Table:
+    """What a processor's events and its standing cost, each with its source."""
+    rows = [[name, f"{each.value:g} {each.unit}", each.source] for name, each in PRICES.items()]
+    return Table(["of a processor", "price", "source"], rows, words=True)
