@@ -135,11 +135,6 @@ class Verdict:
         return sum(layer.different for layer in self.spikes.values())
 
     @property
-    def equal(self) -> int:
-        """Decisions that are the float model's."""
-        return int(np.sum(self.float_predictions == self.chip_predictions))
-
-    @property
     def accuracy(self) -> Mapping[str, float]:
         """Shares of recordings that each side, ``float`` and ``chip``, gets right."""
         sides = {"float": self.float_predictions, "chip": self.chip_predictions}

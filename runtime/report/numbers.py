@@ -34,13 +34,7 @@ def si(value: float, unit: str) -> str:
 
 
 def dominant(static_j: Iterable[float], dynamic_j: Iterable[float]) -> str:
-    """Which term of a decision is the larger at the pace of a sensor, by any source.
-
-    Examples
-    --------
-    >>> dominant([0.145, 0.52], [8e-6])
-    "at the sensor's pace static power dominates: 145 mJ to 520 mJ, 18,125 times what events take or more"
-    """
+    """Which term of a decision is the larger at the pace of a sensor, by any source; joules."""
     (least, *_, most), high = sorted([*static_j] * 2), max(dynamic_j)
     if least <= high:
         return f"at the sensor's pace events take {si(high, 'J')}, static power {si(least, 'J')} to {si(most, 'J')}"

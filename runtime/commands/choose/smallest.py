@@ -15,7 +15,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.systems import MLP, SYSTEMS
-from spikeloom.compiler.targets.base import COMPARTMENTS, Target, load_target
+from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
@@ -109,7 +109,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         target,
         budgets,
         store,
-        partial(_made, sensor=sensor, training=training, test=test, target=target, arguments=arguments),
+        partial(_made, sensor=sensor, splits=(training, test), arguments=arguments),
         sensor=sensor,
         command=_command(arguments),
         jobs=arguments.jobs,
@@ -122,13 +122,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
 
 def _made(
-    candidate: Candidate,
-    *,
-    sensor: Sensor,
-    training: Recordings,
-    test: Recordings,
-    target: Target,
-    arguments: argparse.Namespace,
+    candidate: Candidate, *, sensor: Sensor, splits: tuple[Recordings, ...], arguments: argparse.Namespace
 ) -> tuple[Checked, tuple[str, ...]]:
     """Train a candidate on the whole training split, compile and verify it, then read the test split; the commands."""
     netlist, data = arguments.output, arguments.data
@@ -136,24 +130,21 @@ def _made(
     read = repeat.words({"data": data, "bin": arguments.bin})
     trained = [*read, *repeat.words(sensor.options_of(candidate.system)), *candidate.words]
     trained += [*([] if counts else ["--keep", "last"]), "-o", network]
-    made = repeat.words(
-        {"target": target.name, "weight_bits": candidate.storage, "calibrate": None if counts else data}
-    )
-    made += [] if counts else repeat.words({"bin": arguments.bin})
+    made = repeat.words({"target": arguments.target, "weight_bits": candidate.storage})
+    made += [] if counts else repeat.words({"calibrate": data, "bin": arguments.bin})
     words = {"train": trained, "compile": [network, *made, "-o", netlist]}
     words |= {"verify": [netlist, "--checkpoint", network, *read], "estimate": [netlist, *read]}
     for name in ("train", "compile"):
         _typed(name, words[name])
-    machine, verdicts = machine_for(netlist), {}
-    for split in ("train", "test"):
-        progress(f"verifying, {split}")
-        verdicts[split] = _typed("verify", [*words["verify"], "--split", split])
-    form = machine.netlist.bins, machine.netlist.clocks.length
-    seen, held = (of_length(joined_bins(each, form[0]), form[1]) for each in (some(training), test))
+    progress("verifying")
+    verdicts = {split: _typed("verify", [*words["verify"], "--split", split]) for split in ("train", "test")}
+    machine = machine_for(netlist)
+    bins, length = machine.netlist.bins, machine.netlist.clocks.length
+    seen, held = (of_length(joined_bins(each, bins), length) for each in (some(splits[0]), splits[1]))
     right = int(np.count_nonzero(machine.run(held.events, lengths=held.lengths).decisions == held.labels))
     costs, stopped = costs_of(machine.netlist, seen)
     price = machine.price(seen.events, bin_s=arguments.bin, lengths=seen.lengths)[1]
-    seconds = float(seen.step_counts.mean()) * form[0] * arguments.bin
+    seconds = float(seen.step_counts.mean()) * bins * arguments.bin
     dynamic = [float(each.mean()) for each in price.dynamic_j.values()]
     words |= {} if stopped is None else {"anytime": [netlist, *read]}
     return Checked(
@@ -162,7 +153,6 @@ def _made(
         netlist=netlist,
         netlist_sha256=sha256_of(Path(netlist)),
         different={split: verdict.different for split, verdict in verdicts.items()},
-        equal={split: verdict.equal for split, verdict in verdicts.items()},
         right=share(right, len(held)),
         costs=costs,
         stopped=stopped,

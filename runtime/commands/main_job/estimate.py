@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from spikeloom.compiler.errors import OptionError
 from spikeloom.models.recordings.evtouch import Recordings, first_part, parse_window
 from spikeloom.models.training.counters import BITS
 from spikeloom.runtime.commands.options import add_detail, add_netlist, add_recordings
@@ -42,6 +43,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
 def _against_processor(arguments: argparse.Namespace, machine: Machine, ran: Run, price: Price) -> Comparison:
     """The same recordings in their own bins, and those of the training split, for a rule on a processor."""
+    if isinstance(arguments.data, Recordings):
+        raise OptionError("against_processor: needs the training split beside these; give the place of the recordings")
     window = parse_window(arguments.window)
     training, test = (
         first_part(load_recordings(each, machine.netlist, labels_for="--against-processor", joined=False), window)

@@ -202,11 +202,6 @@ class Verdict:
         return self.model.differences
 
     @property
-    def equal(self) -> int:
-        """Decisions that are those of the network of the file; all, if it has one model."""
-        return self.samples if self.network is None else self.network.decisions_equal
-
-    @property
     def exact(self) -> bool:
         """Whether nothing differs, and no membrane left its register."""
         differ = self.model.differences or self.spec.differences

@@ -63,8 +63,8 @@ class Choice:
 class Checked:
     """The choice, trained on the whole training split: its files, and float model beside chip on both splits.
 
-    `different` are spikes and `equal` decisions of ``train`` and ``test``; `right` is the chip's on the test split,
-    which nothing else has looked at. `pace` says which term of the energy is the larger at the pace of the sensor.
+    `different` are spikes in the recordings of ``train`` and ``test``; `right` is the chip's on the test split, which
+    nothing else has looked at. `pace` says which term of the energy is the larger at the pace of the sensor.
     """
 
     network: str
@@ -72,7 +72,6 @@ class Checked:
     netlist: str
     netlist_sha256: str
     different: Mapping[str, int]
-    equal: Mapping[str, int]
     right: Share
     costs: Costs
     stopped: Costs | None

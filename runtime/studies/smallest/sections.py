@@ -172,13 +172,12 @@ def _dropped(result: Smallest, dropped: Sequence[Tried]) -> Iterator[str]:
 
 def _checked(result: Smallest) -> str:
     """What the choice reaches, trained on all of the training split."""
-    checked, data = result.checked, result.data
-    equal = f"{checked.equal['train']} of {data.train} in training and {checked.equal['test']} of {data.test} on test"
-    different = f"{checked.different['train']:,} and {checked.different['test']:,} spikes differ"
+    checked = result.checked
+    different = " and ".join(f"{count:,} in {split}" for split, count in checked.different.items())
     return "\n".join(
         [
-            f"chip accuracy on the test split: {percent(checked.right.correct, data.test)}",
-            f"network and chip: decisions equal {equal}, {different}",
+            f"chip accuracy on the test split: {percent(checked.right.correct, result.data.test)}",
+            f"spikes in which network and chip differ: {different}",
             checked.pace,
             f"written: {checked.network}, sha256 {checked.network_sha256}",
             f"written: {checked.netlist}, sha256 {checked.netlist_sha256}",
