@@ -5,8 +5,8 @@
 FOLDER holds ``Ev-Objects.zip`` and ``Ev-Containers.zip``, the released ``objects_manual.t7`` and, for the chart of
 Containers, ``containers-knn1.pt`` (``spikeloom train --data Ev-Containers.zip --graph knn:1``), for its processor
 ``containers-200ms.pt``: ``spikeloom train --data Ev-Containers.zip --join 10 --graph manual --recipe timed --keep last
---current-decay fc1=0.6,fc2=0.6,fc3=0.6``. Each study is a file in benchmarks/results, with the commands, the hash of the
-recordings and the state of the code that made it.
+--current-decay fc1=0.6,fc2=0.6,fc3=0.6``. Each study is a file in benchmarks/results, with the commands, the hash of
+the recordings and the state of the code that made it.
 """
 
 import argparse
