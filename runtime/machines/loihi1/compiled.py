@@ -13,6 +13,7 @@ from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.passes import Compilation
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice
+from spikeloom.compiler.targets.loihi1.storage.held_out import Trial
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
 from spikeloom.runtime.machines.loihi1 import description
 from spikeloom.runtime.machines.loihi1.description import LayerFacts, NetlistFacts
@@ -44,7 +45,8 @@ class LayoutChoice:
 class CompilationFacts:
     """A netlist with the reasons for its scales, the proofs and the placement.
 
-    `facts` is what was read from a file of another format.
+    `facts` is what was read from a file of another format; `finetune` the command that helps where no storage keeps
+    the share `keep` of the decisions.
     """
 
     netlist: NetlistFacts = field(metadata=INLINE)
@@ -52,13 +54,16 @@ class CompilationFacts:
     proofs: Sequence[RangeProof]
     removals: Sequence[Removal]
     exactness: Sequence[Exactness]
+    trials: Sequence[Trial]
+    keep: float | None
     core_bound: int
     placement: Placement
     layout: LayoutChoice
     facts: Sequence[str] | None = field(default=None, metadata=OPTIONAL)
+    finetune: str | None = field(default=None, metadata=OPTIONAL)
 
 
-def outcome(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> Outcome:
+def outcome(done: Compilation, sha256: str, facts: Sequence[str] = (), finetune: str | None = None) -> Outcome:
     """Facts of a compilation, whose netlist was written to a file with a hash, with their layout."""
     result = CompilationFacts(
         netlist=description.describe(done.netlist, done.uses, sha256),
@@ -66,12 +71,20 @@ def outcome(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> Outcom
         proofs=done.proofs,
         removals=done.removals,
         exactness=done.exactness,
+        trials=done.trials,
+        keep=done.options.keep if done.trials else None,
         core_bound=core_bound(done.held, done.target),
         placement=done.placement,
         layout=LayoutChoice(optimize=done.options.optimize, expected=_layout(done.layout), usual=_layout(done.usual)),
         facts=facts or None,
+        finetune=finetune if done.trials and not _holds(done.options.keep, done.trials) else None,
     )
     return Outcome(result, sections)
+
+
+def _holds(keep: float | None, trials: Sequence[Trial]) -> bool:
+    """Whether the last storage that was tried keeps enough decisions."""
+    return keep is not None and not trials[-1].refused and trials[-1].equal >= keep * trials[-1].decisions
 
 
 def _layout(layout: Layout) -> LayoutFacts:
@@ -106,12 +119,37 @@ def _storage(facts: CompilationFacts) -> Iterator[Block]:
         yield Text(f"storage chosen on training recordings (each layer on {receives}):")
         yield Table(["layer", "tried", "weights clipped", "errors", "spikes moved", "of"], rows)
         yield from _exactness(facts.exactness)
+        yield from _tried(facts)
     for choice in facts.calibration:
         if choice.zeroed > ZEROED * choice.weights:
             yield Text(
                 f"{choice.layer}: {100 * choice.zeroed / choice.weights:.0f} % of its weights round to zero; "
                 "more --planes, --scale-groups or --weight-bits keep them"
             )
+
+
+def _tried(facts: CompilationFacts) -> Iterator[Block]:
+    """What cheaper storages lost, and what each costs."""
+    if not facts.trials or facts.keep is None:
+        return
+    names = [f"{trial.planes} × 8 bits, {trial.groups} scales" for trial in facts.trials]
+    names = [name.removeprefix("1 × ").removesuffix(", 1 scales") for name in names]
+    kept = [trial.equal for trial in facts.trials]
+    chosen, share = names[kept.index(max(kept))], f"{100 * facts.keep:g} % of the decisions"
+    held = _holds(facts.keep, facts.trials)
+    yield Text(
+        f"storage: {chosen}, {'the cheapest that keeps' if held else 'which keeps most; none keeps'} {share} "
+        "of quarters of thinned, held-out training recordings:"
+    )
+    rows = [
+        [name, f"{t.equal} of {t.decisions}", f"{t.operations:,.0f}", f"{t.synapse_words:,}", str(t.cores)]
+        if not t.refused
+        else [name, "does not fit", "", "", ""]
+        for name, t in zip(names, facts.trials, strict=True)
+    ]
+    yield Table(["storage", "decisions kept", "operations a recording", "synapse words", "cores"], rows)
+    if facts.finetune is not None:
+        yield Text(f"--spike-exact names the registers in the way; to train on the chip's integers: {facts.finetune}")
 
 
 def _exactness(layers: Sequence[Exactness]) -> Iterator[Block]:

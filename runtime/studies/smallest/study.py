@@ -205,9 +205,10 @@ def train_again(
         costs=costs,
     )
     read = repeat.words({"data": data.path, "bin": data.bin_s})
+    rounding = [] if counts else repeat.words({"weight_bits": 8, "calibrate": data.path})
     return checked, (
         repeat.command("train", "--data", data.path, *typed, "-o", network),
-        repeat.command("compile", network, *([] if counts else ["--calibrate", data.path]), "-o", output),
+        repeat.command("compile", network, *rounding, "-o", output),
         repeat.command("verify", output, "--checkpoint", network, *read),
         repeat.command("estimate", output, *read),
     )
