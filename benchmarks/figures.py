@@ -38,9 +38,9 @@ SHIPPED = {  # Row: network with its options, recordings, options of `compile`
     "objects_manual": (f"{MANUAL} --graph manual", OBJECTS, ""),
     "objects_manual, spike-exact": (f"{MANUAL} --graph manual", OBJECTS, "--spike-exact"),
     "objects": ("pretrained:objects", OBJECTS, ""),
-    "objects-200ms": ("pretrained:objects-200ms", OBJECTS, ""),
+    "objects-200ms": ("pretrained:objects-200ms", OBJECTS, "--weight-bits 8"),
     "objects-200ms, spike-exact": ("pretrained:objects-200ms", OBJECTS, "--spike-exact"),
-    "containers": ("pretrained:containers", CONTAINERS, ""),
+    "containers": ("pretrained:containers", CONTAINERS, "--weight-bits 8"),
     "objects-counters": ("pretrained:objects-counters", OBJECTS, ""),
     "containers-counters": ("pretrained:containers-counters", CONTAINERS, ""),
     "grasps": ("pretrained:grasps", "synthetic", ""),
@@ -210,7 +210,7 @@ def chart(session: Session, data: str) -> Json:
 def anytime(session: Session, data: str) -> Json:
     """Windows and rules."""
     network = f"{MANUAL} --graph manual" if data == OBJECTS else "pretrained:containers"
-    session.run(f"compile {network} --calibrate {data} -o net.loom")
+    session.run(f"compile {network} --calibrate {data} --weight-bits 8 -o net.loom")
     found = session.run(f"anytime net.loom --data {data} --calibrate {data} -o anytime.json", "anytime.json")
     windows = {str(each["percent"]): each["chip"]["correct"] for each in found["windows"]}
     rules = {str(each["allowed"]): {key: each[key] for key in each if key != "samples"} for each in found["rules"]}
@@ -309,7 +309,7 @@ def shown(session: Session, page: str) -> Json:
 
 def confusion(session: Session) -> Json:
     """What the chip takes for what on Containers: another container, or another filling of the same."""
-    session.run(f"compile pretrained:containers --calibrate {CONTAINERS} -o net.loom")
+    session.run(f"compile pretrained:containers --calibrate {CONTAINERS} --weight-bits 8 -o net.loom")
     found = session.run(f"run net.loom --data {CONTAINERS}")
     pairs = list(zip(found["labels"], found["predictions"], strict=True))
     other = sum(label // FILLINGS != decided // FILLINGS for label, decided in pairs)

@@ -138,56 +138,50 @@ def _quantize(done: Compilation) -> Compilation:
 
 def _cheapest(done: Compilation) -> Compilation:
     """Round to the cheapest storage that keeps decisions of held-out recordings, or to the one that keeps most."""
-    options, network, known = done.options, done.network, done.calibration
+    options, network, few = done.options, done.network, done.calibration
     events, keep = options.training_events, options.keep
-    if events is None or keep is None or known is None or len(events) < 2:
+    if events is None or keep is None or few is None or len(events) < 2:
         return _quantize.apply(replace(done, options=replace(options, keep=None)))
     _, several, held = held_out.split(len(events))
     judge, many = HeldOut(network, events[held]), None
-    best, trials = done, list[Trial]()
+    best, most, trials = done, -1, list[Trial]()
     for packing in held_out.ladder(done.target):
         if many is None and (packing.planes > 1 or options.prune_unused):
-            chosen = channels_last(events[calibration.evenly_spaced(several, calibration.MANY)], network.input.clocks)
-            many = calibration.calibrate(network, chosen)
-        asked = replace(
-            done, options=replace(options, packings=(packing,), optimize="cores"), calibration=many or known
-        )
+            chosen = events[calibration.evenly_spaced(several, calibration.MANY)]
+            many = calibration.calibrate(network, channels_last(chosen, network.input.clocks))
+        asked = replace(options, packings=(packing,), optimize="cores")
+        trial = Trial(planes=packing.planes, groups=packing.groups)
         try:
-            tried = run((_quantize, *INTEGERS, *LAYOUT), asked)
+            tried = run((_quantize, *INTEGERS, *LAYOUT), replace(done, options=asked, calibration=many or few))
         except (CapacityError, ModelError) as error:
             if not trials:
                 raise  # nor does what is larger fit
-            trials.append(Trial(planes=packing.planes, groups=packing.groups, refused=str(error)))
+            trials.append(replace(trial, refused=str(error)))
             continue
-        trial = Trial(
-            planes=packing.planes,
-            groups=packing.groups,
+        measured = replace(
+            trial,
             equal=judge.equal(tried.integer),
             decisions=len(judge),
-            operations=_operations(tried, known),
+            operations=_operations(tried, few),
             synapse_words=sum(use.used for use in tried.uses if use.name == "core.synapse_words"),
             cores=tried.netlist.n_cores,
         )
-        if not trials or trial.equal > max(each.equal for each in trials):
-            best = tried
-        trials.append(trial)
-        if trial.equal >= keep * trial.decisions:
+        trials.append(measured)
+        if measured.equal > most:
+            best, most = tried, measured.equal
+        if most >= keep * len(judge):
             break
-    options = replace(options, packings=best.options.packings)
-    return replace(
-        done, integer=best.integer, choices=best.choices, options=options, connected=LATER, trials=tuple(trials)
-    )
+    rounded = {"integer": best.integer, "choices": best.choices, "connected": LATER}
+    return replace(done, **rounded, trials=tuple(trials), options=replace(options, packings=best.options.packings))
 
 
 def _operations(done: Compilation, known: Calibration) -> float:
     """Synaptic operations of a training recording, on average, if every spike is the float model's."""
     total = 0.0
-    for projection in done.held.projections:
-        weight, rate = projection.weight, known.rate(projection.pre, INPUT)
-        rate = rate if projection.pre == INPUT else rate[done.identity[projection.pre]]
-        total += float(rate[weight.indices] @ (weight.data != 0))
-    steps: int = known.events.shape[1]
-    return total * steps
+    for projection in done.integer.projections:
+        weight = projection.weight
+        total += float(known.rate(projection.pre, INPUT)[weight.indices] @ (weight.data != 0))
+    return total * float(known.events.shape[1])
 
 
 @step("bounds every register by the weights alone", keeps="the network")

@@ -77,14 +77,14 @@ def outcome(done: Compilation, sha256: str, facts: Sequence[str] = (), finetune:
         placement=done.placement,
         layout=LayoutChoice(optimize=done.options.optimize, expected=_layout(done.layout), usual=_layout(done.usual)),
         facts=facts or None,
-        finetune=finetune if done.trials and not _holds(done.options.keep, done.trials) else None,
+        finetune=finetune if done.trials and not _holds(done.trials, done.options.keep) else None,
     )
     return Outcome(result, sections)
 
 
-def _holds(keep: float | None, trials: Sequence[Trial]) -> bool:
-    """Whether the last storage that was tried keeps enough decisions."""
-    return keep is not None and not trials[-1].refused and trials[-1].equal >= keep * trials[-1].decisions
+def _holds(trials: Sequence[Trial], keep: float | None) -> bool:
+    """Whether a storage that was tried keeps enough decisions."""
+    return any(trial.equal >= (keep or 0) * trial.decisions for trial in trials if not trial.refused)
 
 
 def _layout(layout: Layout) -> LayoutFacts:
@@ -130,23 +130,22 @@ def _storage(facts: CompilationFacts) -> Iterator[Block]:
 
 def _tried(facts: CompilationFacts) -> Iterator[Block]:
     """What cheaper storages lost, and what each costs."""
-    if not facts.trials or facts.keep is None:
+    if facts.keep is None:
         return
-    names = [f"{trial.planes} × 8 bits, {trial.groups} scales" for trial in facts.trials]
-    names = [name.removeprefix("1 × ").removesuffix(", 1 scales") for name in names]
-    kept = [trial.equal for trial in facts.trials]
-    chosen, share = names[kept.index(max(kept))], f"{100 * facts.keep:g} % of the decisions"
-    held = _holds(facts.keep, facts.trials)
+    rows = []
+    for trial in facts.trials:
+        name = f"{trial.planes} × 8 bits".removeprefix("1 × ") + (
+            f", {trial.groups} scales" if trial.groups > 1 else ""
+        )
+        costs = [f"{trial.operations:,.0f}", f"{trial.synapse_words:,}", str(trial.cores)]
+        kept = [f"{trial.equal} of {trial.decisions}", *costs]
+        rows.append([name, *(["does not fit", "", "", ""] if trial.refused else kept)])
+    chosen = rows[max(range(len(rows)), key=lambda row: facts.trials[row].equal)][0]
+    why = "the cheapest that keeps" if _holds(facts.trials, facts.keep) else "which keeps most; none keeps"
     yield Text(
-        f"storage: {chosen}, {'the cheapest that keeps' if held else 'which keeps most; none keeps'} {share} "
-        "of quarters of thinned, held-out training recordings:"
+        f"storage: {chosen}, {why} {100 * facts.keep:g} % of the decisions of quarters of thinned, held-out training "
+        "recordings:"
     )
-    rows = [
-        [name, f"{t.equal} of {t.decisions}", f"{t.operations:,.0f}", f"{t.synapse_words:,}", str(t.cores)]
-        if not t.refused
-        else [name, "does not fit", "", "", ""]
-        for name, t in zip(names, facts.trials, strict=True)
-    ]
     yield Table(["storage", "decisions kept", "operations a recording", "synapse words", "cores"], rows)
     if facts.finetune is not None:
         yield Text(f"--spike-exact names the registers in the way; to train on the chip's integers: {facts.finetune}")

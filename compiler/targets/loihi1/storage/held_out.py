@@ -42,7 +42,7 @@ class Trial:
     operations: float = 0.0  # Synaptic operations of a training recording, where spikes are the float model's
     synapse_words: int = 0  # Memory of all cores
     cores: int = 0
-    refused: str = field(default="", metadata={"optional": True})  # Why the chip does not hold it
+    refused: str | None = field(default=None, metadata={"optional": True})  # Why the chip does not hold it
 
 
 def ladder(target: Target) -> Iterator[Packing]:
