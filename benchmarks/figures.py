@@ -59,7 +59,7 @@ FILLINGS, CONTAINER_CLASSES = 5, 20
 
 STORAGE = {
     "8 bits, from the weights": "",
-    "8 bits": "--calibrate DATA",
+    "8 bits": "--calibrate DATA --weight-bits 8",
     "2 × 8 bits": "--calibrate DATA --planes 2",
     "2 × 8 bits, 8 scales": "--calibrate DATA --planes 2 --scale-groups 8",
     "spike-exact": "--calibrate DATA --spike-exact",
