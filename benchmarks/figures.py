@@ -40,9 +40,9 @@ SHIPPED = {  # Row: network with its options, recordings, options of `compile`
     "objects_manual": (f"{MANUAL} --graph manual", OBJECTS, ""),
     "objects_manual, spike-exact": (f"{MANUAL} --graph manual", OBJECTS, "--spike-exact"),
     "objects": ("pretrained:objects", OBJECTS, ""),
-    "objects-200ms": ("pretrained:objects-200ms", OBJECTS, ""),
+    "objects-200ms": ("pretrained:objects-200ms", OBJECTS, "--weight-bits 8"),
     "objects-200ms, spike-exact": ("pretrained:objects-200ms", OBJECTS, "--spike-exact"),
-    "containers": ("pretrained:containers", CONTAINERS, ""),
+    "containers": ("pretrained:containers", CONTAINERS, "--weight-bits 8"),
     "objects-counters": ("pretrained:objects-counters", OBJECTS, ""),
     "containers-counters": ("pretrained:containers-counters", CONTAINERS, ""),
     "grasps": ("pretrained:grasps", "synthetic", ""),
@@ -73,7 +73,7 @@ FILLINGS, CONTAINER_CLASSES = 5, 20
 
 STORAGE = {
     "8 bits, from the weights": "",
-    "8 bits": "--calibrate DATA",
+    "8 bits": "--calibrate DATA --weight-bits 8",
     "2 × 8 bits": "--calibrate DATA --planes 2",
     "2 × 8 bits, 8 scales": "--calibrate DATA --planes 2 --scale-groups 8",
     "spike-exact": "--calibrate DATA --spike-exact",
@@ -224,7 +224,7 @@ def chart(session: Session, data: str) -> Json:
 def anytime(session: Session, data: str) -> Json:
     """Windows and rules."""
     network = f"{MANUAL} --graph manual" if data == OBJECTS else "pretrained:containers"
-    session.run(f"compile {network} --calibrate {data} -o net.loom")
+    session.run(f"compile {network} --calibrate {data} --weight-bits 8 -o net.loom")
     found = session.run(f"anytime net.loom --data {data} --calibrate {data} -o anytime.json", "anytime.json")
     windows = {str(each["percent"]): each["chip"]["correct"] for each in found["windows"]}
     rules = {str(each["allowed"]): {key: each[key] for key in each if key != "samples"} for each in found["rules"]}
@@ -323,7 +323,7 @@ def shown(session: Session, page: str) -> Json:
 
 def confusion(session: Session) -> Json:
     """What the chip takes for what on Containers: another container, or another filling of the same."""
-    session.run(f"compile pretrained:containers --calibrate {CONTAINERS} -o net.loom")
+    session.run(f"compile pretrained:containers --calibrate {CONTAINERS} --weight-bits 8 -o net.loom")
     found = session.run(f"run net.loom --data {CONTAINERS}")
     pairs = list(zip(found["labels"], found["predictions"], strict=True))
     other = sum(label // FILLINGS != decided // FILLINGS for label, decided in pairs)

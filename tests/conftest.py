@@ -88,8 +88,8 @@ def place(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("place")
     recordings_folder(folder / "data")
     own_file(folder / "net.pt")
-    words = ["compile", f"{folder}/net.pt", "--calibrate", f"{folder}/data", "-o", f"{folder}/net.loom", "--json"]
-    assert cli.main(words) == 0
+    words = ["compile", f"{folder}/net.pt", "--weight-bits", "8", "--calibrate", f"{folder}/data", "--json"]
+    assert cli.main([*words, "-o", f"{folder}/net.loom"]) == 0
     return folder
 
 

@@ -152,7 +152,7 @@ def test_verify_passes(compiled, released_checkpoint, objects_zip, shared_dir):
 def test_the_shipped_network_of_longer_bins(tmp_path, objects_zip):
     """What its card says of it on the chip, at a fifth of what steps of 20 ms take."""
     netlist = tmp_path / "n.loom"
-    as_json("compile", "pretrained:objects-200ms", "--calibrate", objects_zip, "-o", netlist)
+    as_json("compile", "pretrained:objects-200ms", "--weight-bits", 8, "--calibrate", objects_zip, "-o", netlist)
     report = as_json("run", netlist, "--data", objects_zip, "--detail", "counts")
     assert report["accuracy"] == 130 / 144
     assert report["costs"]["pace"]["bin_s"] == pytest.approx(0.2)

@@ -40,7 +40,7 @@ SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
 
 # -- compile and inspect -----------------------------------------------------------------------------------------------
 def test_compile_counts_and_says_what_was_realised(as_json, tmp_path, place):
-    report = as_json("compile", "net.pt", "--calibrate", "data", "-o", tmp_path / "out.loom")
+    report = as_json("compile", "net.pt", "--calibrate", "data", "--weight-bits", 8, "-o", tmp_path / "out.loom")
     content = (tmp_path / "out.loom").read_bytes()
     assert content == (place / "net.loom").read_bytes()
     assert report["sha256"] == hashlib.sha256(content).hexdigest()

@@ -52,7 +52,7 @@ def float_side(made):
 
 LISTS = """
 anytime:
-    bins chip_steps decisions files full labelled labels least_interval rules samples source split windows
+    bins chip_steps decisions files full held_out labelled labels least_interval rules samples source split windows
 chart:
     budget chosen_by command data format grid networks points refused spikeloom tables target
 compile:

@@ -58,7 +58,7 @@ def test_what_is_written_decides_and_costs_as_reported(as_json):
     assert row["training"]["differ"] <= 2
     netlist = read_netlist("lean.loom")
     assert netlist.provenance["lean"] == {"differ": 0.1} | row["removed"]
-    as_json("compile", "net.pt", "--calibrate", "data", "-o", "whole.loom")
+    as_json("compile", "net.pt", "--weight-bits", 8, "--calibrate", "data", "-o", "whole.loom")
     whole = read_netlist("whole.loom")
     for split, key in (("train", "training"), ("test", "test")):
         data = load_data("data", split)

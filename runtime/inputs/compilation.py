@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
-from spikeloom.compiler import Packing, __version__
+from spikeloom.compiler import KEEP, Packing, __version__
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
 from spikeloom.models.recordings.evtouch import Recordings
@@ -63,6 +63,21 @@ def parse_packings(arguments: argparse.Namespace) -> tuple[Packing, ...] | None:
             raise OptionError(f"{option}: {len(values)} numbers, another option gives {layers}; give as many, or one")
     columns = [values if len(values) == layers else values * layers for values in asked.values()]
     return tuple(Packing(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
+
+
+def parse_keep(arguments: argparse.Namespace) -> float | None:
+    """Share of decisions that storage has to keep; OptionError if it is none, or nothing can be chosen by it."""
+    keep = arguments.keep
+    if keep is None:
+        return KEEP
+    if not 0 <= keep <= 1:
+        raise OptionError(f"--keep {keep:g}: not a share; give a number from 0 to 1")
+    if arguments.calibrate is None:
+        raise OptionError(f"--keep {keep:g}: no recordings to hold out; give --calibrate")
+    if arguments.spike_exact or parse_packings(arguments) is not None:
+        chosen = "--weight-bits, --planes, --scale-groups and --spike-exact"
+        raise OptionError(f"--keep {keep:g}: chooses storage; omit it, or {chosen}")
+    return float(keep)
 
 
 def storage(packings: tuple[Packing, ...] | None, checkpoint: Checkpoint | None) -> Mapping[str, Any]:

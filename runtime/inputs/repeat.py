@@ -15,7 +15,7 @@ from spikeloom.models.recordings.events import BIN_S
 NETWORK = ("graph", "taxels", "edges", "directed", "run", "weights", "beta", "theta")
 """Options that say how a checkpoint is read."""
 
-ROUNDING = ("weight_bits", "planes", "scale_groups", "spike_exact", "prune_unused")
+ROUNDING = ("weight_bits", "planes", "scale_groups", "spike_exact", "prune_unused", "keep")
 """Options of ``compile`` that say how a float network is stored."""
 
 PLACING = ("keep_all", "cores_for", "chips", "optimize")

@@ -15,6 +15,9 @@ from spikeloom.compiler.targets.base import Target
 GOALS = ("cores", "latency")
 """What a layout may be chosen for."""
 
+KEEP = 0.98
+"""Share of equal decisions that storage has to keep if nothing else is asked for."""
+
 MAX_PLANES = 3
 
 
@@ -37,6 +40,9 @@ class Options:
     # Add planes and scales until every spike on the training recordings, all of them, is the float64 model's, see
     # :mod:`storage.spike_exact`; takes the width from `packings` and nothing else
     spike_exact: bool = False
+    # Least share of equal decisions on held-out training recordings for which the cheapest storage is chosen, see
+    # :mod:`storage.held_out`, where nothing else says how layers are stored; None: 8 bits
+    keep: float | None = None
     keep_all: bool = False  # Keep neurons that provably do nothing, too
     prune_unused: bool = False  # Remove neurons that did not fire on any training recording, too
     # (samples, taxels, polarities, steps); recordings for calibration: 32, evenly spaced, are used, of planes 256
@@ -47,6 +53,12 @@ class Options:
     # One of ``GOALS``: what the layout is chosen for, see :mod:`layout.choose`; latency needs training events
     optimize: str = "cores"
     provenance: Mapping[str, Any] = field(default_factory=dict)  # JSON values to store with the netlist
+
+    @property
+    def chooses(self) -> bool:
+        """Whether held-out training recordings choose the storage."""
+        said = self.packings is not None or self.spike_exact or self.forms is not None
+        return self.keep is not None and self.training_events is not None and not said
 
     def require_consistent(self, *, calibrated: bool) -> None:
         """Refuse options that contradict each other; `calibrated` where there are, or will be, training events."""

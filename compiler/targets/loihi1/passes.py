@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import channels_last
-from spikeloom.compiler.ir import IntegerNetwork, Network
+from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
 from spikeloom.compiler.passes import calibrate as calibration
 from spikeloom.compiler.passes import expand, prune
 from spikeloom.compiler.passes.calibrate import Calibration
@@ -21,7 +24,9 @@ from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, require_legal
 from spikeloom.compiler.targets.loihi1.netlist import FILE, Netlist
 from spikeloom.compiler.targets.loihi1.options import Options, Packing, check_packings, require_stored
+from spikeloom.compiler.targets.loihi1.storage import held_out
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice, choose_storage, round_to_forms
+from spikeloom.compiler.targets.loihi1.storage.held_out import HeldOut, Trial
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness, make_exact
 from spikeloom.compiler.types import FloatArray, IntArray
 
@@ -41,6 +46,7 @@ class Compilation:
     gone: Masks = ()  # Neurons that are to go in any case, see :func:`without`
     integer: IntegerNetwork = LATER  # In the integers of the chip (`quantize`)
     choices: tuple[Choice, ...] = ()  # Scale of each layer and why
+    trials: tuple[Trial, ...] = ()  # Storages that were tried, the cheapest first, where held-out recordings choose
     exactness: tuple[Exactness, ...] = ()  # What is in the way of equal spikes, where these were asked for; else empty
     proofs: tuple[RangeProof, ...] = ()  # Worst-case register values of each layer (`prove`)
     held: IntegerNetwork = LATER  # What the chip holds of it (`remove`)
@@ -82,14 +88,14 @@ def _expand(done: Compilation) -> Compilation:
 
 @step("runs the float network on training recordings, where there are any", keeps="the network")
 def _calibrate(done: Compilation) -> Compilation:
-    options = done.options
-    if options.training_events is None:
+    options, events = done.options, done.options.training_events
+    if events is None:
         return done
-    events = channels_last(options.training_events, done.network.input.clocks)
     if not (options.spike_exact or options.prune_unused):
         several = any(packing.planes > 1 for packing in options.packings or ())
-        events = calibration.evenly_spaced(events, calibration.MANY if several else calibration.FEW)
-    found = calibration.calibrate(done.network, events)
+        few = calibration.evenly_spaced(np.arange(len(events)), calibration.MANY if several else calibration.FEW)
+        events = events[held_out.split(len(events))[0] if options.chooses else few]
+    found = calibration.calibrate(done.network, channels_last(events, done.network.input.clocks))
     return replace(done, calibration=found, rates=found.rates)
 
 
@@ -115,6 +121,8 @@ def _disconnect(done: Compilation) -> Compilation:
 )
 def _quantize(done: Compilation) -> Compilation:
     options, network, target = done.options, done.connected, done.target
+    if options.chooses:
+        return _cheapest(done)
     packings = options.packings or (Packing(),)
     if options.forms is not None:
         require_stored(options.forms, [population.name for population in network.populations], target)
@@ -126,6 +134,54 @@ def _quantize(done: Compilation) -> Compilation:
         return replace(done, integer=integer, choices=choices, exactness=exactness, connected=LATER)
     integer, choices = choose_storage(network, target, packings=packings, calibration=done.calibration)
     return replace(done, integer=integer, choices=choices, connected=LATER)  # large, and no pass needs it again
+
+
+def _cheapest(done: Compilation) -> Compilation:
+    """Round to the cheapest storage that keeps decisions of held-out recordings, or to the one that keeps most."""
+    options, network, few = done.options, done.network, done.calibration
+    events, keep = options.training_events, options.keep
+    if events is None or keep is None or few is None or len(events) < 2:
+        return _quantize.apply(replace(done, options=replace(options, keep=None)))
+    _, several, held = held_out.split(len(events))
+    judge, many = HeldOut(network, events[held]), None
+    best, most, trials = done, -1, list[Trial]()
+    for packing in held_out.ladder(done.target):
+        if many is None and (packing.planes > 1 or options.prune_unused):
+            chosen = events[calibration.evenly_spaced(several, calibration.MANY)]
+            many = calibration.calibrate(network, channels_last(chosen, network.input.clocks))
+        asked = replace(options, packings=(packing,), optimize="cores")
+        trial = Trial(planes=packing.planes, groups=packing.groups)
+        try:
+            tried = run((_quantize, *INTEGERS, *LAYOUT), replace(done, options=asked, calibration=many or few))
+        except (CapacityError, ModelError) as error:
+            if not trials:
+                raise  # nor does what is larger fit
+            trials.append(replace(trial, refused=str(error)))
+            continue
+        measured = replace(
+            trial,
+            equal=judge.equal(tried.integer),
+            decisions=len(judge),
+            operations=_operations(tried, few),
+            synapse_words=sum(use.used for use in tried.uses if use.name == "core.synapse_words"),
+            cores=tried.netlist.n_cores,
+        )
+        trials.append(measured)
+        if measured.equal > most:
+            best, most = tried, measured.equal
+        if most >= keep * len(judge):
+            break
+    rounded = {"integer": best.integer, "choices": best.choices, "connected": LATER}
+    return replace(done, **rounded, trials=tuple(trials), options=replace(options, packings=best.options.packings))
+
+
+def _operations(done: Compilation, known: Calibration) -> float:
+    """Synaptic operations of a training recording, on average, if every spike is the float model's."""
+    total = 0.0
+    for projection in done.integer.projections:
+        weight = projection.weight
+        total += float(known.rate(projection.pre, INPUT)[weight.indices] @ (weight.data != 0))
+    return total * float(known.events.shape[1])
 
 
 @step("bounds every register by the weights alone", keeps="the network")
@@ -174,6 +230,8 @@ def _emit(done: Compilation) -> Compilation:
     if done.choices:
         provenance["compensated"] = [choice.layer for choice in done.choices if choice.compensated]
     provenance["digests"] = digests(done.integer, prune.either(done.silent, done.unread))
+    if done.trials and done.options.packings:
+        provenance |= {"planes": done.options.packings[0].planes, "scale_groups": done.options.packings[0].groups}
     made = emit(
         done.held,
         done.layout.cores,

@@ -130,8 +130,10 @@ def _made(
     read = repeat.words({"data": data, "bin": arguments.bin})
     trained = [*read, *repeat.words(sensor.options_of(candidate.system)), *candidate.words]
     trained += [*([] if counts else ["--keep", "last"]), "-o", network]
-    made = repeat.words({"target": arguments.target, "weight_bits": candidate.storage})
-    made += [] if counts else repeat.words({"calibrate": data, "bin": arguments.bin})
+    made = repeat.words({"target": arguments.target})
+    made += (
+        [] if counts else repeat.words({"weight_bits": candidate.storage or 8, "calibrate": data, "bin": arguments.bin})
+    )
     words = {"train": trained, "compile": [network, *made, "-o", netlist]}
     words |= {"verify": [netlist, "--checkpoint", network, *read], "estimate": [netlist, *read]}
     for name in ("train", "compile"):

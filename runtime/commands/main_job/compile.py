@@ -11,6 +11,7 @@ from typing import Any
 from spikeloom.compiler import (
     DEFAULT_TARGET,
     GOALS,
+    KEEP,
     Compilation,
     Options,
     __version__,
@@ -25,11 +26,11 @@ from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_bin_option, add_network, group
-from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
+from spikeloom.runtime.inputs.compilation import parse_cores, parse_keep, parse_packings, provenance
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings
-from spikeloom.runtime.inputs.repeat import NETWORK, ROUNDING, refuse
+from spikeloom.runtime.inputs.repeat import NETWORK, ROUNDING, command, given, refuse, words
 from spikeloom.runtime.machines.base import chip_module, describe, trained_for
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE
@@ -67,7 +68,13 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     storage.add_argument(
         "--prune-unused", action="store_true", help="leave out neurons that never fired on the training split, too"
     )
-    storage.add_argument("--calibrate", metavar="PATH", help="recordings whose train split chooses the scales")
+    storage.add_argument("--calibrate", metavar="PATH", help="recordings whose train split chooses storage and scales")
+    storage.add_argument(
+        "--keep",
+        type=float,
+        metavar="X",
+        help=f"share of equal decisions on held-out training recordings that storage has to keep (default: {KEEP:g})",
+    )
     add_bin_option(sub)
     storage.add_argument(
         "--in-time",
@@ -109,6 +116,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     options = chip.module.Options(
         packings=parse_packings(arguments),
         spike_exact=arguments.spike_exact,
+        keep=parse_keep(arguments),
         keep_all=arguments.keep_all,
         prune_unused=arguments.prune_unused,
         cores_for=parse_cores(arguments.cores_for),
@@ -118,6 +126,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     options.require_consistent(calibrated=arguments.calibrate is not None)
     asked = load_network(arguments.checkpoint, arguments)
     checkpoint, training, found = asked.checkpoint, None, None
+    if checkpoint is not None and checkpoint.forms is not None:
+        refuse(arguments, ("keep",), f"{arguments.checkpoint} was fine-tuned for its own storage")
     if arguments.calibrate is not None:
         progress("reading the recordings")
         found = recordings(
@@ -148,8 +158,15 @@ def run(arguments: argparse.Namespace) -> Outcome:
         after=dump,
     )
     sha256 = write_netlist(compilation.netlist, arguments.output)
-    outcome: Outcome = chip_module(arguments.target, "compiled").outcome(compilation, sha256, asked.facts)
-    return outcome
+    shown = chip_module(arguments.target, "compiled").outcome(compilation, sha256, asked.facts, _finetune(arguments))
+    return shown  # type: ignore[no-any-return]
+
+
+def _finetune(arguments: argparse.Namespace) -> str:
+    """What to type for training on the chip's integers."""
+    given_network = words(given(arguments, NETWORK))
+    data = ("--data", str(arguments.calibrate), "--weight-bits", "8")
+    return command("finetune", str(arguments.checkpoint), *given_network, *data, "-o", "TUNED.pt")
 
 
 def _compile_integers(arguments: argparse.Namespace) -> Outcome:

@@ -13,6 +13,7 @@ from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.passes import Compilation
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice
+from spikeloom.compiler.targets.loihi1.storage.held_out import Trial
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
 from spikeloom.runtime.machines.loihi1 import description
 from spikeloom.runtime.machines.loihi1.description import LayerFacts, NetlistFacts
@@ -44,7 +45,8 @@ class LayoutChoice:
 class CompilationFacts:
     """A netlist with the reasons for its scales, the proofs and the placement.
 
-    `facts` is what was read from a file of another format.
+    `facts` is what was read from a file of another format; `finetune` the command that helps where no storage keeps
+    the share `keep` of the decisions.
     """
 
     netlist: NetlistFacts = field(metadata=INLINE)
@@ -52,13 +54,16 @@ class CompilationFacts:
     proofs: Sequence[RangeProof]
     removals: Sequence[Removal]
     exactness: Sequence[Exactness]
+    trials: Sequence[Trial]
+    keep: float | None
     core_bound: int
     placement: Placement
     layout: LayoutChoice
     facts: Sequence[str] | None = field(default=None, metadata=OPTIONAL)
+    finetune: str | None = field(default=None, metadata=OPTIONAL)
 
 
-def outcome(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> Outcome:
+def outcome(done: Compilation, sha256: str, facts: Sequence[str] = (), finetune: str | None = None) -> Outcome:
     """Facts of a compilation, whose netlist was written to a file with a hash, with their layout."""
     result = CompilationFacts(
         netlist=description.describe(done.netlist, done.uses, sha256),
@@ -66,12 +71,20 @@ def outcome(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> Outcom
         proofs=done.proofs,
         removals=done.removals,
         exactness=done.exactness,
+        trials=done.trials,
+        keep=done.options.keep if done.trials else None,
         core_bound=core_bound(done.held, done.target),
         placement=done.placement,
         layout=LayoutChoice(optimize=done.options.optimize, expected=_layout(done.layout), usual=_layout(done.usual)),
         facts=facts or None,
+        finetune=finetune if done.trials and not _holds(done.trials, done.options.keep) else None,
     )
     return Outcome(result, sections)
+
+
+def _holds(trials: Sequence[Trial], keep: float | None) -> bool:
+    """Whether a storage that was tried keeps enough decisions."""
+    return any(trial.equal >= (keep or 0) * trial.decisions for trial in trials if not trial.refused)
 
 
 def _layout(layout: Layout) -> LayoutFacts:
@@ -106,12 +119,36 @@ def _storage(facts: CompilationFacts) -> Iterator[Block]:
         yield Text(f"storage chosen on training recordings (each layer on {receives}):")
         yield Table(["layer", "tried", "weights clipped", "errors", "spikes moved", "of"], rows)
         yield from _exactness(facts.exactness)
+        yield from _tried(facts)
     for choice in facts.calibration:
         if choice.zeroed > ZEROED * choice.weights:
             yield Text(
                 f"{choice.layer}: {100 * choice.zeroed / choice.weights:.0f} % of its weights round to zero; "
                 "more --planes, --scale-groups or --weight-bits keep them"
             )
+
+
+def _tried(facts: CompilationFacts) -> Iterator[Block]:
+    """What cheaper storages lost, and what each costs."""
+    if facts.keep is None:
+        return
+    rows = []
+    for trial in facts.trials:
+        name = f"{trial.planes} × 8 bits".removeprefix("1 × ") + (
+            f", {trial.groups} scales" if trial.groups > 1 else ""
+        )
+        costs = [f"{trial.operations:,.0f}", f"{trial.synapse_words:,}", str(trial.cores)]
+        kept = [f"{trial.equal} of {trial.decisions}", *costs]
+        rows.append([name, *(["does not fit", "", "", ""] if trial.refused else kept)])
+    chosen = rows[max(range(len(rows)), key=lambda row: facts.trials[row].equal)][0]
+    why = "the cheapest that keeps" if _holds(facts.trials, facts.keep) else "which keeps most; none keeps"
+    yield Text(
+        f"storage: {chosen}, {why} {100 * facts.keep:g} % of the decisions of quarters of thinned, held-out training "
+        "recordings:"
+    )
+    yield Table(["storage", "decisions kept", "operations a recording", "synapse words", "cores"], rows)
+    if facts.finetune is not None:
+        yield Text(f"--spike-exact names the registers in the way; to train on the chip's integers: {facts.finetune}")
 
 
 def _exactness(layers: Sequence[Exactness]) -> Iterator[Block]:

@@ -36,11 +36,11 @@ class Storage:
     own: bool = field(default=False, metadata=key("fine_tuned"))  # Whether the network was fine-tuned for it
 
     def options(self) -> JsonObject:
-        """Options of ``compile`` that ask for it, where it is not the usual one."""
+        """Options of ``compile`` that ask for it; a network that was fine-tuned for its own takes none."""
         if self.own:
             return {}
         return {
-            "weight_bits": None if self.bits == (8,) else ",".join(map(str, self.bits)),
+            "weight_bits": ",".join(map(str, self.bits)),
             "planes": None if self.planes == 1 else str(self.planes),
             "scale_groups": None if self.groups == 1 else str(self.groups),
             "prune_unused": self.prune,

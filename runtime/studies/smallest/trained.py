@@ -70,7 +70,7 @@ def without(plan: Plan, training: Recordings, held: IntArray, epochs: int, targe
         file = Path(folder, "network.pt")
         kind.save(file, {"last": made.last}, plan, {})
         asked = arguments(target)
-        asked.weight_bits = None if storage is None else str(storage)
+        asked.weight_bits = str(storage or 8)
         loaded, events = load_network(str(file), asked), np.ascontiguousarray(seen.events)
         options = target.module.Options(training_events=events, packings=parse_packings(asked))
         return compile_network(loaded.model, options, target=target.name).netlist
