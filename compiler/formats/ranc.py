@@ -40,7 +40,8 @@ class Terms:
     """A network as RANC has it: every spike is the same, and a membrane is ``scale`` times ours, plus ``shift``.
 
     scale, shift: (neurons,) int64.
-    ticks: from the initial membranes on until which that is proven; None for ever.
+    ticks: from the initial membranes on until which that is proven, as far as no register of ours saturates; None for
+        ever.
     """
 
     netlist: CrossbarNetlist
@@ -61,7 +62,7 @@ def expressed(netlist: CrossbarNetlist, ticks: int | None = None) -> Terms:
     """
     reset_to, held = netlist.reset_mode == RESET_TO, netlist.negative_saturates > 0
     if reversing := np.count_nonzero((netlist.leak_reversal > 0) & (netlist.leak != 0)):
-        raise ModelError(f"--to ranc: RANC has no leak with reversal ({reversing} neurons); leave them out")
+        raise ModelError(f"RANC has no leak with reversal ({reversing} neurons); leave them out")
 
     centred, floor = reset_to & held, netlist.negative_threshold
     span = netlist.reset + floor
@@ -77,7 +78,7 @@ def expressed(netlist: CrossbarNetlist, ticks: int | None = None) -> Terms:
     if longest is not None and (longest == 0 or (ticks or 0) > longest):
         count = np.count_nonzero(falling & (room + fall * (ticks or 1) < 0))
         raise ModelError(
-            f"--to ranc: RANC has no negative threshold that holds a membrane which its spikes do not reset; {count} "
+            f"RANC has no negative threshold that holds a membrane which its spikes do not reset; {count} "
             f"neurons might reach theirs after {longest} ticks; give shorter recordings, or lower negative thresholds"
         )
     return Terms(

@@ -14,6 +14,7 @@ import hashlib
 import shlex
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -113,16 +114,17 @@ class Built:
     mesh: Mesh
     sizes: dict[str, int]
     folder: Path
+    files: Mapping[str, str]  # That a run reads, beside its recording
     key: str  # Changes with everything that a run depends on, but its recording
 
     def run(self, events: EventArray) -> Compared:
         """Compare one recording (n_inputs, T); OptionError if a tick does not end."""
-        here = self.folder / "recording"
-        shutil.rmtree(here, ignore_errors=True)
-        here.mkdir()
-        for memory in self.folder.glob("*.mem"):
-            (here / memory.name).symlink_to(memory)
-        (here / "input.txt").write_text("\n".join(packet_lines(self.terms, self.sizes, events)) + "\n", "utf-8")
+        with tempfile.TemporaryDirectory(prefix="recording-", dir=self.folder) as here:
+            return self._compared(events, Path(here))
+
+    def _compared(self, events: EventArray, here: Path) -> Compared:
+        lines = packet_lines(self.terms, self.sizes, events)
+        _write(here, {**self.files, "input.txt": "\n".join(lines) + "\n"})
         _call([self.folder / "simulation"], here)
         trace = self.machine.simulate(events[None], spikes=True, membranes=True)
         assert trace.spikes is not None, "spikes are kept"
@@ -171,15 +173,17 @@ def build(machine: TrueNorth, folder: Path, sources: Sequence[Path], simulator: 
     parts = [SIMULATORS[simulator], files["sizes.vh"], *(each.read_text("utf-8") for each in (HARNESS, *sources))]
     made = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     if not (stamp := folder / "built").is_file() or stamp.read_text("utf-8") != made:
-        for name, text in files.items():
-            (folder / name).write_text(text, "utf-8")
+        _write(folder, files)
         _call(words, folder)
         stamp.write_text(made, "utf-8")
-    for name, text in memories(terms, found):
-        files[name] = text
+    files |= memories(terms, found)
+    key, mesh = hashlib.sha256("\0".join([made, *files.values()]).encode()).hexdigest(), mesh_of(machine.netlist)
+    return Built(machine=machine, terms=terms, mesh=mesh, sizes=found, folder=folder, files=files, key=key)
+
+
+def _write(folder: Path, files: Mapping[str, str]) -> None:
+    for name, text in files.items():
         (folder / name).write_text(text, "utf-8")
-    key = hashlib.sha256("\0".join([made, *files.values()]).encode()).hexdigest()
-    return Built(machine=machine, terms=terms, mesh=mesh_of(machine.netlist), sizes=found, folder=folder, key=key)
 
 
 def _call(words: Sequence[str | Path], folder: Path) -> None:
