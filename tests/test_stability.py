@@ -13,6 +13,7 @@ from made_files import CLASSES, TAXELS, events, recordings_folder
 from numpy.testing import assert_array_equal
 from random_netlists import large_netlist, lively, netlists, recordings, voting
 from random_networks import random_checkpoint, ring
+from test_truenorth_counting import CHIP, random_counters, random_events
 
 from spikeloom.compiler import compile_network, write_netlist
 from spikeloom.compiler.dynamics import Clocks
@@ -265,6 +266,20 @@ def test_verdicts_are_those_of_plain_runs(bins, clocks):
         assert (found.at_least >= 1) == (wanted["removed"] + wanted["added"] == 0)
         assert found.at_most is None or found.at_most > found.at_least
         assert all((each.alter > 0) == (each.to is not None and each.to != known) for each in found.kinds.values())
+
+
+def test_a_chip_that_knows_no_short_cut_runs_every_change():
+    counters = random_counters(1, taxels=2, classes=3)
+    netlist = CHIP.compile(counters).netlist
+    given = np.stack([random_events(seed, counters) for seed in (5, 6)])
+    for one, found in zip(given, study_of(netlist, given, shift=1).verdicts, strict=True):
+        cells, alter = cells_of(one, netlist), 0
+        for channel, step in cells.cells.tolist():
+            changed = one.copy()
+            changed.reshape(-1, one.shape[-1])[channel, step] ^= 1
+            alter += int(decided(netlist, changed[None])[0] != found.decision)
+        assert found.kinds["removed"].alter + found.kinds["added"].alter == alter
+        assert (found.at_least, found.at_most) == ((0, 1) if alter else (1, None))
 
 
 def test_an_attack_alters_the_decision_with_the_events_that_it_names():
