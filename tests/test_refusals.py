@@ -174,6 +174,15 @@ TABLE = [
     ("compile net.pt -o net.pt", "-o net.pt: is an input of this command"),
     ("run net.loom --data data --spikes net.loom", "--spikes net.loom: is an input"),
     ("train --data words.txt --graph manual -o words.txt", "-o words.txt: is an input"),
+    *(
+        (f"{command} --picture x.txt", "--picture x.txt: allowed are .png, .svg, .pdf")
+        for command in (
+            "train --data data -o x.pt",
+            NETLISTS[3].replace(" ", " net.loom ", 1),
+            "certify net.loom --data data",
+        )
+    ),
+    ("certify net.loom --data data -o x.svg --picture x.svg", "--picture x.svg: is what -o names, too"),
     ("data convert grasp_label_1.npz -o grasp_label_1.npz", "-o grasp_label_1.npz: exists already"),
     # what does not belong together
     ("verify net.loom --data data --checkpoint bare.pt", "bare.pt: the graph is not in this file"),

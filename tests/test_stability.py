@@ -302,9 +302,9 @@ def test_the_command(tmp_path, monkeypatch):
     write_netlist(small_netlist(1), "net.loom")
     recordings_folder(tmp_path / "data", test=events(3, samples=4))
     words = ["certify", "net.loom", "--data", "data", "--shift", "2"]
-    found = as_json(*words, "-o", "found.json", "--picture", "map.png")
+    found = as_json(*words, "-o", "found.json", "--picture", "map.svg")
     assert json.loads((tmp_path / "found.json").read_text()) == found
-    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "map.svg").read_bytes().startswith(b"<?xml")
     result = decode(Stability, found)
     assert len(result.verdicts) == 4
     assert result.unaltered("dead") == sum(not each.taxels["dead"] for each in result.verdicts)

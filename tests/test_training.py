@@ -98,9 +98,9 @@ def test_seeds_side_by_side_equal_single_ones_and_finished_ones_are_left_alone(d
         (["--picture", "none/x.png"], "--picture none/x.png: the folder does not exist"),
         (
             ["--picture", "./x-seed1.png", "--seeds", "2", "-o", "x.png"],
-            "--picture ./x-seed1.png: is a network that -o names",
+            "--picture ./x-seed1.png: is what -o names",
         ),
-        (["--picture", "x.png", "-o", "x.png"], "--picture x.png: is a network that -o names"),
+        (["--picture", "x.png", "-o", "x.png"], "--picture x.png: is what -o names"),
         (
             ["--epochs", "1", "--resume"],
             "--resume: nothing was interrupted, neither x.pt nor x.pt.state.validation exists",

@@ -49,6 +49,11 @@ def group(parser: argparse.ArgumentParser, title: str) -> argparse._ArgumentGrou
     return next(found, None) or parser.add_argument_group(title)
 
 
+def add_picture(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add ``--picture``."""
+    parser.add_argument("--picture", metavar="OUT.png|svg|pdf", help=f"draw {what}")
+
+
 def add_common(parser: argparse.ArgumentParser) -> None:
     """Add the options of every command."""
     common = group(parser, "output")

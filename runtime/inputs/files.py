@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import zipfile
+from collections.abc import Callable, Iterable
 from importlib import resources
 from pathlib import Path
 
 from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.files import write_atomically
 from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name
+from spikeloom.runtime.report.drawing import PICTURES, Drawing
 
 _RECORDINGS = "recordings are shown by spikeloom data describe"
 
@@ -64,6 +67,29 @@ def require_place(path: str | None, option: str, arguments: argparse.Namespace |
         for each in given if isinstance(given, list) else [given]:
             if isinstance(each, str) and Path(shipped(each)).exists() and place.samefile(shipped(each)):
                 raise OptionError(f"{option} {path}: is an input of this command ({each}); give another name")
+
+
+def require_picture(arguments: argparse.Namespace, outputs: Iterable[str | Path | None]) -> None:
+    """Refuse a ``--picture`` that could not be written, of another kind than is drawn, or that is one of the `outputs`.
+
+    Raises OptionError.
+    """
+    path = arguments.picture
+    if path is None:
+        return
+    require_place(path, "--picture", arguments)
+    if Path(path).suffix not in (kinds := [f".{kind}" for kind in PICTURES]):
+        raise OptionError(f"--picture {path}: allowed are {', '.join(kinds)}; name one of these")
+    if Path(path).absolute() in [Path(output).absolute() for output in outputs if output is not None]:
+        raise OptionError(f"--picture {path}: is what -o names, too; give another name")
+
+
+def write_picture(path: str | None, draw: Callable[[], Drawing]) -> None:
+    """Write what ``--picture`` asks for, PNG, SVG or PDF by the name's ending; nothing without a path."""
+    if path is not None:
+        content = draw().file(Path(path).suffix[1:])
+        with write_atomically(path) as file:
+            file.write(content)
 
 
 def is_recordings(path: str) -> bool:

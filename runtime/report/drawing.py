@@ -29,6 +29,8 @@ CHIP, FLOAT = COLOURS[0], COLOURS[4]
 GREY = "#808890"
 DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 2)), (0, (8, 2, 2, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "<", ">")
+PICTURES = {"png": ("Software",), "svg": ("Creator", "Date", "Format", "Type"), "pdf": ("CreationDate",)}
+"""Kinds of files by their ending, and what each would say of itself that differs from day to day."""
 WIDTH = 9.6
 """Of a figure, in inches."""
 
@@ -98,11 +100,11 @@ class Drawing:
         return found
 
     def file(self, kind: str, **options: Any) -> bytes:
-        """As PNG, SVG or PDF; the same bytes for the same drawing."""
+        """As one of `PICTURES`; the same bytes for the same drawing."""
         content = io.BytesIO()
-        none = {"svg": ("Creator", "Date", "Format", "Type"), "pdf": ("CreationDate",), "png": ("Software",)}[kind]
         with _in_style():
-            self.figure.savefig(content, format=kind, dpi=150, metadata=dict.fromkeys(none), **options)
+            none = dict.fromkeys(PICTURES[kind])
+            self.figure.savefig(content, format=kind, dpi=150, metadata=none, **options)
         return content.getvalue()
 
 

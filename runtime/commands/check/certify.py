@@ -11,9 +11,9 @@ import numpy as np
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.files import sha256_of, write_atomically
-from spikeloom.runtime.commands.options import add_netlist, add_recordings
-from spikeloom.runtime.inputs.files import require_place
+from spikeloom.compiler.files import sha256_of
+from spikeloom.runtime.commands.options import add_netlist, add_picture, add_recordings
+from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.base import machine_for
 from spikeloom.runtime.report.encode import write_json
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--most", type=int, default=MOST, metavar="N", help=f"changed events to look for a proof of (default: {MOST})"
     )
     parser.add_argument("--jobs", type=int, metavar="N", help="recordings at a time (default: one a core)")
-    parser.add_argument("--picture", metavar="OUT.png", help="draw how many decisions hang on each taxel")
+    add_picture(parser, "how many decisions hang on each taxel")
     parser.add_argument("-o", "--output", metavar="OUT.json", help="write what --json prints")
     parser.epilog = NOTES.format(kinds="; ".join(KINDS.values()))
 
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     require_place(arguments.output, "-o", arguments)
-    require_place(arguments.picture, "--picture", arguments)
+    require_picture(arguments, [arguments.output])
     for name, least in (("shift", 0), ("most", 1), ("jobs", 1)):
         count = getattr(arguments, name)
         if count is not None and count < least:
@@ -68,8 +68,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
             split=arguments.split,
         ),
     )
-    if arguments.picture is not None:
-        with write_atomically(arguments.picture) as file:
-            file.write(taxel_map(result).file("png"))
+    write_picture(arguments.picture, lambda: taxel_map(result))
     write_json(arguments.output, result)
     return Outcome(result, sections)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.files import write_atomically
-from spikeloom.runtime.commands.options import add_netlist_and_model, add_recordings
-from spikeloom.runtime.inputs.files import require_place
+from spikeloom.runtime.commands.options import add_netlist_and_model, add_picture, add_recordings
+from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.stress.bench import NAMES
@@ -39,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="accuracy that the chip must keep, as in taxels_dead:3>=0.85; else exit code 1; may be repeated",
     )
     parser.add_argument("--jobs", type=int, metavar="N", help="measurements at a time (default: one a core)")
-    parser.add_argument("--picture", metavar="OUT.png", help="draw the curves")
+    add_picture(parser, "the curves")
     parser.add_argument("-o", "--output", metavar="OUT.json", help="write what --json prints; report --stress shows it")
     parser.epilog = NOTES.format(names=", ".join(NAMES))
 
@@ -47,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; exit code 1 where a requirement is missed."""
     require_place(arguments.output, "-o", arguments)
-    require_place(arguments.picture, "--picture", arguments)
+    require_picture(arguments, [arguments.output])
     for name in ("seeds", "jobs"):
         count = getattr(arguments, name)
         if count is not None and count < 1:
@@ -61,8 +60,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
         if wanted.name not in chosen:
             raise OptionError(f"--require {wanted}: --only leaves {wanted.name} out; add it there")
     result = study(arguments, [name for name in NAMES if name in chosen], requirements)
-    if arguments.picture is not None:
-        with write_atomically(arguments.picture) as file:
-            file.write(picture(result))
+    write_picture(arguments.picture, lambda: picture(result))
     write_json(arguments.output, result)
     return Outcome(result, sections, 1 if result.missed else 0)

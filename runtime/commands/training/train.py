@@ -9,7 +9,6 @@ from typing import Any
 
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS, TACTILESGNET, TITLES, Grid
 from spikeloom.compiler.targets.native import BASES, USUAL_COPIES
@@ -28,10 +27,10 @@ from spikeloom.models.training.recipes import (
     check_recipe,
     decays_asked,
 )
-from spikeloom.runtime.commands.options import add_data, add_graph_options, group
+from spikeloom.runtime.commands.options import add_data, add_graph_options, add_picture, group
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import whole_numbers
-from spikeloom.runtime.inputs.files import require_place
+from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
 from spikeloom.runtime.inputs.network import load_graph, sensor_places
 from spikeloom.runtime.inputs.recordings import recordings, require_bins, require_splits
 from spikeloom.runtime.report.console import progress
@@ -45,8 +44,6 @@ from spikeloom.runtime.studies.training import (
     train_seeds,
     training_sections,
 )
-
-PICTURES = (".png", ".svg", ".pdf")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -120,7 +117,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=WEIGHTS,
         help="epoch to store: last, best (on test) or clean (on validation); may be repeated (default: all three)",
     )
-    parser.add_argument("--picture", metavar="OUT.png", help="draw learning curves")
+    add_picture(parser, "learning curves")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
 
 
@@ -133,21 +130,13 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise OptionError(f"--seeds {arguments.seeds}: at least 1 is needed; give a positive number")
     require_bins(arguments.join)
     require_place(arguments.output, "-o", arguments)
-    if arguments.picture is not None:
-        require_place(arguments.picture, "--picture", arguments)
-        if Path(arguments.picture).suffix not in PICTURES:
-            raise OptionError(f"--picture {arguments.picture}: allowed are {', '.join(PICTURES)}; name one of these")
-        for seed in range(arguments.seed, arguments.seed + arguments.seeds):
-            if output_of(arguments.output, seed, arguments.seeds).absolute() == Path(arguments.picture).absolute():
-                raise OptionError(f"--picture {arguments.picture}: is a network that -o names; give another name")
+    seeds = range(arguments.seed, arguments.seed + arguments.seeds)
+    require_picture(arguments, [output_of(arguments.output, seed, arguments.seeds) for seed in seeds])
     graph, _ = _sensor(arguments)
     percent = WHOLE if arguments.window is None else parse_window(arguments.window)
     training, test = (first_part(each, percent) for each in both_splits(arguments.data, graph.n_taxels, arguments.bin))
     records = train_seeds(plan_jobs(arguments, training, test), resume=arguments.resume)
-    if arguments.picture is not None:
-        kind = Path(arguments.picture).suffix.removeprefix(".")
-        with write_atomically(arguments.picture) as file:
-            file.write(picture(records).file(kind))
+    write_picture(arguments.picture, lambda: picture(records))
     return Outcome(TrainingReport(runs=records, protocols=summary(records)), training_sections)
 
 

@@ -109,13 +109,13 @@ def _curve(drawing: Drawing, axes: Any, name: str, curve: Curve, side: str) -> N
         drawing.tips.append((axes, x, b, tip))
 
 
-def picture(result: Stress) -> bytes:
-    """The figure as a PNG that says by itself what it is of."""
+def picture(result: Stress) -> Drawing:
+    """The figure as a file has it: it says by itself what it is of."""
     about, seeds = result.provenance, f"{result.seeds} seed{'s' if result.seeds > 1 else ''}"
     title = f"{about.netlist} on {result.recordings} recordings of {about.data}, {seeds}; accuracy in per cent"
     drawn = figure(result, title, across=5)
     drawn.figure.supxlabel(title, fontsize=9)
-    return drawn.file("png")
+    return drawn
 
 
 def verdicts(result: Stress) -> Table:
