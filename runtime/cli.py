@@ -107,13 +107,13 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
     """Describe the command line, with the options of one command, of none (""), or of all (None)."""
     parser = Parser(
         prog="spikeloom",
-        usage="%(prog)s [-h] [--version] [--print-completion {bash,zsh,tcsh}] COMMAND …",
+        usage="%(prog)s [-h] [-V] [--print-completion {bash,zsh,tcsh}] COMMAND …",
         description="Lower a trained spiking graph network for touch to a netlist for a neuromorphic chip, run it bit "
         "for bit, compare it with the float model and price it.",
         epilog=_overview() + "\n\nspikeloom COMMAND --help shows the options of a command",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"spikeloom {__version__}")
+    parser.add_argument("-V", "--version", action="version", version=f"spikeloom {__version__}")
     parser.add_argument(
         "--print-completion", choices=("bash", "zsh", "tcsh"), help="print a completion script for a shell"
     )
@@ -131,6 +131,8 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
 
 def _parse(words: Sequence[str]) -> Arguments | None:
     """Options of a command; None where help was wanted of none and is printed."""
+    if words[:1] == ["help"]:
+        words = [*words[1:], "--help"]
     first = next((word for word in words if not word.startswith("-")), None)
     if "--print-completion" in words:
         import shtab
@@ -138,7 +140,7 @@ def _parse(words: Sequence[str]) -> Arguments | None:
         sys.stdout.write(shtab.complete(build_parser(), shell=words[-1]) + "\n")
         return None
     if first is None:
-        if words and not {"-h", "--help", "--version"} & set(words):
+        if words and not {"-h", "--help", "-V", "--version"} & set(words):
             raise OptionError(f"{words[0]}: stands before a command; see spikeloom --help")
         build_parser("").parse_args(words or ["--help"])
     elif first not in COMMANDS:

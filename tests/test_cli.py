@@ -197,6 +197,16 @@ def test_help_names_every_command(capsys):
 
 
 @pytest.mark.parametrize(
+    ("words", "shown"), [(["-V"], f"spikeloom {__version__}"), (["help"], "COMMAND"), (["help", "run"], "NET.loom")]
+)
+def test_short_words_for_help_and_version(capsys, words, shown):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(words)
+    assert stop.value.code == 0
+    assert shown in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
     ("words", "meant"),
     [(["verfy"], "verify"), (["run", "x.loom", "--lable"], "--table"), (["run", "--dta", "x"], "--data")],
 )
