@@ -36,10 +36,13 @@ HEADER = "time_s,taxel,polarity"
 LIVELY = lively()
 
 
-def objects(*words: object) -> dict[str, list[dict]]:
+LATE = "spikeloom: 1 event so far after the end of a bin, this one of {} s: late, not used\n"
+
+
+def objects(*words: object, said: str = "") -> dict[str, list[dict]]:
     """All objects that the command prints, by kind."""
     code, out, err = commands.run("watch", *words, "--json")
-    assert (code, err) == (0, "")
+    assert (code, err) == (0, said)
     values = [json.loads(line) for line in out.splitlines()]
     return {kind: [v for v in values if v["kind"] == kind] for kind in ("bin", "grasp", "end")}
 
@@ -110,7 +113,15 @@ def test_any_recording_is_a_run(lively_file, lines, low, inside):
             time_s = pytest.approx((t + 1) * 0.02, abs=1e-12)
             assert found["bin"][t] == {"kind": "bin", "grasp": 1, "bins": t + 1, "time_s": time_s} | shown
         assert len(found["bin"]) == 40
-        total = {"kind": "end", "grasps": 1, "bins": 40, "events": int(events.sum()), "repeated": 0, "late": 0}
+        total = {
+            "kind": "end",
+            "grasps": 1,
+            "bins": 40,
+            "events": int(events.sum()),
+            "repeated": 0,
+            "late": 0,
+            "after_decision": 0,
+        }
         assert found["end"] == [total | {"interrupted": False}]
 
 
@@ -156,7 +167,7 @@ def test_late_and_repeated_events_are_counted_and_not_used(lively_file, lines):
     rows.insert(len(rows) // 2, "0.0,3,1")
     rows.insert(len(rows) * 3 // 4, "0.01,3,0")
     rows[-1:] = rows[-1:] * 3
-    found = objects(lively_file, lines("\n".join(rows)))
+    found = objects(lively_file, lines("\n".join(rows)), said=LATE.format("0.0"))
     assert found["grasp"][0]["counts"] == votes_of_run(LIVELY, events)
     end = found["end"][0]
     assert (end["late"], end["repeated"], end["events"]) == (2, 2, events.sum() + 4)
@@ -171,7 +182,7 @@ def test_grasps_of_a_given_length(lively_file, lines):
         votes_of_run(LIVELY, long[:, :, :30]),
         votes_of_run(LIVELY, padded),
     ]
-    assert found["end"][0]["late"] == long[:, :, 30:].sum()
+    assert found["end"][0]["after_decision"] == long[:, :, 30:].sum()
     assert found["end"][0]["bins"] == 60
 
 
@@ -203,7 +214,9 @@ def feed(descriptor: int, *parts: tuple[str, float]) -> threading.Thread:
 def test_silence(pair_file, speed):
     read_end, write_end = os.pipe()
     thread = feed(write_end, ("0.0,0,1\n", 0.1), ("# nothing\n0.0", 0.3), ("1,0,1\n", 0))
-    found = objects(pair_file, "--input", f"/dev/fd/{read_end}", "--speed", speed)
+    found = objects(
+        pair_file, "--input", f"/dev/fd/{read_end}", "--speed", speed, said=LATE.format("0.01") * (speed == "real")
+    )
     thread.join()
     os.close(read_end)
     end = found["end"][0]
@@ -307,7 +320,8 @@ def test_a_grasp_ends_as_soon_as_it_is_sure(lively_file, lines, factor):
         assert (grasp["bins"], grasp["early"], len(found["bin"])) == (bins, early, bins)
         assert grasp["decision"] == at.leader[0, end if early else -1]
         assert found["end"][0]["early"] == early
-        assert found["end"][0]["late"] == events[..., bins + 1 :].sum() + (events[..., bins].sum() if early else 0)
+        after = events[..., bins + 1 :].sum() + (events[..., bins].sum() if early else 0)
+        assert (found["end"][0]["late"], found["end"][0]["after_decision"]) == (0, after)
         ended += early
     assert ended or factor is None
 

@@ -7,7 +7,7 @@ of ``run`` on the same recording. A bin is stepped
 * in real time, not before its end by the wall clock, which the first event of a grasp sets; and at the latest one bin
   after its end, so that decisions go on while nothing touches the sensor.
 
-An event whose bin was stepped already, or whose grasp was decided already, is late: it is counted, not used.
+An event whose bin was stepped already is late; what comes after a grasp's decision is counted apart. Neither is used.
 """
 
 from __future__ import annotations
@@ -31,12 +31,13 @@ from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.eventlines import Event, EventLines, Mark
 from spikeloom.runtime.commands.options import add_netlist
 from spikeloom.runtime.machines.base import Step, Stream
+from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 
 NOTES = """\
-Lines come in the order of their times: an event whose bin is over, since a later one came, is counted as late and not
-used. What follows a # is a comment, and a grasp may begin with a header that names the columns, in any order. An empty
+Lines come in the order of their times: an event whose bin is over, since a later one came, is counted as late, said at
+once and not used; so is, apart from these, what comes after a grasp's decision. What follows a # is a comment, and a grasp may begin with a header that names the columns, in any order. An empty
 line or the line "reset" ends a grasp. Polarity is 0 and 1, or -1 and 1. --json prints one object a line: kind "bin"
 for every bin, "grasp" for every decision, and "end" last.
 """
@@ -58,6 +59,7 @@ class Summary:
     events: int = 0
     repeated: int = 0
     late: int = 0
+    after_decision: int = 0
     interrupted: bool = False
     early: int | None = field(default=None, metadata=OPTIONAL)
 
@@ -128,8 +130,14 @@ class Watch:
             )
         while self._is_open() and self.stream.index < index:
             self._close_bin()
-        if self.decided or index < self.stream.index:
+        if self.decided:
+            self.found.after_decision += 1
+            return
+        if index < self.stream.index:
             self.found.late += 1
+            if str(self.found.late).strip("0") == "1":  # 1, 10, 100, …
+                many = number(self.found.late, "event")
+                tell(f"{many} so far after the end of a bin, this one of {event.time_s} s: late, not used")
             return
         self.found.repeated += int(self.column[event.channel])
         self.column[event.channel] = 1
@@ -303,5 +311,6 @@ def sections(found: Summary) -> list[Section]:
     """The summary for people."""
     parts = [number(found.grasps, "grasp"), number(found.bins, "bin"), number(found.events, "event")]
     parts += [f"{found.repeated} repeated within a bin", f"{found.late} late"]
+    parts += [f"{found.after_decision} after the decision"] if found.after_decision else []
     text = ", ".join([*parts, *([] if found.early is None else [f"{found.early} ended early"])])
     return [Section("Watched", [Text(text + ("\ninterrupted" if found.interrupted else ""))])]
