@@ -444,6 +444,12 @@ def test_the_terminal_shows_the_choice_and_fronts(chart, golden):
     golden("chart.txt", told(chart))
 
 
+def test_a_choice_that_others_surpass_on_test_says_so(chart):
+    below = "on the test split its interval lies below those of "
+    assert below not in told(chart)  # those above it exceed the budget
+    assert f"{below}#6, #12, which" in told(made_chart("accuracy=80"))
+
+
 # -- pictures ----------------------------------------------------------------------------------------------------------
 def test_colours_are_for_networks_where_there_are_several_else_for_storage(chart):
     assert series_of(chart.points) == "network"

@@ -37,9 +37,10 @@ from spikeloom.runtime.report.sections import Outcome, Section, Text
 
 NOTES = """\
 Lines come in the order of their times: an event whose bin is over, since a later one came, is counted as late, said at
-once and not used; so is, apart from these, what comes after a grasp's decision. What follows a # is a comment, and a grasp may begin with a header that names the columns, in any order. An empty
-line or the line "reset" ends a grasp. Polarity is 0 and 1, or -1 and 1. --json prints one object a line: kind "bin"
-for every bin, "grasp" for every decision, and "end" last.
+once and not used; what comes after a grasp's decision is counted apart. What follows a # is a comment, and a grasp may
+begin with a header that names the columns, in any order. An empty line or the line "reset" ends a grasp. Polarity is
+0 and 1, or -1 and 1. --json prints one object a line: kind "bin" for every bin, "grasp" for every decision, and "end"
+last.
 """
 
 MAX_GAP = 100_000

@@ -18,6 +18,7 @@ from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Block, Code, Details, Figure, Section, Table, Text
 from spikeloom.runtime.studies.chart.results import Chart, ChosenBy, Point
+from spikeloom.runtime.studies.chart.study import above_on_test
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,6 +73,10 @@ def _choice(chart: Chart) -> list[Block]:
     if pick.budgets:
         lines.append(f"{' and '.join(pick.budgets)}: {pick.fitting or 'none'} of {len(chart.points)} points fit")
     lines.append(f"{'take' if pick.fits else 'the nearest is'} #{point.number} {point.label}")
+    if better := ", ".join(f"#{each.number}" for each in above_on_test(chart)):
+        lines.append(
+            f"on the test split its interval lies below those of {better}, which the training split did not show"
+        )
     return [Text("\n".join(lines)), _table([point], chart.chosen_by, "The choice"), *_commands([point])]
 
 

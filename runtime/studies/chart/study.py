@@ -18,7 +18,7 @@ from spikeloom.runtime.studies.chart import work
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile
 from spikeloom.runtime.studies.chart.results import Chart, ChosenBy, Data, Pick, Point, Refused
-from spikeloom.runtime.studies.fronts import Budget, front
+from spikeloom.runtime.studies.fronts import Budget, front, parse_budgets
 from spikeloom.runtime.studies.jobs import sweep
 
 STORE = "points.sqlite"
@@ -143,22 +143,30 @@ def pick(points: Sequence[Point], budgets: Sequence[Budget], by: ChosenBy) -> Pi
     def energy(point: Point) -> float:
         return costs["energy"](point.train)
 
-    def excess(point: Point) -> float:
-        """Factor by which a point misses the budgets; at most 1 where it fits."""
-        factors = [0.0]
-        for budget in budgets:
-            if budget.what == "accuracy":
-                factors.append(budget.limit / point.expected if point.expected else float("inf"))
-            else:
-                factors.append(costs[budget.what](point.train) / budget.limit)
-        return max(factors)
-
-    fitting = [point for point in points if excess(point) <= 1 + NEAR]
+    fitting = [point for point in points if _excess(point, budgets, by) <= 1 + NEAR]
     if not fitting:
-        chosen = min(points, key=lambda point: (excess(point), energy(point)))
+        chosen = min(points, key=lambda point: (_excess(point, budgets, by), energy(point)))
     else:
         wanted = any(budget.what == "accuracy" for budget in budgets)
         enough = 0.0 if wanted else max(point.expected for point in fitting) - LOSS - NEAR
         chosen = min((point for point in fitting if point.expected >= enough), key=energy)
     words = tuple(budget.words for budget in budgets)
     return Pick(budgets=words, fits=bool(fitting), fitting=len(fitting), point=chosen.number)
+
+
+def above_on_test(chart: Chart) -> list[Point]:
+    """Points that fit the budgets and whose test intervals lie above the chosen one's: reported, never chosen by."""
+    budgets = parse_budgets(chart.budget.budgets)
+    higher = [point for point in chart.points if point.test.low > chart.chosen.test.high]
+    return [point for point in higher if _excess(point, budgets, chart.chosen_by) <= 1 + NEAR]
+
+
+def _excess(point: Point, budgets: Sequence[Budget], by: ChosenBy) -> float:
+    """Factor by which a point misses budgets, on the training split; at most 1 where it fits."""
+    factors = [0.0]
+    for budget in budgets:
+        if budget.what == "accuracy":
+            factors.append(budget.limit / point.expected if point.expected else float("inf"))
+        else:
+            factors.append(by.costs()[budget.what](point.train) / budget.limit)
+    return max(factors)
