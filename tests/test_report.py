@@ -31,6 +31,7 @@ from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
+from spikeloom.runtime.equivalence.verdict import LEVELS
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.report import drawing, html
@@ -39,7 +40,7 @@ from spikeloom.runtime.report.sections import Code, Details, Facts, Figure, Sect
 from spikeloom.runtime.studies.chart.sections import page, picture, printed, series_of
 
 REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data", "-o", "out.html")
-HEADINGS = ["Verdict", "Decisions", "Cores", "Taxels", "One recording", "Energy and time", "Provenance"]
+HEADINGS = ["Verdict", "Decisions", "Cores", "Taxels", "One recording", "Energy and time", "Provenance", "Words"]
 LAYERS = ("conv1", "fc1", "fc2", "fc3")
 RASTERS = [f"raster-{place}" for place in range(1 + len(LAYERS))]  # of the input and of the layers
 FIGURES = {*RASTERS}
@@ -87,6 +88,21 @@ def test_every_chapter_and_figure_is_there_captioned_and_in_numbers(made):
         assert re.search('role="img" aria-label=".+"', figure)
         assert len(re.findall("<(?:path|use|g)[ >]", figure)) >= 5
         assert "<table" in figure or 'id="raster-0"' in figure, "whose spikes cannot differ"
+
+
+def test_it_begins_with_a_sentence_and_explains_each_level(made):
+    assert re.search(
+        r"<p>The netlist is its checkpoint, rounded; the chip decides as .* on \d of 6 recordings", made[0]
+    )
+    assert "<p>A TactileSGNet, graph ring, on 1 core, compared with its float model on 6 recordings.</p>" in made[0]
+    words = made[0].partition("<h2>Words</h2>")[2]
+    assert all(f'<th scope="row">{level}</th>' in words for level in LEVELS)
+
+
+def test_a_recording_that_is_decided_differently_is_drawn(made):
+    apart = [row[0] for row in re.findall(r"<caption>Decided differently.*?</table>", made[0], re.DOTALL)]
+    decided = made[1]["recording"]["decision"]
+    assert (decided["float"] != decided["chip"]) == bool(apart)
 
 
 def test_the_page_needs_nothing_else_and_is_the_same_each_time(spikeloom, made, place):

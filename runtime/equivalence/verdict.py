@@ -27,7 +27,14 @@ from spikeloom.runtime.report.sections import Block, Section, Table, Text
 if TYPE_CHECKING:
     from spikeloom.runtime.equivalence.certificates import Certificate  # it loads numba
 
-LEVELS = ("EN", "E0", "E1", "E2", "E3")
+LEVELS = {
+    "EN": "every number of the netlist is what the checkpoint's becomes by rounding",
+    "E0": "the fast simulator does in every bit what the chip's definition does",
+    "E1": "a model that was trained on the chip's integers does what the chip does",
+    "E2": "share of spikes that float model and chip have in common",
+    "E3": "share of recordings that both decide alike",
+}
+"""What a comparison is held to, from the files to the decisions."""
 
 SHARES = ("E2", "E3")
 """Levels whose gate needs a share."""
@@ -166,6 +173,18 @@ def spike_agreement(spikes: LayerSpikes) -> float:
     """
     total = spikes.float + spikes.chip
     return 1 - spikes.different / total if total else 1.0
+
+
+def in_a_sentence(verdict: Verdict) -> str:
+    """What it comes to, for a reader of nothing else."""
+    if verdict.missed:
+        return f"Do not use this netlist: {'; '.join(verdict.missed)}."
+    equal = round(verdict.decision_agreement * verdict.samples)
+    chip, model = (round(verdict.accuracy[side] * verdict.samples) for side in ("chip", "float"))
+    alike = f"decides as the float model on {equal} of {verdict.samples} recordings"
+    return (
+        f"The netlist is its checkpoint, rounded; the chip {alike} and is right on {chip}, the float model on {model}."
+    )
 
 
 def mcnemar(labels: IntArray, first: IntArray, second: IntArray) -> tuple[int, int, float]:

@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.systems import TITLES
+from spikeloom.models.recordings.counts import number
+from spikeloom.runtime.equivalence.verdict import LEVELS, in_a_sentence
 from spikeloom.runtime.equivalence.verdict import sections as verdict_sections
 from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.page import pictures
@@ -28,11 +31,29 @@ SPIKES = 200
 ROWS = 3000
 """Rows of a raster, at most; a screen shows fewer."""
 
+WORDS = LEVELS | {
+    "spike, vote": "what a neuron sends; one of the last layer, and the class with the most votes is decided",
+    "membrane": "sum of what a neuron received, part of which is lost each step; above its threshold the neuron spikes",
+    "specification, engine": "the chip's definition, written to be read; the fast simulator that made all figures",
+    "ill-posed": "a spike that sums in 32 and 64 bits decide otherwise, so that neither is wrong",
+    "ladder": "the chip's deviations from the float model, added one by one, and the spikes that then differ",
+    "certified": "equal in whatever order the float model adds up; undecided: it depends on the order",
+    "McNemar p": "how often chance alone splits what only one of the two gets right so unevenly",
+    "core, tile, chip step": "cores compute side by side, some share a tile; a step updates every neuron once",
+    "compartment, axon": "a neuron as a core holds it; a core's entry for the spikes of one sender",
+    "synaptic operation": "one spike on one stored synapse",
+    "packet, hop": "a spike on its way to a core; a link between tiles that it takes",
+    "taxel graph": "which elements of the touch sensor (taxels) are neighbours; manual: joined by hand",
+}
+"""What a reader of the page alone may ask."""
+
 
 def sections(report: Report) -> list[Section]:
     """Chapters of the page."""
     chapters = [
-        Section("Verdict", [Facts(_cards(report)), *verdict_sections(report.verify)]),
+        Section(
+            "Verdict", [Text(in_a_sentence(report.verify)), Facts(_cards(report)), *verdict_sections(report.verify)]
+        ),
         Section("Decisions", _decisions(report.decisions)),
         Section("Cores", [*_of_chip(report.described), *_cores(report.cores)]),
         Section("Taxels", _taxels(report.taxels)),
@@ -40,6 +61,7 @@ def sections(report: Report) -> list[Section]:
         Section("Energy and time", [*_of_chip(report.price.outcome), Section("", report.figures)]),
         Section("Stability", [] if report.stress is None else stability(report.stress)),
         Section("Provenance", _provenance(report.provenance)),
+        Section("Words", [Table(["word", "meaning"], list(map(list, WORDS.items())), words=True, most=0)]),
     ]
     return [Section(each.title, each.blocks, chapter=True) for each in chapters if each.blocks]
 
@@ -51,10 +73,11 @@ def _of_chip(outcome: Outcome) -> Iterable[Block]:
 
 def about(report: Report) -> str:
     """The page in a sentence."""
-    system = report.provenance.checkpoint.facts["system"] or "network"
+    system = TITLES.get(report.provenance.checkpoint.facts["system"], "a network")
     graph = f", graph {report.taxels.graph}" if report.taxels.graph else ""
     cores, samples = len(report.cores.cores), report.verify.samples
-    return f"A {system}{graph}, on {cores} cores, compared with its float model on {samples} recordings."
+    where = f"on {number(cores, 'core')}, compared with its float model on {number(samples, 'recording')}"
+    return f"{system[0].upper()}{system[1:]}{graph}, {where}."
 
 
 def _cards(report: Report) -> dict[str, tuple[str, str]]:
@@ -67,10 +90,12 @@ def _cards(report: Report) -> dict[str, tuple[str, str]]:
     cards["decisions equal"] = f"{equal} of {verdict.samples}", "chip and float model"
     exact = f"every spike, membrane and count of {verdict.spec_samples} recordings"
     cards["specification = engine"] = "yes" if verdict.spec_equals_engine else "NO", exact
-    if price.energy_j:
-        ends = sorted(float(each.mean()) for each in price.energy_j.values())
-        shown = dict.fromkeys(si(value, "J") for value in (ends[0], ends[-1]))
-        cards["dynamic energy an inference"] = " … ".join(shown), ", ".join(price.energy_j)
+    energy = {name: float(each.mean()) for name, each in price.dynamic_j.items()}
+    static = "static power, not in that energy"
+    for name, unit, found in (("dynamic energy an inference", "J", energy), (static, "W", price.static_w)):
+        if found:
+            ends = dict.fromkeys(si(value, unit) for value in (min(found.values()), max(found.values())))
+            cards[name] = " … ".join(ends), ", ".join(found)
     for table, seconds in list(price.time_s.items())[:1]:
         cards["time an inference"] = si(float(seconds.mean()), "s"), f"at full speed, {table}, simple model"
     held = sum(core.compartments for core in report.cores.cores)
@@ -105,7 +130,10 @@ def _decisions(found: Decisions) -> list[Block]:
             "Rows are labels, columns decisions; right ones lie on the diagonal, the others are of another colour.",
             [Table(["class", "recordings", "float", "chip"], classes, "Right decisions by class", most=0)],
         ),
-        Text(f"{len(wrong)} kinds of wrong decisions, {len(moved)} recordings that the two decide differently"),
+        Text(
+            f"{number(len(wrong), 'kind')} of wrong decisions, {number(len(moved), 'recording')} that the two decide "
+            "differently"
+        ),
         *(table for table in tables if table.rows),
     ]
 

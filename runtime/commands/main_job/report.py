@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+import numpy as np
+
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.models.recordings.evtouch import Recordings
@@ -36,7 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_netlist_and_model(parser)
     add_recordings(parser)
     parser.add_argument(
-        "--recording", metavar="NAME|N", help="recording to draw, by name or from 0 (default: the first that differs)"
+        "--recording",
+        metavar="NAME|N",
+        help="recording to draw, by name or from 0 (default: the first decided differently)",
     )
     parser.add_argument("--stress", metavar="STRESS.json", help="show what stress -o wrote about this netlist")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.html")
@@ -94,7 +98,9 @@ def _report(
         progress=account.begin,
     )
     if chosen is None:
-        chosen = 0 if verdict.first_divergence is None else data.files.index(verdict.first_divergence.file)
+        first = verdict.first_divergence
+        apart = np.flatnonzero(verdict.float_predictions != verdict.chip_predictions)
+        chosen = int(apart[0]) if len(apart) else 0 if first is None else data.files.index(first.file)
     account.begin("costs")
     ran, price = machine.price(data.events, lengths=data.lengths, bin_s=arguments.bin)
     account.begin("the recording")
