@@ -1,17 +1,37 @@
 """Small checkpoints and recordings on disk, for the tests that go through files and the command line."""
 
+import io
 import tempfile
+import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from spikeloom.compiler.archive import ZIP_DATE
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.graphs import Graph, normalised_adjacency
 from spikeloom.models.networks.checkpoint import save_checkpoint
 
 TAXELS, FEATURES, CLASSES, STEPS = 6, 5, 4, 24
+
+
+def zipped(members: Mapping[str, bytes | str], compression: int = zipfile.ZIP_STORED) -> bytes:
+    """A zip of these members; equal members give equal bytes."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(zipfile.ZipInfo(name, ZIP_DATE), content, compression)
+    return file.getvalue()
+
+
+def torch_bytes(content: object, *, new: bool = True, protocol: int = 2) -> bytes:
+    """What torch writes; `new` is a zip, as since 1.6."""
+    file = io.BytesIO()
+    torch.save(content, file, _use_new_zipfile_serialization=new, pickle_protocol=protocol)
+    return file.getvalue()
 
 
 def ring(taxels: int = TAXELS) -> Graph:

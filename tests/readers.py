@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from google.protobuf import json_format
 from made_chart import made_figures
+from made_files import torch_bytes
 from made_modules import NETS, example_of, one_step
 from made_onnx import two_layers
 from onnx import ModelProto, defs
@@ -127,15 +128,13 @@ def small_weights(seed: int = 0) -> dict[str, np.ndarray]:
     return made_files.weights(seed, features=2, hops=2, sizes=(3, 3, 2))
 
 
-def saved(value: Any, *, new: bool = True) -> bytes:
-    file = io.BytesIO()
-    torch.save(value, file, _use_new_zipfile_serialization=new)
-    return file.getvalue()
+def unpickled(content: bytes) -> Any:
+    return torch.load(io.BytesIO(content))
 
 
 def torch_files(new: bool) -> list[bytes]:
     states = [made_files.state_dict(small_weights(seed), old=not new) for seed in (0, 1)]
-    return [saved(made_files.released(*states), new=new), saved(states[0], new=new)]
+    return [torch_bytes(made_files.released(*states), new=new), torch_bytes(states[0], new=new)]
 
 
 def own() -> list[bytes]:
@@ -151,11 +150,7 @@ def recording_zip() -> list[bytes]:
     names = [f"x/{split}/sample_{i}_label_{i}.npy" for split in ("test", "train") for i in (0, 1)]
     made = made_files.events(samples=4, steps=6).astype(np.float32)
     members = {name: archive.npy_bytes(one) for name, one in zip(names, made, strict=True)}
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
-        for name, content in members.items():
-            file.writestr(name, content)
-    return [archive.zip_bytes(members), packed.getvalue()]
+    return [archive.zip_bytes(members), made_files.zipped(members, zipfile.ZIP_DEFLATED)]
 
 
 def npz() -> list[bytes]:
@@ -163,9 +158,11 @@ def npz() -> list[bytes]:
     return [archive.zip_bytes({f"{name}.npy": archive.npy_bytes(array) for name, array in events.items()})]
 
 
-def hdf5(family: str) -> list[bytes]:
-    if family == "nir":
-        return [path.read_bytes() for path in sorted((Path(__file__).parent / "nir").glob("*.ni[r]"))]
+def nir_files() -> list[bytes]:
+    return [path.read_bytes() for path in sorted((Path(__file__).parent / "nir").glob("*.ni[r]"))]
+
+
+def netx_files() -> list[bytes]:
     rng, file = np.random.default_rng(0), io.BytesIO()
 
     def even(*shape, **more):
@@ -360,20 +357,13 @@ def kept(path: Path) -> str:
 NIR_WORDS = ("Affine", "AvgPool2d", "Conv1d", "Conv2d", "CubaLIF", "Delay", "Flatten", "I", "IF", "Input", "LI", "LIF")
 NIR_WORDS += ("Linear", "NIRGraph", "Output", "Scale", "SumPool2d", "Threshold", "a\nb", "\x1b[31m", "ä" * 200)
 NETX_WORDS = ("conv", "dense", "dense_rec", "flatten", "input")
-TOML_WORDS = (
-    "[energy.x]",
-    "[time.y]",
-    "hops = 1",
-    'hop = { value = inf, unit = "pJ", source = "x" }',
-    "a.b = {}",
-    "",
-    "[",
-)
+TOML_WORDS = ("[energy.x]", "[time.y]", "hops = 1", 'hop = { value = inf, unit = "pJ", source = "x" }')
+TOML_WORDS += ("a.b = {}", "", "[")
 CELLS = ("x", "label", "-1", "1e9", "nan", "", "#", "\x1b")
 OPERATORS = tuple(sorted({schema.name for schema in defs.get_all_schemas()}))
 
 signed = partial(Reader, apart=parts_of_archive, together=archive_of, sealed=True)
-pickled = partial(Reader, read=checkpoint, apart=lambda data: torch.load(io.BytesIO(data)), words=("fc9.weight", "fc1"))
+pickled = partial(Reader, read=checkpoint, apart=unpickled, words=("fc9.weight", "fc1"))
 zipped = partial(Reader, apart=parts_of_zip, together=zip_of, words=("test/sample_5_label_2.npy", "../x"), sealed=True)
 table = partial(Reader, ".csv", apart=cells, together=lines_of, words=CELLS)
 nir = partial(network, partial(read_nir, dt=1e-4, convention="exponential"))
@@ -384,14 +374,14 @@ READERS = {
     "network for crossbars": signed(".pt", trained, partial(values, read_trained)),
     "counting network": signed(".pt", counters, partial(network, read_network)),
     "own checkpoint": Reader(".pt", own, checkpoint, parts_of_checkpoint, checkpoint_of, sealed=True),
-    "released checkpoint": pickled(".pt", partial(torch_files, True), together=saved, sealed=True),
-    "released checkpoint, older form": pickled(".t7", partial(torch_files, False), together=partial(saved, new=False)),
-    "training state": Reader(".state", states, trains, lambda data: torch.load(io.BytesIO(data)), saved, share=0.25),
-    "ONNX": Reader(".onnx", onnx, partial(network, read_onnx), message, message_of, OPERATORS),
-    "NIR": Reader(".nir", partial(hdf5, "nir"), nir, tree_of, hdf5_of, NIR_WORDS, share=0.25),
-    "netx": Reader(
-        ".net", partial(hdf5, "netx"), partial(network, read_netx), tree_of, hdf5_of, NETX_WORDS, share=0.25
+    "released checkpoint": pickled(".pt", partial(torch_files, True), together=torch_bytes, sealed=True),
+    "released checkpoint, older form": pickled(
+        ".t7", partial(torch_files, False), together=partial(torch_bytes, new=False)
     ),
+    "training state": Reader(".state", states, trains, unpickled, torch_bytes, share=0.25),
+    "ONNX": Reader(".onnx", onnx, partial(network, read_onnx), message, message_of, OPERATORS),
+    "NIR": Reader(".nir", nir_files, nir, tree_of, hdf5_of, NIR_WORDS, share=0.25),
+    "netx": Reader(".net", netx_files, partial(network, read_netx), tree_of, hdf5_of, NETX_WORDS, share=0.25),
     "recordings": zipped(".zip", recording_zip, recordings),
     "events": zipped(".npz", npz, recordings),
     "bins": Reader(".npy", npy, recordings, lambda data: {"x": archive.read_npy(data)}, npy_of),

@@ -12,7 +12,7 @@ import made_files as made
 import numpy as np
 import pytest
 import torch
-from made_files import checkpoint_bytes, state_dict
+from made_files import checkpoint_bytes, state_dict, torch_bytes, zipped
 from oracles import refused
 
 from spikeloom.compiler.archive import npy_bytes, read_npy
@@ -35,12 +35,6 @@ def tensors(seed: int = 0, *, old: bool = False) -> dict[str, torch.Tensor]:
 def write(path: Path, content: bytes) -> Path:
     path.write_bytes(content)
     return path
-
-
-def torch_bytes(content: object, *, new: bool = True, protocol: int = 2) -> bytes:
-    file = io.BytesIO()
-    torch.save(content, file, _use_new_zipfile_serialization=new, pickle_protocol=protocol)
-    return file.getvalue()
 
 
 def released(*states: dict[str, torch.Tensor], **more: object) -> bytes:
@@ -79,14 +73,6 @@ def rebuilt(content: bytes, change: object, *, sign: bool = True, compression: i
         arrays = {n.removesuffix(".npy"): read_npy(m) for n, m in members.items() if n.endswith(".npy")}
         manifest["sha256"] = content_digest(manifest, arrays)
     return zipped(members | {"manifest.json": json.dumps(manifest)}, compression)
-
-
-def zipped(members: dict[str, bytes | str], compression: int = zipfile.ZIP_STORED) -> bytes:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", compression) as archive:
-        for name, member in members.items():
-            archive.writestr(name, member)
-    return file.getvalue()
 
 
 # --- the released layout -------------------------------------------------------------------------------------------

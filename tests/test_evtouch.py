@@ -9,9 +9,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from made_files import events
+from made_files import events, zipped
 from oracles import refused
 
+from spikeloom.compiler.archive import npy_bytes as npy
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.events import load_data
@@ -19,12 +20,6 @@ from spikeloom.models.recordings.evtouch import Recordings, first_part, parse_wi
 
 EVENTS = (np.arange(3 * 2 * 5) % 3 == 0).reshape(3, 2, 5)
 SAMPLE = "sample_0_label_0.npy"
-
-
-def npy(array) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, array, allow_pickle=False)
-    return buffer.getvalue()
 
 
 GOOD = npy(EVENTS.astype(np.float32))
@@ -39,9 +34,7 @@ def folder(path: Path, files: dict[str, bytes]) -> Path:
 
 
 def archive(path: Path, files: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
-    with zipfile.ZipFile(path, "w", method) as file:
-        for name, data in files.items():
-            file.writestr(name, data)
+    path.write_bytes(zipped(files, method))
     return path
 
 

@@ -7,41 +7,42 @@ import numpy as np
 import pytest
 import torch
 from commands import as_json, run
-from made_files import csv_folder, events, own_file, state_dict, weights
-from random_networks import random_checkpoint, ring
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_files import TAXELS, csv_folder, events, own_file, small_checkpoint, state_dict, weights
+from random_networks import chain, random_checkpoint, ring
 from test_truenorth_counting import random_counters
 from timed_networks import events_of, written
 
 from spikeloom.compiler import Options, Packing, compile_network, read_netlist, write_netlist
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.counters import write_counters
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.truenorth.netlist import read_crossbars, write_crossbars
+from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.machines.integer import integer_machine
 
 
-def put(netlist, field, place, value):
-    values = getattr(netlist, field).copy()
-    values[place] = value
-    return dataclasses.replace(netlist, **{field: values})
+def changed(field, place, to):
+    """Damage: other values of a field at a place, which may be found in the netlist."""
 
-
-def added(field, place=0, by=1):
-    return lambda net: put(net, field, place, getattr(net, field)[place] + by)
-
-
-def exchanged(field, find):
-    def damage(net):
-        pair = find(net)
-        return put(net, field, pair, getattr(net, field)[pair[::-1]])
+    def damage(netlist):
+        values, at = getattr(netlist, field).copy(), place(netlist) if callable(place) else place
+        values[at] = to(values[at])
+        return dataclasses.replace(netlist, **{field: read_only(values)})
 
     return damage
 
 
-def of_layer(layer):
-    return lambda net: net.compartments_of(layer)[:2]
+def plus(by):
+    return lambda values: values + by
+
+
+def of_layer(layer, part=slice(None)):
+    return lambda net: net.compartments_of(layer)[part]
 
 
 def unlike_targets(net):
@@ -73,29 +74,29 @@ def layer_with(**changes):
 
 
 WEIGHTS = "weights (that are not the nearest,|than the compiler chose.*;) the farthest, from .* to neuron"
+BIASES = "fc1 has .*biases"
+FIRST, PAIR = slice(1), slice(2)
 DAMAGES = {
-    "sign": (lambda net: put(net, "synapse_weight", largest(net), -net.synapse_weight[largest(net)]), WEIGHTS),
-    "sign of the least": (
-        lambda net: put(net, "synapse_weight", smallest(net), -net.synapse_weight[smallest(net)]),
-        WEIGHTS,
-    ),
-    "a step": (lambda net: added("synapse_weight", smallest(net), 2)(net), WEIGHTS),
+    "sign": (changed("synapse_weight", largest, np.negative), WEIGHTS),
+    "sign of the least": (changed("synapse_weight", smallest, np.negative), WEIGHTS),
+    "a step": (changed("synapse_weight", smallest, plus(2)), WEIGHTS),
     "axon dropped": (without_axon, WEIGHTS),
-    "axon of another source": (exchanged("axon_source", lambda _: np.array([0, 1])), WEIGHTS),
-    "targets": (exchanged("synapse_target", unlike_targets), WEIGHTS),
-    "exponent": (added("format_exponent"), "limit|weights"),
-    "threshold": (added("threshold"), r"conv1 neuron 0 has threshold (\d+) instead of \d+$"),
+    "axon of another source": (changed("axon_source", PAIR, np.flip), WEIGHTS),
+    "targets": (changed("synapse_target", unlike_targets, np.flip), WEIGHTS),
+    "exponent": (changed("format_exponent", 0, plus(1)), "limit|weights"),
+    "threshold": (changed("threshold", 0, plus(1)), r"conv1 neuron 0 has threshold (\d+) instead of \d+$"),
     "decay of a layer": (
-        lambda net: added("decay_v", net.compartments_of(2))(net),
+        changed("decay_v", of_layer(2), plus(1)),
         "fc2 has decay registers 4095 and 3278 instead of 4095 and 3277",
     ),
-    "decay of a neuron": (added("decay_u", by=-1), "layer conv1: has 2 values of decay_u"),
-    "bias zeroed": (lambda net: put(net, "bias_mantissa", net.compartments_of(1)[0], 0), "fc1 has .*biases"),
-    "neurons": (exchanged("neuron", of_layer(1)), WEIGHTS),
-    "votes": (exchanged("readout_class", of_layer(3)), "fc3 has 2 of 4 neurons that vote for another class"),
+    "decay of a neuron": (changed("decay_u", 0, plus(-1)), "layer conv1: has 2 values of decay_u"),
+    "bias zeroed": (changed("bias_mantissa", of_layer(1, FIRST), np.zeros_like), BIASES),
+    "bias at its end": (changed("bias_exponent", of_layer(1, FIRST), lambda _: 7), f"{BIASES} that are not"),
+    "neurons": (changed("neuron", of_layer(1, PAIR), np.flip), WEIGHTS),
+    "votes": (changed("readout_class", of_layer(3, PAIR), np.flip), "fc3 has 2 of 4 neurons that vote for another"),
     "window": (layer_with(depth=1), "conv1 has a window from step 1 instead of 0"),
     "theta": (layer_with(theta=0.6), "conv1 has theta 0.6 instead of 0.5"),
-    "limit": (added("threshold", np.arange(9), np.arange(9)), "12 used, 8 allowed .loihi1.core.threshold_slots"),
+    "limit": (changed("threshold", slice(9), plus(np.arange(9))), "12 used, 8 allowed .loihi1.core.threshold_slots"),
 }
 
 
@@ -113,10 +114,12 @@ def test_verify_names_every_damage_and_fails(place, netlists, tmp_path, name, ro
     (damage, named), netlist = DAMAGES[name], netlists[rounded]
     assert bool(netlist.provenance["compensated"]) == (rounded == "calibrated")
     write_netlist(damage(netlist), tmp_path / "x.loom")
-    words = ("--checkpoint", place / "net.pt", *(["--data", place / "data"] if name == "sign of the least" else []))
+    recordings = ["--data", place / "data", "--min-agreement", "0"] if name == "sign of the least" else []
+    words = ("--checkpoint", place / "net.pt", *recordings)
     code, out, _ = run("verify", tmp_path / "x.loom", *words)
     assert code == 1
-    assert re.search(f"EN  NOT the rounding of this checkpoint: .*({named})", out, re.MULTILINE)
+    assert re.search(f"^EN  NOT the rounding of this checkpoint: .*({named})", out, re.MULTILINE)
+    assert ("\nmissed: EN: NOT the rounding" in out) == bool(recordings)
     assert run("verify", place / f"{rounded}.loom", *words)[0] == 0
 
 
@@ -128,13 +131,22 @@ def random_network(kind, seed, folder):
     return expand(checkpoint, ring(6)), events(seed, samples=40)
 
 
+def checked(netlist, network, **provenance):
+    netlist = dataclasses.replace(netlist, provenance=netlist.provenance | provenance)
+    return check_rounding(integer_machine(machine_of(netlist)), network)
+
+
 MADE = {
     "4 bits": {"packings": (Packing(bits=4),), "keep_all": True},
-    "pruned": {"packings": (Packing(bits=4, planes=2),), "prune_unused": True},
+    "3 planes": {"packings": (Packing(bits=3, planes=3),)},
     "groups": {"packings": (Packing(planes=2, groups=4),)},
+    "8 groups": {"packings": (Packing(groups=8),)},
+    "2 planes": {"packings": (Packing(planes=2),), "keep_all": True},
+    "pruned": {"packings": (Packing(bits=4, planes=2),), "prune_unused": True},
     "spike-exact": {"spike_exact": True},
     "cores": {"chips": 2, "cores_for": {"fc1": 2}},
 }
+"""What options make; if they need no recordings, without them, too."""
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -143,20 +155,77 @@ MADE = {
 def test_whatever_the_compiler_makes_passes(tmp_path, kind, name, seed):
     network, training = random_network(kind, seed, tmp_path)
     recorded = {"prune_unused": name == "pruned"}
-    for chosen in (training, *([None] if name in ("4 bits", "groups", "cores") else [])):
+    for chosen in (training, *([] if name in ("pruned", "spike-exact") else [None])):
         netlist = compile_network(network, Options(**MADE[name], provenance=recorded, training_events=chosen)).netlist
-        found = check_rounding(integer_machine(machine_of(netlist)), network)
+        found = checked(netlist, network)
         assert found.holds, found.text
+        moved = [layer for layer, each in found.layers.items() if each.nearest < each.weights]
+        assert moved == [layer for layer, each in found.layers.items() if each.compensated]
+        assert all(f"{layer} " in found.text for layer in moved)
+        alone = checked(netlist, network, compensated=[]).holds
+        assert alone == (not moved) or (name == "pruned" and not moved)  # only biases
+        if chosen is None:
+            assert found.text.endswith("weight, bias, threshold and decay is the checkpoint's, rounded to the nearest")
+            assert all(0 < each.nearest == each.weights for each in found.layers.values())
+            assert all(0 < each.farthest_steps <= 0.5 + 1e-9 or "planes" in name for each in found.layers.values())
+
+
+def test_weights_that_the_range_cuts_off_are_at_its_end():
+    network = chain([[1.0, 0.3, -0.2]])
+    netlist = compile_network(network, Options()).netlist
+    clipped = chain([[1000.0, 0.3, -0.2]])  # at the same scale
+    assert checked(netlist, network).holds
+    assert checked(netlist, clipped).holds == (np.abs(netlist.synapse_weight).max() == 254)
+
+
+@pytest.fixture(scope="module", params=[2, 8])
+def rounded(request, tmp_path_factory):
+    network = expand(*small_checkpoint(tmp_path_factory.mktemp("small")))
+    netlist = compile_network(network, Options(packings=(Packing(bits=request.param),))).netlist
+    assert checked(netlist, network).holds
+    return netlist, network
+
+
+@settings(max_examples=60)
+@given(st.data())
+def test_every_single_change_is_found(rounded, data):
+    netlist, network = rounded
+    field = data.draw(st.sampled_from(["synapse_weight", "bias_mantissa", "threshold", "decay_v", "decay_u"]))
+    values = getattr(netlist, field)
+    if field.startswith("decay"):
+        place = netlist.compartments_of(data.draw(st.integers(0, len(netlist.layers) - 1)))
+        by = -1 if values[place[0]] == 4095 else data.draw(st.sampled_from([-1, 1]))
+    else:
+        place = data.draw(st.integers(0, len(values) - 1))
+        step = 512 >> netlist.layers[0].weight_bits if field == "synapse_weight" else 1
+        by = step * (-1 if values[place] > 0 else 1)
+    assert not checked(changed(field, place, plus(by))(netlist), network).holds
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_another_checkpoint_graph_or_neuron_model(tmp_path, calibrated):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    training = events(1, samples=40) if calibrated else None
+    netlist = compile_network(expand(checkpoint, adjacency), Options(training_events=training)).netlist
+    other, _ = small_checkpoint(tmp_path, last=weights(9))
+    edges = np.array([[0, 2], [2, 0], [1, 3], [3, 1], [4, 5], [5, 4]])
+    for network in (
+        expand(other, adjacency),
+        expand(checkpoint, normalised_adjacency(edges, TAXELS)),
+        expand(dataclasses.replace(checkpoint, beta=0.3), adjacency),
+        expand(dataclasses.replace(checkpoint, theta=0.4), adjacency),
+    ):
+        assert not checked(netlist, network).holds
 
 
 CROSSBAR_DAMAGES = {
-    "threshold": (added("threshold", 2), r"threshold\[2\] of \w+ neuron \d+ is .* instead of"),
-    "weight": (added("weight", (1, 0)), r"weight\[1, 0\] of"),
-    "leak": (added("leak", 0), r"leak\[0\] of votes neuron 0"),
-    "phase": (added("initial", 0), r"initial\[0\] of votes"),
-    "feeds": (exchanged("feed_channel", lambda _: np.array([0, 1])), r"feed_channel\[0\] is .*, and 1 more"),
-    "votes": (exchanged("readout_class", lambda _: np.array([0, 1])), r"readout_class\[0\]"),
-    "delay": (added("wire_delay", 0), r"wire_delay\[0\] is 2 instead of 1"),
+    "threshold": (changed("threshold", 2, plus(1)), r"threshold\[2\] of \w+ neuron \d+ is .* instead of"),
+    "weight": (changed("weight", (1, 0), plus(1)), r"weight\[1, 0\] of"),
+    "leak": (changed("leak", 0, plus(1)), r"leak\[0\] of votes neuron 0"),
+    "phase": (changed("initial", 0, plus(1)), r"initial\[0\] of votes"),
+    "feeds": (changed("feed_channel", PAIR, np.flip), r"feed_channel\[0\] is .*, and 1 more"),
+    "votes": (changed("readout_class", PAIR, np.flip), r"readout_class\[0\]"),
+    "delay": (changed("wire_delay", 0, plus(1)), r"wire_delay\[0\] is 2 instead of 1"),
     "bins": (lambda net: dataclasses.replace(net, bins=2), "bins is 2 instead of 1"),
 }
 
@@ -189,20 +258,14 @@ def test_a_netlist_remembers_bins_and_data(tmp_path, monkeypatch):
     assert run("estimate", "x.loom", "--data", "taps")[1].startswith("per inference of 13 chip steps")
 
 
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        (
-            "compile net.pt -o x.loom --calibrate few",
-            "few: the network was trained on taps; calibrate on what it knows",
-        ),
-        ("run net.loom --data few", "few: the network was trained on taps; their classes are 0..1, the network's 0..3"),
-        (
-            "run net.loom --data four",
-            "four: has events of taxels 0..3 only, the network has 6; are they of its sensor?",
-        ),
-    ],
-)
+OTHERS = {
+    "compile net.pt -o x.loom --calibrate few": "trained on taps; calibrate on what it knows",
+    "run net.loom --data few": "trained on taps; their classes are 0..1, the network's 0..3",
+    "run net.loom --data four": "events of taxels 0..3 only, the network has 6; are they of its sensor?",
+}
+
+
+@pytest.mark.parametrize(("words", "why"), OTHERS.items())
 def test_recordings_that_look_like_others_are_warned_of(tmp_path, monkeypatch, words, why):
     monkeypatch.chdir(tmp_path)
     csv_folder(tmp_path / "few", classes=2 if words.startswith("run") else 4)
@@ -210,7 +273,8 @@ def test_recordings_that_look_like_others_are_warned_of(tmp_path, monkeypatch, w
     own_file(tmp_path / "net.pt", training={"data": "taps"})
     assert run("compile", "net.pt", "-o", "net.loom")[0] == 0
     code, _, err = run(*words.split())
-    assert (code, err.count(f"spikeloom: warning: {why}")) == (0, 1)
+    assert (code, err.count("warning: ")) == (0, 1)
+    assert re.search(rf"^spikeloom: warning: {words.split()[-1]}: .*{re.escape(why)}$", err, re.MULTILINE)
 
 
 def test_graph_time_step_and_names_are_the_netlists(tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ import commands
 import numpy as np
 import pytest
 import torch
-from made_files import CLASSES, TAXELS, csv_folder, events, own_file, recordings_folder, released, state_dict
+from made_files import CLASSES, TAXELS, csv_folder, events, own_file, recordings_folder, released, state_dict, zipped
 from made_files import weights as made_weights
 
 from spikeloom.compiler import read_netlist, write_netlist
@@ -35,11 +35,6 @@ class Evil:
         return os.mkdir, ("unpickled",)
 
 
-def zipped(path, name, content):
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(name, content)
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
     """A folder with recordings, checkpoints and netlists, good ones and damaged ones."""
@@ -55,8 +50,8 @@ def place(tmp_path_factory):
     own_file(at / "same.pt", last=made_weights(7))
     (at / "empty.pt").touch()
     (at / "words.txt").write_text("hello")
-    zipped(at / "bomb.pt", "manifest.json", bytes(1 << 20))
-    zipped(at / "notes.zip", "a/b/notes.txt", "hello")
+    (at / "bomb.pt").write_bytes(zipped({"manifest.json": bytes(1 << 20)}, zipfile.ZIP_DEFLATED))
+    (at / "notes.zip").write_bytes(zipped({"a/b/notes.txt": "hello"}))
     for name in ("events", "grasp_label_1"):
         np.savez(at / f"{name}.npz", time_s=np.zeros(1), taxel=np.zeros(1), polarity=np.ones(1))
     for new in (True, False):

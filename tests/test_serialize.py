@@ -14,6 +14,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from made_files import zipped
 from random_networks import compiled, integer_chain, integer_networks
 
 from spikeloom.compiler import archive
@@ -74,9 +75,8 @@ def write_members(path, members, *, sign=True, compression=zipfile.ZIP_STORED):
     if sign:
         held = {name: members[name] for name in ("manifest", *ARRAYS) if name in members}
         members = members | {"sha256": np.array(archive.digest(held))}
-    with zipfile.ZipFile(path, "w", compression) as file:
-        for name, array in members.items():
-            file.writestr(f"{name}.npy", archive.npy_bytes(np.asarray(array)))
+    named = {f"{name}.npy": archive.npy_bytes(np.asarray(array)) for name, array in members.items()}
+    path.write_bytes(zipped(named, compression))
 
 
 def rewrite(path, **changes):

@@ -38,7 +38,12 @@ def write_state(
     `options` are the JSON values that must be equal to go on: digests of data and graph, architecture, epochs, seed,
     rates. `history` has a dataclass of figures for each epoch, `weights` are those of epochs that are kept.
     """
-    state = _contents(options, network, optimizer, order, history, weights)
+    state = {
+        "options": dict(options),
+        "history": [asdict(epoch) for epoch in history],
+        "order": order.bit_generator.state,
+        **_trained(network, optimizer, weights),
+    }
     with write_atomically(path) as file:
         try:
             torch.save(state, file)
@@ -48,18 +53,10 @@ def write_state(
             raise
 
 
-def _contents(
-    options: Mapping[str, Any],
-    network: torch.nn.Module,
-    optimizer: torch.optim.Optimizer,
-    order: np.random.Generator,
-    history: Sequence[Any],
-    weights: Mapping[str, Weights],
+def _trained(
+    network: torch.nn.Module, optimizer: torch.optim.Optimizer, weights: Mapping[str, Weights]
 ) -> dict[str, Any]:
     return {
-        "options": dict(options),
-        "history": [asdict(epoch) for epoch in history],
-        "order": order.bit_generator.state,
         "network": {name: parameter.detach() for name, parameter in network.named_parameters()},
         "optimizer": optimizer.state_dict(),
         "kept": {which: {name: torch.tensor(array) for name, array in held.items()} for which, held in weights.items()},
@@ -99,8 +96,8 @@ def restore(
         for parameter in model.parameters():
             parameter.grad = torch.zeros_like(parameter)
         stepped.step()
-        due = _contents(options, model, stepped, order, [], keeps(len(figures)))
-        if not all(_alike(state[name], due[name]) for name in ("network", "optimizer", "kept")):
+        due = _trained(model, stepped, keeps(len(figures)))
+        if not _alike({name: state[name] for name in due}, due):
             raise FileFault("is not the state of this network")
         network.load_state_dict(state["network"], strict=False)
         optimizer.load_state_dict(state["optimizer"])

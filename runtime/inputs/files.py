@@ -92,12 +92,21 @@ def write_picture(path: str | None, draw: Callable[[], Drawing]) -> None:
             file.write(content)
 
 
+def _members(path: str) -> list[str] | None:
+    """Names in a zip; None where it is none."""
+    try:
+        if not Path(path).is_file():  # a pipe would wait for ever
+            return None
+        with zipfile.ZipFile(path) as archive:
+            return archive.namelist()
+    except (zipfile.BadZipFile, OSError, ValueError):
+        return None
+
+
 def is_recordings(path: str) -> bool:
     """Whether a file holds recordings, by its name and by those of its members."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-    except (zipfile.BadZipFile, OSError, ValueError):
+    names = _members(path)
+    if names is None:
         names = [path] if path.endswith(".csv") and Path(path).is_file() else []
     return any(name.endswith(".csv") or name == "time_s.npy" or label_in_name(name) != UNLABELLED for name in names)
 
@@ -117,13 +126,9 @@ def require_inspectable(path: str) -> None:
     """
     if Path(path).is_dir():
         raise OptionError(f"{path}: is a folder, not a netlist or a checkpoint; {_RECORDINGS}")
-    try:
-        if not Path(path).is_file():  # a pipe would wait for ever
-            return
-        with zipfile.ZipFile(path) as archive:
-            names = {Path(name) for name in archive.namelist()}
-    except (zipfile.BadZipFile, OSError, ValueError):
+    if (members := _members(path)) is None:
         return  # a released checkpoint is no zip; what else there is, its reader says
+    names = {Path(name) for name in members}
     ours = {"manifest.json", "manifest.npy"} & {name.name for name in names}
     torch = any(name.suffix == ".pkl" for name in names)
     if ours or torch or path.endswith(".loom"):

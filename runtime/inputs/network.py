@@ -98,9 +98,9 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
     made = {} if netlist is None else netlist.provenance
     if kind is None:
         checkpoint = load_checkpoint(path, arguments)
-        if netlist is not None and arguments.weights is None and _from_file(netlist, checkpoint):
-            made = netlist.provenance["weights"]
-            checkpoint = load_checkpoint(path, argparse.Namespace(**(vars(arguments) | {"weights": made})))
+        epoch = made.get("weights") if made.get("checkpoint_sha256") == checkpoint.sha256 else None
+        if arguments.weights is None and epoch in checkpoint.sets and epoch != checkpoint.weights:
+            checkpoint = load_checkpoint(path, argparse.Namespace(**vars(arguments) | {"weights": epoch}))
         graph, adjacency = propagation(checkpoint, _graph_of(checkpoint, arguments, made), path)
         return LoadedNetwork(
             network=expand(checkpoint, adjacency),
@@ -160,14 +160,6 @@ def network_kind(path: str) -> str | None:
     """Which of ``NETWORKS`` a file holds; None for a checkpoint, or nothing of ours."""
     suffix = next((suffix for suffix in (ONNX, NIR) if path.endswith(suffix)), None)
     return suffix or (COUNTERS if stated(Path(shipped(path)), "format") == COUNTERS else None)
-
-
-def _from_file(netlist: Netlist, checkpoint: Checkpoint) -> bool:
-    """Whether a netlist was compiled from another epoch of the same file."""
-    made = netlist.provenance
-    if made.get("checkpoint_sha256") != checkpoint.sha256:
-        return False
-    return made.get("weights") in checkpoint.sets and made["weights"] != checkpoint.weights
 
 
 def _require_fit(path: str, kind: str | None, arguments: argparse.Namespace) -> None:
