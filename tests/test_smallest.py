@@ -15,7 +15,7 @@ from spikeloom.runtime.commands.choose import smallest
 from spikeloom.runtime.studies.counting import decisions_of
 from spikeloom.runtime.studies.fronts import parse_budgets
 from spikeloom.runtime.studies.pruning.results import Costs
-from spikeloom.runtime.studies.smallest import baselines, choice, space, work
+from spikeloom.runtime.studies.smallest import baselines, space, study, work
 from spikeloom.runtime.studies.smallest.results import Tried
 from spikeloom.runtime.studies.smallest.space import Candidate
 
@@ -34,8 +34,9 @@ def tried(number, right, joules, rung=3, other=None, cores=1, order=0):
         neurons=1,
         synapses=1,
     )
-    measured = work.Measured(right=tuple(5 * decided), tried=(5,) * RECORDINGS, setting=0.1, costs=costs)
     return Tried(
+        right=tuple(5 * decided),
+        tried=(5,) * RECORDINGS,
         number=number,
         candidate=Candidate(system="counters", options={"thresholds": str(number)}),
         rung=rung,
@@ -44,7 +45,6 @@ def tried(number, right, joules, rung=3, other=None, cores=1, order=0):
         high=1.0,
         setting=0.1,
         costs=costs,
-        measured=measured,
     )
 
 
@@ -58,27 +58,27 @@ POOL = (
 
 
 def budgets(*words):
-    return parse_budgets(words, choice.LIMITS)
+    return parse_budgets(words, study.LIMITS)
 
 
 def test_the_cheapest_that_is_not_shown_to_be_worse():
-    found = choice.choose(POOL, ())
+    found = study.choose(POOL, ())
     assert (found.best, found.cheapest, found.allowed, found.fits) == (1, {"one": 2, "two": 3}, (1, 2, 3), True)
     assert found.ahead == 1
-    ahead, error = choice.gap(POOL[0].measured, POOL[3].measured)
+    ahead, error = study.gap(POOL[0], POOL[3])
     wrong = np.repeat([1.0, 0.0], [4, 36])
     assert (ahead, error) == (pytest.approx(0.1), pytest.approx(wrong.std(ddof=1) / np.sqrt(40)))
     shifted = tried(6, 32, UJ, order=8)  # as good as number 4, wrong elsewhere: less is known of the difference
-    assert not choice.worse(tried(1, 33, UJ), shifted)
-    assert choice.choose([POOL[0], POOL[3]], ()).cheapest["one"] == 1
+    assert not study.worse(tried(1, 33, UJ), shifted)
+    assert study.choose([POOL[0], POOL[3]], ()).cheapest["one"] == 1
 
 
 def test_the_difference_is_of_recordings_that_both_decided():
     fold = work.Measured(right=(1, 0, 0, 0), tried=(1, 1, 0, 0), setting=0.1)
-    assert choice.accuracy(fold) == 0.5
+    assert study.accuracy(fold) == 0.5
     none = work.Measured(right=(0,) * 4, tried=(0,) * 4, setting=0.1, refused="too large")
-    assert (choice.accuracy(none), choice.gap(fold, none)) == (0.0, (0.0, 0.0))
-    ahead, error = choice.gap(work.Measured(right=(5, 3, 0, 0), tried=(5,) * 4, setting=0.1), fold)
+    assert (study.accuracy(none), study.gap(fold, none)) == (0.0, (0.0, 0.0))
+    ahead, error = study.gap(work.Measured(right=(5, 3, 0, 0), tried=(5,) * 4, setting=0.1), fold)
     assert (ahead, error) == (pytest.approx(0.3), pytest.approx(0.3))
 
 
@@ -94,7 +94,7 @@ def test_the_difference_is_of_recordings_that_both_decided():
     ],
 )
 def test_budgets(words, chosen, fits):
-    found = choice.choose(POOL, budgets(*words))
+    found = study.choose(POOL, budgets(*words))
     assert (found.cheapest["one"], found.fits, found.budgets) == (chosen, fits, tuple(words))
 
 
@@ -104,19 +104,19 @@ def test_budgets_that_are_none():
             budgets(words)
     timeless = replace(POOL[0], costs=replace(POOL[0].costs, time_s={}))
     with pytest.raises(OptionError, match="no time table"):
-        choice.choose([timeless], budgets("time=5ms"))
+        study.choose([timeless], budgets("time=5ms"))
     with pytest.raises(OptionError, match="holds no candidate; the first: too large"):
-        choice.choose([replace(POOL[0], costs=None, refused="too large")], ())
+        study.choose([replace(POOL[0], costs=None, refused="too large")], ())
 
 
 def test_who_goes_on():
-    assert [each.number for each in choice.going_on(POOL[:4], 1)] == [1, 2, 3, 4]
+    assert [each.number for each in study.going_on(POOL[:4], 1)] == [1, 2, 3, 4]
     dominated = tried(6, 20, 20 * UJ)
-    assert choice.going_on([dominated, *POOL], 1)[-1] == dominated
-    assert choice.going_on([replace(dominated, costs=None)], 2) == []
-    assert len(choice.going_on([dominated] * 30, 2)) == choice.KEPT[2]
+    assert study.going_on([dominated, *POOL], 1)[-1] == dominated
+    assert study.going_on([replace(dominated, costs=None)], 2) == []
+    assert len(study.going_on([dominated] * 30, 2)) == study.KEPT[2]
     for words, on in (("energy=8.5uJ", [2, 4]), ("cores=1", [2, 3, 4]), ("energy=1nJ", [1, 2, 3, 4])):
-        assert sorted(each.number for each in choice.going_on(POOL[:4], 1, budgets(words))) == on
+        assert sorted(each.number for each in study.going_on(POOL[:4], 1, budgets(words))) == on
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.models.recordings.evtouch import data_digest
 from spikeloom.runtime.commands.options import add_data, add_model
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.machines.base import DEFAULT
@@ -16,7 +15,7 @@ from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
 from spikeloom.runtime.studies.chart.networks import read_networks, require_grid, require_suited
-from spikeloom.runtime.studies.chart.results import Data
+from spikeloom.runtime.studies.chart.results import data_of
 from spikeloom.runtime.studies.fronts import parse_budgets
 
 NOTES = """\
@@ -72,14 +71,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise OptionError(f"--table {energy}: {target.title} has no such energy table; give {' or '.join(tables)}")
     progress("reading the recordings")
     splits = read_splits(arguments.data, arguments.bin, networks[0])
-    data = Data(
-        path=arguments.data,
-        bin_s=arguments.bin,
-        sha256=data_digest(splits["train"], splits["test"]),
-        train=len(splits["train"]),
-        test=len(splits["test"]),
-        steps=splits["test"].steps,
-    )
+    data = data_of(arguments.data, arguments.bin, splits["train"], splits["test"])
     require_suited(networks, splits, data.sha256)
     require_grid(networks, grid, target)
     folder.mkdir(exist_ok=True)

@@ -18,7 +18,7 @@ from spikeloom.compiler.systems import MLP, SYSTEMS
 from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import joined_bins, of_length
-from spikeloom.models.recordings.evtouch import Recordings, data_digest
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import taxels_alone
 from spikeloom.runtime.commands.options import add_data, add_graph_options
 from spikeloom.runtime.inputs import repeat
@@ -28,11 +28,11 @@ from spikeloom.runtime.machines.base import chip_module, machine_for
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.numbers import dominant
 from spikeloom.runtime.report.sections import Outcome
-from spikeloom.runtime.studies.chart.results import Data, share
+from spikeloom.runtime.studies.chart.results import data_of, share
 from spikeloom.runtime.studies.fronts import parse_budgets
-from spikeloom.runtime.studies.smallest.choice import LIMITS
 from spikeloom.runtime.studies.smallest.results import Checked
 from spikeloom.runtime.studies.smallest.space import Candidate, counting, networks
+from spikeloom.runtime.studies.smallest.study import LIMITS, smallest
 from spikeloom.runtime.studies.smallest.trained import Sensor
 from spikeloom.runtime.studies.smallest.work import costs_of, some
 
@@ -78,7 +78,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; exit code 1 if no candidate fits a budget."""
     from spikeloom.runtime.commands.training.train import both_splits
     from spikeloom.runtime.studies.smallest.sections import page, sections
-    from spikeloom.runtime.studies.smallest.study import smallest
 
     output = Path(arguments.output)
     network = output.with_suffix(".pt")
@@ -92,14 +91,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     taxels = None if arguments.taxels is None else len(sensor_places(arguments.taxels))
     training, test = both_splits(arguments.data, taxels, arguments.bin)
     sensor = _sensor(arguments, training.taxels)
-    data = Data(
-        path=arguments.data,
-        bin_s=arguments.bin,
-        sha256=data_digest(training, test),
-        train=len(training),
-        test=len(test),
-        steps=training.steps,
-    )
+    data = data_of(arguments.data, arguments.bin, training, test)
     target = load_target(arguments.target)
     bits = chip_module(target.name, "machine").COUNTING_BITS
     systems = () if target.cores != COMPARTMENTS else SYSTEMS if len(sensor.graph.edges) else (MLP,)
@@ -144,11 +136,11 @@ def _made(
     bins, length = machine.netlist.bins, machine.netlist.clocks.length
     seen, held = (of_length(joined_bins(each, bins), length) for each in (some(splits[0]), splits[1]))
     right = int(np.count_nonzero(machine.run(held.events, lengths=held.lengths).decisions == held.labels))
-    costs, stopped = costs_of(machine.netlist, seen)
+    costs = costs_of(machine.netlist, seen)
     price = machine.price(seen.events, bin_s=arguments.bin, lengths=seen.lengths)[1]
     seconds = float(seen.step_counts.mean()) * bins * arguments.bin
     dynamic = [float(each.mean()) for each in price.dynamic_j.values()]
-    words |= {} if stopped is None else {"anytime": [netlist, *read]}
+    words |= {"anytime": [netlist, *read]} if "whole" in costs else {}
     return Checked(
         network=network,
         network_sha256=sha256_of(Path(network)),
@@ -156,8 +148,8 @@ def _made(
         netlist_sha256=sha256_of(Path(netlist)),
         different={split: verdict.different for split, verdict in verdicts.items()},
         right=share(right, len(held)),
-        costs=costs,
-        stopped=stopped,
+        costs=costs.get("whole", costs["costs"]),
+        stopped=costs["costs"] if "whole" in costs else None,
         pace=dominant([watts * seconds for watts in price.static_w.values()], dynamic),
     ), tuple(repeat.command(name, *typed) for name, typed in words.items())
 

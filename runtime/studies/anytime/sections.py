@@ -72,6 +72,5 @@ def rule_table(result: Anytime) -> Table:
         if rule.stop.allowed is not None:
             whose = "held-out decisions" if result.held_out else "training races"
             name, ahead = f"sure, {_allowed(rule.stop)} of {whose}", f"{rule.stop.factor:.3f}·√left"
-        changed = [str(rule.changes.differ), shown(rule.changes.correct)]
-        rows.append([name, ahead, *cells(rule.mean), *changed])
+        rows.append([name, ahead, *cells(rule.mean), str(rule.differ), shown(rule.correct)])
     return Table(head, rows)

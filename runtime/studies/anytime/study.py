@@ -37,16 +37,6 @@ class Full:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Changes:
-    """Decisions that differ from those at the end, right ones, and those that stopping makes right or wrong."""
-
-    differ: int
-    correct: int | None
-    gained: int
-    lost: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Samples:
     """What a rule comes to for every recording."""
 
@@ -59,11 +49,17 @@ class Samples:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rule:
-    """A rule and what it comes to: `mean` is what is spent up to the stop."""
+    """A rule and what it comes to: `mean` is what is spent up to the stop.
+
+    Decisions that differ from those at the end, right ones, and those that stopping makes right or wrong.
+    """
 
     stop: exits.Calibrated = field(metadata=INLINE)
     mean: Costs
-    changes: Changes = field(metadata=INLINE)
+    differ: int
+    correct: int | None
+    gained: int
+    lost: int
     samples: Samples
 
 
@@ -156,12 +152,10 @@ def _rule(rule: exits.Calibrated, ran: Cumulative, at: exits.Standing, sure: Boo
     return Rule(
         stop=rule,
         mean=_costs(ran, index),
-        changes=Changes(
-            differ=int(np.count_nonzero(early != late)),
-            correct=_correct(early, labels),
-            gained=int(np.count_nonzero(known & (early == labels) & (late != labels))),
-            lost=int(np.count_nonzero(known & (early != labels) & (late == labels))),
-        ),
+        differ=int(np.count_nonzero(early != late)),
+        correct=_correct(early, labels),
+        gained=int(np.count_nonzero(known & (early == labels) & (late != labels))),
+        lost=int(np.count_nonzero(known & (early != labels) & (late == labels))),
         samples=Samples(
             chip_steps=(index + 1).tolist(),
             decisions=early.tolist(),

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.runtime.report.encode import INLINE, key
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.chart.grid import Grid
@@ -119,6 +120,12 @@ class Data:
     train: int
     test: int
     steps: int
+
+
+def data_of(path: str, bin_s: float, training: Recordings, test: Recordings) -> Data:
+    """The recordings of both splits; their bins are of the test split, of which a chart observes parts."""
+    sizes = {"train": len(training), "test": len(test), "steps": test.steps}
+    return Data(path=path, bin_s=bin_s, sha256=data_digest(training, test), **sizes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,22 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL
+from spikeloom.runtime.report.encode import HIDDEN, INLINE
 from spikeloom.runtime.studies.chart.results import ChosenBy, Data, Share
-from spikeloom.runtime.studies.processor import Processor
 from spikeloom.runtime.studies.pruning.results import Costs
 from spikeloom.runtime.studies.smallest.space import Candidate
 from spikeloom.runtime.studies.smallest.work import Measured
 
-RUNGS = 3
-"""What comes to the last one may be chosen."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Tried:
-    """A candidate as far as it came: its accuracy by cross-validation with the Wilson interval, and its costs.
-
-    Costs are those until the decision is proven; `whole` are those to the end, where they are others.
+class Tried(Measured):
+    """A candidate as far as it came: what was measured, and its accuracy by cross-validation with the Wilson interval.
 
     `behind` is what the best has ahead of it on the same recordings, with its standard error. It is on the `front` if
     no other one that came as far is cheaper and as accurate.
@@ -32,15 +26,11 @@ class Tried:
     accuracy: float
     low: float
     high: float
-    setting: float
-    costs: Costs | None = field(default=None, metadata=OPTIONAL)
-    whole: Costs | None = field(default=None, metadata=OPTIONAL)
-    refused: str | None = field(default=None, metadata=OPTIONAL)
-    processor: Processor | None = field(default=None, metadata=OPTIONAL)
+    right: tuple[int, ...] = field(metadata=HIDDEN)
+    tried: tuple[int, ...] = field(metadata=HIDDEN)
     behind: float = 0.0
     behind_error: float = 0.0
     front: bool = False
-    measured: Measured = field(metadata=HIDDEN)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -11,11 +10,12 @@ from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.report import html
 from spikeloom.runtime.report.drawing import COLOURS, GREY, MARKERS, Drawing, scale, sheet, styled
 from spikeloom.runtime.report.numbers import percent, si
-from spikeloom.runtime.report.sections import Code, Details, Figure, Section, Table, Text
+from spikeloom.runtime.report.sections import Block, Code, Details, Figure, Section, Table, Text
 from spikeloom.runtime.studies.processor import price_table
 from spikeloom.runtime.studies.smallest import baselines
-from spikeloom.runtime.studies.smallest.choice import energy, worse
-from spikeloom.runtime.studies.smallest.results import RUNGS, Smallest, Tried
+from spikeloom.runtime.studies.smallest.results import Smallest, Tried
+from spikeloom.runtime.studies.smallest.study import energy, worse
+from spikeloom.runtime.studies.smallest.work import RUNGS
 
 LOWER = 12
 """Points below the last rung's intervals that are drawn."""
@@ -30,21 +30,22 @@ MEANINGS = (
 
 def sections(result: Smallest) -> Iterator[Section]:
     """All of a search."""
-    tried = sorted((each for each in result.tried if each.rung == RUNGS), key=energy)
-    beside = [each for each in result.baselines if each.rung == RUNGS]
-    dropped = [each for each in (*result.tried, *result.baselines) if each.rung < RUNGS]
-    dropped.sort(key=lambda each: (-each.rung, -each.accuracy))
+    every = [*sorted(result.tried, key=lambda each: energy(each) if each.costs else 0.0), *result.baselines]
+    last = [each for each in every if each.rung == RUNGS]
+    dropped = sorted((each for each in every if each.rung < RUNGS), key=lambda each: (-each.rung, -each.accuracy))
     yield Section("The choice", [*map(Text, [*_why(result), _needless(result)])])
     figure = Figure("front", partial(picture, result), "Accuracy over energy of a mean inference.")
     yield Section("Accuracy against cost", [figure, Details("What is drawn", [Text(MEANINGS)], unfolded=True)])
-    yield Section(
-        "Candidates",
-        [
-            _table(result, [*tried, *beside], "Candidates of the last rung, cheapest first, then baselines"),
-            Text("\n".join(_dropped(result, dropped))),
-            Details("All that was dropped", [_table(result, dropped, "Candidates of earlier rungs", 0)]),
-        ],
-    )
+    lines = [f"dropped before the last rung: {number(len(dropped), 'candidate')}"]
+    if refused := [each for each in result.tried if each.refused]:
+        first = f"{refused[0].candidate.name}: {refused[0].refused}"
+        lines.append(f"the chip does not hold {number(len(refused), 'candidate')}; the first is {first}")
+    blocks: list[Block] = [
+        _table(result, last, "Candidates of the last rung, cheapest first, then baselines"),
+        Text("\n".join(lines)),
+        Details("All that was dropped", [_table(result, dropped, "Candidates of earlier rungs", 0)]),
+    ]
+    yield Section("Candidates", blocks)
     yield Section("On the chip", [Text(_checked(result))])
     yield Section("Again", [Code([result.command, *result.commands]), price_table()])
 
@@ -58,20 +59,28 @@ def page(result: Smallest) -> str:
 # -- the choice --------------------------------------------------------------------------------------------------------
 
 
-def _joules(each: Tried) -> str:
-    assert each.costs is not None, "only what is priced is shown"
-    return ", ".join(f"{si(joules, 'J')} ({table})" for table, joules in each.costs.energy_j.items())
-
-
 def _spent(each: Tried) -> str:
-    """Joules by the first table, of a baseline at least and at most."""
+    """Joules by each table, of a baseline at least and at most."""
     if (plain := each.processor) is not None:
         return f"{si(plain.least_j, 'J')} … {si(plain.most_j, 'J')}"
-    return "–" if each.costs is None else si(energy(each), "J")
+    costs = {} if each.costs is None else each.costs.energy_j
+    return ", ".join(f"{si(joules, 'J')} ({table})" for table, joules in costs.items())
 
 
 def _named(each: Tried) -> str:
     return f"#{each.number} {each.candidate.name}: {100 * each.accuracy:.1f} %"
+
+
+def _interval(each: Tried) -> str:
+    return f"{100 * each.low:.1f} … {100 * each.high:.1f}"
+
+
+def _behind(each: Tried) -> str:
+    return f"{100 * each.behind:.1f} ± {100 * each.behind_error:.1f}"
+
+
+def _tip(each: Tried) -> str:
+    return f"{_named(each)} ({_interval(each)}), {_spent(each)}"
 
 
 def _why(result: Smallest) -> Iterator[str]:
@@ -83,28 +92,23 @@ def _why(result: Smallest) -> Iterator[str]:
     )
     if choice.budgets:
         yield f"budget: {' and '.join(choice.budgets)}{'' if choice.fits else ': nothing fits, the nearest is taken'}"
-    interval = f"95 % interval {100 * chosen.low:.1f} … {100 * chosen.high:.1f}"
-    whole = f"; to the end {_joules(replace(chosen, costs=chosen.whole))}" if chosen.whole else ""
-    yield f"take {_named(chosen)} ({interval}), {_joules(chosen)}{whole}"
+    whole = f"; to the end {_spent(replace(chosen, costs=chosen.whole))}" if chosen.whole else ""
+    yield f"take {_named(chosen)} (95 % interval {_interval(chosen)}), {_spent(chosen)}{whole}"
     if chosen.number == best.number:
         yield "it is the best of them, and nothing cheaper is as good"
     else:
         ahead = f"recording by recording it is {_behind(chosen)} points ahead"
-        yield f"the best is {_named(best)} for {_joules(best)}; {ahead}"
+        yield f"the best is {_named(best)} for {_spent(best)}; {ahead}"
     for table, index in choice.cheapest.items():
         if index != chosen.number:
             other = result.candidate(index)
-            yield f"by the table {table} it would be {_named(other)}, {_joules(other)}"
+            yield f"by the table {table} it would be {_named(other)}, {_spent(other)}"
     if choice.ahead is None:
         yield "no candidate is a point more accurate"
     else:
         more = result.candidate(choice.ahead)
         times = energy(more) / energy(chosen)
-        yield f"a point more costs {times:.1f} times the energy: {_named(more)}, {_joules(more)}"
-
-
-def _behind(each: Tried) -> str:
-    return f"{100 * each.behind:.1f} ± {100 * each.behind_error:.1f}"
+        yield f"a point more costs {times:.1f} times the energy: {_named(more)}, {_spent(more)}"
 
 
 def _needless(result: Smallest) -> str:
@@ -112,16 +116,14 @@ def _needless(result: Smallest) -> str:
     last = [(each, each.processor) for each in result.baselines if each.processor and each.rung == RUNGS]
     if not last:
         return baselines.MISSING
-    chosen = result.chosen
-    enough = [pair for pair in last if not worse(chosen, pair[0])]
+    enough, joules = [pair for pair in last if not worse(result.chosen, pair[0])], energy(result.chosen)
     each, costs = min(enough, key=lambda pair: pair[1].most_j) if enough else max(last, key=lambda p: p[0].accuracy)
     words = f"{each.candidate.name}, {100 * each.accuracy:.1f} %, {_spent(each)} on a processor"
     if not enough:
         return f"without spikes: the best is {words}; that is shown to be worse"
-    if costs.most_j < energy(chosen):
+    if costs.most_j < joules:
         return f"no spiking network is needed here: {words}, is not shown to be worse, and takes less in any case"
-    unsure = costs.least_j < energy(chosen)
-    rest = "; whether it takes less depends on the processor" if unsure else ", but takes more"
+    rest = "; whether it takes less depends on the processor" if costs.least_j < joules else ", but takes more"
     return f"without spikes: {words}, is not shown to be worse{rest}"
 
 
@@ -132,42 +134,20 @@ def _table(result: Smallest, tried: Sequence[Tried], caption: str, most: int | N
     """Candidates by the first tables of energy and time; of baselines what a processor takes at least and at most."""
     by, rows = result.chosen_by, []
     for each in tried:
-        mark = f"#{each.number}" if each.processor is None else "–"
-        marks = {
-            mark: True,
-            "choice": each is result.chosen,
-            "best": each.number == result.choice.best,
-            "front": each.front,
-        }
-        row = [
-            " ".join(name for name, on in marks.items() if on and (name == mark or each.processor is None)),
-            each.candidate.name,
-            f"{100 * each.accuracy:.1f}",
-            f"{100 * each.low:.1f} … {100 * each.high:.1f}",
-            _behind(each),
-            _spent(each),
-        ]
-        costs, plain = each.costs, each.processor
-        row += [] if by.time is None else ["–" if costs is None else si(costs.time_s[by.time], "s")]
-        if costs is not None:
-            row += [f"{costs.operations:,.0f}", str(costs.cores)]
-        else:
-            row += ["–", "–"] if plain is None else [f"{plain.operations:,.0f}", "processor"]
-        rows.append(row)
+        costs, plain, name, spent, time = each.costs, each.processor, f"#{each.number}", "–", "–"
+        size = ["–", "–"]
+        if plain is not None:
+            name, spent, size = "–", _spent(each), [f"{plain.operations:,.0f}", "processor"]
+        elif costs is not None:
+            marks = {"choice": each is result.chosen, "best": each.number == result.choice.best, "front": each.front}
+            name, spent = " ".join([name, *(mark for mark, on in marks.items() if on)]), si(energy(each), "J")
+            size = [f"{costs.operations:,.0f}", str(costs.cores)]
+            time = "–" if by.time is None else si(costs.time_s[by.time], "s")
+        known = [name, each.candidate.name, f"{100 * each.accuracy:.1f}", _interval(each), _behind(each), spent]
+        rows.append([*known, *([] if by.time is None else [time]), *size])
     head = ["#", "candidate", "accuracy %", "interval", "behind the best", f"energy ({by.energy})"]
     head += [] if by.time is None else [f"time ({by.time})"]
     return Table([*head, "operations", "cores"], rows, caption, most=most)
-
-
-def _dropped(result: Smallest, dropped: Sequence[Tried]) -> Iterator[str]:
-    """How many stayed behind on each rung, and what the chip does not hold."""
-    counts = Counter((each.rung, each.candidate.system) for each in dropped)
-    for rung in sorted({rung for rung, _ in counts}):
-        words = ", ".join(f"{count} {system}" for (at, system), count in sorted(counts.items()) if at == rung)
-        yield f"dropped after rung {rung}, since a cheaper one is ahead: {words}"
-    if refused := [each for each in result.tried if each.refused]:
-        first = f"{refused[0].candidate.name}: {refused[0].refused}"
-        yield f"the chip does not hold {number(len(refused), 'candidate')}; the first is {first}"
 
 
 def _checked(result: Smallest) -> str:
@@ -226,12 +206,3 @@ def picture(result: Smallest) -> Drawing:
     panel.grid(True)
     drawing.figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
     return drawing
-
-
-def _tip(each: Tried) -> str:
-    share = f"{_named(each)} ({100 * each.low:.1f} … {100 * each.high:.1f})"
-    if each.costs is None:
-        return f"{share}, {_spent(each)}"
-    times = [f"{si(seconds, 's')} ({name})" for name, seconds in each.costs.time_s.items()]
-    size = f"{each.costs.operations:,.0f} synaptic operations, {number(each.costs.cores, 'core')}"
-    return f"{share}, {', '.join([_joules(each), *times, size])}, rung {each.rung}"

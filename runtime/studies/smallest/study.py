@@ -2,28 +2,53 @@
 
 On the first rung every candidate is cross-validated once at one strength; what may still be chosen goes on, with more
 strengths, and from there to five rounds. Everything happens on the training split but the last look at the choice.
+Taken is the cheapest that is not shown to be worse than the best.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from spikeloom.compiler import __version__
+from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.chart.results import ChosenBy, Data
 from spikeloom.runtime.studies.fronts import Budget, front
 from spikeloom.runtime.studies.jobs import sweep
-from spikeloom.runtime.studies.smallest import choice, work
+from spikeloom.runtime.studies.smallest import work
 from spikeloom.runtime.studies.smallest.baselines import baselines
-from spikeloom.runtime.studies.smallest.results import RUNGS, Checked, Smallest, Tried
+from spikeloom.runtime.studies.smallest.results import Checked, Choice, Smallest, Tried
 from spikeloom.runtime.studies.smallest.space import Candidate, variants
 from spikeloom.runtime.studies.smallest.trained import Sensor
+from spikeloom.runtime.studies.smallest.work import RUNGS, Measured
+
+NEAR = 1e-9
+"""Shares closer than this are equal."""
+
+POINT = 0.01
+"""Accuracy whose price is told."""
+
+LIMITS = ("energy", "time", "operations", "cores", "accuracy")
+"""What ``--budget`` limits."""
+
+KEPT = {1: 20, 2: 14}
+"""Candidates that go on from a rung."""
+
+VARIED = {1: 12, 2: 4}
+"""Those of them, the first, of which variants go on, too."""
+
+BEST = 50
+"""How much more it weighs to be behind a cheaper one than behind the best: the front goes on, down to cheap ones."""
+
+SLACK = 1.25
+"""Factor by which a candidate may miss a budget on an early rung: a variant may fit."""
 
 
 def smallest(
@@ -44,10 +69,10 @@ def smallest(
     `command` repeats it; `make` also gives the commands that do what it does.
     """
     trial = partial(work.trial, data=data, sensor=sensor, target=target.name)
-    on = partial(choice.going_on, budgets=budgets)
+    on = partial(going_on, budgets=budgets)
     beside = search(baselines(), most_accurate, trial, store, jobs=jobs, fresh=fresh)
     tried = search(candidates, on, trial, store, jobs=jobs)
-    taken = choice.choose(tried, budgets)
+    taken = choose(tried, budgets)
     best = tried[taken.best - 1]
     tried = [_beside(each, best, tried) for each in tried]
     times = {table.name: table.title for table in target.time}
@@ -79,22 +104,20 @@ def search(
 ) -> list[Tried]:
     """All candidates, as far as each came; `going_on` chooses those that go on from a rung."""
     known: dict[str, Tried] = {}
-    alive: dict[str, tuple[Candidate, float | None]]  # by name, with the setting that the rung before has chosen
-    alive = {each.name: (each, None) for each in candidates}
+    # By name, with the setting that the rung before has chosen
+    alive: dict[str, tuple[Candidate, float | None]] = {each.name: (each, None) for each in candidates}
     for rung in range(1, RUNGS + 1):
-        works = {name: trial(each, rung, setting) for name, (each, setting) in alive.items()}
-        label = f"rung {rung} of {RUNGS}"
-        points, anew = list(works.values()), fresh and rung == 1
-        found = sweep(points, work.measure, store, jobs=jobs, fresh=anew, label=label, kind=work.Measured)
-        for name, each in works.items():
-            number = known[name].number if name in known else len(known) + 1
-            known[name] = _tried(number, each.candidate, rung, found[each.key])
+        works = [trial(each, rung, setting) for each, setting in alive.values()]
+        anew, label = fresh and rung == 1, f"rung {rung} of {RUNGS}"
+        found = sweep(works, work.measure, store, jobs=jobs, fresh=anew, label=label, kind=Measured)
+        for job in works:
+            number = known[job.label].number if job.label in known else len(known) + 1
+            known[job.label] = _tried(number, job, found[job.key])
         if rung < RUNGS:
             on = going_on([known[name] for name in alive], rung)
-            extra = [
-                (other, each.setting) for each in on[: choice.VARIED[rung]] for other in variants(each.candidate, rung)
-            ]
-            alive = {each.name: (each, setting) for each, setting in [*((e.candidate, e.setting) for e in on), *extra]}
+            alive = {each.candidate.name: (each.candidate, each.setting) for each in on}
+            for each in on[: VARIED[rung]]:
+                alive |= {other.name: (other, each.setting) for other in variants(each.candidate, rung)}
     return list(known.values())
 
 
@@ -105,29 +128,121 @@ def most_accurate(tried: Sequence[Tried], rung: int) -> list[Tried]:
     return [each for kind in kinds for each in [e for e in ordered if e.candidate.system == kind][: {1: 3, 2: 1}[rung]]]
 
 
-def _tried(number: int, candidate: Candidate, rung: int, measured: work.Measured) -> Tried:
-    right, recordings = choice.accuracy(measured), int(np.count_nonzero(measured.tried))
+def _tried(number: int, trial: work.Trial, measured: Measured) -> Tried:
+    found: dict[str, Any] = {each.name: getattr(measured, each.name) for each in fields(measured)}
+    right, recordings = accuracy(measured), int(np.count_nonzero(measured.tried))
     low, high = wilson(right * recordings, recordings)
-    return Tried(
-        number=number,
-        candidate=candidate,
-        rung=rung,
-        accuracy=right,
-        low=low,
-        high=high,
-        setting=measured.setting,
-        costs=measured.stopped or measured.costs,
-        whole=measured.costs if measured.stopped else None,
-        refused=measured.refused,
-        processor=measured.processor,
-        measured=measured,
-    )
+    found |= {"number": number, "candidate": trial.candidate, "rung": trial.rung}
+    return Tried(**found, accuracy=right, low=low, high=high)
 
 
 def _beside(each: Tried, best: Tried, tried: Sequence[Tried]) -> Tried:
     """A candidate with what the best has ahead of it, and whether it is on the front of those that came as far."""
-    behind, error = choice.gap(best.measured, each.measured)
+    behind, error = gap(best, each)
     peers = [other for other in tried if other.rung == each.rung and other.costs is not None]
-    marks = front([other.accuracy for other in peers], [choice.energy(other) for other in peers])
+    marks = front([other.accuracy for other in peers], [energy(other) for other in peers])
     on = any(mark and other.number == each.number for mark, other in zip(marks, peers, strict=True))
     return replace(each, behind=behind, behind_error=error, front=on)
+
+
+def accuracy(found: Measured) -> float:
+    """Share of right decisions, over recordings that were decided at all, each with the same weight."""
+    right, tried = np.array([found.right, found.tried])
+    return float((right[tried > 0] / tried[tried > 0]).mean()) if tried.any() else 0.0
+
+
+def gap(best: Measured, other: Measured) -> tuple[float, float]:
+    """What one has ahead of another, over recordings that both decided, and the standard error of that.
+
+    Examples
+    --------
+    >>> best = Measured(right=(5, 5, 5, 0), tried=(5, 5, 5, 5), setting=0.1)
+    >>> gap(best, Measured(right=(5, 5, 0, 5), tried=(5, 5, 5, 5), setting=0.1))
+    (0.0, 0.408248290463863)
+    """
+    tried = np.array([best.tried, other.tried])
+    both = (tried > 0).all(axis=0)
+    share = (np.array([best.right, other.right]) / np.maximum(tried, 1))[:, both]
+    ahead = share[0] - share[1]
+    if not len(ahead):
+        return 0.0, 0.0
+    error = ahead.std(ddof=1) / np.sqrt(len(ahead)) if len(ahead) > 1 else 0.0
+    return float(ahead.mean()), float(error)
+
+
+def going_on(tried: Iterable[Tried], rung: int, budgets: Sequence[Budget] = ()) -> list[Tried]:
+    """Those that may still be chosen: least behind a cheaper one, or, which weighs less, behind the best.
+
+    Where budgets are nearly met by any, those alone go on.
+    """
+    priced = [each for each in tried if each.costs is not None]
+    limits = [budget for budget in budgets if budget.what != "accuracy"]
+    able = [each for each in priced if all(excess(each, budget) <= SLACK for budget in limits)] or priced
+    top = max((each.accuracy for each in able), default=0.0)
+
+    def lag(each: Tried) -> float:
+        cheaper = max(other.accuracy for other in able if energy(other) <= energy(each))
+        return cheaper - each.accuracy + (top - each.accuracy) / BEST
+
+    return sorted(able, key=lambda each: (lag(each), energy(each)))[: KEPT[rung]]
+
+
+def energy(tried: Tried, table: str | None = None) -> float:
+    """Joules of a mean inference, by the first table unless another is named; operations where none prices them."""
+    assert tried.costs is not None, "what the chip does not hold has no price"
+    return tried.costs.least if table is None else tried.costs.energy_j[table]
+
+
+def choose(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
+    """The cheapest of the last rung, by each table, that fits the budgets and is not shown to be worse than the best.
+
+    Worse is one whose accuracy is lower by more than a standard error of the difference, recording by recording. Where
+    an accuracy is wanted, all that reach it are good enough. Where no candidate of the last rung fits, earlier ones
+    may.
+    """
+    priced = [each for each in tried if each.costs is not None]
+    if not priced:
+        raise OptionError(f"the chip holds no candidate; the first: {tried[0].refused}")
+    pool = [each for each in priced if each.rung == RUNGS]
+
+    def fitting(each: Tried) -> bool:
+        return all(excess(each, budget) <= 1 + NEAR for budget in budgets)
+
+    fits = [each for each in pool if fitting(each)] or [each for each in priced if fitting(each)]
+    allowed = fits or [min(pool, key=lambda each: (max(excess(each, b) for b in budgets), energy(each)))]
+    best = min(allowed, key=lambda each: (-each.accuracy, energy(each)))
+    if not any(budget.what == "accuracy" for budget in budgets):
+        allowed = [each for each in allowed if not worse(best, each)]
+    assert best.costs is not None, "all of these are priced"
+    tables = list(best.costs.energy_j)
+    cheapest = {table: min(allowed, key=lambda each: (energy(each, table), -each.accuracy)).number for table in tables}
+    chosen = next(each for each in allowed if each.number == cheapest[tables[0]])
+    above = [each for each in pool if each.accuracy >= chosen.accuracy + POINT - NEAR]
+    return Choice(
+        budgets=tuple(budget.words for budget in budgets),
+        fits=bool(fits),
+        best=best.number,
+        cheapest=cheapest,
+        allowed=tuple(each.number for each in allowed),
+        ahead=min(above, key=energy).number if above else None,
+    )
+
+
+def worse(best: Tried, other: Tried) -> bool:
+    """Whether one is shown to be worse than another."""
+    ahead, error = gap(best, other)
+    return ahead > error + NEAR
+
+
+def excess(tried: Tried, budget: Budget) -> float:
+    """Factor by which a candidate misses a budget; at most 1 where it fits."""
+    costs = tried.costs
+    assert costs is not None, "what the chip does not hold has no price"
+    if budget.what == "accuracy":
+        return budget.limit / tried.accuracy if tried.accuracy else float("inf")
+    if budget.what == "time":
+        if not costs.time_s:
+            raise OptionError(f"--budget {budget.words}: the chip has no time table, nothing is timed; omit it")
+        return next(iter(costs.time_s.values())) / budget.limit
+    found = {"energy": costs.least, "operations": costs.operations, "cores": costs.cores}[budget.what]
+    return found / budget.limit

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import product
 from typing import Any
@@ -14,7 +14,6 @@ from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import CapacityError, DataError, ModelError
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
-from spikeloom.compiler.systems import SYSTEMS
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.recordings.events import joined_bins, of_length
@@ -33,7 +32,7 @@ from spikeloom.models.training.counters import (
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.base import chip_module, machine_of
 from spikeloom.runtime.machines.integer import IntegerMachine
-from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.report.encode import OPTIONAL, encode
 from spikeloom.runtime.studies.anytime.study import study
 from spikeloom.runtime.studies.chart.results import Data
 from spikeloom.runtime.studies.jobs import Job, content_key
@@ -46,11 +45,14 @@ from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF
 from spikeloom.runtime.studies.smallest.space import Candidate
 from spikeloom.runtime.studies.smallest.trained import Sensor, plan_of, without
 
-FORMAT = 2
+FORMAT = 3
 """Of what is measured; goes up when a figure means something else."""
 
 PRICED = 48
 """Training recordings that a candidate is priced on, evenly spaced."""
+
+RUNGS = 3
+"""What comes to the last one may be chosen."""
 
 ROUNDS = 5
 """Of cross-validation on the last rung."""
@@ -70,40 +72,27 @@ class Trial(Job):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measured:
-    """How often each training recording was decided, and rightly; the costs of a mean inference, where it is priced."""
+    """How often each training recording was decided, and rightly; the costs of a mean inference, where it is priced.
+
+    Costs are those until the decision is proven; `whole` are those to the end, where they are others.
+    """
 
     right: tuple[int, ...]
     tried: tuple[int, ...]
     setting: float  # Strength of the rule
-    costs: Costs | None = None
-    stopped: Costs | None = None  # Until the decision is proven
-    refused: str | None = None  # Why the chip does not hold it
-    processor: Processor | None = None  # Costs of a baseline
+    costs: Costs | None = field(default=None, metadata=OPTIONAL)
+    whole: Costs | None = field(default=None, metadata=OPTIONAL)
+    refused: str | None = field(default=None, metadata=OPTIONAL)  # Why the chip does not hold it
+    processor: Processor | None = field(default=None, metadata=OPTIONAL)  # Costs of a baseline
 
 
 def trial(candidate: Candidate, rung: int, setting: float | None, data: Data, sensor: Sensor, target: str) -> Trial:
     """Work whose key is of everything that decides the result."""
-    about = {"format": FORMAT, "spikeloom": __version__, "data": data.sha256, "bin_s": data.bin_s, "target": target}
-    about |= {
-        "system": candidate.system,
-        "options": dict(candidate.options),
-        "stored": candidate.storage,
-        "rung": rung,
-        "setting": setting,
-    }
-    if candidate.system in SYSTEMS:
-        graph = sensor.graph
-        about["graph"] = arrays_digest({"edges": graph.edges, "coordinates": graph.coordinates})
-    return Trial(
-        key=content_key(about),
-        label=candidate.name,
-        candidate=candidate,
-        rung=rung,
-        setting=setting,
-        data=data,
-        sensor=sensor,
-        target=target,
-    )
+    graph = arrays_digest({"edges": sensor.graph.edges, "coordinates": sensor.graph.coordinates})
+    about = {"format": FORMAT, "spikeloom": __version__, "data": data.sha256, "bin_s": data.bin_s, "graph": graph}
+    about |= {"target": target, "candidate": encode(candidate), "rung": rung, "setting": setting}
+    own: dict[str, Any] = {"candidate": candidate, "rung": rung, "setting": setting, "data": data, "sensor": sensor}
+    return Trial(key=content_key(about), label=candidate.name, target=target, **own)
 
 
 def measure(work: Trial) -> JsonObject:
@@ -128,16 +117,21 @@ def _counting(work: Trial, training: Recordings) -> Measured:
     """A counting network: its strength, its decisions, its costs."""
     plan = work.candidate.plan({1: STRENGTHS[2:3], 2: STRENGTHS}.get(work.rung, (work.setting or 0.0,)))
     classes, data = int(training.labels.max()) + 1, counted(training, plan)
-    right = np.zeros(len(training), np.int64)
-    last = work.rung == 3
-    for seed in range(1, ROUNDS + 1) if last else (0,):
+    right, seeds = np.zeros(len(training), np.int64), range(1, ROUNDS + 1) if work.rung == RUNGS else (0,)
+    for seed in seeds:
         decided, strength, lowest = cross_validated(data, classes, training, seed)
         right += decided == training.labels
     rule = linear_rules(data, classes, [strength])[strength]
     made = counters_of(data, Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest), training, classes)
-    rounds = (ROUNDS if last else 1,) * len(training)
-    costs = _counting_costs(made, training, work.target)
-    return Measured(right=tuple(right.tolist()), tried=rounds, setting=strength, **costs)
+    costs: dict[str, Any]
+    try:
+        source = chip_module(work.target, "machine").counting_source(made)
+        netlist = compile_network(source, target=work.target).netlist
+    except (CapacityError, ModelError, DataError) as error:
+        costs = {"refused": str(error).splitlines()[0]}
+    else:
+        costs = costs_of(netlist, of_length(joined_bins(some(training), made.bins), made.clocks.length))
+    return Measured(right=tuple(right.tolist()), tried=(len(seeds),) * len(right), setting=strength, **costs)
 
 
 def _network(work: Trial, training: Recordings) -> Measured:
@@ -146,39 +140,34 @@ def _network(work: Trial, training: Recordings) -> Measured:
     epochs = work.candidate.options["epochs"] // (2 if work.rung == 1 else 1)
     fold = folds(training.labels, FOLDS, np.random.default_rng(0))
     right, tried = np.zeros((2, len(training)), np.int64)
-    costs: tuple[Costs | None, Costs | None] = None, None
+    costs: dict[str, Any] = {}
     steps = joined_bins(training, plan.bins)
-    for part in range(FOLDS if work.rung == 3 else 1):
+    for part in range(FOLDS if work.rung == RUNGS else 1):
         held = fold == part
         try:
             netlist = without(plan, training, held, epochs, target, work.candidate.storage)
         except (CapacityError, ModelError) as error:
-            none = (0,) * len(training)
-            return Measured(right=none, tried=none, setting=epochs, refused=str(error).splitlines()[0])
-        costs = costs if part else costs_of(netlist, some(steps))
+            right[:], tried[:], costs = 0, 0, {"refused": str(error).splitlines()[0]}
+            break
+        costs = costs or costs_of(netlist, some(steps))
         right[held], tried[held] = decisions_on_chip(netlist, steps.part(held)) == training.labels[held], 1
-    made, stopped = costs
-    return Measured(
-        right=tuple(right.tolist()), tried=tuple(tried.tolist()), setting=epochs, costs=made, stopped=stopped
-    )
+    return Measured(right=tuple(right.tolist()), tried=tuple(tried.tolist()), setting=epochs, **costs)
 
 
 def _baseline(work: Trial, training: Recordings) -> Measured:
     """A support vector machine: its constant, its decisions, its costs."""
-    system, last = work.candidate.system, work.rung == 3
-    tried = {1: baselines.STRENGTHS[system][:1], 2: sorted(baselines.STRENGTHS[system])}.get(work.rung, (work.setting,))
-    seen, labels = baselines.features(training, work.candidate), training.labels
-    right = {strength: np.zeros(len(training), np.int64) for strength in tried if strength is not None}
-    for strength, seed in product(right, range(1, ROUNDS + 1) if last else (0,)):
+    system, labels, rung = work.candidate.system, training.labels, work.rung
+    tried = {1: baselines.STRENGTHS[system][:1], 2: sorted(baselines.STRENGTHS[system])}.get(
+        rung, (work.setting or 0.0,)
+    )
+    seen, seeds = baselines.features(training, work.candidate), range(1, ROUNDS + 1) if rung == RUNGS else (0,)
+    right = {strength: np.zeros(len(training), np.int64) for strength in tried}
+    for strength, seed in product(right, seeds):
         fold = folds(labels, FOLDS, np.random.default_rng(seed))
         right[strength] += baselines.decided(system, strength, seen, labels, fold) == labels
     best = max(right, key=lambda strength: right[strength].sum())
-    return Measured(
-        right=tuple(right[best].tolist()),
-        tried=(ROUNDS if last else 1,) * len(training),
-        setting=best,
-        processor=baselines.priced(system, best, training, work.candidate),
-    )
+    costs, rounds = baselines.priced(system, best, training, work.candidate), (len(seeds),) * len(training)
+    return Measured(right=tuple(right[best].tolist()), tried=rounds, setting=best, processor=costs)
 
 
 def cross_validated(data: Counted, classes: int, sensor: Recordings, seed: int) -> tuple[IntArray, float, float]:
@@ -212,21 +201,11 @@ def decisions(made: Counters, data: Counted) -> IntArray:
     return found
 
 
-def costs_of(netlist: Any, of: Recordings) -> tuple[Costs, Costs | None]:
-    """What a mean inference costs to its end, and until its decision is proven, where the chip can be stopped there."""
+def costs_of(netlist: Any, of: Recordings) -> dict[str, Costs]:
+    """`costs` of a mean inference until its decision is proven, where the chip can be stopped there, and `whole`."""
     machine, costs = machine_of(netlist), priced(netlist, of)[1]
     if not isinstance(machine, IntegerMachine):
-        return costs, None
+        return {"costs": costs}
     proven = study(machine, of, machine.cumulative(of.events, of.step_counts)).rules[0].mean
-    return costs, replace(costs, operations=proven.operations, energy_j=proven.energy_j, time_s=proven.time_s)
-
-
-def _counting_costs(made: Counters, training: Recordings, target: str) -> JsonObject:
-    """Costs of a counting network on a chip, or why that does not hold it."""
-    chip = chip_module(target, "machine")
-    try:
-        netlist = compile_network(chip.counting_source(made), target=target).netlist
-    except (CapacityError, ModelError, DataError) as error:
-        return {"refused": str(error).splitlines()[0]}
-    costs, stopped = costs_of(netlist, of_length(joined_bins(some(training), made.bins), made.clocks.length))
-    return {"costs": costs, "stopped": stopped}
+    stopped = replace(costs, operations=proven.operations, energy_j=proven.energy_j, time_s=proven.time_s)
+    return {"costs": stopped, "whole": costs}
