@@ -195,12 +195,13 @@ def _verdict(chip: Side, small: Side) -> str:
 
 def sections(found: Comparison) -> Iterator[Section]:
     """The comparison for people."""
-    plan, work, rows = found.plan, found.work, []
+    plan, work = found.plan, found.work
     about = (
         f"on a processor: {found.counters} counters of {', '.join(map(str, plan.thresholds))} events in "
         f"{plan.parts} parts, {plan.bits}-bit weights; {work.operations:,.0f} operations, "
         f"{work.accesses:,.0f} memory accesses, {work.cycles:,.0f} cycles"
     )
+    rows = []
     for name, side in (("chip", found.chip), ("processor", found.processor)):
         ends = ((side.dynamic_j, "J"), (side.static_w, "W"), (side.pace_j, "J"))
         cells = [f"{si(low, unit)} … {si(high, unit)}" for (low, high), unit in ends]
@@ -209,11 +210,9 @@ def sections(found: Comparison) -> Iterator[Section]:
     even = "break-even: at no event rate, an event takes more on the chip by any price"
     if found.break_even is not None:
         fastest = min(found.chip.events_per_s, found.processor.events_per_s)
-        beyond = f", more than the {fastest:,.0f} that both can take" if found.break_even > fastest else ""
-        even = (
-            f"break-even: {found.break_even:,.0f} events/s where every price favours the chip, the sensor has "
-            f"{found.events / found.seconds:,.0f}{beyond}"
-        )
+        even = f"break-even: {found.break_even:,.0f} events/s where every price favours the chip, the sensor has "
+        even += f"{found.events / found.seconds:,.0f}"
+        even += f", more than the {fastest:,.0f} that both can take" if found.break_even > fastest else ""
     lines = [found.verdict, even, *(f"not priced: {line}" for line in found.not_priced)]
     yield Section("Against a processor", [Text(about), table, Text("\n".join(lines)), price_table()])
 

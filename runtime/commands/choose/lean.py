@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from spikeloom.compiler import __version__, write_netlist
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.ir import Network
-from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_network, add_recordings
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import storage
@@ -65,8 +64,12 @@ def run(arguments: argparse.Namespace) -> Outcome:
             "give what that was fine-tuned or joined from"
         )
     require_splits(arguments.data)
-    training = _read(arguments, loaded.network, "train", None)
-    test = _read(arguments, loaded.network, arguments.split, arguments.limit)
+    progress("reading the recordings")
+    taken = loaded.network.input
+    shared: dict[str, Any] = {"bin_s": arguments.bin, "bins": taken.bins, "taxels": taken.taxels, "labels_for": "lean"}
+    shared["classes"] = loaded.network.classes
+    training = recordings(arguments.data, "train", **shared)
+    test = recordings(arguments.data, arguments.split, limit=arguments.limit, **shared)
     result, netlist, spared = study(loaded, training, test, arguments.differ, arguments.output)
     if arguments.output is not None:
         lean = {"differ": result.differ} | encode(result.rows[result.taken].removed)
@@ -85,17 +88,3 @@ def run(arguments: argparse.Namespace) -> Outcome:
         save_again(arguments.network, less, training=made | {"pruned_from": loaded.sha256})
     write_json(arguments.report, result)
     return Outcome(result, sections)
-
-
-def _read(arguments: argparse.Namespace, network: Network, split: str, limit: int | None) -> Recordings:
-    progress("reading the recordings")
-    return recordings(
-        arguments.data,
-        split,
-        limit=limit,
-        classes=network.classes,
-        taxels=network.input.taxels,
-        bin_s=arguments.bin,
-        bins=network.input.bins,
-        labels_for="lean",
-    )
