@@ -177,14 +177,20 @@ def shipped_grasps(monkeypatch, tmp_path):
 
 
 @pytest.mark.usefixtures("shipped_grasps")
-def test_demo_runs_the_main_job(spikeloom, tmp_path):
+def test_demo_runs_the_main_job(spikeloom, tmp_path, monkeypatch):
+    (tmp_path / "kept").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "kept"))
     code, out, err = spikeloom("demo", "--json")
     assert err == ""
     reports = json.loads(out)
     assert list(reports) == ["compile", "verify", "estimate"]
     assert reports["verify"]["samples"] == reports["estimate"]["samples"] == 6
     assert code == (0 if reports["verify"]["decision_agreement"] >= 0.95 else 1)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["grasps.pt"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["grasps.pt", "kept"]
+    *_, verdict, kept, following = spikeloom("demo")[1].splitlines()
+    assert verdict.startswith("verdict: The netlist is its checkpoint, rounded; ")
+    assert following.split()[3] in kept
+    assert Path(following.split()[3]).is_file()
 
 
 def test_help_names_every_command(capsys):

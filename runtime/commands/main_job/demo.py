@@ -8,7 +8,9 @@ from typing import Any
 
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.runtime.commands.main_job import compile, estimate, verify
-from spikeloom.runtime.report.sections import Code, Outcome, Section
+from spikeloom.runtime.equivalence.verdict import in_a_sentence
+from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.report.sections import Code, Outcome, Section, Text
 
 COMMANDS = {"compile": compile, "verify": verify, "estimate": estimate}
 
@@ -17,7 +19,7 @@ STEPS = (
     ("verify", "{folder}/grasps.loom", "--checkpoint", "pretrained:grasps", "--data", SYNTHETIC),
     ("estimate", "{folder}/grasps.loom", "--data", SYNTHETIC),
 )
-"""Commands that run in a temporary folder."""
+"""Commands that run in a new folder for temporary files, where the netlist stays."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,13 +31,17 @@ def run(_arguments: argparse.Namespace) -> Outcome:
     results: dict[str, Any] = {}
     shown: list[Section] = []
     worst = 0
-    with tempfile.TemporaryDirectory(prefix="spikeloom-") as folder:
-        for name, *words in STEPS:
-            parser = argparse.ArgumentParser()
-            COMMANDS[name].add_arguments(parser)
-            found = COMMANDS[name].run(parser.parse_args([word.format(folder=folder) for word in words]))
-            typed = " ".join(["spikeloom", name, *words]).replace("{folder}/", "")
-            first, *others = found.sections(found.result)
-            shown += [Section(first.title, [Code([typed]), *first.blocks]), *others]
-            results[name], worst = found.result, max(worst, found.code)
+    folder = tempfile.mkdtemp(prefix="spikeloom-")
+    for name, *words in STEPS:
+        parser = argparse.ArgumentParser()
+        COMMANDS[name].add_arguments(parser)
+        found = COMMANDS[name].run(parser.parse_args([word.format(folder=folder) for word in words]))
+        typed = " ".join(["spikeloom", name, *words]).replace("{folder}/", "")
+        first, *others = found.sections(found.result)
+        shown += [Section(first.title, [Code([typed]), *first.blocks]), *others]
+        results[name], worst = found.result, max(worst, found.code)
+    net = f"{folder}/grasps.loom"
+    following = repeat.command("report", net, *STEPS[1][2:], "-o", "grasps.html")
+    verdict = f"verdict: {in_a_sentence(results['verify'])}\nkept: {net}; all of it on one page:"
+    shown.append(Section("Next", [Text(verdict), Code([following])]))
     return Outcome(results, lambda _: shown, worst)
