@@ -44,9 +44,16 @@ def main() -> None:
         name, _, file = each.partition("=")
         results[name] = read_json(Stability, Path(file), "--verdicts", "spikeloom certify -o")
     found["networks"] = {name: summary(result) for name, result in results.items()}
+    found["fall"] = {kind: fallen(list(results.values()), kind) for kind in KINDS}
     if arguments.brute:
         found["brute_force"] = brute_force(arguments.brute, test)
     arguments.output.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def fallen(results: list[Stability], kind: str) -> Json:
+    """Recordings whose decision some change of a kind alters in every network, and in some."""
+    falls = [{each.file for each in result.verdicts if each.kinds[kind].alter} for result in results]
+    return {"in_all": len(set.intersection(*falls)), "in_some": len(set.union(*falls))}
 
 
 def summary(result: Stability) -> Json:
