@@ -58,7 +58,7 @@ chart:
 compile:
     chips classes compartments cores layers limits neurons provenance sha256 synapses synapses_nonzero
     synapses_stored target taxels tiles bins? calibration? clocks? core_bound? exactness? facts? layout? path?
-    placement? proofs? removals?
+    placement? proofs? removals? keep? trials? finetune?
 compile, crossbars:
     axons classes cores crossing_points drain_ticks feeds layers limits max_crossing_points_of_an_axon neurons
     provenance sha256 target taxels tick_clocks ticks_per_step wires bins? clocks?
@@ -110,7 +110,7 @@ verify, crossbars:
 watch bin:
     bins counts decision grasp kind margin time_s
 watch end:
-    bins events grasps interrupted kind late repeated
+    after_decision bins events grasps interrupted kind late repeated
 watch grasp:
     bins counts decision grasp kind margin time_s
 yardsticks:
