@@ -16,7 +16,7 @@ import numpy as np
 from spikeloom.compiler import compile_network
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.graphs import Graph
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
@@ -36,7 +36,7 @@ class Sensor:
     graph: Graph
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def options_of(self, system: str) -> dict[str, Any]:
+    def options_of(self, system: str) -> JsonObject:
         """Those that a system takes."""
         names = ("graph", "taxels", "edges", "directed") if system in GRAPH_SYSTEMS else ("taxels",)
         return {name: self.options.get(name) for name in names}
