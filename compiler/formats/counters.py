@@ -105,6 +105,7 @@ def read_counters(path: str | os.PathLike[str]) -> tuple[Counters, str]:
     with reading(path, ModelError, AGAIN):
         manifest, members = read_archive(path, COUNTERS, VERSION, KINDS, lambda _: ("counter", "weight"))
         require_none(_array_faults(manifest, members["counter"], members["weight"]))
+        manifest = {**manifest, **{name: float(manifest[name]) for name in CONSTANTS}}  # too large: OverflowError
     counters = Counters(
         **{name: manifest[name] for name in (*SIZES, *CONSTANTS, "training")},
         counter=read_only(members["counter"]),
