@@ -152,7 +152,7 @@ def _mistake(error: Exception) -> str:
     """Lines for a user: one, or one per violated limit."""
     if isinstance(error, OSError) and error.strerror:
         where = error.filename or "a file"
-        return f"{where}: {error.strerror}; check space and permissions, nothing was changed"
+        return f"{where}: {error.strerror}; check space and permissions"
     if isinstance(error, MemoryError):
         return f"out of memory ({error or 'no size known'}); give fewer recordings with --limit"
     return " ".join([str(error), *(f"({note})" for note in getattr(error, "__notes__", ()))])

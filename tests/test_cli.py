@@ -287,7 +287,7 @@ def test_a_full_disk_behind_standard_output(spikeloom, monkeypatch, capsys):
         monkeypatch.setattr(sys, "stdout", full)
         assert cli.main(["inspect", "net.loom"]) == 2
     assert capsys.readouterr().err == (
-        "spikeloom: standard output: No space left on device; check space and permissions, nothing was changed\n"
+        "spikeloom: standard output: No space left on device; check space and permissions\n"
     )
 
 

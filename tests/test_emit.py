@@ -5,6 +5,7 @@ import itertools
 
 import numpy as np
 import pytest
+from commands import refusal
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from oracles import assert_same_network, refused
@@ -24,7 +25,7 @@ from random_networks import (
     tight_targets,
 )
 
-from spikeloom.compiler import Options, Packing, compile_network, lift
+from spikeloom.compiler import Options, Packing, compile_network, lift, write_netlist
 from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.invariants import verify
@@ -169,9 +170,13 @@ def netlist_of(*neurons: Neuron) -> Netlist:
 
 
 @pytest.mark.parametrize("field", ["decay_u", "decay_v"])
-def test_different_decays_in_a_layer_are_refused(field):
-    netlist = netlist_of(Neuron(), Neuron(**{field: 7}), Neuron(layer=1))
+def test_different_decays_in_a_layer_are_refused(field, tmp_path):
+    netlist, file = netlist_of(Neuron(), Neuron(**{field: 7}), Neuron(layer=1)), tmp_path / "net.loom"
     refused(FormatError, f"layer0|2 values of {field}", lift, netlist)
+    write_netlist(file, netlist)
+    for form in ("nir", "netx"):
+        said = refusal("export", file, "--to", form, "-o", tmp_path / "out")
+        assert said.startswith(f"{file}: layer layer0: has 2 values of {field}")
 
 
 @pytest.mark.parametrize(("votes", "layers"), [([-1, -1], 0), ([0, 0], 2)])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from spikeloom.compiler.errors import FormatError
+from spikeloom.compiler.files import reading
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.formats.netx import writer as netx
 from spikeloom.compiler.formats.nir import CONVENTIONS
@@ -106,12 +108,15 @@ def _nir(request: Request) -> Export:
         convention=CONVENTIONS[0],
     )
     lines = (f"in steps of {dt:g} s ({facts.convention})",)
-    return Export(content=[nir.export(netlist, dt)], facts=facts, lines=lines)
+    with reading(request.source, FormatError, "compile it again"):
+        content = nir.export(netlist, dt)
+    return Export(content=[content], facts=facts, lines=lines)
 
 
 def _netx(request: Request) -> Export:
     netlist = read_netlist(request.source)
-    network = lift(netlist)
+    with reading(request.source, FormatError, "compile it again"):
+        network = lift(netlist)
     blocks = netx.blocks_for(network)
     layers = [NetxLayer(rounding=block.rounding) for block in blocks]
     rounded = [line for block in blocks if (line := str(block.rounding))]
