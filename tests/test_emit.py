@@ -173,7 +173,7 @@ def netlist_of(*neurons: Neuron) -> Netlist:
 def test_different_decays_in_a_layer_are_refused(field, tmp_path):
     netlist, file = netlist_of(Neuron(), Neuron(**{field: 7}), Neuron(layer=1)), tmp_path / "net.loom"
     refused(FormatError, f"layer0|2 values of {field}", lift, netlist)
-    write_netlist(file, netlist)
+    write_netlist(netlist, file)
     for form in ("nir", "netx"):
         said = refusal("export", file, "--to", form, "-o", tmp_path / "out")
         assert said.startswith(f"{file}: layer layer0: has 2 values of {field}")
