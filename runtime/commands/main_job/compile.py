@@ -32,7 +32,7 @@ from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings
 from spikeloom.runtime.inputs.repeat import NETWORK, ROUNDING, command, given, refuse, words
 from spikeloom.runtime.machines.base import chip_module, describe, trained_for
-from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.console import Progress, progress
 from spikeloom.runtime.report.encode import INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 
@@ -140,9 +140,11 @@ def run(arguments: argparse.Namespace) -> Outcome:
             trained=origin_of(asked.training),
         )
         training = of_length(found, asked.network.input.clocks.length).events
+    passes = Progress(len(names))
     progress("compiling")
 
     def dump(name: str, done: Compilation) -> None:
+        passes(names.index(name) + 1, "compiling")
         if name in arguments.dump_after:
             sys.stderr.write(text(done.newest))
 
