@@ -4,8 +4,6 @@ What all netlist files share, whatever chip they are for. Equal members give equ
 compressed, in the order given and with a fixed date. Nothing is ever pickled.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -3,8 +3,6 @@
 Files are read and written by :mod:`compiler.formats`; :mod:`passes.expand` writes the first layer out as synapses.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

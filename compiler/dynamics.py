@@ -10,8 +10,6 @@ twice the threshold, its bias is zero, so that it spikes when its channel has an
 first dense layer they are a bias that changes with time.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, field
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Write a file whole or not at all, read one within limits, say in one line what is wrong about it."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import secrets

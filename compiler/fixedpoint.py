@@ -8,8 +8,6 @@ References
 .. [2] nengo, ``builder/discretize.py`` and ``emulator/interface.py`` of its back-end; lava, ``proc/lif/models.py``.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

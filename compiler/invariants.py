@@ -4,8 +4,6 @@ A broken rule is a defect of a pass, not of the user: :class:`errors.VerifyError
 refused by the front-ends and by the target's ``legalize`` before it gets here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -6,8 +6,6 @@ sparse matrices whose *stored* entries are the structural synapses: a stored zer
 object can know is checked on construction, everything else in :mod:`compiler.invariants`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any

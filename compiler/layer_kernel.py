@@ -4,8 +4,6 @@ A spike adds the weights that it has, source by source, those of the layer itsel
 as the spikes that arrive in it, and a pass over the neurons.
 """
 
-from __future__ import annotations
-
 import gc
 import sys
 from collections.abc import Callable, Sequence

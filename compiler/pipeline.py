@@ -1,7 +1,5 @@
 """A compilation is a list of passes; what the list is, every target says for itself."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar

@@ -1,7 +1,5 @@
 """Which element of an input is which taxel and polarity."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

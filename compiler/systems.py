@@ -20,8 +20,6 @@ References
    arXiv:1609.02907: the renormalisation trick.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, dataclass
 from typing import Any

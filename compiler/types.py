@@ -1,7 +1,5 @@
 """Names of types that everything shares: arrays, and what JSON files hold."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -10,8 +10,6 @@ with the very edges that it was trained on: the choices that the released code m
 (``neutouch.toml``). On any other layout, ties go to the lower index pair.
 """
 
-from __future__ import annotations
-
 import math
 import tomllib
 from dataclasses import dataclass

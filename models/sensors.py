@@ -4,8 +4,6 @@ What makes a graph wrong is an error (a taxel that does not exist, two taxels in
 itself). A graph in parts may be meant but rarely is: a warning, text that the caller shows.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What the first layer of each system sees of a sensor: its taxel graph, its taxels one by one, or a grid over them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from spikeloom.compiler.errors import DataError, OptionError

@@ -4,8 +4,6 @@ Exit codes: 0 fine, 1 a check failed, 2 a user's mistake (one line on stderr, a 
 Results go to stdout, progress to stderr when it is a terminal.
 """
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import json

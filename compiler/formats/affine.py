@@ -4,8 +4,6 @@ Convolutions and poolings are the sparse matrices that they are, for any number 
 cross-correlation, as in torch: kernels are not turned round. Images are (channels, space), flat in that order.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

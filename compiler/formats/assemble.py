@@ -4,8 +4,6 @@ What reads a network from elsewhere, an ONNX graph or a torch module, ends here:
 threshold and affine stages from other layers, and with how the output is counted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Generic, TypeVar

@@ -32,8 +32,6 @@ The manifest may have, beside these,
 Versions 1 to 5 are those that lacked some of these entries.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

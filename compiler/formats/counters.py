@@ -12,8 +12,6 @@ The file is an archive of :mod:`compiler.archive`: the ``manifest`` has the size
 ``training`` (how it was made and what it reached), ``counter`` and ``weight`` are arrays.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Read an HDF5 file as plain data, trusting nothing in it: no size, no link to elsewhere."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import os

@@ -1,7 +1,5 @@
 """Names from files and for files: how a message shows them, and what other programs accept."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager

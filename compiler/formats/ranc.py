@@ -13,8 +13,6 @@ The file serves as input and as configuration: ``ranc_sim NET.json OUT.txt NET.j
   by the threshold. Other neurons are written in these terms, see :func:`expressed`.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ leak, both thresholds, reset mode, and where its spikes go. ``tc_PLACE.mem`` hol
 parameters of the description.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

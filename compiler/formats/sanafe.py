@@ -21,8 +21,6 @@ References
 .. [1] J. Boyle et al., "SANA-FE", IEEE TCAD 44(8), 3165-3178, 2025; format of version 2.2.9.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import pairwise
 

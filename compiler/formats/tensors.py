@@ -8,8 +8,6 @@ neurons spike most wins.
 Neurons of the first layer count as in any network of the system, with the features of all towers at each place.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any

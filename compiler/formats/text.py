@@ -1,7 +1,5 @@
 """Stable printed form of what passes make: for people, for ``--dump-after`` and for golden tests."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass

@@ -8,8 +8,6 @@ of old releases (``conv1.lin.weight``, the filters of all hops side by side).
 torch is imported here only, late, and always with ``weights_only=True``: files that hold code are refused.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import math

@@ -4,8 +4,6 @@ Neurons that recordings removed, and weights that recordings rounded so that the
 checkpoint. Digests show that they are those that the compiler chose, wherever it put them.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 

@@ -12,8 +12,6 @@ The other systems differ in what stands for the powers ``A^k``: a stack of matri
 filter. Outputs equal those of the factored form up to floating-point rounding (float64 throughout).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ is taken out before rounding: its weights then no longer take room in the accumu
 become finer. Left out on request only: neurons that did not fire on the training recordings.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar

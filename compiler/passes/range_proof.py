@@ -1,7 +1,5 @@
 """Prove that registers stay in range for any input, from the weights alone."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

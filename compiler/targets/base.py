@@ -5,8 +5,6 @@ A target is a folder with ``chip.toml``, every number once with unit and source,
 begin with and those that are due. Nothing else knows which chips there are.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import tomllib

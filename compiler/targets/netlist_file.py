@@ -10,8 +10,6 @@ every array field
 Equal netlists give equal bytes: members are stored, not compressed, in a fixed order and with a fixed date.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields

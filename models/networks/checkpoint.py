@@ -1,7 +1,5 @@
 """Write our own checkpoint format; :mod:`formats.checkpoint_reader` describes and reads it."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping, Sequence

@@ -14,8 +14,6 @@ References
    IROS 2020.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

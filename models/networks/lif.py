@@ -4,8 +4,6 @@ A network is any ``nn.Module`` with :class:`LIF` layers in it; whatever lies bet
 compiled (:func:`module.module_network`). How it is trained is its own affair.
 """
 
-from __future__ import annotations
-
 from torch import Tensor, nn
 
 from spikeloom.models.networks.layers import Spike

@@ -4,8 +4,6 @@ A stage is read in float64, so the compiler need not know its layers: torch's de
 combinations tell whether it is affine at all. New layer types need nothing but a ``forward``.
 """
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

@@ -5,8 +5,6 @@ sums are sums of integers in float32, exact below 2**24, which the 21-bit accumu
 integers. Gradients pass the rounding straight through, and a spike by the same surrogate as in training.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -6,8 +6,6 @@ first and then propagated, as torch_geometric does it; the sums of the others ar
 network run one after the other, so that each has every spike that it has alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

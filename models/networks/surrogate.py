@@ -1,7 +1,5 @@
 """The surrogate derivative of a spike, in training."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 RECTANGULAR, FAST_SIGMOID = SHAPES = ("rectangular", "fast-sigmoid")

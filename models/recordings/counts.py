@@ -1,7 +1,5 @@
 """What was odd about recordings while their events were put into bins: counted, said on stderr, kept as JSON."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, field
 

@@ -6,8 +6,6 @@ the order that the reader asks for. Blank lines, and what follows a ``#``, do no
 A table of labels, ``labels.csv`` beside recordings, has lines ``file,label``.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import os

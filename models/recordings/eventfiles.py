@@ -5,8 +5,6 @@ one code per file. The label is the class of the whole recording: one constant, 
 ``grasp_7_label_3.csv``.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

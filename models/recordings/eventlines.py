@@ -5,8 +5,6 @@ in another order, a fourth column ``label`` is passed over, and what follows a `
 means something, though: the end of a grasp, after which a header may come again.
 """
 
-from __future__ import annotations
-
 import enum
 import io
 import select

@@ -4,8 +4,6 @@ Events are put into time bins of one width. Nothing is mended in silence: what c
 event of the same taxel, polarity and bin, and long silences are counted. Each recording counts for its own length.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Fetch the released recordings, once, and find them again by name."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -8,8 +8,6 @@ After the generator drew its numbers, only operations that IEEE 754 rounds exact
 exponential), so that a seed gives the same bytes wherever numpy draws the same numbers.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

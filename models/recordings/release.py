@@ -3,8 +3,6 @@
 A table beside the splits says which file each of them was.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import os

@@ -1,7 +1,5 @@
 """By how much a network misses, a few recordings at a time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ A recipe is what ``train --recipe`` names; single values may be overridden there
 system or the graph, and nothing of how a training is reported (:mod:`training.train`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass

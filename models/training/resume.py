@@ -1,7 +1,5 @@
 """State of a training between two epochs, so that a killed one continues to the same weights, bit for bit."""
 
-from __future__ import annotations
-
 import copy
 import math
 import os

@@ -19,8 +19,6 @@ References
    IROS 2020.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

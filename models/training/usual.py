@@ -1,7 +1,5 @@
 """Networks of floats, for chips whose compiler rounds them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Networks of whole numbers, trained as crossbar cores hold them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

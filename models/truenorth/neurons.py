@@ -3,8 +3,6 @@
 All numbers that reach a membrane are whole, below 2**24, and so exact in float32 in whatever order they are added.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

@@ -4,8 +4,6 @@ Shares of equal spikes hide them: a silent layer agrees with a quiet one, and on
 and then.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -12,8 +12,6 @@ References
    of a sum of products err by at most ``gamma_n = n u / (1 - n u)`` of the sum of magnitudes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -15,8 +15,6 @@ weights must be the nearest, and no bias may make up for more than its neuron's 
 calibration moves it by at most.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ The reference is the float model in the released operator order, in float32. A f
 in which the two differ are ill-posed, decided by the rounding of a sum and not by the chip.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np

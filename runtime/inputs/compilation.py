@@ -1,7 +1,5 @@
 """What the options of ``compile`` ask for: storage of each layer, cores, and what a netlist remembers of it."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Files that a user names: shipped checkpoints, places to write, what can be inspected."""
 
-from __future__ import annotations
-
 import argparse
 import zipfile
 from collections.abc import Callable, Iterable

@@ -1,7 +1,5 @@
 """The float network that a command is given: a checkpoint on its graph, or an ONNX or NIR file that holds all."""
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 from collections.abc import Mapping

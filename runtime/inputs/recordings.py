@@ -1,7 +1,5 @@
 """Recordings that a user names, held against a network."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping
 from difflib import get_close_matches

@@ -1,7 +1,5 @@
 """Options as they are typed: to get the same again, or to refuse what does not apply."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 from collections.abc import Mapping, Sequence

@@ -5,8 +5,6 @@ A machine is found by the target that its netlist names: the module ``machines/N
 :func:`chip_module`.
 """
 
-from __future__ import annotations
-
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping

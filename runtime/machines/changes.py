@@ -1,7 +1,5 @@
 """What changed events bring about: beside the known run of a recording, on any chip."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

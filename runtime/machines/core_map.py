@@ -1,7 +1,5 @@
 """Where the cores of a netlist lie, how full each is, and who sends how much to whom."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -3,8 +3,6 @@
 A command names each part as it begins; what is known about parts stands here, once. Nothing is measured but the time.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple

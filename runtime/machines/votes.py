@@ -1,7 +1,5 @@
 """Read-out of a simulated netlist: spike counts to classes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from spikeloom.compiler.interpret import vote

@@ -1,7 +1,5 @@
 """Figures of the page that are of one kind: cores on the mesh, taxels on the fingertip, membranes of one neuron."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """One recording for the page: spikes of float model and chip, and membranes where they part."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

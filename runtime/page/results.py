@@ -1,7 +1,5 @@
 """All that the page of a network shows, as its JSON has it, and where that is from."""
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import platform

@@ -1,7 +1,5 @@
 """The page of a network: chapters with figures, each table laid out once for page and terminal."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from functools import partial

@@ -1,7 +1,5 @@
 """How results and progress reach a terminal."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

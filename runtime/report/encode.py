@@ -1,7 +1,5 @@
 """Results as JSON values, the one encoder of every ``--json``, and back from a file that a command wrote."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Numbers as people read them, and their intervals: sixty test samples deserve to say how little they know."""
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections.abc import Iterable, Sequence

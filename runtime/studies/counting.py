@@ -1,7 +1,5 @@
 """What ``train --system counters`` does: choose the strength of the rule, fit it, and read the test split once."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which of many configurations no other one beats, and the words of ``--budget``."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A sweep can be ended at any time, by Ctrl-C, a kill or a loss of power. What was
 name everything that decides a result; the same command goes on from there. joblib does the work.
 """
 
-from __future__ import annotations
-
 import _thread
 import hashlib
 import json

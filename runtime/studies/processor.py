@@ -14,8 +14,6 @@ References
 .. [2] Arm, "Cortex-M4 Technical Reference Manual", table 3-1: a load takes two cycles, arithmetic and stores one.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Seeds of a training side by side, one process each, all ended together, each continued from where it was ended."""
 
-from __future__ import annotations
-
 import statistics
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence

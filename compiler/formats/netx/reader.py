@@ -11,8 +11,6 @@ References
 .. [1] lava-dl 0.6.0, ``netx/README.md``, ``netx/hdf5.py`` and ``slayer/block/base.py``.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from dataclasses import dataclass, replace

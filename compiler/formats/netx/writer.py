@@ -7,8 +7,6 @@ dense layers. A layer whose weights are stored with an exponent is rescaled by a
 It says nothing of the sensor, of clocks, which are inputs as others, and of classes for which several neurons vote.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

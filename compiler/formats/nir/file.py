@@ -10,8 +10,6 @@ References
    brain-inspired computing", Nature Communications 15, 8122, 2024; layout as in the package nir 1.0.8.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

@@ -9,8 +9,6 @@ keeps ``beta``, and the rest, ``1 - beta``, comes from ``v_leak + r * I``:
     ``beta = exp(-dt / tau)``, exact for an input that is constant over the step, which sinabs means.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -13,8 +13,6 @@ float is not.
 Neurons that the chip leaves out are there and receive nothing.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

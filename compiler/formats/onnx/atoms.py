@@ -4,8 +4,6 @@ Atoms are the inputs of the graph, each tensor that is compared with a threshold
 from it, and products of a membrane with its spikes (a reset).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

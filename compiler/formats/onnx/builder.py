@@ -3,8 +3,6 @@
 Operator set 17 with IR version 8, which onnxruntime reads since 1.13. Equal graphs give equal bytes.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ On numbers ONNX's own reference runs them, once the shapes that it infers for th
 That is for constants, and for positions of elements: an operator that only moves numbers shows by them where each goes.
 """
 
-from __future__ import annotations
-
 import math
 import string
 from collections.abc import Callable, Mapping, Sequence

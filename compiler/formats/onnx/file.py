@@ -5,8 +5,6 @@ stood in the program's text, a constant without dimensions or an attribute, is r
 that float32 (0.2, not 0.200000003); the float32 model is the same, the float64 one is the one that was meant.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

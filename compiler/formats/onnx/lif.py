@@ -7,8 +7,6 @@ product, a Where, with the reset before or after the decay, makes no difference 
 Neurons of one step are layers as they are, those of several steps by what carries on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ comparison of a membrane with a threshold gives a spike; a product of a membrane
 is, since it is how a membrane is reset. Everything else is refused by name.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -4,8 +4,6 @@ The graph is run on values that vary, in float64: what is affine between two spi
 held against a threshold becomes a layer, and everything else is refused by name.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -33,8 +33,6 @@ Form ``scan``: whole recordings of the same length, a loop over the form ``step`
 ====================== ======================= ========================================================================
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, replace
 

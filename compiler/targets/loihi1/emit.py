@@ -4,8 +4,6 @@ Every non-zero synapse is stored once; nothing else changes. Lists are stored sp
 far as the core's memory allows it, because a zero inside a dense list is visited, and paid, like any other synapse.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

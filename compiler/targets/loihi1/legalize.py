@@ -3,8 +3,6 @@
 Nothing is changed. Every violated limit is listed, with its owner and what would make it fit.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

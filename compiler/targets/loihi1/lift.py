@@ -5,8 +5,6 @@ to zero stores no synapse; it is given an empty projection from the layer before
 hold come back without synapses or bias, so that they never fire.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

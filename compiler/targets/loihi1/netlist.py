@@ -22,8 +22,6 @@ compartment spiked in chip step ``t - 1``. A compartment of a layer of depth ``d
 ``d … d + T - 1`` of a recording of ``T`` steps and is held at zero, silent, outside them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple

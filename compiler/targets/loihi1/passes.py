@@ -1,7 +1,5 @@
 """The passes of this chip in their order: a trained network at the top, a netlist that obeys every limit at the end."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 A draft checks nothing that a chip limits: it may break any rule, and :mod:`truenorth.legalize` lists them all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

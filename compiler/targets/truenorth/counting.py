@@ -18,8 +18,6 @@ votes count, and the ramp starts so much lower. The votes are those of other chi
 crosses the threshold before the data end, or counters spike a second time shortly before.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

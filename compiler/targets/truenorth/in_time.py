@@ -17,8 +17,6 @@ spike. A layer whose inputs fit a core is added up in one tick instead. Spikes o
 those of the others by copies of the neurons.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

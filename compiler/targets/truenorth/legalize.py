@@ -4,8 +4,6 @@ Several offenders against one rule on one core share a line, which names the fir
 it is lowered, with every reason that no layout could avoid; one that breaks none of these may still not fit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np

@@ -22,8 +22,6 @@ A stage at depth d runs d ticks behind the data: clocks reach it d ticks later, 
 membranes start where the leak of d ticks brings them to rest, see :func:`steepest_leak`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any

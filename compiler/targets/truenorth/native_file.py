@@ -7,8 +7,6 @@ with the parts of :class:`native.Stage`, and the ``sha256``. All numbers are who
 computes.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

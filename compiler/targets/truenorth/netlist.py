@@ -20,8 +20,6 @@ recording of ``T`` data steps takes ``T * bin_ticks + drain`` ticks from the ini
 neuron that votes count in the ticks ``readout_first … readout_first + T * bin_ticks - 1``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

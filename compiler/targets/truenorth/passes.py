@@ -4,8 +4,6 @@ Networks that were trained for the chip and counting networks are whole numbers 
 network without memory (``--in-time``) is written out, and its weights become levels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any

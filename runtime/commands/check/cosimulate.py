@@ -1,7 +1,5 @@
 """The command ``cosimulate``: a netlist in a hardware description that others wrote, spike by spike."""
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 from pathlib import Path

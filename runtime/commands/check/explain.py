@@ -4,8 +4,6 @@ The reference is the float model in float64, run from the synapses that the comp
 float32, as the model was trained.
 """
 
-from __future__ import annotations
-
 import argparse
 
 from spikeloom.compiler.errors import OptionError

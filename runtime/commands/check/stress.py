@@ -1,7 +1,5 @@
 """The command ``stress``: where float network and chip break, and whether at the same place."""
 
-from __future__ import annotations
-
 import argparse
 
 from spikeloom.compiler.errors import OptionError

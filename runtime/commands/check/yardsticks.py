@@ -1,7 +1,5 @@
 """The command ``yardsticks``: what others count of the float model, beside what the chip does."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The command ``anytime``: how early a decision could have been taken, and what that saves."""
 
-from __future__ import annotations
-
 import argparse
 
 from spikeloom.compiler.errors import OptionError

@@ -1,7 +1,5 @@
 """The command ``chart``: accuracy against energy, time and size, for every configuration of a grid."""
 
-from __future__ import annotations
-
 import argparse
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The command ``lean``: what of a network its recordings do not need, what that costs, and a netlist without it."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The command ``smallest``: the cheapest network that does the job, chosen by cross-validation."""
 
-from __future__ import annotations
-
 import argparse
 from functools import partial
 from importlib import import_module

@@ -1,7 +1,5 @@
 """The commands under ``spikeloom data``: fetch recordings, describe them, convert them to the released layout."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The command ``export``: a netlist in the format of another program."""
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 from collections.abc import Iterator

@@ -10,8 +10,6 @@ of ``run`` on the same recording. A bin is stepped
 An event whose bin was stepped already is late; what comes after a grasp's decision is counted apart. Neither is used.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import json

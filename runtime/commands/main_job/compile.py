@@ -1,7 +1,5 @@
 """The command ``compile``: a checkpoint or a file of another format becomes a netlist."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """The command ``demo``: the main job on what the package ships."""
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 from typing import Any

@@ -1,7 +1,5 @@
 """The command ``estimate``: synaptic operations, energy and time of an inference."""
 
-from __future__ import annotations
-
 import argparse
 
 from spikeloom.compiler.errors import OptionError

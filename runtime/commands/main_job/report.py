@@ -1,7 +1,5 @@
 """The command ``report``: everything about one netlist on one page, and the same as tables on the terminal."""
 
-from __future__ import annotations
-
 import argparse
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The command ``run``: decisions and spikes, bit for bit the chip's."""
 
-from __future__ import annotations
-
 import argparse
 import zipfile
 from collections.abc import Iterator

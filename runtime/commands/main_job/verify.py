@@ -1,7 +1,5 @@
 """The command ``verify``: the netlist held against its checkpoint; on recordings their spikes, too."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 

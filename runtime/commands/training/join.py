@@ -1,7 +1,5 @@
 """The command ``join``: several trained networks as one whose votes add up."""
 
-from __future__ import annotations
-
 import argparse
 from argparse import Namespace
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The command ``train``: one system, any number of seeds, reported at three epochs."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from pathlib import Path

@@ -13,8 +13,6 @@ A netlist is entitled to round weights, biases, decays and membranes, and to the
 it stores is the rounding of its checkpoint at all is for :mod:`equivalence.rounding` to say.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Why one recording differs: entries of each layer, roots by cause, and each root with what removes it."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field

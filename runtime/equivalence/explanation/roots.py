@@ -11,8 +11,6 @@ in the steps that the neuron remembers. An entry that follows from none is a *ro
 differs. Every diverging entry inherits the roots of what it follows from, and may have several.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -24,8 +24,6 @@ synapses that reach it are all zero. Only those without a bias can be idle, the 
 turn 64 comparisons into one word. LLVM makes of them what the machine has.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 

@@ -1,7 +1,5 @@
 """Lay a netlist out for :mod:`loihi1.block_kernel`, where that is proven to compute what the chip does."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a compilation chose, proved and removed, and how ``compile`` shows it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """What a netlist is: sizes, layers, use of every limit; and how ``inspect`` shows it."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

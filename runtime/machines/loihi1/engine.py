@@ -7,8 +7,6 @@ Any other network is run step after step in :mod:`loihi1.kernel`, which knows no
 state by any number of chip steps.
 """
 
-from __future__ import annotations
-
 import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """Netlists in the formats of other programs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from spikeloom.compiler.errors import FormatError

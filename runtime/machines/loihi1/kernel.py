@@ -7,8 +7,6 @@ to one of them, so that the low bits say whether anything arrived at all, which 
 ``f <= 4096`` nothing exceeds 2**24.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

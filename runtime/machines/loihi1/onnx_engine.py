@@ -3,8 +3,6 @@
 It takes recordings as :func:`engine.simulate` does and gives the same spikes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -24,8 +24,6 @@ References
 .. [2] lava, ``proc/lif/models.py``; nengo-loihi, ``emulator/interface.py``: the same integer rule in two emulators.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

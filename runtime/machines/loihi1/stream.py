@@ -14,8 +14,6 @@ on the bins up to ``t - d`` of the layer that is read out; :meth:`Stream.finish`
 by step, all spikes and counts equal those of :func:`engine.simulate` on the whole recording, bit for bit.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

@@ -17,8 +17,6 @@ References
    25 % of the latency of three applications).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from math import lcm

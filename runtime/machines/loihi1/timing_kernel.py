@@ -7,8 +7,6 @@ nor depend on their order. Only what congestion and blocking add is fractional.
 sent, so each core needs only a queue.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

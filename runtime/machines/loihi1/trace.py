@@ -4,8 +4,6 @@ Chip steps run from 0 to ``T + netlist.max_depth - 1`` for a recording of ``T`` 
 order of the netlist's ids. A batch of recordings adds one leading axis to every array.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

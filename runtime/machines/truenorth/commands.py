@@ -1,7 +1,5 @@
 """What TrueNorth does in its own way: networks trained for it, counting ones, and history-free ones (``--in-time``)."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable, Mapping

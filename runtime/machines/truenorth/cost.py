@@ -7,8 +7,6 @@ network that does little, the second charges it with 4,096 cores of which it use
 stands beside it. A tick takes its time in full, whatever happens in it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any

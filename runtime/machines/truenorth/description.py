@@ -1,7 +1,5 @@
 """What ``inspect`` says of a netlist of crossbar cores, and of a network that was trained for them."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The fast twin of :mod:`truenorth.spec`: crossbar cores by events, bit for bit the same."""
 
-from __future__ import annotations
-
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Files of crossbar cores for other programs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from spikeloom.compiler.dynamics import with_clocks

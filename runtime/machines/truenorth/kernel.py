@@ -6,8 +6,6 @@ neighbours. All but those that are reset by their threshold provably stay below 
 the run is broken off. The other neurons are computed one by one.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

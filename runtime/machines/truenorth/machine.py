@@ -1,7 +1,5 @@
 """TrueNorth as a :class:`machines.base.Machine`."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from functools import cached_property

@@ -24,8 +24,6 @@ References
 .. [4] NeMo (markplagge), ``tn_neuron.c``: leak reversal and negative threshold.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ registers are equal and the same weights reach them from the same kinds of axons
 added up apart, so that the counts of registers that were left stay the same, too.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -19,8 +19,6 @@ References
    beyond an order statistic of n values follows a beta distribution, whatever theirs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

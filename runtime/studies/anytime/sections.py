@@ -1,7 +1,5 @@
 """The study of early decisions laid out for people."""
 
-from __future__ import annotations
-
 import math
 
 from spikeloom.runtime.report.numbers import percent, si

@@ -1,7 +1,5 @@
 """What stopping early saves and changes, for each rule of :mod:`exits`, from one run of the recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

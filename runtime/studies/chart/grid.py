@@ -4,8 +4,6 @@ A grid is ``AXIS=VALUE,VALUE,AXIS=VALUE …``; values stand between commas or sl
 ``bits=2-6,8,cores=cores/latency,window=25-100%:25``. Axes that it does not name keep their usual value.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields

@@ -1,7 +1,5 @@
 """The networks of a chart, and the storages that a grid asks for."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """What a chart is: configurations of networks with their figures on both splits, and the one to deploy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar

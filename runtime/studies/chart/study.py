@@ -4,8 +4,6 @@ The *choice* is made on the training split alone; test figures are reported besi
 split: they describe.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -4,8 +4,6 @@ Everything here is a function of files and of a request, so that a netlist is th
 ``compile`` would write. A network is rounded once for any number of layouts.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field

@@ -1,7 +1,5 @@
 """What ``lean`` returns and prints: what is used, what may go, and what that changes and saves."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

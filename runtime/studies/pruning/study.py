@@ -1,7 +1,5 @@
 """The study: neurons, taxels or hops are taken from a network, and it is measured again."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 import numpy as np

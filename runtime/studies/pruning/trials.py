@@ -5,8 +5,6 @@ What is silenced together is found by bisection along a ranking, least effect fi
 largest that changes no more training decisions than allowed. Nothing is chosen on the recordings that are reported.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 Prices are those of :mod:`studies.processor`; that weights of 8 bits are enough is assumed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from importlib.util import find_spec
 from typing import Any

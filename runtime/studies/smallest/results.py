@@ -1,7 +1,5 @@
 """What a search for the smallest network comes to."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """A search for people: the choice and why, the front, what was dropped, baselines, and the commands that repeat it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial

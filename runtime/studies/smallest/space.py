@@ -1,7 +1,5 @@
 """What is tried: counting networks of many sizes, a few trained ones, and support vector machines beside them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace

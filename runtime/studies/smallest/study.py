@@ -5,8 +5,6 @@ strengths, and from there to five rounds. Everything happens on the training spl
 Taken is the cheapest that is not shown to be worse than the best.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
 from functools import partial

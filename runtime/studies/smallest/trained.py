@@ -1,7 +1,5 @@
 """Networks that are trained by gradients, as candidates: a part left out at a time, decided by the compiled network."""
 
-from __future__ import annotations
-
 import argparse
 import io
 import tempfile

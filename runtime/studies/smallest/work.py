@@ -1,7 +1,5 @@
 """One candidate by cross-validation inside the training split, and what it costs; work that crosses process borders."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import product

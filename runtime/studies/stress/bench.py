@@ -1,7 +1,5 @@
 """What ``stress`` works on: netlist and float network, sensor and recordings; and how recordings become inputs."""
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 from collections.abc import Callable

@@ -5,8 +5,6 @@ moves by as much in its own units, which is the same relative change up to round
 neuron that the chip does not hold stays as it is in the float network.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -6,8 +6,6 @@ five dead taxels are the three and two more, an event that is lost at a rate of 
 taxels; they are not among the events here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

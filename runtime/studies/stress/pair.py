@@ -3,8 +3,6 @@
 What is counted is what spikes after `begin`, so that recordings may follow others without a reset.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext

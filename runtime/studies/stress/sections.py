@@ -1,7 +1,5 @@
 """What ``stress`` has to say, laid out for terminals and for the page of a network, and its figure."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any

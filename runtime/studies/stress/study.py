@@ -1,7 +1,5 @@
 """The study: every perturbation at every level, once for each seed, on both sides at once."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import zlib

@@ -7,8 +7,6 @@ chip: *robust* if it never leaves, *breaks* if it comes down to chance, else *de
 place* if the second has left, or has an interval that overlaps the other's, at the first level at which one leaves.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

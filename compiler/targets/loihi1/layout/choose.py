@@ -16,8 +16,6 @@ References
 .. [1] J. Boyle et al., "SANA-FE", IEEE TCAD 44(8), 3165-3178, 2025.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections.abc import Mapping
 from contextlib import suppress

@@ -3,8 +3,6 @@
 Nothing is changed. Neurons are looked at in *chunks*, runs of neighbours of one population.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

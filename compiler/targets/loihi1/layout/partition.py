@@ -7,8 +7,6 @@ how many output axons the populations before it need, so populations are cut fro
 needs some for its own chunks, so it is cut again until they are enough.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Mapping

@@ -10,8 +10,6 @@ References
    the interconnect as the objective.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TypeVar
 

@@ -6,8 +6,6 @@ Weights are then rounded so that their errors cancel, where that keeps more spik
 finer, take up what is left. Without calibration the weights alone decide.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter

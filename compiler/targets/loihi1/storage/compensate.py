@@ -13,8 +13,6 @@ References
    integers without an inverse.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace

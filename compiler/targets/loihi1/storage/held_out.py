@@ -5,8 +5,6 @@ a recording that is held out loses a quarter of its events, and each quarter of 
 few spikes that move tell there, and one run of each model gives four decisions. Nothing but the training split is read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any

@@ -3,8 +3,6 @@
 Nothing here looks at the rest of the network; :mod:`storage.choose_storage` chooses among what is found here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

@@ -4,8 +4,6 @@ Each layer is judged on the float64 model's own input, so that one layer's error
 moves a spike, the whole network does not. Where spikes still move, it is said which limit of the chip is in the way.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, replace
 

@@ -9,8 +9,6 @@ units to each membrane unit of the float model, so the threshold carries no roun
 bits are one weight of up to 16 bits. Only a weight that the finest plane cannot hold uses the next one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -11,8 +11,6 @@ References
 .. [2] J. Boyle et al., "SANA-FE", IEEE TCAD 44(8), 3165-3178, 2025.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise

@@ -4,8 +4,6 @@ Whatever is linear in events is added up by the engine itself (:class:`trace.Cha
 window is run for itself. A chip that is stopped after so many steps has done, and cost, what stands there.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, largest_current

@@ -3,8 +3,6 @@
 Every message is scheduled for these, and energy is told by core. Spikes are the same in both details.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TypeVar

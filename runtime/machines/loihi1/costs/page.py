@@ -1,7 +1,5 @@
 """What the page of a network shows of this chip: costs with figures, and cores on the mesh."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 

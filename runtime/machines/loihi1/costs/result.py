@@ -1,7 +1,5 @@
 """Costs of an inference in numbers: by part, layer and core, by table and time model; with what is not known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Costs laid out for people: the mean inference and its range, where energy and time go."""
 
-from __future__ import annotations
-
 from spikeloom.runtime.machines.loihi1.costs.result import Amounts, CostReport
 from spikeloom.runtime.report.numbers import dominant, si
 from spikeloom.runtime.report.sections import Section, Table, Text
