@@ -30,9 +30,6 @@ EventArray = npt.NDArray[np.uint8] | npt.NDArray[np.bool_]
 Place = tuple[int, int]
 
 
-# -- neurons in RANC's terms -------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Terms:
     """A network as RANC has it: every spike is the same, and a membrane is ``scale`` times ours, plus ``shift``.
@@ -106,9 +103,6 @@ def _least_sums(netlist: CrossbarNetlist) -> IntArray:
     return least
 
 
-# -- places and packets ------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Mesh:
     """Where the cores and the output bus of a network are; x, y: (cores,) int64."""
@@ -167,9 +161,6 @@ def crossbar(netlist: CrossbarNetlist, core: int) -> tuple[IntArray, IntArray]:
         held = slice(*netlist.axon_synapses[axon : axon + 2].tolist())
         points[netlist.synapse_neuron[held], netlist.axon_line[axon]] = 1
     return kinds, points
-
-
-# -- the simulator's file ----------------------------------------------------------------------------------------------
 
 
 def export(given: CrossbarNetlist, events: EventArray | None = None) -> Iterator[str]:

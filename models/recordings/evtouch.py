@@ -218,8 +218,6 @@ def data_digest(training: Recordings, test: Recordings) -> str:
     )
 
 
-# -- the first part of recordings --------------------------------------------------------------------------------------
-
 WHOLE = 100
 """Per cent of a recording."""
 

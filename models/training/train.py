@@ -248,9 +248,6 @@ def _require_suited(recordings: Recordings, architecture: Sizes) -> None:
         )
 
 
-# -- last, best and clean epoch ----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reported:
     """A training and what it reached at its last, best and clean epoch."""

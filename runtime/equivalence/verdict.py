@@ -290,9 +290,6 @@ def unmet(levels: tuple[Level, ...], required: Mapping[str, float]) -> list[str]
     return missed
 
 
-# -- for people --------------------------------------------------------------------------------------------------------
-
-
 def sections(verdict: Verdict) -> list[Section]:
     """Accuracies, levels and warnings; spikes; the ladder; the certificate; the first divergence."""
     spikes = [

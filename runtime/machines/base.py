@@ -314,9 +314,6 @@ class Machine(ABC):
         """State of one grasp that runs bin after bin; OptionError if the simulator runs whole recordings only."""
 
 
-# -- formats of other programs -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Request:
     """What a format is written from; options that were not given are None.
@@ -371,9 +368,6 @@ class Format:
     title: str
     write: Callable[[Request], Export]
     options: tuple[str, ...] = ()
-
-
-# -- where chips are found ---------------------------------------------------------------------------------------------
 
 
 def _module(name: str) -> Any:

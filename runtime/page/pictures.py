@@ -16,8 +16,6 @@ DETAILED = 1000
 """Taxels up to which their graph is drawn and each tells its values."""
 
 
-# -- cores -------------------------------------------------------------------------------------------------------------
-
 Place = tuple[float, float]
 """Left and upper end of a core in tiles, which are as wide as high."""
 
@@ -78,9 +76,6 @@ def _places(cores: CoreMap) -> tuple[dict[int, Place], Place, dict[Place, int], 
     return places, (wide, high), tiles, chips
 
 
-# -- taxels ------------------------------------------------------------------------------------------------------------
-
-
 @styled
 def fingertip(taxels: Taxels) -> Drawing:
     """Taxels where they lie, joined as the graph joins them; discs grow with events, and with first-layer spikes."""
@@ -119,9 +114,6 @@ def _reach(points: FloatArray) -> float:
     span = float(np.ptp(points, axis=0).max()) or 1.0
     nearest = KDTree(points).query(points, k=2)[0][:, 1].min() if len(points) > 1 else span
     return float(min(max(0.5 * nearest, span / 300), span / 16))
-
-
-# -- membranes ---------------------------------------------------------------------------------------------------------
 
 
 @styled

@@ -141,9 +141,6 @@ def taxels(
     )
 
 
-# -- where it is from --------------------------------------------------------------------------------------------------
-
-
 def provenance(
     arguments: argparse.Namespace,
     netlist: Netlist,

@@ -136,9 +136,6 @@ def _decisions(found: Decisions) -> list[Block]:
     ]
 
 
-# -- cores and taxels --------------------------------------------------------------------------------------------------
-
-
 def _cores(found: CoreMap) -> list[Block]:
     limits = list(dict.fromkeys(name for core in found.cores for name in core.fill))
     short = [name.removeprefix("core.").replace("_", " ") for name in limits]
@@ -206,9 +203,6 @@ def _taxels(found: Taxels) -> list[Block]:
     ]
 
 
-# -- one recording -----------------------------------------------------------------------------------------------------
-
-
 def _recording(found: Recording) -> list[Block]:
     sides = zip(found.votes["float"], found.votes["chip"], strict=True)
     votes = [[str(k), str(ours), str(chip)] for k, (ours, chip) in enumerate(sides) if ours or chip]
@@ -274,9 +268,6 @@ def _raster(layer: LayerRaster, steps: int, place: int) -> Figure:
         f"{layer.name}: rows are {some}the {len(active):,} {what}, in order.",
         numbers,
     )
-
-
-# -- the rest ----------------------------------------------------------------------------------------------------------
 
 
 def _provenance(made: Provenance) -> list[Block]:

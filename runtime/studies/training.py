@@ -163,9 +163,6 @@ def _finished(job: Job, record: Any) -> Finished:
     return Finished(**values, file=job.output.name, sha256=sha256_of(job.output))
 
 
-# -- all seeds ---------------------------------------------------------------------------------------------------------
-
-
 def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
     """Train several seeds, side by side on the cores where there are several; results are those of `run_job`.
 
@@ -236,9 +233,6 @@ def _kept(written: Sequence[str], jobs: Sequence[Job]) -> str:
     if kept:
         parts.append(f"the epochs so far are kept in {', '.join(kept)}")
     return f"{' and '.join(parts)}; go on with the same command and --resume" if parts else ""
-
-
-# -- for people --------------------------------------------------------------------------------------------------------
 
 
 def summary(records: Sequence[TrainingRecord]) -> dict[str, Accuracies]:

@@ -213,9 +213,6 @@ def _name_causes(
     return found
 
 
-# -- replay ------------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Variant:
     """A replay: the stored neurons without the deviation `cause`.

@@ -157,8 +157,6 @@ def remedy(cause: str, layer: str, *, bits: int, planes: int, clipped: bool = Fa
     }.get(cause, "none is known")
 
 
-# -- for people -------------------------------------------------------------------------------------------------------
-
 WIDTH = 116
 """Columns of a line of text."""
 

@@ -115,9 +115,6 @@ class Lasting(NamedTuple):
     current: AnyArray  # (blocks * 64,) int32; last currents
 
 
-# -- vectors -----------------------------------------------------------------------------------------------------------
-
-
 def _intrinsic(function: Function) -> Function:
     """Let compiled functions call what `function` emits, without the typing context that it takes first."""
     return cast(Function, intrinsic(function))
@@ -394,9 +391,6 @@ def scratch_of(blocks: Blocks, channels: int, steps: int, *, membranes: bool) ->
         membranes=np.empty(steps * positions if membranes else 0, np.int32),
     )
     return scratch, Lasting(blocks.keep_u, np.empty(positions, np.int32)) if blocks.keep_u.any() else None
-
-
-# -- recordings --------------------------------------------------------------------------------------------------------
 
 
 @compiled

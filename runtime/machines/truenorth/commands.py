@@ -110,8 +110,6 @@ def provenance(trained: Trained) -> JsonObject:
     }
 
 
-# -- chip against definition and model: every spike of every copy of every neuron --------------------------------------
-
 Modelled = tuple[Mapping[str, BoolArray], tuple[PartialSums, ...]]
 Model = Callable[[npt.NDArray[np.uint8]], Modelled]
 """Spikes (steps, neurons) of each layer for events (taxels, polarities, steps); partial sums that travel in time."""

@@ -65,9 +65,6 @@ class Trace:
     membranes: MembraneArray | None
 
 
-# -- the definition ----------------------------------------------------------------------------------------------------
-
-
 @dataclass(slots=True)
 class Neuron:
     """Parameters and membrane of one neuron; the names are those of the netlist."""

@@ -60,9 +60,6 @@ def parse_grid(text: str, target: Target) -> Grid:
     return Grid(**{name: tuple(values) for name, values in found.items()})
 
 
-# -- values ------------------------------------------------------------------------------------------------------------
-
-
 def _readers(target: Target) -> dict[str, tuple[Callable[[str], Sequence[Any]], str]]:
     """What reads the values of each axis, with nothing for a value that is not allowed; and what is."""
     widths, slots = sorted(target.choices["synapse.weight_bits"]), target.limit("core.threshold_slots")

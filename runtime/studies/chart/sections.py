@@ -107,9 +107,6 @@ def _provenance(chart: Chart) -> list[Block]:
     ]
 
 
-# -- points ------------------------------------------------------------------------------------------------------------
-
-
 def _head(by: ChosenBy) -> list[str]:
     timed = [] if by.time is None else [f"time ({by.time})"]
     figures = ["expected %", "test %", "interval", "float %", "equal", f"dynamic energy ({by.energy})", *timed]
@@ -146,9 +143,6 @@ def _tip(by: ChosenBy, point: Point) -> str:
     named = list(zip(_head(by), _row(by, point), strict=True))[2:]
     figures = ", ".join(f"{name} {cell}" for name, cell in named)
     return "\n".join([f"#{point.number} {point.label}: {figures}", *point.commands])
-
-
-# -- the picture -------------------------------------------------------------------------------------------------------
 
 
 @styled
@@ -211,9 +205,6 @@ def _scatter(drawing: Drawing, panel: Axes, chart: Chart, name: str) -> None:
     panel.xaxis.set_minor_formatter(NullFormatter())
     scale(panel.xaxis, unit)
     panel.grid(True)
-
-
-# -- files -------------------------------------------------------------------------------------------------------------
 
 
 def write_chart(folder: Path, chart: Chart) -> None:

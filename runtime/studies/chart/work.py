@@ -78,9 +78,6 @@ def measurement(
     )
 
 
-# -- commands ----------------------------------------------------------------------------------------------------------
-
-
 def _layout_options(layout: str) -> JsonObject:
     """Options of ``compile`` that ask for a layout, where it is not the usual one."""
     if layout == "cores":
@@ -100,9 +97,6 @@ def commands(work: Measurement, layout: str, window: int) -> tuple[str, str]:
     part = None if window == WHOLE else f"{window}%"
     read = repeat.words({"data": data.path, "bin": data.bin_s, "detail": "counts", "window": part})
     return repeat.command("compile", network.path, *stored, "-o", file), repeat.command("run", file, *read)
-
-
-# -- what is kept from one piece to the next ---------------------------------------------------------------------------
 
 
 def read_splits(path: str, bin_s: float, network: NetworkFile) -> dict[str, Recordings]:
@@ -143,9 +137,6 @@ def _decided(network: NetworkFile, data: Data, windows: tuple[int, ...]) -> dict
 def _part(network: NetworkFile, data: Recordings, window: int) -> Recordings:
     """As long a part of each recording as a window says, run as long as the network says."""
     return of_length(first_part(data, window), network.length)
-
-
-# -- the work ----------------------------------------------------------------------------------------------------------
 
 
 def measure(work: Measurement) -> JsonObject:

@@ -92,9 +92,6 @@ class Lean:
     output: str | None
 
 
-# -- for people --------------------------------------------------------------------------------------------------------
-
-
 def sections(result: Lean) -> list[Section]:
     """Use of layers and taxels, every row, and what is taken."""
     trained, tested = result.samples["training"], result.samples["test"]

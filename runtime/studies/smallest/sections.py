@@ -54,9 +54,6 @@ def page(result: Smallest) -> str:
     return html.page(f"The smallest network for {name}", "Point at a mark to read its figures.", sections(result))
 
 
-# -- the choice --------------------------------------------------------------------------------------------------------
-
-
 def _spent(each: Tried) -> str:
     """Joules by each table, of a baseline at least and at most."""
     if (plain := each.processor) is not None:
@@ -125,9 +122,6 @@ def _needless(result: Smallest) -> str:
     return f"without spikes: {words}, is not shown to be worse{rest}"
 
 
-# -- tables ------------------------------------------------------------------------------------------------------------
-
-
 def _table(result: Smallest, tried: Sequence[Tried], caption: str, most: int | None = None) -> Table:
     """Candidates by the first tables of energy and time; of baselines what a processor takes at least and at most."""
     by, rows = result.chosen_by, []
@@ -161,9 +155,6 @@ def _checked(result: Smallest) -> str:
             f"written: {checked.netlist}, sha256 {checked.netlist_sha256}",
         ]
     )
-
-
-# -- the figure --------------------------------------------------------------------------------------------------------
 
 
 @styled

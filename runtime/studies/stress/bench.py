@@ -45,9 +45,6 @@ def in_steps(events: Events, lengths: IntArray, netlist: Netlist) -> tuple[Event
     return fitted(joined, steps), np.full_like(lengths, steps)
 
 
-# -- inputs ------------------------------------------------------------------------------------------------------------
-
-
 def whole(events: Events, netlist: Netlist, lengths: IntArray) -> Inputs:
     """Recordings from their first bin on."""
 
@@ -110,9 +107,6 @@ _ALL = (*vars(disturbances).values(), warm_state, longer, *vars(damages).values(
 
 NAMES = {each.name: each for each in _ALL if isinstance(each, Perturbation)}
 """Every perturbation: of recordings, of the state that is left over, of the network."""
-
-
-# -- from files --------------------------------------------------------------------------------------------------------
 
 
 def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:

@@ -30,9 +30,6 @@ Mask = npt.NDArray[np.bool_]
 HIDDEN = "share of hidden neurons"
 
 
-# -- weights -----------------------------------------------------------------------------------------------------------
-
-
 def with_weights(pair: Pair, weight: npt.NDArray[Any]) -> Pair:
     """Store other mantissas (synapses,); float weights move by as many weight units.
 
@@ -85,9 +82,6 @@ def weight_bit_flips(pair: Pair, share: float, rng: np.random.Generator) -> Pair
     half = np.int64(1) << (bits - 1)
     flipped = (((code + 2 * half) ^ flips) & (2 * half - 1)) + half
     return with_weights(pair, ((flipped & (2 * half - 1)) - half) * weight_steps(bits))
-
-
-# -- neurons -----------------------------------------------------------------------------------------------------------
 
 
 def relays(pair: Pair) -> Mask:
@@ -206,9 +200,6 @@ def layers_late(pair: Pair, steps: int) -> Pair:
     """
     layers = tuple(replace(layer, depth=layer.depth + steps) if layer.depth else layer for layer in pair.netlist.layers)
     return Pair(netlist=replace(pair.netlist, layers=layers), network=pair.network)
-
-
-# -- storage and decay -------------------------------------------------------------------------------------------------
 
 
 def several_planes(pair: Pair) -> str | None:

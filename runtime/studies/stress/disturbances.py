@@ -21,9 +21,6 @@ MOST_STEPS = 100_000
 DENSITY = "share of entries with an event"
 
 
-# -- taxels ------------------------------------------------------------------------------------------------------------
-
-
 def chosen(events: Events, count: int, rng: np.random.Generator) -> IntArray:
     """Some taxels at random; (count,) int64."""
     picked: IntArray = rng.permutation(events.shape[1])[:count]
@@ -69,9 +66,6 @@ def held(events: Events, taxels: IntArray, value: int) -> Events:
     changed = events.copy()
     changed[:, taxels] = value
     return changed
-
-
-# -- events ------------------------------------------------------------------------------------------------------------
 
 
 @perturbation("probability", (0.1, 0.25, 0.5, 0.75, 0.9))

@@ -145,8 +145,6 @@ def _from(spikes: BoolArray, step: int) -> BoolArray:
     return moved
 
 
-# -- perturbations -----------------------------------------------------------------------------------------------------
-
 Level = int | float
 
 TAXELS = "taxels"

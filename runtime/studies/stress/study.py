@@ -79,9 +79,6 @@ def _measured(
     return runs
 
 
-# -- one point ---------------------------------------------------------------------------------------------------------
-
-
 def generator(name: str, seed: int) -> np.random.Generator:
     """Source of a perturbation's chance: the same for all levels, so that a harsher one contains a milder one."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])

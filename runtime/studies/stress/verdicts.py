@@ -29,9 +29,6 @@ TWICE = 2.0  # Factor by which a layer fires more or less often
 REASONS = 2  # So many are named at most
 
 
-# -- requirements ------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Requirement:
     """What the chip must reach: ``name:level>=share``."""
@@ -78,9 +75,6 @@ def unmet(requirements: Sequence[Requirement], curves: Mapping[str, Curve]) -> t
         for wanted, mean in zip(requirements, reached, strict=True)
         if mean < wanted.share
     )
-
-
-# -- curves ------------------------------------------------------------------------------------------------------------
 
 
 def spread(right: Sequence[int], recordings: int) -> Spread:
