@@ -45,16 +45,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.archive import (
-    AGAIN,
-    CLOCKS,
-    GRAPH,
-    Kind,
-    arrays_digest,
-    entry_faults,
-    read_npy,
-    stored_members,
-)
+from spikeloom.compiler.archive import AGAIN, CLOCKS, GRAPH, Kind, arrays_digest, entry_faults, read_npy, stored_members
 from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, constant_faults, layers_of
 from spikeloom.compiler.dynamics import MOST_STEPS, PLAIN, Clocks, Dynamics, dynamics_faults
 from spikeloom.compiler.errors import ModelError, OptionError

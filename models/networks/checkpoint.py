@@ -73,12 +73,7 @@ def save_checkpoint(
     if forms is not None:
         layers = ["conv1", *(f"fc{stage}" for stage in range(1, stages + 1))]
         manifest["forms"] = [
-            {
-                "layer": layer,
-                "bits": form.bits,
-                "exponents": list(form.exponents),
-                "threshold": form.threshold.tolist(),
-            }
+            {"layer": layer, "bits": form.bits, "exponents": list(form.exponents), "threshold": form.threshold.tolist()}
             for layer, form in zip(layers, forms, strict=True)
         ]
     manifest["sha256"] = content_digest(manifest, arrays)

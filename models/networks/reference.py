@@ -29,11 +29,7 @@ STEPS = 32
 
 
 def float_spikes(
-    checkpoint: Checkpoint,
-    adjacency: npt.NDArray[np.float64],
-    events: npt.NDArray[np.uint8],
-    *,
-    dtype: str = "float32",
+    checkpoint: Checkpoint, adjacency: npt.NDArray[np.float64], events: npt.NDArray[np.uint8], *, dtype: str = "float32"
 ) -> dict[str, npt.NDArray[np.bool_]]:
     """Spikes of every layer, (samples, steps, neurons) by name, on recordings (samples, taxels, channels, steps).
 
@@ -43,11 +39,7 @@ def float_spikes(
 
 
 def float_membranes(
-    checkpoint: Checkpoint,
-    adjacency: npt.NDArray[np.float64],
-    events: npt.NDArray[np.uint8],
-    *,
-    dtype: str = "float32",
+    checkpoint: Checkpoint, adjacency: npt.NDArray[np.float64], events: npt.NDArray[np.uint8], *, dtype: str = "float32"
 ) -> dict[str, npt.NDArray[np.floating]]:
     """Membranes of every layer before the comparison; as :func:`float_spikes`, (samples, steps, neurons) of `dtype`."""
     return _run(checkpoint, adjacency, events, np.dtype(dtype), membranes=True)

@@ -255,7 +255,5 @@ def first_part(recordings: Recordings, percent: int) -> Recordings:
     kept = steps_of(own, percent)
     longest = int(kept.max(initial=0))
     return replace(
-        recordings,
-        events=recordings.events[..., :longest],
-        lengths=None if recordings.lengths is None else kept,
+        recordings, events=recordings.events[..., :longest], lengths=None if recordings.lengths is None else kept
     )

@@ -63,12 +63,7 @@ def synthetic_split(split: str, *, limit: int | None = None, coordinates: ArrayL
 
 
 def synthetic_grasps(
-    *,
-    coordinates: ArrayLike = NEUTOUCH,
-    per_class: int,
-    steps: int,
-    seed: int,
-    classes: tuple[str, ...] = SHAPES,
+    *, coordinates: ArrayLike = NEUTOUCH, per_class: int, steps: int, seed: int, classes: tuple[str, ...] = SHAPES
 ) -> Recordings:
     """Draw grasps with random place, orientation, size, depth and speed.
 

@@ -177,10 +177,7 @@ class NativeNet(TrainedModule):
             reach = torch.clamp(torch.floor((flat - 1) / max(1, depth - 1)), max=LEAK_MOST)
             leak = torch.maximum(torch.minimum(torch.round(bias * flat), reach), -reach)
         return Rounded(
-            weight=_past(weight * threshold, level * UNIT),
-            leak=_past(bias * flat, leak),
-            threshold=flat,
-            floor=flat,
+            weight=_past(weight * threshold, level * UNIT), leak=_past(bias * flat, leak), threshold=flat, floor=flat
         )
 
     def forward(self, events: Tensor, lengths: Tensor | None = None) -> Tensor:

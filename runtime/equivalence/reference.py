@@ -20,14 +20,7 @@ from spikeloom.compiler import Netlist
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
-from spikeloom.compiler.interpret import (
-    Simulation,
-    channels_last,
-    cut,
-    float_simulation,
-    integer_simulation,
-    run_float,
-)
+from spikeloom.compiler.interpret import Simulation, channels_last, cut, float_simulation, integer_simulation, run_float
 from spikeloom.compiler.ir import IntegerNetwork, Network, Projection, Sparse
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.passes.range_proof import prove_ranges

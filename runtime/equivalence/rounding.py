@@ -259,11 +259,7 @@ def _check_layer(
         told = f"; {where}" if what == "weights" else ""
         faults.append(f"{wanted.name} has other {what} than the compiler chose, by the netlist's own record{told}")
     return LayerRounding(
-        weights=weights,
-        nearest=weights - wrong,
-        farthest_steps=farthest,
-        compensated=moved,
-        faults=tuple(faults),
+        weights=weights, nearest=weights - wrong, farthest_steps=farthest, compensated=moved, faults=tuple(faults)
     )
 
 

@@ -238,9 +238,5 @@ def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
     if is_recordings(path):
         raise ModelError(f"{path}: holds recordings; give the network here, and these as --calibrate or --data")
     return read_checkpoint(
-        shipped(path),
-        run=arguments.run,
-        weights=arguments.weights,
-        beta=arguments.beta,
-        theta=arguments.theta,
+        shipped(path), run=arguments.run, weights=arguments.weights, beta=arguments.beta, theta=arguments.theta
     )

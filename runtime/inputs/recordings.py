@@ -123,11 +123,7 @@ def require_bins(bins: int) -> None:
 
 
 def load_recordings(
-    arguments: argparse.Namespace,
-    netlist: Netlist,
-    *,
-    labels_for: str | None = None,
-    joined: bool = True,
+    arguments: argparse.Namespace, netlist: Netlist, *, labels_for: str | None = None, joined: bool = True
 ) -> Recordings:
     """Recordings that the options of a command name, held against a netlist; as `recordings` otherwise.
 

@@ -226,12 +226,7 @@ class Machine(ABC):
         )
 
     def run(
-        self,
-        events: EventArray,
-        *,
-        lengths: IntArray | None = None,
-        spikes: bool = False,
-        membranes: bool = False,
+        self, events: EventArray, *, lengths: IntArray | None = None, spikes: bool = False, membranes: bool = False
     ) -> Run:
         """Run recordings, each from rest.
 

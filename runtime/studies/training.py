@@ -24,11 +24,7 @@ from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.sections import Section, Table, Text
 from spikeloom.runtime.studies.jobs import ended_by_signal, only_one, side_by_side
 
-TITLES = {
-    "last": "last epoch",
-    "best": "best epoch on test",
-    "clean": "clean epoch, chosen on validation",
-}
+TITLES = {"last": "last epoch", "best": "best epoch on test", "clean": "clean epoch, chosen on validation"}
 """What the epochs of ``WEIGHTS`` are called where people read of them."""
 
 WIDTH = 118

@@ -39,10 +39,7 @@ _SOURCE = "Horowitz, ISSCC 2014, figure 1.1.9 (45 nm, 0.9 V)"
 HOROWITZ = {"float32_add": 0.9, "float32_multiply": 3.7, "int8_multiply": 0.2, "int32_add": 0.1}
 """Energy of one operation, pJ."""
 
-MULTIPLY_ACCUMULATE = {
-    "float32": ("float32_multiply", "float32_add"),
-    "int8": ("int8_multiply", "int32_add"),
-}
+MULTIPLY_ACCUMULATE = {"float32": ("float32_multiply", "float32_add"), "int8": ("int8_multiply", "int32_add")}
 """Parts of a multiply-accumulate; products of 8-bit numbers are summed in 32 bits. The last one is the accumulation
 alone, all that a spike needs."""
 
@@ -176,9 +173,7 @@ def _neurobench(
         connection_sparsity=round(float(np.float32(zeros) / np.float32(weights)), 4),
         activation_sparsity=float(np.mean(1 - fired / (neurons * last))),
         synaptic_operations=SynapticOperations(
-            effective_macs=macs / len(inputs),
-            effective_acs=acs / len(inputs),
-            dense=weights * float(last.mean()),
+            effective_macs=macs / len(inputs), effective_acs=acs / len(inputs), dense=weights * float(last.mean())
         ),
     )
 

@@ -51,9 +51,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     storage, layout, output = (group(sub, title) for title in ("storage", "layout", "output"))
     sub.add_argument("--target", default=DEFAULT_TARGET, help=f"chip: {DEFAULT_TARGET} (default), or truenorth")
     storage.add_argument(
-        "--weight-bits",
-        metavar="N[,N]",
-        help="storage width, one or one a layer: 2 to 6 or 8 (default: 8)",
+        "--weight-bits", metavar="N[,N]", help="storage width, one or one a layer: 2 to 6 or 8 (default: 8)"
     )
     storage.add_argument("--planes", metavar="N[,N]", help="times a synapse is stored, 1 to 3 (default: 1)")
     storage.add_argument("--scale-groups", metavar="N[,N]", help="scales in a layer, 1 to 8 (default: 1)")

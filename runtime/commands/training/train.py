@@ -16,15 +16,7 @@ from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part, p
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.models.systems import PADDINGS, sensor_grid, taxels_alone
 from spikeloom.models.training.kinds import Plan
-from spikeloom.models.training.recipes import (
-    DECAY_EPOCHS,
-    RECIPES,
-    RELEASED,
-    STEPS,
-    Recipe,
-    check_recipe,
-    decays_asked,
-)
+from spikeloom.models.training.recipes import DECAY_EPOCHS, RECIPES, RELEASED, STEPS, Recipe, check_recipe, decays_asked
 from spikeloom.runtime.commands.options import add_data, add_graph_options, add_picture, group
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import whole_numbers

@@ -139,7 +139,7 @@ def sections(facts: NetlistFacts) -> Iterator[Section]:
     left = "" if facts.compartments == facts.neurons else f" ({facts.compartments:,} on the chip)"
     lines = [
         f"{facts.target}: {facts.neurons:,} neurons{left}, {facts.synapses:,} synapses "
-        f"({facts.synapses_stored:,} stored, {facts.synapses_nonzero:,} non-zero), {facts.cores} cores on {where}",
+        f"({facts.synapses_stored:,} stored, {facts.synapses_nonzero:,} non-zero), {facts.cores} cores on {where}"
     ]
     if facts.clocks is not None and facts.clocks.channels:
         channels, steps = facts.clocks.channels, facts.clocks.steps

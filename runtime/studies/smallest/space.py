@@ -17,12 +17,7 @@ from spikeloom.runtime.report.encode import OPTIONAL
 JOINS = (1, 2, 5, 10, 25)
 PARTS = (1, 2, 3, 5, 10)
 WINDOWS = (100, 50)
-THRESHOLDS = (
-    (1,),
-    (1, 4, 16, 64),
-    (1, 3, 8, 20, 50),
-    (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 130),
-)
+THRESHOLDS = ((1,), (1, 4, 16, 64), (1, 3, 8, 20, 50), (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 130))
 """Of counting networks."""
 
 RAMPS = (16, 64)
@@ -38,11 +33,7 @@ MOST_COUNTERS = {100: 50, 50: 20}
 """Counters of a channel at most, by window: what is larger gains little and takes minutes."""
 
 
-NETWORKS = (
-    (TACTILESGNET, 10, 16, "64,64"),
-    (TACTILESGNET, 10, 32, "128,256"),
-    (MLP, 10, 16, "64,64"),
-)
+NETWORKS = ((TACTILESGNET, 10, 16, "64,64"), (TACTILESGNET, 10, 32, "128,256"), (MLP, 10, 16, "64,64"))
 """System, join, features and neurons of the dense layers of those that are trained by gradients."""
 
 EPOCHS = 15

@@ -122,10 +122,7 @@ def prepare(netlist: Netlist, target: Target, by: Literal["layer", "core", "whol
         "zeros": caused(netlist.synapse_weight == 0, *entries),
     }
     return Meter(
-        target=target,
-        names=tuple(amounts),
-        caused=np.concatenate(list(amounts.values()), axis=1),
-        neurons=neurons,
+        target=target, names=tuple(amounts), caused=np.concatenate(list(amounts.values()), axis=1), neurons=neurons
     )
 
 

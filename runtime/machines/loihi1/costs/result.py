@@ -259,10 +259,7 @@ def _times(table: str, model: str, times: StepTimes) -> Times:
         table=table,
         model=model,
         inference_s={"mean": float(seconds.mean()), "min": float(seconds.min()), "max": float(seconds.max())},
-        step_s={
-            "mean": float(times.duration_ns[ran].mean() * 1e-9),
-            "max": float(times.duration_ns.max() * 1e-9),
-        },
+        step_s={"mean": float(times.duration_ns[ran].mean() * 1e-9), "max": float(times.duration_ns.max() * 1e-9)},
         critical_core=tuple(
             CriticalCore(
                 core=int(core),
