@@ -32,6 +32,7 @@ from spikeloom.models.training.evaluate import evaluate
 from spikeloom.models.training.finetune import finetune, initial_forms
 from spikeloom.models.training.recipes import DECAY_EPOCHS, RELEASED, Recipe
 from spikeloom.models.training.record import training_record
+from spikeloom.models.training.robust import worn
 from spikeloom.models.training.train import Epoch, state_files, train, train_both, validation_split
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.loihi1 import engine
@@ -168,12 +169,16 @@ def same(a: object, b: object) -> bool:
     return all(np.array_equal(a[name], b[name]) for name in a) and set(a) == set(b)
 
 
-def test_a_killed_training_resumes_to_the_same_weights(tmp_path):
+@pytest.mark.parametrize("robust", [0.0, 0.2])
+def test_a_killed_training_resumes_to_the_same_weights(tmp_path, robust):
     training, test, state = grasps(0), grasps(1), tmp_path / "x.state"
-    whole = train(training, test, ADJACENCY, SMALL, epochs=4, seed=2, keep_epoch=2)
+    options = {"epochs": 4, "seed": 2, "keep_epoch": 2, "recipe": replace(RELEASED, robust=robust)}
+    whole = train(training, test, ADJACENCY, SMALL, **options)
     with pytest.raises(KilledError):
-        train(training, test, ADJACENCY, SMALL, epochs=4, seed=2, keep_epoch=2, state=state, after_epoch=killed)
-    resumed = train(training, test, ADJACENCY, SMALL, epochs=4, seed=2, keep_epoch=2, state=state, resume=True)
+        train(training, test, ADJACENCY, SMALL, **options, state=state, after_epoch=killed)
+    resumed = train(training, test, ADJACENCY, SMALL, **options, state=state, resume=True)
+    plain = train(training, test, ADJACENCY, SMALL, epochs=4, seed=2, keep_epoch=2)
+    assert same(plain.last, whole.last) == (robust == 0)
     assert same(resumed.last, whole.last)
     assert same(resumed.best, whole.best)
     assert same(resumed.kept, whole.kept)
@@ -310,6 +315,21 @@ def test_weights_that_would_overflow_are_shrunk(tmp_path):
         assert np.maximum(-integers.units, 0).sum(axis=0).max() <= ONE_STEP_SUM_MAX
 
 
+def test_what_is_lost_and_comes_has_its_chance():
+    rng = np.random.default_rng(0)
+    events = (rng.random((200, 20, 2, 50)) < rng.uniform(0.05, 0.4, (200, 1, 1, 1))).astype(np.uint8)
+    found = worn(events, 0.2, np.random.default_rng(1))
+    dead = ~found.any(axis=(2, 3))
+    assert dead.mean() == pytest.approx(0.2, abs=0.02)
+    was, now = (each[~dead] == 1 for each in (events, found))
+    rate = events.mean(axis=(1, 2, 3))
+    come = np.repeat(0.2 * rate[:, None], 20, axis=1)[~dead]
+    assert (was & ~now).sum() / was.sum() == pytest.approx(0.2 * (1 - come.mean()), abs=0.01)
+    assert (now & ~was).sum() == pytest.approx((come[:, None, None] * ~was).sum(), rel=0.03)
+    assert worn(events, 0.0, np.random.default_rng(1)) is events
+    assert events.dtype == found.dtype
+
+
 # --- fine-tuning
 def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
@@ -317,7 +337,11 @@ def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
     whole = finetune(checkpoint, adjacency, train, test, LOIHI, bits=[2], epochs=4, seed=3)
 
     state = tmp_path / "x.state"
+    for robust, same in ((0.0, True), (0.2, False)):
+        other = finetune(checkpoint, adjacency, train, test, LOIHI, bits=[2], epochs=4, seed=3, robust=robust)
+        assert (other.history == whole.history) is same
     options = {"bits": [2], "epochs": 4, "seed": 3, "state": state}
+    refused(OptionError, "--robust -0.1: ", finetune, checkpoint, adjacency, train, test, LOIHI, robust=-0.1, **options)
     refused(KilledError, "", finetune, checkpoint, adjacency, train, test, LOIHI, after_epoch=killed, **options)
     rest = finetune(checkpoint, adjacency, train, test, LOIHI, resume=True, **options)
     assert rest.history == whole.history

@@ -93,6 +93,7 @@ def test_seeds_side_by_side_equal_single_ones_and_finished_ones_are_left_alone(d
     ("words", "told"),
     [
         (["--seeds", "0"], "--seeds 0: at least 1 is needed"),
+        (["--robust", "1"], "--robust 1: allowed are numbers from 0 to below 1"),
         (["--seed", str(10**22)], f"--seed {10**22}: allowed are 0 to {2**63 - 1}"),
         (["--picture", "x.jpg"], "--picture x.jpg: allowed are .png, .svg, .pdf"),
         (["--picture", "none/x.png"], "--picture none/x.png: the folder does not exist"),

@@ -48,6 +48,7 @@ from spikeloom.models.networks.quantised import QuantisedNet
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.evaluate import evaluate, one_thread, rate_loss, require_finite
 from spikeloom.models.training.resume import restore, set_rate, write_state
+from spikeloom.models.training.robust import require_chance, worn
 
 BATCH = 4
 """Recordings per step of the optimizer: the weights are rounded anew for each."""
@@ -97,6 +98,7 @@ def finetune(
     groups: int = 8,
     epochs: int = 40,
     seed: int = 0,
+    robust: float = 0.0,
     state: Path | None = None,
     resume: bool = False,
     after_epoch: Callable[[TunedEpoch], None] | None = None,
@@ -104,8 +106,9 @@ def finetune(
     """Train a network on chip integers: storage of `bits`, one or one a layer, with at most so many `groups` of scales.
 
     Nothing is chosen on `test`, it is read before the first epoch and after the last. The `seed` is that of the order
-    of recordings. The file `state` holds the state after each epoch, which the caller removes when the result is safe;
-    `resume` goes on from it, to the same weights as without interruption.
+    of recordings, and of what of them is lost (`robust`, see :func:`robust.worn`). The file `state` holds the state
+    after each epoch, which the caller removes when the result is safe; `resume` goes on from it, to the same weights as
+    without interruption.
 
     OptionError, ModelError or DataError if options, network or recordings cannot be used, or the loss is no longer a
     number.
@@ -115,6 +118,7 @@ def finetune(
     for name, value, least in (("--epochs", epochs, 1), ("--seed", seed, 0)):
         if value < least:
             raise OptionError(f"{name} {value}: allowed are {least} or more; choose another")
+    require_chance(robust)
     network = expand(checkpoint, adjacency)
     calibration = calibrate(network, evenly_spaced(channels_last(training.events)))
     forms = initial_forms(network, calibration, widths, groups, target.choices["synapse.exponent"])
@@ -131,6 +135,7 @@ def finetune(
         "scale groups": groups,
         "epochs": epochs,
         "seed": seed,
+        "robust": robust,
     }
     order = np.random.default_rng(seed)
     history: list[TunedEpoch] = []
@@ -144,7 +149,7 @@ def finetune(
             model.round()
         with tqdm(total=epochs, initial=len(history), desc="finetune", unit="epoch", disable=None) as bar:
             for index in range(len(history), epochs):
-                history.append(_epoch(model, optimizer, training, order.permutation(len(training)), index, epochs))
+                history.append(_epoch(model, optimizer, training, order, robust, index, epochs))
                 if state is not None:
                     write_state(state, options, model, optimizer, order, history)
                 bar.set_postfix(loss=f"{history[-1].loss:.4f}", training=f"{history[-1].correct}/{len(training)}")
@@ -159,10 +164,12 @@ def _epoch(
     model: QuantisedNet,
     optimizer: torch.optim.Optimizer,
     training: Recordings,
-    order: NDArray[np.int64],
+    draw: np.random.Generator,
+    robust: float,
     index: int,
     epochs: int,
 ) -> TunedEpoch:
+    order = draw.permutation(len(training))
     steps = math.ceil(len(order) / BATCH)
     total, correct = 0.0, 0
     for step in range(steps):
@@ -171,7 +178,7 @@ def _epoch(
         optimizer.zero_grad()
         labels = training.labels[chosen]
         lengths = None if training.lengths is None else torch.tensor(training.lengths[chosen])
-        rates = model(time_first(training.events[chosen]), lengths)
+        rates = model(time_first(worn(training.events[chosen], robust, draw)), lengths)
         loss = rate_loss(rates, labels)
         loss.backward()  # type: ignore[no-untyped-call]
         require_finite(model, float(loss.detach()), index + 1, step + 1)

@@ -14,6 +14,7 @@ from spikeloom.compiler.fixedpoint import decay_registers, kept_shares
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 from spikeloom.models.systems import HOPS
+from spikeloom.models.training.robust import require_chance
 
 DECAY_EPOCHS = 40
 """There the learning rate falls to a tenth after so many epochs; the first of each such block still has the old one."""
@@ -60,15 +61,13 @@ class Recipe:
     # Added to the loss for each synapse that carries a spike in every step: this times the share of the synapses behind
     # neurons that do so, mean over steps and recordings
     penalty: float = 0.0
+    robust: float = 0.0  # Chance of an event and of a taxel to be lost, see :func:`robust.worn`
 
     def to_json(self) -> JsonObject:
-        """JSON values; without the number of epochs, which a training states by itself, usual sizes, and no penalty."""
+        """JSON values; without the number of epochs, which a training states by itself, and what is usual."""
         values = asdict(self) | {"betas": dict(self.betas), "alphas": dict(self.alphas)}
-        if self.hidden == HIDDEN:
-            del values["hidden"]
-        if not self.penalty:
-            del values["penalty"]
-        return {name: value for name, value in values.items() if name != "epochs"}
+        usual = {"epochs": self.epochs, "hidden": HIDDEN, "penalty": 0, "robust": 0}
+        return {name: value for name, value in values.items() if name not in usual or value != usual[name]}
 
     @property
     def layers(self) -> tuple[str, ...]:
@@ -161,6 +160,7 @@ def check_recipe(recipe: Recipe) -> None:
             raise OptionError(f"--{option} {value}: allowed are 1 to {MOST_SIZE}; choose another")
     if not 0 <= recipe.hops <= MOST_HOPS:
         raise OptionError(f"--hops {recipe.hops}: allowed are 0 to {MOST_HOPS}; choose another")
+    require_chance(recipe.robust)
     if not 0 <= recipe.penalty < math.inf:
         raise OptionError(f"--spike-penalty {recipe.penalty:g}: allowed are numbers from 0 up; choose another")
     if not 0 <= recipe.clocks <= MOST_CLOCKS:

@@ -38,6 +38,7 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.evaluate import evaluate, loss_of, one_thread, require_finite
 from spikeloom.models.training.recipes import ADAMW, COSINE, RELEASED, Recipe
 from spikeloom.models.training.resume import restore, set_rate, write_state
+from spikeloom.models.training.robust import worn
 
 MOST_SEED = 2**63 - 1
 """What a torch generator takes."""
@@ -135,8 +136,7 @@ def train(
                 if course is not None:
                     set_rate(optimizer, course(0.0))
                 rate = float(optimizer.param_groups[0]["lr"])
-                shuffled = order.permutation(len(training))
-                training_loss = _train_epoch(network, optimizer, training, shuffled, recipe, course, epoch=index + 1)
+                training_loss = _train_epoch(network, optimizer, training, order, recipe, course, epoch=index + 1)
                 if course is None and index % recipe.decay_epochs == 0 and index > 1:
                     set_rate(optimizer, rate * 0.1)
                 test_loss, correct = evaluate(network, test, recipe)
@@ -191,20 +191,20 @@ def _train_epoch(
     network: TrainedModule,
     optimizer: torch.optim.Optimizer,
     recordings: Recordings,
-    order: NDArray[np.int64],
+    draw: np.random.Generator,
     recipe: Recipe,
     course: Callable[[float], float] | None,
     *,
     epoch: int,
 ) -> float:
-    total = 0.0
+    total, order = 0.0, draw.permutation(len(recordings))
     for step, start in enumerate(range(0, len(order), recipe.batch), 1):
         chosen = order[start : start + recipe.batch]
         if course is not None:
             set_rate(optimizer, course(start / len(order)))
         optimizer.zero_grad()
         lengths = np.array([recordings.steps_of(int(index)) for index in chosen])
-        events = recordings.events[chosen][..., : lengths.max()]
+        events = worn(recordings.events[chosen][..., : lengths.max()], recipe.robust, draw)
         filled = lengths if lengths.min() < lengths.max() else None
         inside = None if filled is None else torch.tensor(filled)
         shown = time_first(events)

@@ -41,7 +41,6 @@ class Forgetting(NamedTuple):
     """What is open in a recording where nothing was known before a step."""
 
     lag: int  # Steps from an event to the first vote that it can alter
-    fired: IntArray  # (steps, classes) int64; votes of the known run, by chip step
     # quiet, back: (steps + 1,) int64; by that step, the first from which on every spike is known, and every register
     quiet: IntArray
     back: IntArray

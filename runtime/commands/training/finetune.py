@@ -28,7 +28,7 @@ from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 from spikeloom.runtime.studies.jobs import only_one
 
-REPEATED = ("weight_bits", "scale_groups", "epochs", "seed")
+REPEATED = ("weight_bits", "scale_groups", "robust", "epochs", "seed")
 """Options of its own that decide the result."""
 
 
@@ -88,6 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scale-groups", type=int, default=8, metavar="N", help="scales in a layer (default: 8)")
     parser.add_argument("--epochs", type=int, default=40, metavar="N", help="default: 40")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the order of recordings (default: 0)")
+    parser.add_argument("--robust", type=float, metavar="X", help="chance of an event, and of a taxel, to be lost: 0.1")
     parser.add_argument("--resume", action="store_true", help="go on with an interrupted one of the same options")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
 
@@ -162,6 +163,7 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
             groups=arguments.scale_groups,
             epochs=arguments.epochs,
             seed=arguments.seed,
+            robust=arguments.robust or 0.0,
             state=state,
             resume=arguments.resume,
         )

@@ -91,6 +91,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--spike-penalty", type=float, metavar="X", help="loss of a spike on every synapse in every step: fewer spikes"
     )
+    parser.add_argument(
+        "--robust", type=float, metavar="X", help="chance of an event, and of a taxel, to be lost while training: 0.1"
+    )
     parser.add_argument("--epochs", type=int, metavar="N", help=f"default: {defaults}")
     parser.add_argument(
         "--decay-epochs",
@@ -131,7 +134,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
 
 SIZES = ("clocks", "features", "hops", "hidden")
-OVERRIDES = ("current_decay", "membrane_decay", *SIZES, "batch", "decay_epochs", "spike_penalty")
+OVERRIDES = ("current_decay", "membrane_decay", *SIZES, "batch", "decay_epochs", "spike_penalty", "robust")
 """Options that change single values of a recipe."""
 
 COUNTERS_ONLY = ("thresholds", "parts", "ramp", "levels", "weight_bits")
@@ -226,7 +229,7 @@ def plan_jobs(arguments: argparse.Namespace, training: Recordings, test: Recordi
 def _recipe(arguments: argparse.Namespace) -> Recipe:
     """The recipe that was named, with the values that were given beside it."""
     recipe = _named_recipe(arguments)
-    whole = repeat.given(arguments, ("clocks", "features", "hops", "batch", "decay_epochs"))
+    whole = repeat.given(arguments, ("clocks", "features", "hops", "batch", "decay_epochs", "robust"))
     whole["penalty"] = arguments.spike_penalty
     if arguments.hidden is not None:
         whole["hidden"] = tuple(whole_numbers(arguments.hidden, "--hidden"))

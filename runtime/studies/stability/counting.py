@@ -116,11 +116,12 @@ class _Option:
 
 def least(
     tally: Tally, recording: BoolArray, votes: IntArray, cells: Cells, most: int
-) -> tuple[int, IntArray | None, IntArray] | None:
+) -> tuple[int, IntArray | None] | None:
     """How many events, up to `most`, do not alter the decision of a recording, whichever they are.
 
     The recording is (channels, steps), its votes (classes,). Also entries whose flips alter it, the fewest if there are
-    one more of them, and decisions with each entry flipped alone. None where the chip does not follow the counts alone.
+    one more of them. None where the chip does not follow the counts alone; where it does, entries of one group that
+    hold events, and those that hold none, do the same.
     """
     recording = recording[: tally.channels]  # without clocks
     membranes, crossing = tally.crossings(recording)
@@ -135,23 +136,7 @@ def least(
         found = _against(tally, options, sums, decision, other, last, best - 1)
         if found is not None:
             best, taken = found
-    return min(best, early) - 1, taken, _alone(tally, recording, sums, cells)
-
-
-def _alone(tally: Tally, recording: BoolArray, sums: IntArray, cells: Cells) -> IntArray:
-    """Decisions with each entry flipped alone, (entries,), where no sum crosses before the last event."""
-    events, group = tally.events(recording)[-1], tally.groups(*cells.cells.T)
-    found = np.zeros(len(group), np.int64)
-    ramp = tally.slope * np.arange(1, tally.steps + 1)[:, None]
-    for there in (False, True):
-        for each in np.unique(group[cells.there == there]).tolist():
-            own = np.flatnonzero(tally.group == each)
-            count = events[each : each + 1].sum()
-            gain = tally.of(own, count + np.array([1 - 2 * there, 0])[:, None])
-            above = sums + gain[0] - gain[1] + ramp > tally.threshold
-            votes = np.where(above.any(axis=0), tally.steps - above.argmax(axis=0), 0)
-            found[(group == each) & (cells.there == there)] = votes.argmax()
-    return found
+    return min(best, early) - 1, taken
 
 
 def _options(tally: Tally, recording: BoolArray, cells: Cells, most: int) -> list[list[_Option]]:

@@ -47,10 +47,6 @@ class Cells:
     there: npt.NDArray[np.bool_]  # (entries,) bool; whether there is an event
     cost: IntArray  # (entries,) int64; events of the recording that must come or go
 
-    def some(self, those: npt.NDArray[np.generic]) -> Cells:
-        """Some of them."""
-        return Cells(cells=self.cells[those], there=self.there[those], cost=self.cost[those])
-
 
 def channels_of(events: Events, netlist: Netlist) -> Events:
     """Input channels (samples, channels, steps) of changed recordings (samples, taxels, polarities, bins)."""

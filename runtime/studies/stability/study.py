@@ -76,12 +76,12 @@ def verdict(
     decision, gaps = needed(votes)
     cells = cells_of(events, netlist)
     counted = None if tally is None else least(tally, channels != 0, votes, cells, most)
-    effects = None
-    if counted is None:
-        effects = machine.effects(channels, single(cells.cells))
-        decided = (effects.votes + votes).argmax(axis=1)
-    else:
-        decided = counted[2]
+    alike = np.arange(len(cells.cells))
+    if tally is not None and counted is not None:
+        alike = 2 * tally.groups(*cells.cells.T) + cells.there
+    _, one, those = np.unique(alike, return_index=True, return_inverse=True)
+    effects = machine.effects(channels, single(cells.cells[one]))
+    decided = (effects.votes + votes).argmax(axis=1)[those]
     altering = (decided != decision) & (cells.cost == 1)
     kinds, taxels = _failures(machine, events, decision, shift)
     for kind, there in (("removed", True), ("added", False)):
@@ -95,9 +95,9 @@ def verdict(
     taken = np.flatnonzero(altering)[:1]
     at_least = 1 - len(taken)
     if not len(taken) and counted is not None:
-        at_least, found = counted[:2]
+        at_least, found = counted
         taken = taken if found is None else found
-    elif not len(taken) and effects is not None and (known := machine.forgetting(channels)) is not None:
+    elif not len(taken) and (known := machine.forgetting(channels)) is not None:
         at_least = max(1, lower_bound(votes, cells, effects, known, most))
         taken = attack(machine, channels, votes, cells, effects)
     if len(taken) and not _alters(machine, channels, votes, cells.cells[taken]):

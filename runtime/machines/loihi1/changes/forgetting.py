@@ -21,12 +21,9 @@ from spikeloom.runtime.machines.loihi1.kernel import kept
 def forgetting(chip: Chip, known: Known, classes: int) -> Forgetting:
     """Bound the runs that are unknown before each step."""
     steps, places = known.fired.shape
-    fired = np.zeros((classes, steps), np.int64)
-    voters = np.flatnonzero(chip.label >= 0)
-    np.add.at(fired, chip.label[voters], known.fired[:, voters].T)
     ends, moved = np.full((2, steps + 1), steps), np.zeros((2, steps + 1, steps, classes), np.int16)
     _forget(chip, known, *np.zeros((6, places), np.int32), np.zeros(places + 1, np.int64), *ends, *moved)
-    return Forgetting(_lag(chip, known), fired.T, *ends, *moved)
+    return Forgetting(_lag(chip, known), *ends, *moved)
 
 
 def _lag(chip: Chip, known: Known) -> int:

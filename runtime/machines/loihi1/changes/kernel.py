@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
-from spikeloom.compiler.layer_kernel import Synapses, by_source, clear, compiled, compiled_and_cached
+from spikeloom.compiler.layer_kernel import Synapses, by_source, clear, compiled, compiled_and_cached, copy, list_fired
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, reach
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.changes import Changes, Effects
@@ -129,7 +129,7 @@ def _run_of(chip: Chip, known: Known) -> _Run:
     places, blocks = len(chip.bias), len(chip.depth)
     delta, current, membrane = np.zeros((3, places), np.int32)
     held, looked = np.zeros((2, blocks), np.uint8)
-    moved, sign = np.zeros((2, places + len(known.events) + 1), np.int64)
+    moved, sign = np.ones((2, places + len(known.events) + 1), np.int64)
     return _Run(delta, current, membrane, np.zeros(places, np.uint8), held, looked, moved, sign)
 
 
@@ -175,12 +175,6 @@ def _differ(ours: Any, theirs: Any, first: Any, places: Any) -> Any:
 
 
 @compiled
-def _fill(to: Any, values: Any, first: Any, places: Any) -> None:
-    for i in range(first, first + places):
-        to[i] = values[i]
-
-
-@compiled
 def _add(total: Any, weight: Any, sign: Any, first: Any, begin: Any, length: Any) -> None:
     for i in range(length):
         total[first + i] += sign * weight[begin + i]
@@ -210,29 +204,22 @@ def _step(chip: Chip, run: Any, sums: Any, first: Any, places: Any) -> None:
 @compiled_and_cached
 def _record(chip: Chip, known: Known, run: Any) -> None:
     channels, length = known.events.shape
-    whole = np.uint64(len(chip.bias))
     for t in range(len(known.sums)):
-        n = 0
-        for channel in range(channels):
-            if t < length and known.events[channel, t]:
-                run.moved[n], run.sign[n] = channel, 1
-                n += 1
-        for c in range(len(chip.bias)):
-            if t and known.fired[t - 1, c]:
-                run.moved[n], run.sign[n] = channels + c, 1
-                n += 1
-        _arrive(chip, run, n)
-        _fill(known.sums[t], run.delta, np.uint64(0), whole)
+        events = list_fired(known.events[:, t], run.moved) if t < length else 0
+        fired = list_fired(known.fired[t - 1], run.moved[events:]) if t else 0
+        run.moved[events : events + fired] += channels
+        _arrive(chip, run, events + fired)
+        copy(run.delta, known.sums[t])
         clear(run.delta)
         for block in range(len(chip.depth)):
             first, places = np.uint64(block * LANES), np.uint64(LANES)
             if chip.depth[block] <= t < chip.depth[block] + length:
                 _step(chip, run, known.sums[t], first, places)
                 _compare(run.other, run.membrane, chip.threshold, known.fired[t], first, places)
-                _fill(known.fired[t], run.other, first, places)
+                copy(run.other[first : first + places], known.fired[t, first : first + places])
                 _reset(run.membrane, chip.threshold, first, places)
-                _fill(known.current[t + 1], run.current, first, places)
-                _fill(known.membrane[t + 1], run.membrane, first, places)
+        copy(run.current, known.current[t + 1])
+        copy(run.membrane, known.membrane[t + 1])
 
 
 @compiled
@@ -251,11 +238,12 @@ def _list_moved(chip: Chip, run: Any, moved: Any, fired: Any, part: Any, channel
 @compiled
 def _span(chip: Chip, known: Known, run: Any, t: Any, begin: Any) -> Any:
     """End of the neighbouring blocks from `begin` on that are looked at together; their registers are held."""
-    block, places = begin, np.uint64(LANES)
+    block = begin
     while block < len(chip.depth) and run.looked[block] and chip.depth[block] == chip.depth[begin]:
         if not run.held[block]:
-            _fill(run.current, known.current[t], np.uint64(block * LANES), places)
-            _fill(run.membrane, known.membrane[t], np.uint64(block * LANES), places)
+            first = block * LANES
+            copy(known.current[t, first : first + LANES], run.current[first : first + LANES])
+            copy(known.membrane[t, first : first + LANES], run.membrane[first : first + LANES])
         block += 1
     return block
 
@@ -306,7 +294,7 @@ def _run(
                 run.sign[moved] = 1 - 2 * np.int64(known.events[channel[flip], t])
                 moved += 1
                 flip += 1
-            _fill(run.looked, run.held, np.uint64(0), np.uint64(blocks))
+            copy(run.held, run.looked)
             _arrive(chip, run, moved)
             moved, any_held, block = 0, False, 0
             while block < blocks:

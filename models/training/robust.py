@@ -1,0 +1,28 @@
+"""Recordings as a worn sensor might send them: what training for stable decisions sees instead of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.errors import OptionError
+
+
+def require_chance(chance: float) -> None:
+    """Refuse what is no chance, with OptionError."""
+    if not 0 <= chance < 1:
+        raise OptionError(f"--robust {chance:g}: allowed are numbers from 0 to below 1; choose another")
+
+
+def worn(events: npt.NDArray[np.uint8], chance: float, draw: np.random.Generator) -> npt.NDArray[np.uint8]:
+    """Recordings (samples, taxels, polarities, steps) of which each event is lost, and each taxel, with a `chance`.
+
+    As many events as are lost in the mean come anywhere else. Without a chance nothing is drawn.
+    """
+    if not chance:
+        return events
+    lost = draw.random(events.shape) < chance
+    come = draw.random(events.shape) < chance * events.mean(axis=(1, 2, 3), keepdims=True)
+    alive = draw.random(events.shape[:2]) >= chance
+    found: npt.NDArray[np.uint8] = ((events & ~lost) | come) & alive[:, :, None, None]
+    return found
