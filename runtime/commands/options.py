@@ -83,12 +83,8 @@ def add_recordings(parser: argparse.ArgumentParser, *, window: bool = False, req
     options.add_argument("--split", default="test", help="split to read (default: test)")
     options.add_argument("--limit", type=int, metavar="N", help="first N recordings only")
     if window:
-        options.add_argument(
-            "--window",
-            default="100%",
-            metavar="PERCENT",
-            help="first part of every recording, as in 50%% (default: 100%%)",
-        )
+        what = "first part of every recording, as in 50%% (default: 100%%)"
+        options.add_argument("--window", default="100%", metavar="PERCENT", help=what)
 
 
 def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], default: str) -> None:
@@ -126,11 +122,8 @@ def add_model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
     if graph:
         add_graph_options(parser, "that it was trained on")
     options.add_argument("--run", type=int, default=0, metavar="N", help="which run of a released file (default: 0)")
-    options.add_argument(
-        "--weights",
-        choices=WEIGHTS,
-        help="epoch, where a checkpoint holds several (default: the first of these that it holds)",
-    )
+    what = "epoch, where a checkpoint holds several (default: the first of these that it holds)"
+    options.add_argument("--weights", choices=WEIGHTS, help=what)
     options.add_argument("--beta", type=float, help="membrane decay, where the file does not say (default: 0.2)")
     options.add_argument("--theta", type=float, help="threshold, where the file does not say (default: 0.5)")
 
@@ -142,18 +135,12 @@ def add_network(parser: argparse.ArgumentParser) -> None:
     options.add_argument("--polarities", type=int, metavar="N", help="of an ONNX or NIR input, where its shape is flat")
     order = options.add_mutually_exclusive_group()
     for name, first in (("first", True), ("last", False)):
+        what = f"they are the {name} axis, where the shape of an ONNX or NIR input does not say"
         order.add_argument(
-            f"--polarities-{name}",
-            dest="polarities_first",
-            action="store_const",
-            const=first,
-            help=f"they are the {name} axis, where the shape of an ONNX or NIR input does not say",
+            f"--polarities-{name}", dest="polarities_first", action="store_const", const=first, help=what
         )
     options.add_argument(
         "--dt", type=float, metavar="SECONDS", help="time step that a NIR file is read in (default: its own)"
     )
-    options.add_argument(
-        "--convention",
-        choices=CONVENTIONS,
-        help=f"a step keeps 1 - dt/tau (euler) or exp(-dt/tau) (exponential) of a state (default: {CONVENTIONS[0]})",
-    )
+    what = f"a step keeps 1 - dt/tau (euler) or exp(-dt/tau) (exponential) of a state (default: {CONVENTIONS[0]})"
+    options.add_argument("--convention", choices=CONVENTIONS, help=what)

@@ -28,13 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_recordings(parser)
     parser.add_argument("--only", metavar="NAME[,…]", help="some perturbations (default: all)")
     parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help=f"draws of each (default: {SEEDS})")
-    parser.add_argument(
-        "--require",
-        action="append",
-        default=[],
-        metavar="NAME:LEVEL>=SHARE",
-        help="accuracy that the chip must keep, as in taxels_dead:3>=0.85; else exit code 1; may be repeated",
-    )
+    what = "accuracy that the chip must keep, as in taxels_dead:3>=0.85; else exit code 1; may be repeated"
+    parser.add_argument("--require", action="append", default=[], metavar="NAME:LEVEL>=SHARE", help=what)
     parser.add_argument("--jobs", type=int, metavar="N", help="measurements at a time (default: one a core)")
     add_picture(parser, "the curves")
     parser.add_argument("-o", "--output", metavar="OUT.json", help="write what --json prints; report --stress shows it")

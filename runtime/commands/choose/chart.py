@@ -30,18 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("checkpoints", nargs="+", metavar="CKPT", help="trained networks of one data set")
     add_model(parser)
     add_data(parser)
-    parser.add_argument(
-        "--grid",
-        metavar="AXIS=V,V,…",
-        help="configurations, as in bits=2-6,8,planes=1-2,window=25-100%% (default: bits=2-6,8,window=25-100%%)",
-    )
-    parser.add_argument(
-        "--budget",
-        action="append",
-        default=[],
-        metavar="WHAT=LIMIT",
-        help="of the point to deploy: energy=0.1mJ, latency=5ms or accuracy=88; may be repeated, all of them hold",
-    )
+    what = "configurations, as in bits=2-6,8,planes=1-2,window=25-100%% (default: bits=2-6,8,window=25-100%%)"
+    parser.add_argument("--grid", metavar="AXIS=V,V,…", help=what)
+    what = "of the point to deploy: energy=0.1mJ, latency=5ms or accuracy=88; may be repeated, all of them hold"
+    parser.add_argument("--budget", action="append", default=[], metavar="WHAT=LIMIT", help=what)
     parser.add_argument("--table", metavar="NAME", help="energy table to choose and draw by (default: the first)")
     sweeps = parser.add_argument_group("sweep")
     sweeps.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")

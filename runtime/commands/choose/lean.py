@@ -34,13 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("checkpoint", metavar=NETWORK_FILES, help="trained network")
     add_network(parser)
     add_recordings(parser)
-    parser.add_argument(
-        "--differ",
-        type=float,
-        default=DIFFER,
-        metavar="X",
-        help=f"share of training decisions that the netlist may change (default: {DIFFER:g})",
-    )
+    what = f"share of training decisions that the netlist may change (default: {DIFFER:g})"
+    parser.add_argument("--differ", type=float, default=DIFFER, metavar="X", help=what)
     parser.add_argument("-o", "--output", metavar="OUT.loom", help="write the netlist without what may go")
     parser.add_argument("--network", metavar="OUT.pt", help="write the float network without dense neurons that may go")
     parser.add_argument("--report", metavar="OUT.json", help="write the result")

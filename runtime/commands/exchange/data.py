@@ -104,21 +104,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _source(sub)
     sub.add_argument("--split", default="test", help="split of recordings that have none (default: test)")
     sub.add_argument("--join", type=int, default=1, metavar="N", help="make one bin of N, an event where one has any")
-    sub.add_argument(
-        "-o",
-        "--output",
-        required=True,
-        metavar="OUT",
-        help="new folder, or a zip; or a .csv of event lines, of one recording",
-    )
+    what = "new folder, or a zip; or a .csv of event lines, of one recording"
+    sub.add_argument("-o", "--output", required=True, metavar="OUT", help=what)
 
 
 def _source(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "source",
-        metavar="SRC",
-        help=f"folder, zip, .csv, .npz or .npy with recordings, '{SYNTHETIC}', or {' or '.join(map(repr, DATA_SETS))}",
-    )
+    what = f"folder, zip, .csv, .npz or .npy with recordings, '{SYNTHETIC}', or {' or '.join(map(repr, DATA_SETS))}"
+    parser.add_argument("source", metavar="SRC", help=what)
     add_bin_option(parser)
     parser.add_argument("--taxels", metavar="N|COORDS.csv", help="how many there are, or where: x,y[,z] in mm")
 

@@ -27,20 +27,13 @@ OF_RECORDINGS = ("split", "bin", "recording", "limit")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
     parser.add_argument("source", metavar="NET.loom", help="a netlist")
-    parser.add_argument(
-        "--to",
-        required=True,
-        choices=tuple(FORMATS),
-        help="; ".join(f"{name}: {each.title}" for name, each in FORMATS.items()),
-    )
+    what = "; ".join(f"{name}: {each.title}" for name, each in FORMATS.items())
+    parser.add_argument("--to", required=True, choices=tuple(FORMATS), help=what)
     parser.add_argument(
         "--form", choices=FORMS, help="onnx: one step with its state, or whole recordings (default: scan)"
     )
-    parser.add_argument(
-        "--data",
-        metavar="PATH",
-        help=f"ranc: a recording to add; netx: those on which spikes that move are counted; {DATA_HELP}",
-    )
+    what = f"ranc: a recording to add; netx: those on which spikes that move are counted; {DATA_HELP}"
+    parser.add_argument("--data", metavar="PATH", help=what)
     parser.add_argument("--split", help="ranc, netx: split to read (default: test)")
     parser.add_argument("--recording", type=int, metavar="N", help="ranc: which of them (default: 0)")
     parser.add_argument("--limit", type=int, metavar="N", help="netx: first N of them only")

@@ -254,26 +254,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--bins", type=int, metavar="N", help="steps of every grasp: shorter ones are filled up, longer ones cut"
     )
-    parser.add_argument(
-        "--origin",
-        choices=("zero", "first"),
-        default="zero",
-        help="where the first bin of a grasp begins: at time 0 or at the first event (default: zero)",
-    )
-    parser.add_argument(
-        "--speed",
-        choices=("real", "full"),
-        default="full",
-        help="keep to the wall clock, or go on as soon as events allow it (default: full)",
-    )
-    parser.add_argument(
-        "--until-sure",
-        nargs="?",
-        type=float,
-        const=math.inf,
-        metavar="A",
-        help="end a grasp of --bins once nothing can change the vote, or it leads by A*sqrt(bins left) (see anytime)",
-    )
+    what = "where the first bin of a grasp begins: at time 0 or at the first event (default: zero)"
+    parser.add_argument("--origin", choices=("zero", "first"), default="zero", help=what)
+    what = "keep to the wall clock, or go on as soon as events allow it (default: full)"
+    parser.add_argument("--speed", choices=("real", "full"), default="full", help=what)
+    what = "end a grasp of --bins once nothing can change the vote, or it leads by A*sqrt(bins left) (see anytime)"
+    parser.add_argument("--until-sure", nargs="?", type=float, const=math.inf, metavar="A", help=what)
     parser.epilog = NOTES
 
 

@@ -55,41 +55,23 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     )
     storage.add_argument("--planes", metavar="N[,N]", help="times a synapse is stored, 1 to 3 (default: 1)")
     storage.add_argument("--scale-groups", metavar="N[,N]", help="scales in a layer, 1 to 8 (default: 1)")
-    storage.add_argument(
-        "--spike-exact",
-        action="store_true",
-        help="add planes and scales until the training spikes are the float model's",
-    )
+    what = "add planes and scales until the training spikes are the float model's"
+    storage.add_argument("--spike-exact", action="store_true", help=what)
     storage.add_argument("--keep-all", action="store_true", help="keep neurons that never fire or reach no neuron")
     storage.add_argument(
         "--prune-unused", action="store_true", help="leave out neurons that never fired on the training split, too"
     )
     storage.add_argument("--calibrate", metavar="PATH", help="recordings whose train split chooses storage and scales")
-    storage.add_argument(
-        "--keep",
-        type=float,
-        metavar="X",
-        help=f"share of equal decisions on held-out training recordings that storage has to keep (default: {KEEP:g})",
-    )
+    what = f"share of equal decisions on held-out training recordings that storage has to keep (default: {KEEP:g})"
+    storage.add_argument("--keep", type=float, metavar="X", help=what)
     add_bin_option(sub)
-    storage.add_argument(
-        "--in-time",
-        type=int,
-        metavar="N",
-        help="truenorth: lower a history-free network, N axons an input (2 to 4), whose sums travel in 20 ticks a step",
-    )
-    layout.add_argument(
-        "--cores-for",
-        metavar="LAYER=N[,…]",
-        help="at least N cores for a layer, which it shares with none, as in conv1=4,fc1=6",
-    )
+    what = "truenorth: lower a history-free network, N axons an input (2 to 4), whose sums travel in 20 ticks a step"
+    storage.add_argument("--in-time", type=int, metavar="N", help=what)
+    what = "at least N cores for a layer, which it shares with none, as in conv1=4,fc1=6"
+    layout.add_argument("--cores-for", metavar="LAYER=N[,…]", help=what)
     layout.add_argument("--chips", type=int, default=1, metavar="N", help="use up to N chips (default: 1)")
-    layout.add_argument(
-        "--optimize",
-        default="cores",
-        metavar="GOAL",
-        help=f"choose the layout for {' or '.join(GOALS)}, which needs --calibrate (default: cores)",
-    )
+    what = f"choose the layout for {' or '.join(GOALS)}, which needs --calibrate (default: cores)"
+    layout.add_argument("--optimize", default="cores", metavar="GOAL", help=what)
     output.add_argument(
         "--dump-after", action="append", default=[], metavar="PASS", help="print the network after a pass, on stderr"
     )

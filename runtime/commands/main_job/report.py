@@ -35,11 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
     add_netlist_and_model(parser)
     add_recordings(parser)
-    parser.add_argument(
-        "--recording",
-        metavar="NAME|N",
-        help="recording to draw, by name or from 0 (default: the first decided differently)",
-    )
+    what = "recording to draw, by name or from 0 (default: the first decided differently)"
+    parser.add_argument("--recording", metavar="NAME|N", help=what)
     parser.add_argument("--stress", metavar="STRESS.json", help="show what stress -o wrote about this netlist")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.html")
     add_check(parser)

@@ -35,23 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"
     )
-    parser.add_argument(
-        "--engine",
-        choices=ENGINES,
-        default=ENGINES[0],
-        help=f"onnx: onnxruntime runs the integer graph beside our engine (default: {ENGINES[0]})",
-    )
-    parser.add_argument(
-        "--min-agreement",
-        type=float,
-        metavar="X",
-        help=f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})",
-    )
-    parser.add_argument(
-        "--require",
-        metavar="E0,E2=X,E3=X",
-        help="levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
-    )
+    what = f"onnx: onnxruntime runs the integer graph beside our engine (default: {ENGINES[0]})"
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0], help=what)
+    what = f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})"
+    parser.add_argument("--min-agreement", type=float, metavar="X", help=what)
+    what = "levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions"
+    parser.add_argument("--require", metavar="E0,E2=X,E3=X", help=what)
     add_check(parser)
     parser.epilog = NOTES
 

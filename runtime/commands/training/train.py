@@ -43,24 +43,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--join", type=int, default=1, metavar="N", help="a step joins N bins, an event where one has any (default: 1)"
     )
     needing = ", ".join((*GRAPH_SYSTEMS, NATIVE))
-    group(parser, "network").add_argument(
-        "--system",
-        choices=(*SYSTEMS, NATIVE, COUNTING),
-        help=f"{', '.join((*SYSTEMS, NATIVE, COUNTING))} (default: {TACTILESGNET}; {needing} need a graph)",
-    )
-    parser.add_argument(
-        "--padding",
-        choices=PADDINGS,
-        help="of a grid-cnn's window: none, moving by 2 (default), or same, of which no core holds all neurons",
-    )
+    what = f"{', '.join((*SYSTEMS, NATIVE, COUNTING))} (default: {TACTILESGNET}; {needing} need a graph)"
+    group(parser, "network").add_argument("--system", choices=(*SYSTEMS, NATIVE, COUNTING), help=what)
+    what = "of a grid-cnn's window: none, moving by 2 (default), or same, of which no core holds all neurons"
+    parser.add_argument("--padding", choices=PADDINGS, help=what)
     add_graph_options(parser, "to train on")
     defaults = ", ".join(f"{recipe.epochs} ({name})" for name, recipe in RECIPES.items())
-    parser.add_argument(
-        "--recipe",
-        choices=tuple(RECIPES),
-        default=RELEASED.name,
-        help="how: as the released code does, or with lasting currents and clocks (default: released)",
-    )
+    what = "how: as the released code does, or with lasting currents and clocks (default: released)"
+    parser.add_argument("--recipe", choices=tuple(RECIPES), default=RELEASED.name, help=what)
     parser.add_argument(
         "--current-decay", metavar="LAYER=X[,…]", help="share of the synaptic current that a step keeps: fc1=0.95"
     )
@@ -95,21 +85,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--robust", type=float, metavar="X", help="chance of an event, and of a taxel, to be lost while training: 0.1"
     )
     parser.add_argument("--epochs", type=int, metavar="N", help=f"default: {defaults}")
-    parser.add_argument(
-        "--decay-epochs",
-        type=int,
-        metavar="N",
-        help=f"the learning rate falls to a tenth every N epochs, after epoch N + 1 first (default: {DECAY_EPOCHS})",
-    )
+    what = f"the learning rate falls to a tenth every N epochs, after epoch N + 1 first (default: {DECAY_EPOCHS})"
+    parser.add_argument("--decay-epochs", type=int, metavar="N", help=what)
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights and order (default: 0)")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds side by side (default: 1)")
     parser.add_argument("--resume", action="store_true", help="go on with an interrupted training of the same options")
-    parser.add_argument(
-        "--keep",
-        action="append",
-        choices=WEIGHTS,
-        help="epoch to store: last, best (on test) or clean (on validation); may be repeated (default: all three)",
-    )
+    what = "epoch to store: last, best (on test) or clean (on validation); may be repeated (default: all three)"
+    parser.add_argument("--keep", action="append", choices=WEIGHTS, help=what)
     add_picture(parser, "learning curves")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
 
