@@ -16,19 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler import ir
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks, with_clocks
 from spikeloom.compiler.fixedpoint import DECAY_ONE, MEMBRANE_MAX, MEMBRANE_SHIFT
-from spikeloom.compiler.ir import (
-    INPUT,
-    IntegerNetwork,
-    IntegerPopulation,
-    IntegerProjection,
-    Network,
-    Population,
-    Projection,
-    Sparse,
-    added_up,
-)
 from spikeloom.compiler.types import BoolArray, IntArray
 
 if TYPE_CHECKING:
@@ -96,7 +86,11 @@ def raster(sources: Sequence[BoolArray]) -> Raster:
 
 
 def float_layer(
-    population: Population, projections: Sequence[Projection], dtype: npt.DTypeLike = np.float64, *, loops: bool = True
+    population: ir.Population,
+    projections: Sequence[ir.Projection],
+    dtype: npt.DTypeLike = np.float64,
+    *,
+    loops: bool = True,
 ) -> Layer:
     """A float population with all projections to it, in the arithmetic of `dtype`.
 
@@ -108,8 +102,8 @@ def float_layer(
 
 
 def integer_layer(
-    population: IntegerPopulation,
-    projections: Sequence[IntegerProjection],
+    population: ir.IntegerPopulation,
+    projections: Sequence[ir.IntegerProjection],
     *,
     saturates: bool = True,
     loops: bool = True,
@@ -133,12 +127,12 @@ def integer_layer(
 
 
 def synapses_of(
-    weights: Sequence[tuple[Any, Sparse]], dtype: npt.DTypeLike, *, loops: bool = True
+    weights: Sequence[tuple[Any, ir.Sparse]], dtype: npt.DTypeLike, *, loops: bool = True
 ) -> tuple[tuple[int, ...], tuple[Synapses, Synapses]]:
     """Presynaptic populations; weights from these, and from the population itself, all planes together."""
     from spikeloom.compiler.layer_kernel import by_source, no_synapses
 
-    merged = added_up((projection.pre, weight) for projection, weight in weights)
+    merged = ir.added_up((projection.pre, weight) for projection, weight in weights)
     own = merged.pop(weights[0][0].post, None) if loops and weights else None
     itself = no_synapses(dtype) if own is None else by_source([own], dtype)
     return tuple(merged), (by_source(list(merged.values()), dtype), itself)
@@ -156,7 +150,7 @@ class Simulation:
         def batch(start: int) -> list[tuple[BoolArray, npt.NDArray[Any]]]:
             done: list[tuple[BoolArray, npt.NDArray[Any]]] = []
             for layer in self.layers:
-                sources = [events[start : start + BATCH] if pre == INPUT else done[pre][0] for pre in layer.pres]
+                sources = [events[start : start + BATCH] if pre == ir.INPUT else done[pre][0] for pre in layer.pres]
                 done.append(layer.run(sources, membranes=membranes))
             return done
 
@@ -172,13 +166,13 @@ def threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count())
 
 
-def float_simulation(network: Network, dtype: npt.DTypeLike = np.float64) -> Simulation:
+def float_simulation(network: ir.Network, dtype: npt.DTypeLike = np.float64) -> Simulation:
     """The float stage, in the arithmetic of `dtype`."""
     into = [[p for p in network.projections if p.post == post] for post in range(len(network.populations))]
     return Simulation(layers=tuple(float_layer(*each, dtype) for each in zip(network.populations, into, strict=True)))
 
 
-def integer_simulation(network: IntegerNetwork, *, saturates: bool = True) -> Simulation:
+def integer_simulation(network: ir.IntegerNetwork, *, saturates: bool = True) -> Simulation:
     """The integer stage; `saturates` as of :func:`integer_layer`."""
     into = [[p for p in network.projections if p.post == post] for post in range(len(network.populations))]
     layers = zip(network.populations, into, strict=True)
@@ -186,14 +180,14 @@ def integer_simulation(network: IntegerNetwork, *, saturates: bool = True) -> Si
 
 
 def run_float(
-    network: Network, events: BoolArray, *, dtype: npt.DTypeLike = np.float64, membranes: bool = False
+    network: ir.Network, events: BoolArray, *, dtype: npt.DTypeLike = np.float64, membranes: bool = False
 ) -> Activity:
     """Run the float stage on events (samples, steps, channels), in the arithmetic of `dtype`."""
     return float_simulation(network, dtype).run(events, membranes=membranes)
 
 
 def run_integer(
-    network: IntegerNetwork, events: BoolArray, *, membranes: bool = False, saturates: bool = True
+    network: ir.IntegerNetwork, events: BoolArray, *, membranes: bool = False, saturates: bool = True
 ) -> Activity:
     """Run the integer stage, aligned with the data; membranes are register values."""
     return integer_simulation(network, saturates=saturates).run(events, membranes=membranes)

@@ -8,35 +8,26 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from spikeloom.compiler import ir
 from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.fixedpoint import BIAS_EXPONENT_MAX, BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, weight_step
-from spikeloom.compiler.ir import (
-    INPUT,
-    IntegerNetwork,
-    IntegerPopulation,
-    IntegerProjection,
-    Network,
-    Population,
-    Projection,
-    depths,
-)
 
 Faults = Iterator[str]
 
 
-def _names_are_unique(network: Network | IntegerNetwork) -> Faults:
+def _names_are_unique(network: ir.Network | ir.IntegerNetwork) -> Faults:
     names = [population.name for population in network.populations]
     for name in sorted({name for name in names if names.count(name) > 1}):
         yield f"two populations are called {name!r}"
 
 
-def _projections_fit(network: Network | IntegerNetwork) -> Faults:
-    populations: tuple[Population | IntegerPopulation, ...] = network.populations
-    sizes = {INPUT: network.input.size} | {i: population.size for i, population in enumerate(populations)}
-    projections: tuple[Projection | IntegerProjection, ...] = network.projections
+def _projections_fit(network: ir.Network | ir.IntegerNetwork) -> Faults:
+    populations: tuple[ir.Population | ir.IntegerPopulation, ...] = network.populations
+    sizes = {ir.INPUT: network.input.size} | {i: population.size for i, population in enumerate(populations)}
+    projections: tuple[ir.Projection | ir.IntegerProjection, ...] = network.projections
     for i, p in enumerate(projections):
         expected = (sizes.get(p.post), sizes.get(p.pre))
-        if p.post == INPUT or p.weight.shape != expected:
+        if p.post == ir.INPUT or p.weight.shape != expected:
             yield f"projection {i} has shape {p.weight.shape}, its populations ask for {expected}"
         if not p.weight.has_canonical_format:
             yield f"projection {i} has unsorted or repeated synapses"
@@ -44,24 +35,24 @@ def _projections_fit(network: Network | IntegerNetwork) -> Faults:
             yield f"projection {i} runs from population {p.pre} to {p.post}, not forward"
 
 
-def _steps_are_kept(network: Network | IntegerNetwork) -> Faults:
+def _steps_are_kept(network: ir.Network | ir.IntegerNetwork) -> Faults:
     count = len(network.populations)
-    projections: tuple[Projection | IntegerProjection, ...] = network.projections
-    if not all(INPUT <= p.pre < count and 0 <= p.post < count for p in projections):
+    projections: tuple[ir.Projection | ir.IntegerProjection, ...] = network.projections
+    if not all(ir.INPUT <= p.pre < count and 0 <= p.post < count for p in projections):
         return  # to populations that there are not, which is said above
-    depth = {INPUT: -1} | dict(enumerate(depths(network)))
+    depth = {ir.INPUT: -1} | dict(enumerate(ir.depths(network)))
     for i, p in enumerate(projections):
         early = depth[p.post] - depth[p.pre] - 1
         if p.pre != p.post and early > 0:  # of a recurrent one, what a step fires arrives in the next here, too
             yield f"projection {i} skips a layer: a spike takes one step on the chip, so it would arrive {early} early"
-    reached = {INPUT}
+    reached = {ir.INPUT}
     for post, pre in sorted((p.post, p.pre) for p in projections):  # a recurrent one after the others
         reached |= {post} if pre in reached else set()
     for post in sorted(set(range(count)) - reached):
         yield f"population {network.populations[post].name!r} is not reached from the input"
 
 
-def _readout_fits(network: Network | IntegerNetwork) -> Faults:
+def _readout_fits(network: ir.Network | ir.IntegerNetwork) -> Faults:
     label = network.readout.label
     if not 0 <= network.readout.population < len(network.populations):
         yield f"the read-out names population {network.readout.population}"
@@ -71,7 +62,7 @@ def _readout_fits(network: Network | IntegerNetwork) -> Faults:
         yield f"the read-out has labels outside 0 … {network.classes - 1}"
 
 
-def _values_are_finite(network: Network) -> Faults:
+def _values_are_finite(network: ir.Network) -> Faults:
     for population in network.populations:
         if not np.all(np.isfinite(population.bias)):
             yield f"population {population.name!r} has biases that are not finite"
@@ -84,7 +75,7 @@ def _values_are_finite(network: Network) -> Faults:
             yield f"projection {i} has weights that are not finite float64"
 
 
-def _registers_hold(network: IntegerNetwork) -> Faults:
+def _registers_hold(network: ir.IntegerNetwork) -> Faults:
     for population in network.populations:
         for what, values, low, high in (
             ("decay", np.array([population.decay_u, population.decay_v]), 0, 4095),
@@ -96,7 +87,7 @@ def _registers_hold(network: IntegerNetwork) -> Faults:
                 yield f"population {population.name!r} has a {what} outside {low} … {high}"
 
 
-def _mantissas_hold(network: IntegerNetwork) -> Faults:
+def _mantissas_hold(network: ir.IntegerNetwork) -> Faults:
     for i, projection in enumerate(network.projections):
         step, data = weight_step(projection.bits), projection.weight.data
         if data.dtype.kind != "i" or np.any(data % step) or np.any(data < -256) or np.any(data > 256 - step):
@@ -105,11 +96,11 @@ def _mantissas_hold(network: IntegerNetwork) -> Faults:
             yield f"projection {i} has exponent {projection.exponent}: below -1 its weights are no whole units"
 
 
-def verify(network: Network | IntegerNetwork) -> None:
+def verify(network: ir.Network | ir.IntegerNetwork) -> None:
     """Check every rule of the network's stage; VerifyError names all that are broken."""
     faults = [*_names_are_unique(network), *_projections_fit(network)]
     faults += [*_steps_are_kept(network), *_readout_fits(network)]
-    if isinstance(network, Network):
+    if isinstance(network, ir.Network):
         faults += _values_are_finite(network)
     else:
         faults += [*_registers_hold(network), *_mantissas_hold(network)]

@@ -20,16 +20,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from spikeloom.compiler.archive import (
-    AGAIN,
-    COUNTERS,
-    Array,
-    Kind,
-    archive_bytes,
-    read_archive,
-    require_none,
-    write_archive,
-)
+from spikeloom.compiler import archive
 from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS
 from spikeloom.compiler.errors import ModelError
@@ -46,7 +37,7 @@ SYSTEM = "counters"
 SIZES = ("taxels", "polarities", "classes", "bins", "steps", "parts", "ramp")
 CONSTANTS = ("slope", "threshold")
 MOST = 2**20
-KINDS: dict[str, Kind] = {
+KINDS: dict[str, archive.Kind] = {
     **dict.fromkeys(SIZES, (1, MOST)),
     "parts": (1, MOST_CLOCKS),
     "ramp": (0, MOST),
@@ -92,17 +83,19 @@ def counting_network(counters: Counters) -> Network:
 def write_counters(path: str | os.PathLike[str], counters: Counters) -> str:
     """Write a file, whole or not at all; return its sha256. Equal input gives equal bytes."""
     manifest = {name: getattr(counters, name) for name in (*SIZES, *CONSTANTS)}
-    manifest |= {"format": COUNTERS, "version": VERSION, "training": dict(counters.training)}
+    manifest |= {"format": archive.COUNTERS, "version": VERSION, "training": dict(counters.training)}
     arrays = {name: getattr(counters, name) for name in ("counter", "weight")}
-    return write_archive(archive_bytes(manifest, arrays), path)
+    return archive.write_archive(archive.archive_bytes(manifest, arrays), path)
 
 
 def read_counters(path: str | os.PathLike[str]) -> tuple[Counters, str]:
     """Read and check a file; also its sha256. ModelError if it is damaged, altered, newer or inconsistent."""
     path = Path(path)
-    with reading(path, ModelError, AGAIN):
-        manifest, members = read_archive(path, COUNTERS, VERSION, KINDS, lambda _: ("counter", "weight"))
-        require_none(_array_faults(manifest, members["counter"], members["weight"]))
+    with reading(path, ModelError, archive.AGAIN):
+        manifest, members = archive.read_archive(
+            path, archive.COUNTERS, VERSION, KINDS, lambda _: ("counter", "weight")
+        )
+        archive.require_none(_array_faults(manifest, members["counter"], members["weight"]))
         manifest = {**manifest, **{name: float(manifest[name]) for name in CONSTANTS}}  # too large: OverflowError
     counters = Counters(
         **{name: manifest[name] for name in (*SIZES, *CONSTANTS, "training")},
@@ -112,7 +105,7 @@ def read_counters(path: str | os.PathLike[str]) -> tuple[Counters, str]:
     return counters, sha256_of(path)
 
 
-def _array_faults(sizes: Mapping[str, Any], counter: Array, weight: Array) -> list[str]:
+def _array_faults(sizes: Mapping[str, Any], counter: archive.Array, weight: archive.Array) -> list[str]:
     """What in the arrays does not suit the sizes, or each other."""
     if sizes["taxels"] * sizes["polarities"] * sizes["parts"] > MOST:
         return [f"more than {MOST:,} channels of parts"]

@@ -15,20 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from spikeloom.compiler import fixedpoint
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.fixedpoint import (
-    BIAS_EXPONENT_MAX,
-    BIAS_MANTISSA_MAX,
-    DECAY_BITS,
-    MEMBRANE_MAX,
-    MEMBRANE_SHIFT,
-    ONE_STEP_SUM_MAX,
-    decay_registers,
-    encode_bias,
-    reach,
-    round_steps,
-    step_units,
-)
 from spikeloom.compiler.formats.tensors import members, side_by_side
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import effective_weight, stack_of
@@ -66,7 +54,7 @@ class QuantisedNet(nn.Module):
         self.forms = tuple(forms)
         self.names = ("conv1", *(dense.name for dense in checkpoint.dense))
         self.theta = checkpoint.theta
-        self.keep = (1 << DECAY_BITS) - decay_registers(checkpoint.beta)[1]
+        self.keep = (1 << fixedpoint.DECAY_BITS) - fixedpoint.decay_registers(checkpoint.beta)[1]
         self.system = checkpoint.system
         self.stack = stack_of(checkpoint, adjacency)
         self.hops = nn.Parameter(torch.tensor(checkpoint.hops))
@@ -91,16 +79,16 @@ class QuantisedNet(nn.Module):
         found = []
         for (weight, bias), form in zip(self.real_weights(), self.forms, strict=True):
             scale = form.threshold / self.theta
-            steps = round_steps(weight, scale[:, None], form.bits, form.exponents)
-            units = steps * step_units(form.bits, form.exponents)
-            mantissa, exponent = encode_bias(bias * scale * (1 << MEMBRANE_SHIFT))
+            steps = fixedpoint.round_steps(weight, scale[:, None], form.bits, form.exponents)
+            units = steps * fixedpoint.step_units(form.bits, form.exponents)
+            mantissa, exponent = fixedpoint.encode_bias(bias * scale * (1 << fixedpoint.MEMBRANE_SHIFT))
             found.append(
                 Integers(
                     units=np.ascontiguousarray(units.T, np.float32),
                     real=(units / scale[:, None]).astype(np.float32),
                     bias=mantissa << exponent,
-                    threshold=form.threshold << MEMBRANE_SHIFT,
-                    unit=1 / (scale * (1 << MEMBRANE_SHIFT)),
+                    threshold=form.threshold << fixedpoint.MEMBRANE_SHIFT,
+                    unit=1 / (scale * (1 << fixedpoint.MEMBRANE_SHIFT)),
                     keep=self.keep,
                 )
             )
@@ -110,8 +98,10 @@ class QuantisedNet(nn.Module):
         """Keep the weights of dense layers within half a step of what their storage holds, so that none gets lost."""
         with torch.no_grad():
             for weight, form in zip(self.weights, self.forms[1:], strict=True):
-                step = step_units(form.bits, form.exponents) * self.theta / form.threshold
-                limit = torch.tensor((reach(form.bits, form.exponents) + 0.5) * step, dtype=torch.float32)[:, None]
+                step = fixedpoint.step_units(form.bits, form.exponents) * self.theta / form.threshold
+                limit = torch.tensor((fixedpoint.reach(form.bits, form.exponents) + 0.5) * step, dtype=torch.float32)[
+                    :, None
+                ]
                 weight.copy_(torch.clamp(weight, -limit, limit))
 
     def make_legal(self) -> None:
@@ -119,7 +109,11 @@ class QuantisedNet(nn.Module):
         with torch.no_grad():
             for layer, form in enumerate(self.forms):
                 bias = self.conv_bias if layer == 0 else self.biases[layer - 1]
-                most = (BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX) * self.theta / (form.threshold << MEMBRANE_SHIFT)
+                most = (
+                    (fixedpoint.BIAS_MANTISSA_MAX << fixedpoint.BIAS_EXPONENT_MAX)
+                    * self.theta
+                    / (form.threshold << fixedpoint.MEMBRANE_SHIFT)
+                )
                 bound = torch.tensor(most.min() if layer == 0 else most, dtype=torch.float32) * SHRINK
                 bias.copy_(torch.clamp(bias, -bound, bound))
             over = True
@@ -129,7 +123,7 @@ class QuantisedNet(nn.Module):
                 for layer, integers in enumerate(self.integers):
                     up = np.maximum(integers.units, 0).sum(axis=0, dtype=np.float64)
                     down = np.maximum(-integers.units, 0).sum(axis=0, dtype=np.float64)
-                    wrong = np.maximum(up, down) > ONE_STEP_SUM_MAX
+                    wrong = np.maximum(up, down) > fixedpoint.ONE_STEP_SUM_MAX
                     if not wrong.any():
                         continue
                     over = True
@@ -181,7 +175,7 @@ class _ChipLayer(torch.autograd.Function):
         source, bounds, membrane, integers, theta, samples = ctx.kept
         above = gradients[0].contiguous().view(membrane.shape).numpy()
         current = np.empty_like(membrane)
-        differentiate(above, membrane, integers.keep / (1 << DECAY_BITS), theta, RECTANGLE, current)
+        differentiate(above, membrane, integers.keep / (1 << fixedpoint.DECAY_BITS), theta, RECTANGLE, current)
         rows = current.reshape(len(membrane) * samples, -1)
         weight = np.zeros_like(integers.units)
         scatter(source, bounds, rows, weight)
@@ -194,9 +188,9 @@ class _ChipLayer(torch.autograd.Function):
 @numba.njit(cache=True)
 def _chip_step(sums: Any, v: Any, bias: Any, threshold: Any, unit: Any, keep: Any, fired: Any, membrane: Any) -> None:
     for i in range(len(v)):
-        magnitude = abs(v[i]) * keep >> DECAY_BITS
-        u = (magnitude if v[i] >= 0 else -magnitude) + (np.int64(sums[i]) << MEMBRANE_SHIFT) + bias[i]
-        u = min(max(u, -MEMBRANE_MAX), MEMBRANE_MAX)
+        magnitude = abs(v[i]) * keep >> fixedpoint.DECAY_BITS
+        u = (magnitude if v[i] >= 0 else -magnitude) + (np.int64(sums[i]) << fixedpoint.MEMBRANE_SHIFT) + bias[i]
+        u = min(max(u, -fixedpoint.MEMBRANE_MAX), fixedpoint.MEMBRANE_MAX)
         spike = u > threshold[i]
         fired[i] = spike
         membrane[i] = u * unit[i]

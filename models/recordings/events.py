@@ -17,21 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.counts import GAP_S, EventCounts
 from spikeloom.models.recordings.csvtable import LABELS, is_table, labels_beside
 from spikeloom.models.recordings.eventfiles import EventStream, read_stream
-from spikeloom.models.recordings.evtouch import (
-    SUFFIXES,
-    UNLABELLED,
-    Members,
-    Recordings,
-    label_in_name,
-    opened,
-    parse_bins,
-    require_class,
-    require_memory,
-    splits_of,
-)
 from spikeloom.models.recordings.fetch import DATA_SETS, find_data
 
 BIN_S = 0.02
@@ -68,7 +57,7 @@ def load_data(
     taxels: int | None = None,
     classes: int | None = None,
     limit: int | None = None,
-) -> Recordings:
+) -> evtouch.Recordings:
     """Read the first `limit` recordings of a split, files in plain string order.
 
     The path is a folder or zip in the released layout; a folder of ``.csv``, ``.npz`` and ``.npy`` recordings, flat (it
@@ -104,12 +93,12 @@ def load_data(
             where = source if path == file else f"{source}: {folder}{name}"
             read.append(_read(file, members[member], where, bin_s, taxels, table.get(file)))
             _require_alike(read[-1], read[0], released)
-            require_class(where, read[-1].label, classes)
+            evtouch.require_class(where, read[-1].label, classes)
             held += read[-1].grid.size
-            require_memory(source, held)
+            evtouch.require_memory(source, held)
     steps = np.array([each.grid.shape[2] for each in read], np.int64)
     shape = max(each.grid.shape[0] for each in read), read[0].grid.shape[1], int(steps.max())
-    require_memory(source, len(read) * math.prod(shape))
+    evtouch.require_memory(source, len(read) * math.prod(shape))
     events = np.zeros((len(read), *shape), dtype=np.uint8)
     for index, each in enumerate(read):
         events[index, : each.grid.shape[0], :, : each.grid.shape[2]] = each.grid
@@ -121,7 +110,7 @@ def load_data(
         shorter=int(np.count_nonzero(steps < steps.max())),
         notes=(*notes, *_unit_notes(read), *(_taxel_notes(source, events) if taxels is None else ())),
     )
-    return Recordings(
+    return evtouch.Recordings(
         events=events,
         labels=np.array([each.label for each in read], dtype=np.int64),
         files=tuple(name for name, _ in chosen),
@@ -135,7 +124,7 @@ def load_data(
 
 def _require_alike(read: _Recording, first: _Recording, released: bool) -> None:
     """Refuse other polarities than the first recording has; in the released layout another shape, and no label."""
-    if released and read.label == UNLABELLED:
+    if released and read.label == evtouch.UNLABELLED:
         raise DataError(
             f"{read.where}: no label in the name, allowed is sample_N_label_L.npy; rename or remove the file"
         )
@@ -158,9 +147,9 @@ def data_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
         return tuple(sorted(filter(None, found)))
 
 
-def need_labels(recordings: Recordings, what: str) -> Recordings:
+def need_labels(recordings: evtouch.Recordings, what: str) -> evtouch.Recordings:
     """Return the recordings if all have labels; else a DataError says `what` needs them, for example training."""
-    missing = recordings.labels == UNLABELLED
+    missing = recordings.labels == evtouch.UNLABELLED
     if missing.any():
         file = recordings.files[int(np.argmax(missing))]
         raise DataError(
@@ -200,7 +189,7 @@ def bin_events(
     step = np.floor(stream.time_s / bin_s + _EDGE).astype(np.int64)
     steps = int(step.max()) + 1
     n = int(stream.taxel.max()) + 1 if taxels is None else taxels
-    require_memory(stream.name, n * 2 * steps)
+    evtouch.require_memory(stream.name, n * 2 * steps)
     grid = np.zeros((n, 2, steps), dtype=np.uint8)
     grid[stream.taxel, stream.polarity, step] = 1
     sent = len(stream.time_s)
@@ -213,7 +202,7 @@ def bin_events(
     )
 
 
-def joined_bins(recordings: Recordings, bins: int) -> Recordings:
+def joined_bins(recordings: evtouch.Recordings, bins: int) -> evtouch.Recordings:
     """Recordings of which one bin was made of so many, with an event wherever one of theirs had one.
 
     The last bin of a recording may be made of fewer.
@@ -236,7 +225,7 @@ def join_bins(events: NDArray[Any], bins: int) -> NDArray[Any]:
     return joined
 
 
-def of_length(recordings: Recordings, steps: int | None) -> Recordings:
+def of_length(recordings: evtouch.Recordings, steps: int | None) -> evtouch.Recordings:
     """Recordings of so many steps each: shorter ones end in silence that counts, longer ones are cut; None: as is."""
     if steps is None:
         return recordings
@@ -256,19 +245,19 @@ def fitted(events: NDArray[Any], steps: int) -> NDArray[Any]:
 
 
 @contextmanager
-def _data_set(path: Path, split: str = "test") -> Iterator[tuple[Members, dict[str, dict[str, str]]]]:
+def _data_set(path: Path, split: str = "test") -> Iterator[tuple[evtouch.Members, dict[str, dict[str, str]]]]:
     """What opens each file, and their names and members by split, ``""`` for any; DataError if there are none."""
     source = path.name or str(path)
     if path.is_file():
-        if path.suffix.lower() in SUFFIXES:
+        if path.suffix.lower() in evtouch.SUFFIXES:
             yield {path.name: partial(path.open, "rb")}, {"": {path.name: path.name}}
             return
         with path.open("rb") as file:
             if file.read(2) != b"PK":
                 raise DataError(f"{path}: not a recording; give a folder, a released zip, or a .csv, .npz or .npy file")
-    with opened(path) as members:
+    with evtouch.opened(path) as members:
         plain = {name: member for name, member in members.items() if not is_table(Path(name))}
-        found = splits_of(source, plain, {"train", "test", split})
+        found = evtouch.splits_of(source, plain, {"train", "test", split})
         flat = {name: name for name in plain if "/" not in name and not name.startswith(".")}
         if not found and flat and path.is_dir():
             found = {"": flat}
@@ -287,7 +276,7 @@ def _unit_notes(read: Sequence[_Recording]) -> list[str]:
     return [f"{place}{others}: {note}" for place, note in odd[:1]]
 
 
-def other_sensor(recordings: Recordings) -> str | None:
+def other_sensor(recordings: evtouch.Recordings) -> str | None:
     """What says that events are of a smaller sensor: in many recordings none of the last quarter of the taxels."""
     last = int(np.flatnonzero(recordings.events.any(axis=(0, 2, 3))).max(initial=-1))
     if recordings.bin_s is None or len(recordings) < SEVERAL or 4 * (recordings.taxels - 1 - last) <= recordings.taxels:
@@ -309,16 +298,16 @@ def _read(
     """One recording; `listed` is its class in a table of labels."""
     if file.suffix.lower() == ".npy":
         require_events(where, bin_s)
-        grid = parse_bins(where, opener, taxels)
+        grid = evtouch.parse_bins(where, opener, taxels)
         busy = np.flatnonzero(grid.any(axis=(0, 1)))
         gaps = int(np.count_nonzero((np.diff(busy) - 1) * bin_s > GAP_S))
         sent = int(np.count_nonzero(grid))
         counts = EventCounts(events=sent, out_of_order=0, duplicates=0, gaps=gaps)
-        label = label_in_name(file.name)
+        label = evtouch.label_in_name(file.name)
     else:
         stream = read_stream(file, taxels=taxels, where=where)
         grid, counts = bin_events(stream, bin_s, taxels=taxels)
         label = stream.label
-    if listed is not None and label not in (UNLABELLED, listed):
+    if listed is not None and label not in (evtouch.UNLABELLED, listed):
         raise DataError(f"{where}: label {label}, and {listed} in {LABELS}; mend one of them")
     return _Recording(where, grid, label if listed is None else listed, counts)

@@ -21,16 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from spikeloom.compiler import fixedpoint
 from spikeloom.compiler.errors import CapacityError, FormatError
-from spikeloom.compiler.fixedpoint import (
-    BIAS_EXPONENT_MAX,
-    BIAS_MANTISSA_MAX,
-    MEMBRANE_SHIFT,
-    decay_registers,
-    encode_bias,
-    reach,
-    step_units,
-)
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection, Network, Projection, Sparse, depths
 from spikeloom.compiler.passes.calibrate import NUDGES
 from spikeloom.compiler.passes.digest import digests
@@ -42,7 +34,7 @@ from spikeloom.runtime.report.sections import Section, Text
 SLACK = 1 + 1e-9
 """Factor by which a value may miss a limit that it meets in real numbers."""
 
-BIAS_LIMIT = BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX
+BIAS_LIMIT = fixedpoint.BIAS_MANTISSA_MAX << fixedpoint.BIAS_EXPONENT_MAX
 """Largest bias that a register holds, membrane units."""
 
 MOVED = 0.5
@@ -158,7 +150,9 @@ def _other_registers(machine: IntegerMachine, network: Network, post: int) -> It
     """What is not the checkpoint's of a layer, beside weights and biases: its numbers, its window, its votes."""
     netlist, chip, wanted = machine.netlist, machine.integer.populations[post], network.populations[post]
     layer, ids = netlist.layers[post], netlist.compartments_of(post)
-    registers = (f"{u} and {v}" for u, v in ((chip.decay_u, chip.decay_v), decay_registers(wanted.beta, wanted.alpha)))
+    registers = (
+        f"{u} and {v}" for u, v in ((chip.decay_u, chip.decay_v), fixedpoint.decay_registers(wanted.beta, wanted.alpha))
+    )
     theta = wanted.theta * chip.scale
     if (bad := ~machine.absent[post] & (np.abs(chip.threshold - theta) > 1e-6 * np.maximum(theta, 1))).any():
         worst = int(np.argmax(bad))
@@ -216,8 +210,8 @@ def _check_layer(
     planes = [p for p in integer.projections if p.post == post]
     bits, exponents = min(p.bits for p in planes), tuple(sorted({p.exponent for p in planes if p.weight.nnz}))
     exponents = exponents or (coarsest,)  # a layer that stores no weight: all of them rounded to zero at some step
-    step = step_units(bits, exponents)
-    most = reach(bits, exponents) * step
+    step = fixedpoint.step_units(bits, exponents)
+    most = fixedpoint.reach(bits, exponents) * step
     weights, wrong, farthest, where = 0, 0, 0.0, ""
     lost = np.zeros((2, wanted.size))  # what each neuron's weights lose to, and gain on, the checkpoint's; weight units
     for pre in sorted({p.pre for stage in (network, integer) for p in stage.projections if p.post == post}):
@@ -243,13 +237,13 @@ def _check_layer(
     moved = compensates and 0 < wrong <= MOVED * weights
     if wrong and not moved:
         faults.append(f"{wanted.name} has {wrong:,} of {weights:,} weights that are not the nearest, {where}")
-    unit = chip.scale * (1 << MEMBRANE_SHIFT)
+    unit = chip.scale * (1 << fixedpoint.MEMBRANE_SHIFT)
     bias = np.clip(wanted.bias * unit, -BIAS_LIMIT, BIAS_LIMIT)
-    coarse = 0.5 * (1 << np.maximum(encode_bias(bias)[1], chip.bias_exponent)) * SLACK
+    coarse = 0.5 * (1 << np.maximum(fixedpoint.encode_bias(bias)[1], chip.bias_exponent)) * SLACK
     # where no weight was moved, the bias takes up what the nearest ones lose
     slack = compensates and wrong <= MOVED * weights
     nudged = sum(NUDGES) * wanted.theta * unit
-    more, less = (lost * (1 << MEMBRANE_SHIFT) * SLACK + nudged) if slack else np.zeros((2, wanted.size))
+    more, less = (lost * (1 << fixedpoint.MEMBRANE_SHIFT) * SLACK + nudged) if slack else np.zeros((2, wanted.size))
     off = chip.bias - bias
     bad = held & ((off > more + coarse) | (-off > less + coarse)) & ~(zeroed[post] & (chip.bias == 0))
     if bad.any():

@@ -8,18 +8,8 @@ from typing import Any
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import JsonObject
+from spikeloom.models.recordings import events
 from spikeloom.models.recordings.counts import show_counts
-from spikeloom.models.recordings.events import (
-    BIN_S,
-    MAX_STEPS,
-    data_splits,
-    joined_bins,
-    load_data,
-    need_labels,
-    of_length,
-    other_sensor,
-    require_events,
-)
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings, first_part, parse_window
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
 from spikeloom.runtime.report.console import progress, tell
@@ -32,7 +22,7 @@ def recordings(
     limit: int | None = None,
     classes: int | None,
     taxels: int | None,
-    bin_s: float = BIN_S,
+    bin_s: float = events.BIN_S,
     bins: int = 1,
     labels_for: str | None = None,
     trained: Mapping[str, Any] | None = None,
@@ -50,25 +40,25 @@ def recordings(
         if limit is not None and limit < 1:
             raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
         data = path.part(slice(limit))
-        return joined_bins(data if labels_for is None else need_labels(data, labels_for), bins)
+        return events.joined_bins(data if labels_for is None else events.need_labels(data, labels_for), bins)
     if path != SYNTHETIC:
         shared: dict[str, Any] = {"limit": limit, "classes": classes, "taxels": taxels}
-        data, own = load_data(path, split, bin_s=bin_s, **shared), (trained or {}).get("bin_s")
+        data, own = events.load_data(path, split, bin_s=bin_s, **shared), (trained or {}).get("bin_s")
         if own is not None and data.bin_s not in (None, own):
-            if bin_s != BIN_S:
+            if bin_s != events.BIN_S:
                 raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {own:g} s; omit --bin")
-            data = load_data(path, split, bin_s=own, **shared)
+            data = events.load_data(path, split, bin_s=own, **shared)
         _require_sensor(data, split, taxels)
         show_counts(data.source, data.counts)
         if labels_for is not None:
-            need_labels(data, labels_for)
+            events.need_labels(data, labels_for)
     else:
-        require_events(SYNTHETIC, bin_s)
+        events.require_events(SYNTHETIC, bin_s)
         data = synthetic_split(split, limit=limit)
         require_suited(data, classes=classes, taxels=taxels)
     if trained and classes is not None and limit is None:
         _warn_of_others(data, trained, classes)
-    return joined_bins(data, bins)
+    return events.joined_bins(data, bins)
 
 
 def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
@@ -79,7 +69,7 @@ def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
 
 def _require_sensor(data: Recordings, split: str, taxels: int | None) -> None:
     """Refuse training recordings that look like another sensor's, warn of others."""
-    if taxels is not None and (why := other_sensor(data)) is not None:
+    if taxels is not None and (why := events.other_sensor(data)) is not None:
         if split == "train":
             raise DataError(f"{why}; give the graph of their sensor (--taxels), or recordings of the network's")
         tell(f"warning: {why}; are they of its sensor?")
@@ -96,7 +86,7 @@ def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int) 
 
 def require_splits(path: str | Recordings) -> None:
     """Refuse recordings without a test split for what trains and tests: a DataError."""
-    if isinstance(path, str) and path != SYNTHETIC and not data_splits(path):
+    if isinstance(path, str) and path != SYNTHETIC and not events.data_splits(path):
         raise DataError(
             f"{path}: has no train/ and test/, so that the same recordings would train and test; make these two "
             "folders, with some of each class in either"
@@ -118,8 +108,8 @@ def require_suited(data: Recordings, *, classes: int | None, taxels: int | None)
 
 def require_bins(bins: int) -> None:
     """Refuse a number of bins to join that is none; OptionError if it is below 1, or more than a recording may have."""
-    if not 1 <= bins <= MAX_STEPS:
-        raise OptionError(f"--join {bins}: allowed are 1 to {MAX_STEPS}; choose another")
+    if not 1 <= bins <= events.MAX_STEPS:
+        raise OptionError(f"--join {bins}: allowed are 1 to {events.MAX_STEPS}; choose another")
 
 
 def load_recordings(
@@ -144,7 +134,7 @@ def load_recordings(
         trained=origin_of(netlist.provenance),
     )
     arguments.bin = data.bin_s or arguments.bin  # what the command goes on with
-    return of_length(first_part(data, window), netlist.clocks.length) if joined else data
+    return events.of_length(first_part(data, window), netlist.clocks.length) if joined else data
 
 
 def find_recording(data: Recordings, wanted: str, option: str) -> int:

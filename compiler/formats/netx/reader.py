@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
+from spikeloom.compiler import ir
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import reading
 from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, kept_shares
@@ -26,16 +27,6 @@ from spikeloom.compiler.formats.affine import convolution
 from spikeloom.compiler.formats.assemble import ReadNetwork
 from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, entry_of, read_hdf5
 from spikeloom.compiler.formats.names import named, printable
-from spikeloom.compiler.ir import (
-    INPUT,
-    MANTISSA,
-    IntegerNetwork,
-    IntegerPopulation,
-    IntegerProjection,
-    Readout,
-    Sparse,
-    with_data,
-)
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.types import IntArray
 
@@ -95,7 +86,7 @@ def blocks_of(tree: Tree) -> list[Block]:
 
 def read_netx(
     path: str | os.PathLike[str], *, polarities: int | None = None, polarities_first: bool | None = None
-) -> ReadNetwork[IntegerNetwork]:
+) -> ReadNetwork[ir.IntegerNetwork]:
     """Read a network; polarities are as of :func:`sensor_layout.sensor_layout`.
 
     Raises ModelError if the file cannot be read, or holds what the chip's neurons here do not do, naming the layer;
@@ -109,14 +100,14 @@ def read_netx(
 
 def integers_of(
     tree: Tree, polarities: int | None = None, polarities_first: bool | None = None
-) -> tuple[IntegerNetwork, list[str]]:
+) -> tuple[ir.IntegerNetwork, list[str]]:
     """Integer network of the content of a file, and facts; raises as :func:`read_netx`."""
     blocks = blocks_of(tree)
     shape = _input_shape(blocks[0])
     sensor, positions, words = sensor_layout(shape, polarities=polarities, polarities_first=polarities_first)
     facts = [f"netx, {len(blocks)} layers, read as they stand", f"input: {words}"]
-    populations: list[IntegerPopulation] = []
-    projections: list[IntegerProjection] = []
+    populations: list[ir.IntegerPopulation] = []
+    projections: list[ir.IntegerProjection] = []
     for block in blocks:
         if block.type == "flatten":
             shape = (math.prod(shape),)
@@ -126,13 +117,13 @@ def integers_of(
         weight, shape = _synapses(block, shape)
         post = len(populations)
         populations.append(_population(block, math.prod(shape), shape))
-        sources = {post - 1 if post else INPUT: weight if post else weight[:, positions]}
+        sources = {post - 1 if post else ir.INPUT: weight if post else weight[:, positions]}
         if block.type == "dense_rec":
             neurons = populations[-1].size
             sources[post] = sparse.csr_array(_matrix(block, "weight_rec", neurons, neurons))
         stored = {pre: _planes(block, part) for pre, part in sources.items()}
         projections += [
-            IntegerProjection(pre=pre, post=post, weight=plane, exponent=exponent, bits=8)
+            ir.IntegerProjection(pre=pre, post=post, weight=plane, exponent=exponent, bits=8)
             for pre, planes in stored.items()
             for plane, exponent in planes
         ]
@@ -141,11 +132,11 @@ def integers_of(
         raise ModelError(f"has no layer of neurons; {AGAIN}")
     voters = populations[-1].size
     facts.append(f"classes: the spikes of {populations[-1].name}, a neuron each")
-    network = IntegerNetwork(
+    network = ir.IntegerNetwork(
         input=sensor,
         populations=tuple(populations),
         projections=tuple(projections),
-        readout=Readout(population=len(populations) - 1, label=np.arange(voters)),
+        readout=ir.Readout(population=len(populations) - 1, label=np.arange(voters)),
         classes=voters,
     )
     return network, facts
@@ -162,7 +153,7 @@ def _input_shape(first: Block) -> tuple[int, ...]:
     raise first.fail("the shape of its input is nowhere, wanted is a layer of type input before it; add one")
 
 
-def _synapses(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]]:
+def _synapses(block: Block, shape: tuple[int, ...]) -> tuple[ir.Sparse, tuple[int, ...]]:
     """Weights of a layer, csr_array (neurons, what it receives) int64, and the shape of its neurons."""
     delay = block.values.get("delay")
     if isinstance(delay, np.ndarray) and np.any(block.integers("delay")):
@@ -192,7 +183,7 @@ def _matrix(block: Block, key: str, neurons: int, received: int) -> IntArray:
     return weight
 
 
-def _conv(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]]:
+def _conv(block: Block, shape: tuple[int, ...]) -> tuple[ir.Sparse, tuple[int, ...]]:
     weight = block.integers("weight")
     if weight.ndim == 5 and weight.shape[4] == 1:
         weight = weight[..., 0]
@@ -213,7 +204,7 @@ def _conv(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]
     return matrix.astype(np.int64), out
 
 
-def _planes(block: Block, weight: Sparse) -> list[tuple[Sparse, int]]:
+def _planes(block: Block, weight: ir.Sparse) -> list[tuple[ir.Sparse, int]]:
     """Mantissas and exponents that make up whole weights; mantissas of 8 bits are even."""
     weight.eliminate_zeros()
     weight.sort_indices()
@@ -223,16 +214,16 @@ def _planes(block: Block, weight: Sparse) -> list[tuple[Sparse, int]]:
             f"has weights from {data.min()} to {data.max()}, allowed are -256 to 255; netx would clip them"
         )
     if not np.any(data % 2):
-        return [(with_data(weight, data.astype(MANTISSA)), 0)]
+        return [(ir.with_data(weight, data.astype(ir.MANTISSA)), 0)]
     if np.abs(data).max() <= 127:
-        return [(with_data(weight, (2 * data).astype(MANTISSA)), -1)]
+        return [(ir.with_data(weight, (2 * data).astype(ir.MANTISSA)), -1)]
     odd = data % 2  # one half step, stored twice as large at half the value
-    units = with_data(weight, (2 * odd).astype(MANTISSA)).copy()
+    units = ir.with_data(weight, (2 * odd).astype(ir.MANTISSA)).copy()
     units.eliminate_zeros()
-    return [(with_data(weight, (data - odd).astype(MANTISSA)), 0), (units, -1)]
+    return [(ir.with_data(weight, (data - odd).astype(ir.MANTISSA)), 0), (units, -1)]
 
 
-def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopulation:
+def _population(block: Block, size: int, shape: tuple[int, ...]) -> ir.IntegerPopulation:
     entries: Tree = entry_of(block.values, "neuron", dict)
     if not entries:
         raise block.fail("has no neuron, so its membranes are the result, and a chip counts spikes; remove it")
@@ -251,7 +242,7 @@ def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopul
     decay_u, decay_v, threshold = neuron.few("iDecay")[0] - 1, neuron.few("vDecay")[0], neuron.few("vThMant")[0]
     bias = _bias(block, size, shape)
     alpha, beta = kept_shares(decay_u, decay_v)
-    return IntegerPopulation(
+    return ir.IntegerPopulation(
         name=f"{block.type}{block.number}",
         beta=beta,
         theta=float(max(threshold, 1)),
@@ -280,7 +271,7 @@ def _bias(block: Block, size: int, shape: tuple[int, ...]) -> IntArray:
     return each
 
 
-def _fact(block: Block, population: IntegerPopulation, planes: int) -> str:
+def _fact(block: Block, population: ir.IntegerPopulation, planes: int) -> str:
     fact = (
         f"{population.name}: {population.size} neurons, decay_u {population.decay_u}, decay_v {population.decay_v}, "
         f"fires at v > 64 * {population.threshold[0]}"

@@ -19,24 +19,9 @@ from spikeloom.compiler.formats.affine import scaled, shifted
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble, by_depth, class_of_each
 from spikeloom.compiler.formats.hdf5 import AGAIN, read_hdf5
 from spikeloom.compiler.formats.names import named, printable, unique_names
-from spikeloom.compiler.formats.nir import CONVENTIONS
+from spikeloom.compiler.formats.nir import CONVENTIONS, stages
 from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, graph_of, loops, only
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
-from spikeloom.compiler.formats.nir.stages import (
-    ALWAYS,
-    STAGES,
-    TOLERANCE,
-    Steps,
-    Value,
-    added,
-    filtered,
-    require_step,
-    shared,
-    spikes_of,
-    spread,
-    stated_step,
-    written_step,
-)
 from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.types import FloatArray, IntArray
@@ -66,19 +51,19 @@ def read_nir(
     """
     with reading(path, ModelError, AGAIN):
         graph = graph_of(*read_hdf5(Path(path), "NIR file"))
-        dt = stated_step(graph) if dt is None else dt
+        dt = stages.stated_step(graph) if dt is None else dt
         if dt is None:
-            written = written_step(graph)
+            written = stages.written_step(graph)
             hint = "" if written is None else f", but its r is tau / {written:g}, as of steps of {written:g} s"
             raise OptionError(f"{path}: NIR keeps no time step{hint}; give --dt SECONDS")
-        steps = Steps(dt=dt, convention=convention or CONVENTIONS[0])
-        require_step(dt)
+        steps = stages.Steps(dt=dt, convention=convention or CONVENTIONS[0])
+        stages.require_step(dt)
         with np.errstate(all="ignore"):  # what is not finite is refused at the end
             return network_of(graph, steps, polarities, polarities_first)
 
 
 def network_of(
-    graph: Graph, steps: Steps, polarities: int | None = None, polarities_first: bool | None = None
+    graph: Graph, steps: stages.Steps, polarities: int | None = None, polarities_first: bool | None = None
 ) -> ReadNetwork[Network]:
     """Network of a graph that was read; parameters and errors as of :func:`read_nir`, without the path."""
     entry, end = only(graph.nodes, INPUT_NODE), only(graph.nodes, OUTPUT_NODE)
@@ -98,35 +83,35 @@ def network_of(
     return ReadNetwork(network=network, facts=tuple(facts), sha256=graph.sha256, read_as=asdict(steps))
 
 
-def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Neurons], Value]:
+def _walk(graph: Graph, steps: stages.Steps, shape: tuple[int, ...]) -> tuple[list[Neurons], stages.Value]:
     """All spiking nodes in order, and what the output gets."""
     received: dict[str, list[str]] = {name: [] for name in graph.nodes}
     for source, target in graph.edges:
         received[target].append(source)
-    values: dict[str, Value] = {}
-    spiking: list[tuple[Node, Value]] = []
+    values: dict[str, stages.Value] = {}
+    spiking: list[tuple[Node, stages.Value]] = []
     late = loops(graph)
     for name in nodes_in_order(graph, late):
         node = graph.nodes[name]
         if node.type == INPUT_NODE:
             if received[name]:
                 raise node.fail("gets values from other nodes; remove these edges")
-            values[name] = spikes_of(INPUT, shape)
+            values[name] = stages.spikes_of(INPUT, shape)
             continue
         with named(node):
-            value = added([values[source] for source in received[name] if source not in late.get(name, ())])
+            value = stages.added([values[source] for source in received[name] if source not in late.get(name, ())])
         if node.type in SPIKING:
-            values[name] = spikes_of(len(spiking), value.shape)
+            values[name] = stages.spikes_of(len(spiking), value.shape)
             spiking.append((node, value))
-        elif node.type in STAGES:
-            values[name] = STAGES[node.type](node, value, steps)
+        elif node.type in stages.STAGES:
+            values[name] = stages.STAGES[node.type](node, value, steps)
         else:
-            known = ", ".join(sorted([*SPIKING, *STAGES]))
+            known = ", ".join(sorted([*SPIKING, *stages.STAGES]))
             raise node.fail(f"is of a type that has no place here, allowed are {known}; replace it")
     found = []
     for node, value in spiking:
         with named(node):
-            every = added([value, *(values[source] for source in late.get(node.name, ()))])
+            every = stages.added([value, *(values[source] for source in late.get(node.name, ()))])
         found.append(_neurons(node, every, steps))
     return found, values[only(graph.nodes, OUTPUT_NODE).name]
 
@@ -140,7 +125,7 @@ def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer
         theta = float(one.theta[0])
         value = scaled(one.value, theta / one.theta)
         sources = dict(value.terms)
-        always = sources.pop(ALWAYS, None)
+        always = sources.pop(stages.ALWAYS, None)
         held.append(always if always is not None and always.count_nonzero() else None)
         for weight in sources.values():
             weight.eliminate_zeros()
@@ -184,7 +169,7 @@ def _with_held(layers: list[Layer], held: list[Sparse | None], sensor: Input) ->
     return found, replace(sensor, clocks=Clocks(channels=1, steps=MOST_STEPS))
 
 
-def _readout(end: Node, result: Value, spiking: Sequence[Neurons]) -> tuple[int, IntArray]:
+def _readout(end: Node, result: stages.Value, spiking: Sequence[Neurons]) -> tuple[int, IntArray]:
     """The spiking node whose spikes are counted, and the class of each of its neurons."""
     remedy = "end the network with a spiking layer, one neuron or one group of neurons a class"
     if result.alpha:
@@ -207,14 +192,14 @@ class Neurons:
     """
 
     node: Node  # As the file has it
-    value: Value  # What it gets, scaled to its membrane, with its leak
+    value: stages.Value  # What it gets, scaled to its membrane, with its leak
     beta: float
     gain: FloatArray  # By which its input was scaled
     theta: FloatArray
     reset: FloatArray
 
 
-def _neurons(node: Node, value: Value, steps: Steps) -> Neurons:
+def _neurons(node: Node, value: stages.Value, steps: stages.Steps) -> Neurons:
     """Neurons of a node of a type in ``SPIKING`` that gets a value; ModelError if the chip has no such neurons."""
     size, shape = value.size, value.shape
     if not size:
@@ -222,7 +207,7 @@ def _neurons(node: Node, value: Value, steps: Steps) -> Neurons:
     _require_reset(node)
 
     def each(key: str) -> FloatArray:
-        return spread(node, key, size, shape)
+        return stages.spread(node, key, size, shape)
 
     nothing, alpha, beta = np.zeros(size), 0.0, 0.0
     gain, drive = np.ones(size), nothing
@@ -233,18 +218,18 @@ def _neurons(node: Node, value: Value, steps: Steps) -> Neurons:
     elif node.type in ("LIF", "CubaLIF"):
         key = "tau" if node.type == "LIF" else "tau_mem"
         kept = steps.keeps(node, key, size, shape)
-        beta = shared(node, key, kept)
+        beta = stages.shared(node, key, kept)
         drive = (1 - kept) * (each("v_leak") - reset)
         gain = each("r") * (1 - kept)
         if node.type == "CubaLIF":
-            alpha = shared(node, "tau_syn", steps.keeps(node, "tau_syn", size, shape))
+            alpha = stages.shared(node, "tau_syn", steps.keeps(node, "tau_syn", size, shape))
             gain = gain * (each("w_in") if node.has("w_in") else np.ones(size)) * (1 - alpha)
         # r = tau / dt, stored in float32, makes a gain of 1 that is not quite one
-        gain = np.where(np.abs(gain - 1) < TOLERANCE, 1.0, gain)
+        gain = np.where(np.abs(gain - 1) < stages.TOLERANCE, 1.0, gain)
     if np.any(theta <= 0):
         raise node.fail(f"fires {theta.min():g} above its reset, allowed are thresholds above it; train it again")
     with named(node):
-        own = shifted(filtered(value, alpha, gain, nothing), drive)  # a leak acts past the current
+        own = shifted(stages.filtered(value, alpha, gain, nothing), drive)  # a leak acts past the current
     return Neurons(node=node, value=own, beta=beta, gain=gain, theta=theta, reset=reset)
 
 
@@ -257,7 +242,7 @@ def _require_reset(node: Node) -> None:
             )
 
 
-def _facts(graph: Graph, steps: Steps, spiking: Sequence[Neurons], sensor: str, clocked: Input) -> list[str]:
+def _facts(graph: Graph, steps: stages.Steps, spiking: Sequence[Neurons], sensor: str, clocked: Input) -> list[str]:
     """How a file was read, its layers, what its input (`sensor`, in words) was taken for, and what files may lose."""
     version = printable(graph.version) or "of no version"
     facts = [f"NIR {version}, read in steps of {steps.dt:g} s ({steps.convention})", sensor]
@@ -280,7 +265,7 @@ def _facts(graph: Graph, steps: Steps, spiking: Sequence[Neurons], sensor: str, 
             f"{', '.join(looped)}: is recurrent, fed by its own spikes of the step before; snnTorch's RLeaky with "
             "reset 'zero' means this with reset_delay=False, else it loses the input of the step after each spike"
         )
-    written = written_step(graph)
+    written = stages.written_step(graph)
     if written is not None and not math.isclose(written, steps.dt, rel_tol=1e-4):
         facts.append(
             f"drift: r is tau / {written:g} in every neuron, as of a file written in steps of {written:g} s; in steps "
@@ -294,7 +279,7 @@ def _facts(graph: Graph, steps: Steps, spiking: Sequence[Neurons], sensor: str, 
 def _decay_words(beta: float) -> str:
     """A membrane decay, and what the chip makes of it where that differs."""
     _, realised = kept_shares(*decay_registers(beta))
-    same = math.isclose(beta, realised, abs_tol=TOLERANCE)
+    same = math.isclose(beta, realised, abs_tol=stages.TOLERANCE)
     return f"decay {beta:.6g}" + ("" if same else f" ({realised:.6g} on the chip)")
 
 

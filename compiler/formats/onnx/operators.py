@@ -15,18 +15,7 @@ from scipy import sparse
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.affine import Affine, added, diagonal, picked_of_all, scaled, shifted, spread, through
 from spikeloom.compiler.formats.names import named, printable
-from spikeloom.compiler.formats.onnx.atoms import (
-    INPUT_ATOM,
-    MEMBRANE,
-    NOT_AFFINE,
-    Table,
-    Value,
-    as_affine,
-    is_binary,
-    is_whole,
-    multiplied,
-    require_finite,
-)
+from spikeloom.compiler.formats.onnx import atoms
 from spikeloom.compiler.formats.onnx.evaluate import FLOATING, LINEAR, MOVES, NUMERIC, evaluate, shapes_of
 from spikeloom.compiler.formats.onnx.file import BOOL, Graph, Node
 
@@ -39,12 +28,12 @@ MIRRORED = {"Greater": "Less", "GreaterOrEqual": "LessOrEqual", "Less": "Greater
 CONSTANT = "is computed from constants by an operator that is not known here; fold constants before the export"
 
 
-def run(graph: Graph, given: Mapping[str, Value], table: Table) -> list[Value]:
+def run(graph: Graph, given: Mapping[str, atoms.Value], table: atoms.Table) -> list[atoms.Value]:
     """Values of a graph's outputs from those `given` for its inputs.
 
     Raises ModelError naming the operator that cannot be evaluated, or is not affine, and why.
     """
-    values: dict[str, Value] = {**given, **graph.constants}
+    values: dict[str, atoms.Value] = {**given, **graph.constants}
     order = needed(graph)
     held = membranes(order, graph.outputs, set(given))
     last = {name: index for index, node in enumerate(order) for name in reads(node)}
@@ -62,16 +51,16 @@ def run(graph: Graph, given: Mapping[str, Value], table: Table) -> list[Value]:
     return [values[name] for name in graph.outputs]
 
 
-def _set_apart(node: Node, name: str, value: Value, table: Table) -> Value:
+def _set_apart(node: Node, name: str, value: atoms.Value, table: atoms.Table) -> atoms.Value:
     """Make a membrane an atom of its own, and remember what it is made of."""
     if not isinstance(value, Affine):
         return value
-    require_finite(value)
+    atoms.require_finite(value)
     only = next(iter(value.terms), -1)
     known = len(value.terms) == 1 and diagonal(value.terms[only]) == 1 and not np.any(value.bias)
-    if known and table.atoms[only].kind in (INPUT_ATOM, MEMBRANE):
+    if known and table.atoms[only].kind in (atoms.INPUT_ATOM, atoms.MEMBRANE):
         return value
-    return table.value(table.atom(MEMBRANE, name, len(value.bias), definition=value, node=str(node)), value.shape)
+    return table.value(table.atom(atoms.MEMBRANE, name, len(value.bias), definition=value, node=str(node)), value.shape)
 
 
 def reads(node: Node) -> list[str]:
@@ -119,7 +108,7 @@ def membranes(order: list[Node], outputs: tuple[str, ...], varying: set[str]) ->
     return found
 
 
-def apply(node: Node, table: Table, operands: Sequence[Value | None]) -> list[Value]:
+def apply(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]) -> list[atoms.Value]:
     """Results of an operator, whatever its operands are.
 
     Raises ModelError if it is not known, or not affine in what varies; without its name.
@@ -133,7 +122,7 @@ def apply(node: Node, table: Table, operands: Sequence[Value | None]) -> list[Va
     if op == "Dropout" and operands[0] is not None:  # passes on what it gets, outside training
         return [operands[0]]
     if op in ("Shape", "Size"):
-        shape = np.array(as_affine(operands[0]).shape, np.int64)
+        shape = np.array(atoms.as_affine(operands[0]).shape, np.int64)
         cut = shape[node.attributes.get("start", 0) : node.attributes.get("end", len(shape))]
         return [cut if op == "Shape" else np.array(np.prod(shape))]
     if not varying:
@@ -155,25 +144,25 @@ def apply(node: Node, table: Table, operands: Sequence[Value | None]) -> list[Va
     return [result]
 
 
-def _constant(node: Node, table: Table, operands: Sequence[Value | None]) -> list[Value]:
+def _constant(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]) -> list[atoms.Value]:
     """An operator on numbers; those that are no more than linear run as their matrix."""
     if node.op in NUMERIC:
         return list(evaluate(node, table, operands))  # type: ignore[arg-type]
     if node.op not in LINEAR:
         raise ModelError(CONSTANT)
-    result = _linear(node, table, [as_affine(operands[0]), *operands[1:]], [0])
+    result = _linear(node, table, [atoms.as_affine(operands[0]), *operands[1:]], [0])
     return [result.bias.reshape(result.shape)]
 
 
-def _compared(node: Node, table: Table, operands: Sequence[Value | None]) -> Affine:
+def _compared(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]) -> Affine:
     """A comparison of a membrane with a threshold: its spikes, or one less them."""
     if all(isinstance(operand, Affine) for operand in operands):
         raise ModelError("compares two values that both vary; only a fixed threshold can be lowered")
     mirrored = not isinstance(operands[0], Affine)
-    membrane, limit = (as_affine(operand) for operand in (operands[::-1] if mirrored else operands))
+    membrane, limit = (atoms.as_affine(operand) for operand in (operands[::-1] if mirrored else operands))
     single = next(iter(membrane.terms), -1)
     factor = diagonal(membrane.terms[single]) if len(membrane.terms) == 1 else None
-    if not factor or table.atoms[single].kind not in (MEMBRANE, INPUT_ATOM):
+    if not factor or table.atoms[single].kind not in (atoms.MEMBRANE, atoms.INPUT_ATOM):
         raise ModelError(
             "compares what is not the membrane of a layer; only a membrane can be held against a threshold"
         )
@@ -189,20 +178,20 @@ def _opposite(spikes: Affine) -> Affine:
     return shifted(scaled(spikes, np.full(size, -1.0)), np.ones(size))
 
 
-def _chosen(table: Table, operands: Sequence[Value | None]) -> Affine:
+def _chosen(table: atoms.Table, operands: Sequence[atoms.Value | None]) -> Affine:
     """``Where(s, a, b) = b + s * (a - b)`` for a spike s."""
-    values = [as_affine(operand) for operand in operands]
-    if not is_binary(table, values[0]):
+    values = [atoms.as_affine(operand) for operand in operands]
+    if not atoms.is_binary(table, values[0]):
         raise ModelError("chooses by what is neither a spike nor a constant; only spikes can choose")
     shape = table.room(np.broadcast_shapes(*(value.shape for value in values)))
     s, a, b = (spread(value, shape) for value in values)
-    product = multiplied(table, s, added([(1.0, a), (-1.0, b)], shape))
+    product = atoms.multiplied(table, s, added([(1.0, a), (-1.0, b)], shape))
     return added([(1.0, b), (1.0, product)], shape)
 
 
-def _scattered(node: Node, table: Table, operands: Sequence[Value | None]) -> Affine:
+def _scattered(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]) -> Affine:
     """A scattering sum: data plus what the updates bring; a gathering of positions tells where each goes."""
-    start, more = as_affine(operands[0]), as_affine(operands[2])
+    start, more = atoms.as_affine(operands[0]), atoms.as_affine(operands[2])
     if not isinstance(operands[1], np.ndarray):
         raise ModelError("takes its indices from what varies; only a fixed graph can be lowered")
     op = node.op.replace("Scatter", "Gather")
@@ -217,19 +206,19 @@ def _scattered(node: Node, table: Table, operands: Sequence[Value | None]) -> Af
     return added([(1.0, start), (1.0, through(matrix, more, start.shape))], start.shape)
 
 
-def _moved(node: Node, table: Table, operands: Sequence[Value | None]) -> list[Value]:
+def _moved(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]) -> list[atoms.Value]:
     """A move, by moving positions; position 0 is a constant zero, then come all elements of all operands in turn."""
     places = MOVES[node.op] or range(len(operands))
     if any(isinstance(value, Affine) and place not in places for place, value in enumerate(operands)):
         raise ModelError("takes indices or sizes from what varies; only a fixed graph can be lowered")
     if node.attributes.get("mode", "constant") != "constant" or node.attributes.get("reduction", "none") != "none":
         raise ValueError("only constant padding, and scattering that replaces or adds, are known")
-    positions: list[Value | None] = list(operands)
+    positions: list[atoms.Value | None] = list(operands)
     parts: list[Affine] = []
     start = 1
     for place, value in enumerate(operands):
         if place in places and value is not None:
-            parts.append(as_affine(value))
+            parts.append(atoms.as_affine(value))
             size = len(parts[-1].bias)
             positions[place] = np.arange(start, start + size).reshape(parts[-1].shape)
             start += size
@@ -237,17 +226,17 @@ def _moved(node: Node, table: Table, operands: Sequence[Value | None]) -> list[V
     return [picked_of_all(parts, rows) for rows in moved]
 
 
-def _linear(node: Node, table: Table, operands: Sequence[Value | None], varying: list[int]) -> Affine:
+def _linear(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None], varying: list[int]) -> Affine:
     """A linear operator through its matrix, and the bias that Conv and Gemm add."""
     has_bias = node.op in ("Conv", "Gemm")
     inner = [place for place in varying if not (has_bias and place == 2)]
     matrix_of, allowed = LINEAR[node.op]
     if has_bias and not inner:  # only the bias varies
-        operands, inner = [as_affine(operands[0]), *operands[1:]], [0]
+        operands, inner = [atoms.as_affine(operands[0]), *operands[1:]], [0]
     if len(inner) != 1 or inner[0] not in allowed:
-        raise ModelError(NOT_AFFINE)
+        raise ModelError(atoms.NOT_AFFINE)
     place = inner[0]
-    value = as_affine(operands[place])
+    value = atoms.as_affine(operands[place])
     arrays = [np.zeros(each.shape) if isinstance(each, Affine) else each for each in operands]
     if not node.op.startswith("Reduce"):  # whose second operand is a list of axes
         arrays = [None if each is None else each.astype(np.float64) for each in arrays]
@@ -263,16 +252,16 @@ def _linear(node: Node, table: Table, operands: Sequence[Value | None], varying:
     result = through(matrix, value, shape)
     if not has_bias or len(operands) < 3 or operands[2] is None:
         return result
-    extra = as_affine(operands[2])
+    extra = atoms.as_affine(operands[2])
     if node.op == "Conv":
         extra = replace(extra, shape=(len(extra.bias), *[1] * (len(shape) - 2)))
     factor = node.attributes.get("beta", 1.0) if node.op == "Gemm" else 1.0
     return added([(1.0, result), (factor, spread(extra, shape))], shape)
 
 
-def _normalised(node: Node, table: Table, operands: Sequence[Value | None]) -> Affine:
+def _normalised(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]) -> Affine:
     """An affine function of each element alone: read from what it does to 0 and 2**20."""
-    value, high = as_affine(operands[0]), 2.0**20
+    value, high = atoms.as_affine(operands[0]), 2.0**20
     at_zero, at_high = (
         evaluate(node, table, [np.full(value.shape, x), *operands[1:]])[0].ravel()  # type: ignore[list-item]
         for x in (0.0, high)
@@ -280,27 +269,27 @@ def _normalised(node: Node, table: Table, operands: Sequence[Value | None]) -> A
     return shifted(scaled(value, (at_high - at_zero) / high), at_zero)
 
 
-def _elementwise(node: Node, table: Table, operands: Sequence[Value | None], varying: list[int]) -> Affine:
-    op, values = node.op, [as_affine(operand) for operand in operands]
+def _elementwise(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None], varying: list[int]) -> Affine:
+    op, values = node.op, [atoms.as_affine(operand) for operand in operands]
     weights = {"Add": 1.0, "Mean": 1 / len(values), "Neg": -1.0, "Sub": 1.0, "Sum": 1.0}
     if op not in (*weights, "Cast", "Div", "Mul", "Not"):
-        raise ModelError(NOT_AFFINE)
+        raise ModelError(atoms.NOT_AFFINE)
     shape = table.room(np.broadcast_shapes(*(value.shape for value in values)))
     parts = [spread(value, shape) for value in values]
     value, other = parts[0], parts[-1]
     if op == "Cast":
         to = int(node.attributes["to"])
-        if to not in FLOATING and not (is_binary(table, value) if to == BOOL else is_whole(table, value)):
-            raise ModelError(f"rounds its input to whole numbers, so it {NOT_AFFINE}")
+        if to not in FLOATING and not (atoms.is_binary(table, value) if to == BOOL else atoms.is_whole(table, value)):
+            raise ModelError(f"rounds its input to whole numbers, so it {atoms.NOT_AFFINE}")
         return value
     if op == "Mul":
         both = len(varying) == 2
-        return multiplied(table, value, other) if both else scaled(parts[varying[0]], parts[1 - varying[0]].bias)
+        return atoms.multiplied(table, value, other) if both else scaled(parts[varying[0]], parts[1 - varying[0]].bias)
     if op == "Div" and varying == [0]:
         # not a product with the reciprocal: 1 / 3 is not a number
         return scaled(value, other.bias, np.divide)
-    if op == "Not" and is_binary(table, value):
+    if op == "Not" and atoms.is_binary(table, value):
         return _opposite(value)
     if op in ("Div", "Not"):
-        raise ModelError(NOT_AFFINE)
+        raise ModelError(atoms.NOT_AFFINE)
     return added([(-1.0 if op == "Sub" and place else weights[op], part) for place, part in enumerate(parts)], shape)

@@ -14,19 +14,12 @@ from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
 from spikeloom.compiler.ir import INPUT, MANTISSA, IntegerNetwork, depths, fan_in
 from spikeloom.compiler.passes.prune import Masks, none_of
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.layout.core_needs import (
-    Cores,
-    Lists,
-    Needs,
-    SynapseFormat,
-    choose_dense,
-    index_bits,
-)
+from spikeloom.compiler.targets.loihi1.layout import core_needs
 from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
 from spikeloom.compiler.types import IntArray
 
 
-def _entries(lists: Lists, dense: IntArray, base: int) -> tuple[npt.NDArray[Any], ...]:
+def _entries(lists: core_needs.Lists, dense: IntArray, base: int) -> tuple[npt.NDArray[Any], ...]:
     """Synapses of lists: entries of each list, targets on a core where the chunk starts at `base`, mantissas."""
     length = np.where(dense, lists.last - lists.first + 1, lists.nonzero)
     start = np.cumsum(length) - length
@@ -61,7 +54,7 @@ def _layers(network: IntegerNetwork, removed: Masks) -> tuple[Layer, ...]:
 
 def emit(
     network: IntegerNetwork,
-    cores: Cores,
+    cores: core_needs.Cores,
     tiles: tuple[int, ...],
     target: Target,
     provenance: Mapping[str, Any],
@@ -86,17 +79,17 @@ def emit(
         """A field of the populations, of each compartment."""
         return np.concatenate([getattr(network.populations[c.population], name)[c.first : c.last] for c in order])
 
-    formats: dict[SynapseFormat, int] = {}
+    formats: dict[core_needs.SynapseFormat, int] = {}
     axons_per_core = np.zeros(len(cores), np.int64)
     parts: dict[str, list[npt.NDArray[Any]]] = {key: [] for key in ("source", "format", "length", "target", "weight")}
-    needs = Needs(network, target)
+    needs = core_needs.Needs(network, target)
     for core, chunks in enumerate(cores):
         base, lean = 0, needs.lean(chunks)
         for chunk in chunks:
-            index = index_bits(base + chunk.size - 1, target)
+            index = core_needs.index_bits(base + chunk.size - 1, target)
             for lists in needs.lists(chunk):
                 projection = network.projections[lists.projection]
-                dense, _ = choose_dense(lists, projection, base, chunk.size, lean=lean, target=target)
+                dense, _ = core_needs.choose_dense(lists, projection, base, chunk.size, lean=lean, target=target)
                 keys = [(projection.bits, projection.exponent, 0 if flag else index) for flag in dense]
                 form = np.array([formats.setdefault(key, len(formats)) for key in keys])
                 source = lists.source

@@ -16,19 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.archive import (
-    AGAIN,
-    CLOCKS,
-    GRAPH,
-    TRAINED,
-    Kind,
-    archive_bytes,
-    array_faults,
-    read_archive,
-    require_none,
-    stated,
-    write_archive,
-)
+from spikeloom.compiler import archive
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import ModelError
@@ -41,11 +29,11 @@ VERSION = 1
 PARTS = {"inputs": 2, "level": 3, "threshold": 1, "floor": 1, "leak": 1}
 """Arrays of a stage, in file order, and their axes."""
 
-KINDS: dict[str, Kind] = {
+KINDS: dict[str, archive.Kind] = {
     "layers": [str, ...],
-    "clocks": CLOCKS,
+    "clocks": archive.CLOCKS,
     "weights": [frozenset(WEIGHTS), ...],
-    "graph": GRAPH,
+    "graph": archive.GRAPH,
     "towers": (1, 1),
     "training": dict,
     **dict.fromkeys(("taxels", "polarities", "classes", "copies"), (1, 2**20)),
@@ -83,7 +71,7 @@ def write_trained(
     """
     one = next(iter(networks.values()))
     manifest = {
-        "format": TRAINED,
+        "format": archive.TRAINED,
         "version": VERSION,
         **{name: getattr(one, name) for name in ("taxels", "polarities", "classes", "copies")},
         "clocks": one.clocks.to_json(),
@@ -99,12 +87,12 @@ def write_trained(
         for stage in network.stages
         for part in PARTS
     }
-    return write_archive(archive_bytes(manifest, arrays), path)
+    return archive.write_archive(archive.archive_bytes(manifest, arrays), path)
 
 
 def is_trained(path: str | os.PathLike[str]) -> bool:
     """Whether a file is an archive that says it holds such a network."""
-    return stated(Path(path), "format") == TRAINED
+    return archive.stated(Path(path), "format") == archive.TRAINED
 
 
 def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) -> Trained:
@@ -118,8 +106,8 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
         members = product(manifest["weights"], manifest["layers"], PARTS)
         return [f"{which}/0/{layer}/{part}" for which, layer, part in members]
 
-    with reading(path, ModelError, AGAIN):
-        manifest, members = read_archive(path, TRAINED, VERSION, KINDS, names)
+    with reading(path, ModelError, archive.AGAIN):
+        manifest, members = archive.read_archive(path, archive.TRAINED, VERSION, KINDS, names)
         sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
         chosen = sets[0] if weights is None else weights
         if chosen not in sets:
@@ -127,7 +115,9 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
         stages: dict[str, dict[str, Any]] = {
             layer: {part: members[f"{chosen}/0/{layer}/{part}"] for part in PARTS} for layer in manifest["layers"]
         }
-        require_none(f"{name}: {fault}" for name, parts in stages.items() for fault in array_faults(parts, PARTS))
+        archive.require_none(
+            f"{name}: {fault}" for name, parts in stages.items() for fault in archive.array_faults(parts, PARTS)
+        )
         network = NativeNetwork(
             **{name: manifest[name] for name in ("taxels", "polarities", "classes", "copies")},
             clocks=Clocks(**manifest["clocks"]),
@@ -140,7 +130,7 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
         edges = np.array(manifest["graph"]["edges"], np.int64).reshape(-1, 2)
         if edges.max(initial=0) >= network.taxels:
             wrong.append(f"the graph joins taxels outside 0..{network.taxels - 1}")
-        require_none(wrong)
+        archive.require_none(wrong)
     return Trained(
         network=network,
         weights=chosen,

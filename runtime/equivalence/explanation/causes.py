@@ -24,20 +24,7 @@ from spikeloom.compiler.interpret import Activity, run_float, step_late
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.equivalence.explanation.results import (
-    BETA,
-    BIAS,
-    LEFT_OUT,
-    SATURATION,
-    TIE,
-    TRUNCATION,
-    UNKNOWN,
-    WEIGHTS,
-    Explanation,
-    LayerRoots,
-    RootCause,
-    remedy,
-)
+from spikeloom.runtime.equivalence.explanation import results
 from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots, sources_of
 from spikeloom.runtime.equivalence.reference import taxel_and_feature
 from spikeloom.runtime.equivalence.rounding import SLACK, Rounding, summed
@@ -68,7 +55,7 @@ def explain(
     absent: Sequence[BoolArray] | None = None,
     unread: Sequence[BoolArray] | None = None,
     pruned: bool = False,
-) -> Explanation:
+) -> results.Explanation:
     """Find the roots of all differences between float64 model and chip on one recording, and their causes.
 
     `network` is the float stage of `model`, `integer` what the netlist holds, `events` (steps, channels) bool, and
@@ -86,7 +73,7 @@ def explain(
         for a, b, population in zip(truth, chip, integer.populations, strict=True)
     ]
     roots = find_roots(differs, resets, sources_of(network, integer))
-    causes: dict[Root, RootCause] = {}
+    causes: dict[Root, results.RootCause] = {}
     for post, population in enumerate(network.populations):
         here = sorted((r for r in roots if r.layer == post), key=lambda r: r.begin - r.step)
         if not here:
@@ -111,9 +98,9 @@ def explain(
         )
         causes |= zip(here, named, strict=True)
     counts = Counter(root.layer for root in roots)
-    return Explanation(
+    return results.Explanation(
         layers=tuple(
-            LayerRoots(
+            results.LayerRoots(
                 name=population.name,
                 float_spikes=int(np.count_nonzero(truth[post])),
                 chip_spikes=int(np.count_nonzero(chip[post])),
@@ -139,7 +126,7 @@ def _name_causes(
     absent: BoolArray,
     pruned: bool,
     compensated: bool,
-) -> list[RootCause]:
+) -> list[results.RootCause]:
     """Causes of roots of one population, which are sorted by the length of what they remember."""
     population, chip = network.populations[post], integer.populations[post]
     rows = np.array([root.neuron for root in roots])
@@ -174,9 +161,9 @@ def _name_causes(
         order = sorted(range(len(variants)), key=lambda k: -moved[k, i])
         enough = [k for k in order if mended[k, i]]
         first = next(iter(enough), order[0] if moved[order[0], i] > 0 else None)
-        cause = TIE if undecided[i] else UNKNOWN if first is None else variants[first].cause
+        cause = results.TIE if undecided[i] else results.UNKNOWN if first is None else variants[first].cause
         if not held:
-            cause = LEFT_OUT if pruned else WEIGHTS
+            cause = results.LEFT_OUT if pruned else results.WEIGHTS
         amounts: dict[str, float] = {}  # the largest of each cause
         for k in order:
             if moved[k, i] > 0:
@@ -184,7 +171,7 @@ def _name_causes(
         clipped = any(variants[k].weights == UNCLIPPED for k in enough)
         taxel, feature = taxel_and_feature(model, post, root.neuron)
         found.append(
-            RootCause(
+            results.RootCause(
                 layer=population.name,
                 neuron=root.neuron,
                 taxel=taxel,
@@ -205,7 +192,7 @@ def _name_causes(
                 clipped_weights=clipped,
                 sufficient=tuple(dict.fromkeys(variants[k].cause for k in enough)) if held else (),
                 moved=amounts if held else {},
-                change=remedy(cause, population.name, bits=bits, planes=planes, clipped=clipped, held=held),
+                change=results.remedy(cause, population.name, bits=bits, planes=planes, clipped=clipped, held=held),
                 dragged=root.dragged,
                 dragged_alone=root.alone,
             )
@@ -256,7 +243,7 @@ def variants_of(
     wanted, chip, one = network.populations[post], integer.populations[post], 1 << DECAY_BITS
     exact = wanted.bias[rows] * chip.scale[rows] * (1 << MEMBRANE_SHIFT)
     netlist = Variant(
-        cause=UNKNOWN,
+        cause=results.UNKNOWN,
         weights=STORED,
         bias=chip.bias[rows].astype(np.float64),
         keep_u=(one - chip.decay_u - 1) / one,
@@ -266,12 +253,12 @@ def variants_of(
     with_weights, alone = (exact, netlist.bias) if compensated else (netlist.bias, exact)
     return [
         netlist,
-        replace(netlist, cause=WEIGHTS, weights=UNCLIPPED),
-        replace(netlist, cause=WEIGHTS, weights=UNROUNDED, bias=with_weights),
-        replace(netlist, cause=BIAS, bias=alone),
-        replace(netlist, cause=BETA, keep_u=wanted.alpha, keep_v=wanted.beta),
-        replace(netlist, cause=SATURATION, limit=np.inf),
-        replace(netlist, cause=TRUNCATION, rounds=False),  # last, see run_variants
+        replace(netlist, cause=results.WEIGHTS, weights=UNCLIPPED),
+        replace(netlist, cause=results.WEIGHTS, weights=UNROUNDED, bias=with_weights),
+        replace(netlist, cause=results.BIAS, bias=alone),
+        replace(netlist, cause=results.BETA, keep_u=wanted.alpha, keep_v=wanted.beta),
+        replace(netlist, cause=results.SATURATION, limit=np.inf),
+        replace(netlist, cause=results.TRUNCATION, rounds=False),  # last, see run_variants
     ]
 
 

@@ -11,17 +11,8 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.studies.pruning import trials
 from spikeloom.runtime.studies.pruning.results import Changed, LayerUse, Lean, Removed, Row, TaxelUse
-from spikeloom.runtime.studies.pruning.trials import (
-    changed_alone,
-    decisions,
-    laid_out,
-    priced,
-    spared_neurons,
-    spared_taxels,
-    without_hops,
-    without_taxels,
-)
 
 
 def study(
@@ -37,31 +28,31 @@ def study(
     compilation = compile_network(loaded.network, Options(forms=forms, training_events=training.events))
     whole, allowed = compilation.netlist, int(differ * len(training) + 1e-9)
     spikes: IntArray = machine_of(whole).run(training.events, lengths=training.lengths).counts.sum(axis=0)
-    wanted, wanted_test = decisions(whole, training), decisions(whole, test)
-    alone = changed_alone(whole, training, wanted)
+    wanted, wanted_test = trials.decisions(whole, training), trials.decisions(whole, test)
+    alone = trials.changed_alone(whole, training, wanted)
 
     def fits(netlist: Netlist) -> bool:
-        return bool(np.count_nonzero(decisions(netlist, training) != wanted) <= allowed)
+        return bool(np.count_nonzero(trials.decisions(netlist, training) != wanted) <= allowed)
 
     def tried() -> Iterator[tuple[str, Removed, Netlist]]:
         yield "nothing", Removed(), whole
-        neurons = spared_neurons(whole, spikes, fits)
+        neurons = trials.spared_neurons(whole, spikes, fits)
         spared.update(_by_layer(whole, neurons))
         counts = {name: len(numbers) for name, numbers in spared.items()}
-        yield "neurons", Removed(neurons=counts), laid_out(compilation, neurons)
-        taxels = spared_taxels(whole, training, alone, fits)
-        deaf = without_taxels(compilation, taxels)
-        yield "taxels", Removed(taxels=tuple(sorted(taxels.tolist()))), laid_out(deaf)
+        yield "neurons", Removed(neurons=counts), trials.laid_out(compilation, neurons)
+        taxels = trials.spared_taxels(whole, training, alone, fits)
+        deaf = trials.without_taxels(compilation, taxels)
+        yield "taxels", Removed(taxels=tuple(sorted(taxels.tolist()))), trials.laid_out(deaf)
         for hops in _hops(loaded):
             name = f"hop {hops[0]}" if len(hops) == 1 else f"hops {hops[0]} to {hops[-1]}"
-            if (fewer := without_hops(compilation, loaded, hops)) is not None:
-                yield name, Removed(hops=hops), laid_out(fewer)
+            if (fewer := trials.without_hops(compilation, loaded, hops)) is not None:
+                yield name, Removed(hops=hops), trials.laid_out(fewer)
 
     rows, spent, netlists, spared = [], [], [], dict[str, IntArray]()
     for name, removed, netlist in tried():
         progress(f"without {name}")
-        trained, training_costs = priced(netlist, training)
-        tested, costs = priced(netlist, test)
+        trained, training_costs = trials.priced(netlist, training)
+        tested, costs = trials.priced(netlist, test)
         changed = _changed(wanted, trained, training.labels)
         changed_test = _changed(wanted_test, tested, test.labels)
         rows.append(Row(name=name, removed=removed, training=changed, test=changed_test, costs=costs))

@@ -12,15 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from spikeloom.compiler import Netlist
-from spikeloom.compiler.fixedpoint import (
-    DECAY_BITS,
-    THRESHOLD_MANTISSA_MAX,
-    decay_registers,
-    frozen,
-    read_only,
-    weight_step,
-)
+from spikeloom.compiler import Netlist, fixedpoint
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.studies.stress.pair import Pair, perturbation
@@ -36,7 +28,7 @@ def with_weights(pair: Pair, weight: npt.NDArray[Any]) -> Pair:
     Entries in which nothing changes keep their float weight, bit for bit.
     """
     netlist, network = pair.netlist, pair.network
-    stored = replace(netlist, synapse_weight=frozen(weight.astype(netlist.synapse_weight.dtype)))
+    stored = replace(netlist, synapse_weight=fixedpoint.frozen(weight.astype(netlist.synapse_weight.dtype)))
     moved = np.flatnonzero(weight != netlist.synapse_weight)
     axon = netlist.axon_of_synapse()[moved]
     units = stored.effective_weight()[moved] - netlist.effective_weight()[moved]
@@ -63,7 +55,7 @@ def _codes(netlist: Netlist) -> tuple[IntArray, IntArray]:
 
 def weight_steps(bits: IntArray) -> IntArray:
     """Distance of neighbouring mantissas of each width; as :func:`fixedpoint.weight_step`."""
-    return np.array([0, 0, *(weight_step(width) for width in range(2, 9))])[bits]
+    return np.array([0, 0, *(fixedpoint.weight_step(width) for width in range(2, 9))])[bits]
 
 
 @perturbation("probability", (1e-4, 1e-3, 0.01, 0.05))
@@ -118,10 +110,12 @@ def stick_neurons(pair: Pair, share: float, rng: np.random.Generator, *, firing:
     target = netlist.synapse_compartment()
     held = replace(
         netlist,
-        synapse_weight=frozen(np.where(stuck[target], 0, netlist.synapse_weight).astype(netlist.synapse_weight.dtype)),
-        bias_mantissa=read_only(np.where(stuck, int(firing), netlist.bias_mantissa)),
-        bias_exponent=read_only(np.where(stuck, 0, netlist.bias_exponent)),
-        threshold=read_only(np.where(stuck & firing, 0, netlist.threshold)),
+        synapse_weight=fixedpoint.frozen(
+            np.where(stuck[target], 0, netlist.synapse_weight).astype(netlist.synapse_weight.dtype)
+        ),
+        bias_mantissa=fixedpoint.read_only(np.where(stuck, int(firing), netlist.bias_mantissa)),
+        bias_exponent=fixedpoint.read_only(np.where(stuck, 0, netlist.bias_exponent)),
+        threshold=fixedpoint.read_only(np.where(stuck & firing, 0, netlist.threshold)),
     )
 
     return Pair(
@@ -135,10 +129,10 @@ def with_thresholds(pair: Pair, threshold: IntArray) -> Pair:
     A neuron with another threshold fires as one with the old one whose weights and bias are divided by the factor.
     """
     netlist = pair.netlist
-    held = np.where(relays(pair), netlist.threshold, np.clip(threshold, 1, THRESHOLD_MANTISSA_MAX))
+    held = np.where(relays(pair), netlist.threshold, np.clip(threshold, 1, fixedpoint.THRESHOLD_MANTISSA_MAX))
     factor = np.maximum(netlist.threshold, 1) / np.maximum(held, 1)
     network = inputs_scaled(pair, factor, np.zeros(len(factor)))
-    return Pair(netlist=replace(netlist, threshold=read_only(held)), network=network)
+    return Pair(netlist=replace(netlist, threshold=fixedpoint.read_only(held)), network=network)
 
 
 def inputs_scaled(pair: Pair, factor: FloatArray, more: FloatArray) -> Network:
@@ -224,10 +218,12 @@ def fewer_bits(pair: Pair, width: int) -> Pair:
 def shorter_decay(pair: Pair, factor: float) -> Pair:
     """Membranes and lasting currents keep a smaller share."""
     netlist = pair.netlist
-    registers = np.array([decay_registers(layer.beta * factor, layer.alpha * factor) for layer in netlist.layers])
+    registers = np.array(
+        [fixedpoint.decay_registers(layer.beta * factor, layer.alpha * factor) for layer in netlist.layers]
+    )
     decay_u, decay_v = registers[netlist.layer].T
-    changed = replace(netlist, decay_u=read_only(decay_u), decay_v=read_only(decay_v))
-    one = 1 << DECAY_BITS
+    changed = replace(netlist, decay_u=fixedpoint.read_only(decay_u), decay_v=fixedpoint.read_only(decay_v))
+    one = 1 << fixedpoint.DECAY_BITS
     populations = tuple(
         replace(population, beta=(one - v) / one, alpha=(one - 1 - u) / one)
         for population, (u, v) in zip(pair.network.populations, registers.tolist(), strict=True)

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from spikeloom.compiler import ir
 from spikeloom.compiler.fixedpoint import (
     CURRENT_MAX,
     DECAY_ONE,
@@ -24,47 +25,36 @@ from spikeloom.compiler.fixedpoint import (
     round_steps,
     split_planes,
 )
-from spikeloom.compiler.ir import (
-    MANTISSA,
-    Form,
-    IntegerPopulation,
-    IntegerProjection,
-    Population,
-    Projection,
-    one_sided,
-    row_parts,
-    with_data,
-)
 from spikeloom.compiler.types import FloatArray, IntArray
 
 FORGETS = DECAY_ONE - 1
 """`decay_u` of a current that forgets everything in one step."""
 
 
-def scales(population: Population, form: Form) -> FloatArray:
+def scales(population: ir.Population, form: ir.Form) -> FloatArray:
     """Weight units per membrane unit of the float model; shape (neurons,)."""
     found: FloatArray = form.threshold / population.theta
     return found
 
 
-def store_steps(projection: Projection, steps: IntArray, form: Form) -> tuple[IntegerProjection, ...]:
+def store_steps(projection: ir.Projection, steps: IntArray, form: ir.Form) -> tuple[ir.IntegerProjection, ...]:
     """One integer projection for each plane in use; the finest holds every structural synapse."""
-    pre, post, stored = projection.pre, projection.post, list[IntegerProjection]()
+    pre, post, stored = projection.pre, projection.post, list[ir.IntegerProjection]()
     for exponent, mantissa in zip(form.exponents, split_planes(steps, form.bits, form.exponents), strict=True):
-        weight = with_data(projection.weight, mantissa.astype(MANTISSA))
+        weight = ir.with_data(projection.weight, mantissa.astype(ir.MANTISSA))
         if stored:
             weight = weight.copy()
             weight.eliminate_zeros()
         if weight.nnz or not stored:
-            stored.append(IntegerProjection(pre=pre, post=post, weight=weight, exponent=exponent, bits=form.bits))
+            stored.append(ir.IntegerProjection(pre=pre, post=post, weight=weight, exponent=exponent, bits=form.bits))
     return tuple(stored)
 
 
-def nearest_steps(population: Population, projection: Projection, form: Form) -> IntArray:
+def nearest_steps(population: ir.Population, projection: ir.Projection, form: ir.Form) -> IntArray:
     """Weights of a projection in whole steps of the finest plane, each rounded to the nearest; shape (synapses,)."""
     weight, scale = projection.weight, scales(population, form)
     steps = np.empty(weight.nnz, np.int32)
-    for rows in row_parts(weight):
+    for rows in ir.row_parts(weight):
         held = slice(weight.indptr[rows.start], weight.indptr[rows.stop])
         each = np.repeat(scale[rows], np.diff(weight.indptr[rows.start : rows.stop + 1]))
         steps[held] = round_steps(weight.data[held], each, form.bits, form.exponents)
@@ -72,12 +62,12 @@ def nearest_steps(population: Population, projection: Projection, form: Form) ->
 
 
 def round_population(
-    population: Population,
-    projections: tuple[Projection, ...],
-    form: Form,
+    population: ir.Population,
+    projections: tuple[ir.Projection, ...],
+    form: ir.Form,
     steps: Sequence[IntArray] | None = None,
     bias: FloatArray | None = None,
-) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
+) -> tuple[ir.IntegerPopulation, tuple[ir.IntegerProjection, ...]]:
     """Registers of one population and its synapses, every weight rounded to the nearest.
 
     Where `steps` are given, an array for each projection, they are taken instead of the weights; a `bias` (neurons,),
@@ -87,7 +77,7 @@ def round_population(
     wanted = population.bias if bias is None else bias
     mantissa, exponent = encode_bias(wanted * scale * (1 << MEMBRANE_SHIFT))
     decay_u, decay_v = decay_registers(population.beta, population.alpha)
-    integer = IntegerPopulation(
+    integer = ir.IntegerPopulation(
         name=population.name,
         beta=population.beta,
         theta=population.theta,
@@ -118,13 +108,13 @@ def current_load(decay_u: int) -> float:
     return max(1.0, ONE_STEP_SUM_MAX * (4096 / (decay_u + 1)) * (1 << MEMBRANE_SHIFT) / CURRENT_MAX)
 
 
-def loads(population: IntegerPopulation, projections: tuple[IntegerProjection, ...]) -> FloatArray:
+def loads(population: ir.IntegerPopulation, projections: tuple[ir.IntegerProjection, ...]) -> FloatArray:
     """One-sided sums, or more where a current that outlasts its step fills a register sooner; shape (neurons,).
 
     What is within ``ONE_STEP_SUM_MAX`` overflows neither accumulator nor current, whatever the input. Nor does it
     saturate a membrane, unless that keeps more than half of itself: the scale would then be too coarse.
     """
-    up, down = one_sided(projections, population.size)
+    up, down = ir.one_sided(projections, population.size)
     worst = np.maximum(up, down).astype(np.float64)
     if population.decay_u == FORGETS:
         return worst
