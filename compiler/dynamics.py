@@ -46,8 +46,7 @@ class Clocks:
         [[1, 1, 0, 0, 0], [0, 0, 1, 1, 0]]
         """
         part = np.arange(first, first + steps) // self.steps
-        ticks: npt.NDArray[np.uint8] = (part == np.arange(self.channels)[:, None]).astype(np.uint8)
-        return ticks
+        return np.asarray((part == np.arange(self.channels)[:, None]).astype(np.uint8))
 
     def to_json(self) -> JsonObject:
         """JSON values."""

@@ -230,5 +230,4 @@ def vote(counts: IntArray) -> IntArray:
     >>> vote(np.array([[1, 3, 3], [0, 0, 0]])).tolist()
     [1, 0]
     """
-    winner: IntArray = np.argmax(counts, axis=1)
-    return winner
+    return np.asarray(np.argmax(counts, axis=1))

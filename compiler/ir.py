@@ -144,8 +144,7 @@ class IntegerPopulation:
     @property
     def realised_theta(self) -> FloatArray:
         """Thresholds in the float model's units; shape (neurons,)."""
-        realised: FloatArray = self.threshold / self.scale
-        return realised
+        return np.asarray(self.threshold / self.scale)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

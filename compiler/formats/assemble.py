@@ -55,8 +55,7 @@ def class_of_each(counts: Sparse) -> IntArray | None:
     one_each = np.all(np.diff(columns.indptr) == 1)
     if not one_each or not columns.nnz or columns.data[0] <= 0 or np.ptp(columns.data) > 1e-12 * columns.data[0]:
         return None
-    label: IntArray = columns.indices.astype(np.int64)
-    return label
+    return np.asarray(columns.indices.astype(np.int64))
 
 
 def by_depth(layers: Sequence[Layer]) -> list[list[int]]:

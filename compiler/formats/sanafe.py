@@ -56,8 +56,7 @@ def dense_neurons(netlist: Netlist) -> BoolArray:
     """Which compartments name the unit of dense synapses."""
     in_dense_list = netlist.format_index_bits[netlist.axon_format[netlist.axon_of_synapse()]] == 0
     balance = np.where(in_dense_list, 1.0, -1.0)
-    found: BoolArray = np.bincount(netlist.synapse_compartment(), balance, netlist.n_compartments) >= 0
-    return found
+    return np.asarray(np.bincount(netlist.synapse_compartment(), balance, netlist.n_compartments) >= 0)
 
 
 def input_tiles(netlist: Netlist, target: Target) -> tuple[int, ...]:

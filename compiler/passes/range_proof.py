@@ -30,8 +30,7 @@ class RangeProof:
 
 def settled(inflow: FloatArray | IntArray, kept: float) -> FloatArray:
     """Limit of ``x <- kept * x + inflow``: what a leaking register can add up to."""
-    limit: FloatArray = inflow / (1 - kept) if kept < 1 else np.where(inflow > 0, np.inf, 0.0)
-    return limit
+    return np.asarray(inflow / (1 - kept) if kept < 1 else np.where(inflow > 0, np.inf, 0.0))
 
 
 def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:

@@ -85,8 +85,7 @@ def _polarity(where: str, values: FloatArray, at: Callable[[int], str]) -> NDArr
         raise DataError(f"{at(row)}: polarity {values[row]:g}, {codes}; 1 is rising")
     if low.any() and zero.any():
         raise DataError(f"{where}: polarities -1 and 0 in one file, {codes}; write one code")
-    rising: NDArray[np.uint8] = high.astype(np.uint8)
-    return rising
+    return np.asarray(high.astype(np.uint8))
 
 
 def _label(where: str, name: str, column: FloatArray | None) -> int:

@@ -221,8 +221,7 @@ def join_bins(events: NDArray[Any], bins: int) -> NDArray[Any]:
     >>> join_bins(np.array([[0, 1, 0, 0, 1]], np.uint8), 2).tolist()
     [[1, 0, 1]]
     """
-    joined: NDArray[Any] = np.maximum.reduceat(events, np.arange(0, events.shape[-1], bins), axis=-1)
-    return joined
+    return np.asarray(np.maximum.reduceat(events, np.arange(0, events.shape[-1], bins), axis=-1))
 
 
 def of_length(recordings: evtouch.Recordings, steps: int | None) -> evtouch.Recordings:

@@ -143,8 +143,7 @@ class Rule:
 
     def sums(self, data: Counted) -> FloatArray:
         """Sums of each class in the end; (samples, classes)."""
-        found: FloatArray = data.spikes[:, self.used] @ self.weight.T
-        return found
+        return np.asarray(data.spikes[:, self.used] @ self.weight.T)
 
     def highest(self, data: Counted) -> float:
         """Largest sum that any class ever has after a step; second spikes count as the first."""

@@ -265,8 +265,7 @@ def native_network(architecture: NativeArchitecture, arrays: Mapping[str, NDArra
 def votes_by_step(network: NativeNetwork, events: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Votes (steps, classes) in one recording (1, taxels, polarities, steps)."""
     spikes = run_network(network, events)[network.stages[-1].name][0]
-    votes: NDArray[np.int64] = spikes.reshape(len(spikes), -1, network.classes).sum(axis=1)
-    return votes
+    return np.asarray(spikes.reshape(len(spikes), -1, network.classes).sum(axis=1))
 
 
 def run_network(network: NativeNetwork, events: NDArray[np.uint8]) -> dict[str, NDArray[np.bool_]]:

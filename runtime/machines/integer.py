@@ -100,8 +100,7 @@ class IntegerMachine(Machine):
     @property
     def received(self) -> BoolArray:
         """Input channels, (channels,) bool, that some core takes in."""
-        received: BoolArray = np.isin(np.arange(self.netlist.n_inputs), self.netlist.axon_source)
-        return received
+        return np.asarray(np.isin(np.arange(self.netlist.n_inputs), self.netlist.axon_source))
 
     @property
     def read_out_lag(self) -> int:

@@ -49,5 +49,4 @@ def wins(decisions: IntArray, least: IntArray, most: IntArray) -> BoolArray:
     rows, classes = np.arange(len(decisions)), np.arange(least.shape[1])
     ahead = least[rows, decisions][:, None] - most
     ahead[rows, decisions] = 0  # no class has to beat itself
-    sure: BoolArray = np.all(ahead >= (classes < decisions[:, None]), axis=1)
-    return sure
+    return np.asarray(np.all(ahead >= (classes < decisions[:, None]), axis=1))

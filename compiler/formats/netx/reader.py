@@ -267,8 +267,7 @@ def _bias(block: Block, size: int, shape: tuple[int, ...]) -> IntArray:
         raise block.fail(
             f"has biases up to {np.abs(values).max()}, allowed are {BIAS_MANTISSA_MAX} steps; train it again"
         )
-    each: IntArray = np.repeat(values, size // values.size)
-    return each
+    return np.asarray(np.repeat(values, size // values.size))
 
 
 def _fact(block: Block, population: ir.IntegerPopulation, planes: int) -> str:

@@ -78,8 +78,7 @@ def _dense(population: IntegerPopulation, weight: Sparse) -> Float32:
             f"{population.name}: has {weight.shape[0]} x {weight.shape[1]} weights, zeros among them, "
             f"{DENSE_LIMIT} are allowed; NIR keeps whole matrices"
         )
-    dense: Float32 = weight.toarray().astype(np.float32)
-    return dense
+    return np.asarray(weight.toarray().astype(np.float32))
 
 
 def _neurons(population: IntegerPopulation, bias: npt.NDArray[np.float64], dt: float) -> Tree:

@@ -131,8 +131,7 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
     def weights(a: int, b: int) -> IntArray:
         here = (pre == a) & (post == b)
         entries = weight[here], (row[here], place[target[here]])
-        matrix: IntArray = sparse.coo_array(entries, shape=(counts[a], counts[b])).toarray()
-        return matrix
+        return np.asarray(sparse.coo_array(entries, shape=(counts[a], counts[b])).toarray())
 
     layers = [
         _layer(netlist, index, name, {a: weights(a, b) for b, a in pairs.tolist() if b == index}, reached)

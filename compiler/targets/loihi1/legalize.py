@@ -54,8 +54,7 @@ def list_words(entries: IntArray, weight_bits: IntArray | int, index_bits: IntAr
     full, rest = np.divmod(entries, block)
     whole = -(-(block * bits + header) // word)
     part = np.where(rest > 0, -(-(rest * bits + header) // word), 0)
-    words: IntArray = full * whole + part
-    return words
+    return np.asarray(full * whole + part)
 
 
 def _distinct_per_core(netlist: Netlist, *columns: IntArray) -> IntArray:

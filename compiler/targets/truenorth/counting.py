@@ -114,8 +114,7 @@ def lower_counters(counters: Counters, chip: Target, *, provenance: Mapping[str,
 def _sources(counters: Counters) -> IntArray:
     """Channel that each counter receives, or its gate; (counters,)."""
     channel, part, _ = counters.counter.T
-    found: IntArray = part * (counters.taxels * counters.polarities) + channel
-    return found
+    return np.asarray(part * (counters.taxels * counters.polarities) + channel)
 
 
 def _least(counters: Counters) -> int:

@@ -69,8 +69,7 @@ def steepest_leak(threshold: IntArray, depth: int) -> IntArray:
     A stage at depth d receives data from tick d on. Its membranes start at ``-d * leak``, and the leak alone brings
     them to rest by then, on a way that must touch no limit; the floor is no nearer than the threshold.
     """
-    found: IntArray = np.minimum((threshold - 1) // max(1, depth - 1), LEAK_MOST)
-    return found
+    return np.asarray(np.minimum((threshold - 1) // max(1, depth - 1), LEAK_MOST))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

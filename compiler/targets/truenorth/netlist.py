@@ -168,8 +168,7 @@ class CrossbarNetlist(netlist_file.Netlist):
     def hops(self) -> IntArray:
         """Cores that the spike of each wire passes, x first and then y; shape (wires,)."""
         core = self.core_of_neuron()[self.wire_neuron]
-        hops: IntArray = np.abs(self.core_x[core] - self.wire_x) + np.abs(self.core_y[core] - self.wire_y)
-        return hops
+        return np.asarray(np.abs(self.core_x[core] - self.wire_x) + np.abs(self.core_y[core] - self.wire_y))
 
 
 def _places(held: tuple[IntArray, IntArray], wanted: tuple[IntArray, IntArray]) -> IntArray:

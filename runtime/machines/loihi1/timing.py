@@ -48,8 +48,7 @@ class StepTimes:
     @property
     def seconds(self) -> FloatArray:
         """Of each recording; shape (samples,)."""
-        seconds: FloatArray = self.duration_ns.sum(axis=1) * 1e-9
-        return seconds
+        return np.asarray(self.duration_ns.sum(axis=1) * 1e-9)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -39,8 +39,7 @@ class TrueNorth(Machine):
 
     def of_layer(self, array: npt.NDArray[T], index: int) -> npt.NDArray[T]:
         """By tick."""
-        of_layer: npt.NDArray[T] = array[:, :, self.netlist.layer == index]
-        return of_layer
+        return np.asarray(array[:, :, self.netlist.layer == index])
 
     @property
     def weight_bits(self) -> int:

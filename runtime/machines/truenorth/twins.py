@@ -97,8 +97,7 @@ def _registers(netlist: CrossbarNetlist, alone: BoolArray) -> IntArray:
     leads[netlist.wire_neuron, 1] = netlist.wire_delay
     columns = [*(getattr(netlist, name) for name in _REGISTERS), netlist.readout_class >= 0, *leads.T]
     rows = np.stack(columns, axis=1).astype(np.int64).reshape(netlist.n_neurons, -1)
-    found: IntArray = np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
-    return found
+    return np.asarray(np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1))
 
 
 def _pairs(axon_kind: IntArray, neuron: IntArray, axon: IntArray, halves: IntArray) -> tuple[IntArray, IntArray]:

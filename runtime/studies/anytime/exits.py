@@ -108,8 +108,7 @@ def exits(sure: BoolArray, at: Standing, factor: float = np.inf) -> IntArray:
 
     By the proof, or where the leader is ahead by more than `factor` votes per root of a step left.
     """
-    first: IntArray = np.argmax(sure | (at.confidence > factor), axis=1)
-    return first
+    return np.asarray(np.argmax(sure | (at.confidence > factor), axis=1))
 
 
 def live(machine: IntegerMachine, bins: int, factor: float) -> Callable[[int, IntArray], bool]:

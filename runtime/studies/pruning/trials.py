@@ -53,8 +53,7 @@ def silenced(netlist: Netlist, sources: IntArray) -> Netlist:
 
 def channels_of(netlist: Netlist, taxels: IntArray) -> IntArray:
     """Input channels of some taxels; shape (taxels, polarities)."""
-    channels: IntArray = taxels[:, None] * netlist.polarities + np.arange(netlist.polarities)
-    return channels
+    return np.asarray(taxels[:, None] * netlist.polarities + np.arange(netlist.polarities))
 
 
 def spared_neurons(netlist: Netlist, spikes: IntArray, fits: Callable[[Netlist], bool]) -> IntArray:

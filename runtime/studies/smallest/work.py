@@ -195,8 +195,7 @@ def decisions(made: Counters, data: Counted) -> IntArray:
     """
     sums: FloatArray = spikes_of(made, data).astype(np.float64) @ made.weight.T
     crossing = np.floor((made.threshold - made.slope * made.steps - sums) / made.slope) + 1
-    found: IntArray = np.where(crossing > made.ramp, np.inf, crossing).argmin(axis=1)
-    return found
+    return np.asarray(np.where(crossing > made.ramp, np.inf, crossing).argmin(axis=1))
 
 
 def costs_of(netlist: Any, of: Recordings) -> dict[str, Costs]:

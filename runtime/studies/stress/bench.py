@@ -154,8 +154,6 @@ def distances(taxels: int, places: FloatArray | None, edges: IntArray | None) ->
         from scipy.sparse import csgraph, csr_array
 
         graph = csr_array((np.ones(len(edges)), edges.T), shape=(taxels, taxels))
-        hops: FloatArray = csgraph.shortest_path(graph, directed=False, unweighted=True)
-        return hops
+        return np.asarray(csgraph.shortest_path(graph, directed=False, unweighted=True))
     where = np.arange(float(taxels))[:, None] if places is None else places
-    apart: FloatArray = np.linalg.norm(where[:, None] - where, axis=2)
-    return apart
+    return np.asarray(np.linalg.norm(where[:, None] - where, axis=2))

@@ -79,14 +79,12 @@ def weight_bit_flips(pair: Pair, share: float, rng: np.random.Generator) -> Pair
 def relays(pair: Pair) -> Mask:
     """Compartments that relay a clock; (compartments,)."""
     first = np.array([population.size - population.relays for population in pair.network.populations])
-    mask: Mask = first[pair.netlist.layer] <= pair.netlist.neuron
-    return mask
+    return np.asarray(first[pair.netlist.layer] <= pair.netlist.neuron)
 
 
 def hidden(pair: Pair) -> IntArray:
     """Compartments that neither vote nor relay a clock; (…,) int64."""
-    ids: IntArray = np.flatnonzero((pair.netlist.readout_class < 0) & ~relays(pair))
-    return ids
+    return np.asarray(np.flatnonzero((pair.netlist.readout_class < 0) & ~relays(pair)))
 
 
 @perturbation(HIDDEN, (0.05, 0.1, 0.25, 0.5))

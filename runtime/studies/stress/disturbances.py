@@ -23,8 +23,7 @@ DENSITY = "share of entries with an event"
 
 def chosen(events: Events, count: int, rng: np.random.Generator) -> IntArray:
     """Some taxels at random; (count,) int64."""
-    picked: IntArray = rng.permutation(events.shape[1])[:count]
-    return picked
+    return np.asarray(rng.permutation(events.shape[1])[:count])
 
 
 def neighbours(distance: FloatArray, count: int, rng: np.random.Generator) -> IntArray:

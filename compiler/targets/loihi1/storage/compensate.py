@@ -104,8 +104,7 @@ def _alike(layer: FloatLayer) -> Iterator[tuple[IntArray, IntArray]]:
 def _places(projection: Projection, rows: IntArray) -> IntArray:
     """Where a projection holds the weights of equally many synapses of each row; (rows, synapses)."""
     begins = projection.weight.indptr[rows]
-    places: IntArray = begins[:, None] + np.arange(projection.weight.indptr[rows[0] + 1] - begins[0])
-    return places
+    return np.asarray(begins[:, None] + np.arange(projection.weight.indptr[rows[0] + 1] - begins[0]))
 
 
 def _spike_times(layer: FloatLayer, calibration: Calibration) -> npt.NDArray[np.uint64]:

@@ -96,5 +96,4 @@ class HeldOut:
         labels = self._readout.label[:, None] == np.arange(self._classes)
         parts = np.array_split(np.arange(self._known.events.shape[1]), PARTS)
         counts = [spikes[self._readout.population][:, part].sum(axis=1) for part in parts]
-        votes: IntArray = np.concatenate(counts) @ labels
-        return votes
+        return np.asarray(np.concatenate(counts) @ labels)

@@ -83,8 +83,7 @@ class Rounded:
 
 def lost(moved: IntArray) -> IntArray:
     """What each neuron loses: spikes that differ, and how many more or fewer there are, or silence would be cheap."""
-    total: IntArray = moved[0] + np.abs(moved[1])
-    return total
+    return np.asarray(moved[0] + np.abs(moved[1]))
 
 
 def rounded(

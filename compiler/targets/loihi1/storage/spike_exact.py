@@ -93,8 +93,7 @@ def _full_range(layer: FloatLayer, candidate: Rounded) -> npt.NDArray[np.bool_]:
     """Whether the largest weight of each neuron fills the planes; shape (neurons,)."""
     form, scale = candidate.form, candidate.population.scale
     steps = layer.peaks() * scale / step_units(form.bits, form.exponents)
-    full: npt.NDArray[np.bool_] = steps >= AT_LIMIT * reach(form.bits, form.exponents)
-    return full
+    return np.asarray(steps >= AT_LIMIT * reach(form.bits, form.exponents))
 
 
 def _limits(layer: FloatLayer, stored: Rounded, slots: int) -> tuple[tuple[str, int], ...]:

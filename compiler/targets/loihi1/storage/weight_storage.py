@@ -33,8 +33,7 @@ FORGETS = DECAY_ONE - 1
 
 def scales(population: ir.Population, form: ir.Form) -> FloatArray:
     """Weight units per membrane unit of the float model; shape (neurons,)."""
-    found: FloatArray = form.threshold / population.theta
-    return found
+    return np.asarray(form.threshold / population.theta)
 
 
 def store_steps(projection: ir.Projection, steps: IntArray, form: ir.Form) -> tuple[ir.IntegerProjection, ...]:
