@@ -70,10 +70,7 @@ def no_synapses(dtype: npt.DTypeLike) -> Synapses:
 
 
 class _Notice(numba_event.Listener):
-    """Says once on a terminal that machine code is being compiled, which takes seconds.
-
-    Meanwhile no garbage is collected: the compiler makes so many objects that a tenth of its time would go into it.
-    """
+    """Says once on a terminal that machine code is being compiled, which takes seconds."""
 
     said, depth, collects = False, 0, True
 
@@ -81,7 +78,7 @@ class _Notice(numba_event.Listener):
         """A function, or one that it calls."""
         if not self.depth:
             self.collects = gc.isenabled()
-            gc.disable()
+            gc.disable()  # the compiler makes so many objects that a tenth of its time would go into it
         self.depth += 1
         if not self.said and sys.stderr.isatty():
             sys.stderr.write("\r\x1b[Kcompiling the simulator's machine code, once after an installation\n")

@@ -65,10 +65,7 @@ def _spread(network: Net, judge: Callable[[Net, int, Known], Mask]) -> Known:
 
 
 def _grow(network: Net, post: int, known: Known, judge: Callable[[Net, int, Known], Mask]) -> None:
-    """Let `judge` say which neurons of a population do nothing, given what is known to do nothing.
-
-    What it finds is known from then on; of a recurrent population it may lead to more.
-    """
+    """Let `judge` say which neurons of a population do nothing, given what is known to do nothing."""
     known[post] = np.zeros(network.populations[post].size, np.bool_)
     known[post] = judge(network, post, known)
     if any(p.pre == p.post == post for p in network.projections):

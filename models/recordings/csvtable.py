@@ -133,11 +133,7 @@ def is_table(file: Path) -> bool:
 
 
 def _read_labels(path: Path, where: str) -> Mapping[str, int] | None:
-    """Class by name of file in a table of labels; None if the file is another kind of table.
-
-    Columns beside that of the file and that of the class are passed over; DataError if a row lacks a class, or a file
-    stands in it twice with different ones.
-    """
+    """Class by name of file in a table of labels; None if the file is another kind of table."""
     rows = list(csv.reader(io.StringIO(read_text(path, where), newline="")))
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     files = [index for index, name in enumerate(header) if name in _FILE]

@@ -172,10 +172,7 @@ def _run(
     fired: Any,
     unsure: Any,
 ) -> None:
-    """Run recordings through a layer; `fired` and `unsure` (recordings, steps, neurons) uint8 are filled.
-
-    It uses `state` (9, neurons) and `listed` (neurons,) int32.
-    """
+    """Run recordings through a layer; `fired` and `unsure` (recordings, steps, neurons) uint8 are filled."""
     start = np.int64(0)  # a plain 0 is a type of its own: all would be compiled once more
     alpha, beta, least, most = constants
     recordings, steps, _ = fired.shape

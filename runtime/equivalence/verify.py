@@ -190,11 +190,7 @@ def _first_divergence(
     events: npt.NDArray[np.uint8],
     files: tuple[str, ...],
 ) -> Divergence | None:
-    """First entry in which spikes of the float32 model and the chip differ.
-
-    Spikes of each layer of these two and of the float64 model are (samples, steps, compared), of neurons that can be
-    compared.
-    """
+    """First entry in which spikes of the float32 model and the chip differ."""
     differs = [(a != b) for a, b in zip(reference, chip, strict=True)]
     broken = np.any([d.any(axis=(1, 2)) for d in differs], axis=0)
     if not broken.any():

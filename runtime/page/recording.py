@@ -158,11 +158,7 @@ def _traces(
     ours: Sequence[Floats],
     chip: Sequence[FloatArray],
 ) -> tuple[Trace, ...]:
-    """Membranes around the first divergence of each layer, the first of all first.
-
-    Where no spike differs, those of the neuron whose membranes lie furthest apart. `spikes` are of both sides, those of
-    each layer (steps, neurons), as are the membranes.
-    """
+    """Membranes around the first divergence of each layer, the first of all first."""
     places = [
         (int(step), layer, int(neuron))
         for layer, (a, b) in enumerate(zip(*spikes, strict=True))

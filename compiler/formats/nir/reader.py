@@ -138,10 +138,7 @@ def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer
 
 
 def _with_held(layers: list[Layer], held: list[Sparse | None], sensor: Input) -> tuple[list[Layer], Input]:
-    """Let a channel that always has an event bring biases that go through a synaptic filter.
-
-    The chip adds a bias past the current, where it acts in full from the first step on.
-    """
+    """Let a channel that always has an event bring biases that go through a filter: the chip adds them past it."""
     lasting = [index for index, channel in enumerate(held) if channel is not None]
     if not lasting:
         return layers, sensor

@@ -76,10 +76,7 @@ def written_step(graph: Graph) -> float | None:
 
 
 def _written_for(node: Node) -> float | None:
-    """The same by a neuron, where its parameters tell: `r` is tau over the step, and not 1.
-
-    Then a step adds its input as it is; snnTorch and SpikingJelly write so.
-    """
+    """The same by a neuron, where its parameters tell: `r` is tau over the step, and not 1."""
     if not node.has("r"):
         return None
     key = {"LIF": "tau", "LI": "tau", "CubaLIF": "tau_mem"}.get(node.type)

@@ -163,10 +163,7 @@ def _sums(draft: Draft, plan: Plan, ends: Mapping[Place, Place]) -> list[list[Pl
 
 
 def _filled(draft: Draft, chip: Target, layer: str, wanted: Iterable[Wanted]) -> list[tuple[int, Place]]:
-    """Add neurons; gives each source and an axon that waits for it.
-
-    A neuron is on the first core with room for it and for an axon of each of its sources.
-    """
+    """Add neurons; gives each source and an axon that waits for it."""
     neurons, axons = chip.limit("core.neurons"), chip.limit("core.axons")
     awaited = defaultdict[int, dict[int, list[int]]](dict)  # neurons of each core by the source that they wait for
     for made, number, end, sources in wanted:

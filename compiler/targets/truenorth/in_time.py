@@ -78,10 +78,7 @@ def first_spikes(network: LevelNetwork) -> dict[str, int]:
 
 @dataclass(slots=True, kw_only=True)
 class _Placing:
-    """Cores as they are made, last layer first; `starts` are those of the layers.
-
-    A layer is added with the axons `ends` that its neurons reach, and notes those that each of its `inputs` must reach.
-    """
+    """Cores as they are made, last layer first; `starts` are those of the layers."""
 
     network: LevelNetwork
     chip: Target

@@ -169,10 +169,7 @@ def lower(network: NativeNetwork, chip: Target, *, provenance: Mapping[str, Any]
 def _place(
     draft: Draft, network: NativeNetwork, depth: int, ends: list[list[Place]] | None, most: int
 ) -> list[list[Place]]:
-    """Add the cores of a stage whose neurons reach the axons `ends`; returns the axons that each of its inputs reaches.
-
-    The last stage, which has no `ends`, votes.
-    """
+    """Add the cores of a stage whose neurons reach the axons `ends`; returns those that each of its inputs reaches."""
     stage, copies = network.stages[depth], network.copies
     first_clock, width = network.taxels * network.polarities, stage.inputs.shape[1]
     reached: list[list[Place]] = [[] for _ in range(stage.inputs.size)]

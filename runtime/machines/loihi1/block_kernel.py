@@ -292,11 +292,7 @@ def _integrate(
 
 
 def _block_step(*, listed: bool, rests: bool, lasts: bool) -> Function:
-    """Make one step of one block.
-
-    Sources come as words, or listed where every source reaches the block; it `rests` where compartments can be idle,
-    and `lasts` where their currents outlast a step.
-    """
+    """Make one step of one block."""
 
     @_intrinsic
     def step(
@@ -493,10 +489,7 @@ def _run_stages(blocks: Blocks, inputs: IntArray, steps: int, scratch: Scratch, 
 
 @compiled
 def _pack_compartments(blocks: Blocks, steps: int, words: AnyArray, out: AnyArray, inverse: Any) -> None:
-    """Write bits into a (chip steps, words) array, compartment c at bit c % 64 of word c // 64.
-
-    Inverted, those of positions that hold a compartment.
-    """
+    """Write bits into a (chip steps, words) array, compartment c at bit c % 64 of word c // 64."""
     for s in range(blocks.stage.size - 1):
         begin, end = blocks.stage[s], blocks.stage[s + 1]
         for t in range(steps):

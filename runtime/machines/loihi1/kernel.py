@@ -139,10 +139,7 @@ def _deliver(tables: Tables, state: State, sources: IntArray) -> None:
 
 @compiled
 def _integrate(tables: Tables, state: State, step: int, length: int) -> bool:
-    """Let all compartments whose window is open integrate, and say whether a register overflows.
-
-    `flags` become those that spike; membranes are left before a reset.
-    """
+    """Let all compartments whose window is open integrate, and say whether a register overflows."""
     depth, keep_u, keep_v, bias, threshold = tables.depth, tables.keep_u, tables.keep_v, tables.bias, tables.threshold
     current, membrane, sums, flags, worked = state.current, state.membrane, state.sums, state.flags, state.worked
     saturations, any_overflow = state.saturations, False

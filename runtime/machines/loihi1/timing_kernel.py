@@ -121,10 +121,7 @@ def _send_all(  # noqa: PLR0915 - one loop over local state, which numba passes 
     done: FloatArray,
     free: FloatArray,
 ) -> tuple[float, float]:
-    """Send the messages of a step; return for how long cores were blocked and the highest load of a link.
-
-    `done` and `free` become the times at which each core has sent and processed everything.
-    """
+    """Send the messages of a step; return for how long cores were blocked and the highest load of a link."""
     # an array taken out of a tuple costs more than a message: take them out once
     destination, processing, route = tables.destination, tables.processing, tables.route
     route_first, route_link, route_share = tables.route_first, tables.route_link, tables.route_share

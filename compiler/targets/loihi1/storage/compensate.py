@@ -119,20 +119,14 @@ def _spike_times(layer: FloatLayer, calibration: Calibration) -> npt.NDArray[np.
 
 
 def _share(together: FloatArray) -> FloatArray:
-    """How much of each input's error the later ones make up for: a Cholesky factor, columns scaled.
-
-    `together` (inputs, inputs) says how often two inputs spiked in the same step.
-    """
+    """How much of each input's error the later ones make up for: a Cholesky factor, columns scaled."""
     damped = together + np.eye(len(together)) * (DAMPING * np.trace(together) / max(len(together), 1))
     factor: FloatArray = np.linalg.cholesky(damped[::-1, ::-1])[::-1, ::-1]
     return factor / np.diag(factor)
 
 
 def _round_in_turn(weight: FloatArray, share: FloatArray) -> FloatArray:
-    """Round columns one after the other, each error passed on to the columns that follow.
-
-    Weights (neurons, inputs) are in steps, `share` (inputs, inputs) is of :func:`_share`.
-    """
+    """Round columns one after the other, each error passed on to the columns that follow."""
     rounded, errors = np.empty_like(weight), np.empty_like(weight)
     for start in range(0, weight.shape[1], BLOCK):
         block = slice(start, start + BLOCK)
