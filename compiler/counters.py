@@ -3,11 +3,9 @@
 Its file, and the spiking network that it stands for, are in :mod:`formats.counters`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.types import IntArray
@@ -42,6 +40,6 @@ class Counters:
             return Clocks(length=length)
         return Clocks(channels=self.parts, steps=-(-self.steps // self.parts), length=length)
 
-    def trained(self, record: Mapping[str, Any]) -> Counters:
+    def trained(self, record: Mapping[str, Any]) -> Self:
         """The same with how it was made."""
         return replace(self, training=record)

@@ -5,15 +5,13 @@ recording is (taxels, polarities, steps), values 0 and 1; of two polarities, 1 i
 contact).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +86,7 @@ class Recordings:
         """Time steps of one recording."""
         return self.steps if self.lengths is None else int(self.lengths[index])
 
-    def part(self, chosen: slice | NDArray[Any], split: str | None = None) -> Recordings:
+    def part(self, chosen: slice | NDArray[Any], split: str | None = None) -> Self:
         """Some of the recordings, by indices, truth values or a slice; of another `split` if it has a name."""
         indices = np.arange(len(self))[chosen]
         return replace(

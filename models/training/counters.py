@@ -12,12 +12,10 @@ References
    ICLR 2023.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +92,7 @@ class Counted:
     at: NDArray[np.int32]  # (samples, counters); step of the first spike, `steps` where there is none
     labels: IntArray
 
-    def part(self, rows: Any) -> Counted:
+    def part(self, rows: Any) -> Self:
         """Some of the recordings."""
         return replace(self, spikes=self.spikes[rows], at=self.at[rows], labels=self.labels[rows])
 

@@ -1,11 +1,9 @@
 """The command ``inspect``: what is in a netlist or a checkpoint."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -75,7 +73,7 @@ class CountingFacts:
     sha256: str
 
     @classmethod
-    def of(cls, found: Counters, sha256: str) -> CountingFacts:
+    def of(cls, found: Counters, sha256: str) -> Self:
         """Those of a file."""
         same = {
             name: getattr(found, name) for name in ("taxels", "classes", "bins", "steps", "parts", "ramp", "training")

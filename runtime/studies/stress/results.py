@@ -1,7 +1,5 @@
 """What ``stress`` returns."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -34,10 +32,6 @@ class Spread:
     low: float
     high: float
     values: tuple[float, ...]
-
-    def meets(self, other: Spread) -> bool:
-        """Whether the intervals overlap."""
-        return max(self.low, other.low) <= min(self.high, other.high)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

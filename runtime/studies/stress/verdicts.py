@@ -96,13 +96,14 @@ def curve(name: str, runs: Mapping[Level, Sequence[Run]], clean: Run, recordings
     chip = breaks["chip"]
     left = {each.leaves for each in breaks.values()}
     first = next((point for point in levels if point.level in left), None)
+    overlap = first is not None and max(first.model.low, first.chip.low) <= min(first.model.high, first.chip.high)
     return Curve(
         what=NAMES[name].what,
         unit=NAMES[name].unit,
         seeded=NAMES[name].seeded,
         levels=levels,
         breaks=breaks,
-        same_place=first is None or left == {first.level} or first.model.meets(first.chip),
+        same_place=first is None or left == {first.level} or overlap,
         verdict=ROBUST if chip.leaves is None else DEGRADES if chip.chance is None else BREAKS,
     )
 
