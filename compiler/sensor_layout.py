@@ -77,9 +77,7 @@ def _polarity_axis(sizes: list[int], shown: str, polarities: int | None, first: 
     if len(fits) == 1 or (fits and inner == 2):
         return fits[0]
     which = "both axes could be" if fits else "no axis is"
-    raise ModelError(
-        f"the input {shown}: {which} the polarities; tell with --polarities N and --polarities-first or -last"
-    )
+    raise ModelError(f"the input {shown}: {which} the polarities; give --polarities N and --polarities-first or -last")
 
 
 def _layout(grid: IntArray, words: str) -> tuple[Input, IntArray, str]:

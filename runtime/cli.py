@@ -112,9 +112,7 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("-V", "--version", action="version", version=f"spikeloom {__version__}")
-    parser.add_argument(
-        "--print-completion", choices=("bash", "zsh", "tcsh"), help="print a completion script for a shell"
-    )
+    parser.add_argument("--print-completion", choices=("bash", "zsh", "tcsh"), help="print a completion script")
     hidden = argparse.SUPPRESS if chosen == "" else None  # the overview names them, by group
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", help=hidden, prog="spikeloom")
     for name in COMMANDS if chosen is None else filter(None, [chosen]):
@@ -179,7 +177,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         tell(_mistake(error))
         if isinstance(error, UnfinishedError):
-            tell(f"go on with: {shlex.join(['spikeloom', *(word for word in words if word != '--fresh')])}")
+            tell(f"go on with: {shlex.join(['spikeloom', *words])}")
             return 1
         return 2
     except KeyboardInterrupt as interrupt:

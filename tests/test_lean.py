@@ -1,8 +1,6 @@
 """The command ``lean``: what it recommends is what it builds, and figures are those of the netlist."""
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,8 +50,7 @@ def counts(netlist, seen):
 
 
 def test_what_is_written_decides_and_costs_as_reported(as_json):
-    report = as_json(*LEAN, "--differ", "0.1", "-o", "lean.loom", "--report", "lean.json")
-    assert report == json.loads(Path("lean.json").read_text("utf-8"))
+    report = as_json(*LEAN, "--differ", "0.1", "-o", "lean.loom")
     row = report["rows"][report["taken"]]
     assert row["training"]["differ"] <= 2
     netlist = read_netlist("lean.loom")

@@ -43,9 +43,7 @@ def picked(value: A, rows: IntArray, shape: tuple[int, ...]) -> A:
     """
     same = np.array_equal(rows, np.arange(len(value.bias)))
     terms = {atom: own if same else own[rows] for atom, own in value.terms.items()}
-    return replace(
-        value, shape=shape, terms={atom: own for atom, own in terms.items() if own.nnz}, bias=value.bias[rows]
-    )
+    return replace(value, shape=shape, terms={a: own for a, own in terms.items() if own.nnz}, bias=value.bias[rows])
 
 
 def picked_of_all(parts: Sequence[Affine], rows: IntArray) -> Affine:

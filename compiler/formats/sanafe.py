@@ -68,9 +68,7 @@ def input_tiles(netlist: Netlist, target: Target) -> tuple[int, ...]:
     free = np.repeat(order, np.maximum(room - used[order], 0))
     wanted = -(-netlist.n_inputs // target.limit("core.compartments"))
     if wanted > len(free):
-        raise ModelError(
-            f"input channels: {wanted} cores needed, the chip has {len(free)} left; compile for fewer cores"
-        )
+        raise ModelError(f"input channels: {wanted} cores needed, the chip has {len(free)} left; use fewer cores")
     return tuple(int(tile) for tile in free[:wanted])
 
 
@@ -79,9 +77,7 @@ def cores(netlist: Netlist, target: Target) -> tuple[str, ...]:
     require_one_chip(netlist.core_tile, target, "--to sanafe")
     width, height = target.limit("mesh.width"), target.limit("mesh.height")
     tiles = [*netlist.core_tile.tolist(), *input_tiles(netlist, target)]
-    return tuple(
-        f"{tile % width * height + tile // width}.{tiles[:core].count(tile)}" for core, tile in enumerate(tiles)
-    )
+    return tuple(f"{tile % width * height + tile // width}.{tiles[:n].count(tile)}" for n, tile in enumerate(tiles))
 
 
 def export(netlist: Netlist, target: Target) -> Iterator[str]:

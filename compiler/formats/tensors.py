@@ -125,9 +125,7 @@ def members(checkpoint: Checkpoint) -> tuple[Checkpoint, ...]:
     return tuple(found)
 
 
-def side_by_side(
-    checkpoint: Checkpoint, every: Sequence[Mapping[str, npt.NDArray[Any]]]
-) -> dict[str, npt.NDArray[Any]]:
+def side_by_side(checkpoint: Checkpoint, every: Sequence[Mapping[str, npt.NDArray[Any]]]) -> Arrays:
     """Values of all neurons from those of each tower; by layer, (..., neurons)."""
     found = {}
     for (name, neurons), owner in zip(checkpoint.neurons.items(), towers_of(checkpoint), strict=True):

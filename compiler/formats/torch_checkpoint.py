@@ -39,9 +39,7 @@ BETA, THETA = 0.2, 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""
 
 
-OTHERS = (
-    "another network comes as ONNX or NIR, or in Python as spikeloom.compile(module, example=…), see docs/formats.md"
-)
+OTHERS = "another network comes as ONNX or NIR, or in Python as spikeloom.compile(module, example=…): docs/formats.md"
 """What to do with a file of torch that holds no network of ours."""
 
 

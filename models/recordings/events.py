@@ -125,9 +125,7 @@ def load_data(
 def _require_alike(read: _Recording, first: _Recording, released: bool) -> None:
     """Refuse other polarities than the first recording has; in the released layout another shape, and no label."""
     if released and read.label == evtouch.UNLABELLED:
-        raise DataError(
-            f"{read.where}: no label in the name, allowed is sample_N_label_L.npy; rename or remove the file"
-        )
+        raise DataError(f"{read.where}: no label in the name, allowed is sample_N_label_L.npy; rename or remove it")
     if read.grid.shape[1] != first.grid.shape[1] or (released and read.grid.shape != first.grid.shape):
         raise DataError(
             f"{read.where}: shape {read.grid.shape}, the recordings before it have {first.grid.shape}; "

@@ -85,9 +85,7 @@ def write_event_lines(path: str | os.PathLike[str], splits: Sequence[Recordings]
     """
     count = sum(len(recordings) for recordings in splits)
     if count != 1:
-        raise DataError(
-            f"-o {path}: {count} recordings, a .csv holds one; give one recording, or a folder or zip to -o"
-        )
+        raise DataError(f"-o {path}: {count} recordings, a .csv holds one; give one, or a folder or zip to -o")
     require_polarities(splits[0])
     step, taxel, polarity = np.nonzero(splits[0].events[0].transpose(2, 0, 1))
     times = (step + 0.5) * bin_s

@@ -133,12 +133,10 @@ def add_network(parser: argparse.ArgumentParser) -> None:
     options = group(parser, "network")
     add_model(parser)
     options.add_argument("--polarities", type=int, metavar="N", help="of an ONNX or NIR input, where its shape is flat")
-    order = options.add_mutually_exclusive_group()
+    axis = options.add_mutually_exclusive_group()
     for name, first in (("first", True), ("last", False)):
         what = f"they are the {name} axis, where the shape of an ONNX or NIR input does not say"
-        order.add_argument(
-            f"--polarities-{name}", dest="polarities_first", action="store_const", const=first, help=what
-        )
+        axis.add_argument(f"--polarities-{name}", dest="polarities_first", action="store_const", const=first, help=what)
     options.add_argument(
         "--dt", type=float, metavar="SECONDS", help="time step that a NIR file is read in (default: its own)"
     )

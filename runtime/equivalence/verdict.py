@@ -284,9 +284,7 @@ def unmet(levels: tuple[Level, ...], required: Mapping[str, float]) -> list[str]
         if wanted is None or (level.share is not None and level.share >= wanted):
             continue
         counted = level.name in SHARES and level.share is not None
-        missed.append(
-            f"{level.name}: " + (f"{level.share:.4f} reached, {wanted:g} required" if counted else level.text)
-        )
+        missed += [f"{level.name}: " + (f"{level.share:.4f} reached, {wanted:g} required" if counted else level.text)]
     return missed
 
 

@@ -65,7 +65,6 @@ def sweep(
     store: Path,
     *,
     jobs: int | None = None,
-    fresh: bool = False,
     label: str,
     kind: Any = Any,
     own: Sequence[Path] = (),
@@ -73,16 +72,17 @@ def sweep(
     """Measure jobs, as far as the store does not know them; their results by key, of a `kind` that is decoded.
 
     They are begun in this order; of those with equal keys the first is measured. `measure` makes JSON values of a job,
-    a function of a module, since it crosses process borders. `store` is an SQLite file in a folder that exists; with
-    `fresh` what it holds is forgotten. `jobs` are processes at a time (one a core), whose libraries use one thread
-    each; `label` says what is done; half-written files are
-    removed from folders that are its `own`.
+    a function of a module, since it crosses process borders. `store` is an SQLite file in a folder that exists. `jobs`
+    are processes at a time (one a core), whose libraries use one thread each; `label` says what is done; half-written
+    files are removed from folders that are its `own`.
 
     What a measurement raises is raised with notes that name it and say what is kept, as does the text of a
     KeyboardInterrupt; UnfinishedError, if a process died.
     """
     keys = list(dict.fromkeys(point.key for point in points))
-    with only_one(store), closing(_opened(store, fresh=fresh)) as kept:
+    if store.exists() and not store.is_file():
+        raise DataError(f"{store}: is not a file; give another output")
+    with only_one(store), closing(sqlite3.connect(store)) as kept:
         for folder in own:
             remove_leftovers(folder)
         with reading(store, DataError, "give another output, or delete it"):
@@ -124,15 +124,6 @@ def _named(measure: Callable[[AJob], AResult], job: AJob) -> AResult:
     except Exception as error:
         error.add_note(job.label)
         raise
-
-
-def _opened(store: Path, *, fresh: bool) -> sqlite3.Connection:
-    """A store, made where there is none."""
-    if fresh:
-        store.unlink(missing_ok=True)
-    if store.exists() and not store.is_file():
-        raise DataError(f"{store}: is not a file; give another output")
-    return sqlite3.connect(store)
 
 
 def sealed(key: str, text: str) -> str:

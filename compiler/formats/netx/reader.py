@@ -210,9 +210,7 @@ def _planes(block: Block, weight: ir.Sparse) -> list[tuple[ir.Sparse, int]]:
     weight.sort_indices()
     data = weight.data
     if data.size and (data.min() < -256 or data.max() > 255):
-        raise block.fail(
-            f"has weights from {data.min()} to {data.max()}, allowed are -256 to 255; netx would clip them"
-        )
+        raise block.fail(f"has weights from {data.min()} to {data.max()}, allowed are -256 to 255; netx clips them")
     if not np.any(data % 2):
         return [(ir.with_data(weight, data.astype(ir.MANTISSA)), 0)]
     if np.abs(data).max() <= 127:
@@ -264,9 +262,7 @@ def _bias(block: Block, size: int, shape: tuple[int, ...]) -> IntArray:
     if values.size not in (1, shape[0], size):
         raise block.fail(f"bias has {values.size} values for {size} neurons; the shapes disagree, {AGAIN}")
     if np.any(np.abs(values) > BIAS_MANTISSA_MAX):
-        raise block.fail(
-            f"has biases up to {np.abs(values).max()}, allowed are {BIAS_MANTISSA_MAX} steps; train it again"
-        )
+        raise block.fail(f"has biases up to {np.abs(values).max()}, allowed are {BIAS_MANTISSA_MAX} steps; train again")
     return np.asarray(np.repeat(values, size // values.size))
 
 

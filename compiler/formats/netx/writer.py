@@ -71,9 +71,7 @@ def blocks_for(network: IntegerNetwork) -> tuple[DenseLayer, ...]:
         before = post - 1 if post else INPUT
         last = len(network.populations) - 1
         if any(projection.pre not in (before, post) for projection in into) or network.readout.population != last:
-            raise ModelError(
-                f"{population.name}: receives more than the layer before it; netx has layers in a row only"
-            )
+            raise ModelError(f"{population.name}: receives more than the layer before it; netx has layers in a row")
         # side by side from the layer before and, where it is recurrent, from its own neurons
         sources = {before: network.input.size if before == INPUT else network.populations[before].size}
         sources |= {post: population.size} if any(projection.pre == post for projection in into) else {}

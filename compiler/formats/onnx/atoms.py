@@ -80,9 +80,7 @@ class Table:
     def atom(self, kind: str, label: str, size: int, **facts: Any) -> int:
         """Add an atom, if there may be one of that size; `facts` are more fields of it."""
         if size > ATOM_LIMIT:
-            raise ModelError(
-                f"{printable(label)} has {size} elements, allowed are {ATOM_LIMIT}; no chip holds such a layer"
-            )
+            raise ModelError(f"{printable(label)} has {size} elements, allowed are {ATOM_LIMIT}; no chip holds that")
         self.atoms.append(Atom(kind=kind, label=label, eye=sparse.eye_array(size, format="csr"), **facts))
         return len(self.atoms) - 1
 

@@ -163,9 +163,7 @@ def _compared(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | N
     single = next(iter(membrane.terms), -1)
     factor = diagonal(membrane.terms[single]) if len(membrane.terms) == 1 else None
     if not factor or table.atoms[single].kind not in (atoms.MEMBRANE, atoms.INPUT_ATOM):
-        raise ModelError(
-            "compares what is not the membrane of a layer; only a membrane can be held against a threshold"
-        )
+        raise ModelError("compares what is not the membrane of a layer; only a membrane has a threshold")
     theta = (spread(limit, membrane.shape).bias - membrane.bias) / factor
     op = MIRRORED[node.op] if mirrored != (factor < 0) else node.op
     spike = table.spike(single, theta, strict=op in ("Greater", "LessOrEqual"))

@@ -123,9 +123,7 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
     place = netlist.number_in_layer()
     counts = {INPUT: netlist.n_inputs} | dict(enumerate(np.bincount(netlist.layer, minlength=len(names)).tolist()))
     if (size := sum(counts[a] * counts[b] for b, a in pairs.tolist())) > SIZE_LIMIT:
-        raise ModelError(
-            f"onnx: dense, the weights need {size} bytes, a file holds {SIZE_LIMIT}; export a smaller network"
-        )
+        raise ModelError(f"onnx: dense, the weights need {size} bytes, a file holds {SIZE_LIMIT}; give a smaller one")
     row = np.append(np.arange(netlist.n_inputs), place)[netlist.axon_source[axon]]
 
     def weights(a: int, b: int) -> IntArray:

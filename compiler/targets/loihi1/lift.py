@@ -77,10 +77,8 @@ def lift(netlist: Netlist) -> IntegerNetwork:
     for index, layer in enumerate(netlist.layers):
         if index not in reached:
             before = next((i for i, other in enumerate(netlist.layers) if other.depth == layer.depth - 1), INPUT)
-            nothing = sparse.csr_array((layer.neurons, sizes[before]), dtype=np.int64)
-            projections.append(
-                IntegerProjection(pre=before, post=index, weight=nothing, exponent=0, bits=layer.weight_bits)
-            )
+            none = sparse.csr_array((layer.neurons, sizes[before]), dtype=np.int64)
+            projections += [IntegerProjection(pre=before, post=index, weight=none, exponent=0, bits=layer.weight_bits)]
     voting = np.unique(netlist.layer[netlist.readout_class >= 0])
     if len(voting) != 1:
         raise FormatError(f"netlist: {len(voting)} layers vote for classes, one is allowed; compile it again")

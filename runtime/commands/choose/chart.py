@@ -21,7 +21,7 @@ Axes of the grid: bits (2-6, 8, or one a layer as in 8+4+4+8), planes (1-3), gro
 latency, or LAYER:N as in fc1:6+conv1:4), window (per cent of each recording, 25-100% is every quarter,
 25-100%:5 every twentieth). The choice, the cheapest point that is at most a point less accurate than the best, is made
 on the training split, the test split is reported. A chart that was interrupted goes on with the same command; netlists
-and figures are kept in FOLDER. The exit code is 1 if no point fits a budget.
+and figures are kept in FOLDER: delete it to measure anew. The exit code is 1 if no point fits a budget.
 """
 
 
@@ -35,9 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = "of the point to deploy: energy=0.1mJ, latency=5ms or accuracy=88; may be repeated, all of them hold"
     parser.add_argument("--budget", action="append", default=[], metavar="WHAT=LIMIT", help=what)
     parser.add_argument("--table", metavar="NAME", help="energy table to choose and draw by (default: the first)")
-    sweeps = parser.add_argument_group("sweep")
-    sweeps.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
-    sweeps.add_argument("--fresh", action="store_true", help="measure anew what an earlier run left")
+    parser.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
     parser.add_argument("-o", "--output", required=True, metavar="FOLDER")
     parser.epilog = NOTES
 
@@ -65,10 +63,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_suited(networks, splits, data.sha256)
     require_grid(networks, grid, target)
     folder.mkdir(exist_ok=True)
-    sweep = {"jobs": arguments.jobs, "fresh": arguments.fresh}
     options = repeat.words(repeat.given(arguments, ("data", *repeat.NETWORK, "grid", "table", "bin")))
     options += [word for budget in arguments.budget for word in ("--budget", budget)]
     command = repeat.command("chart", *arguments.checkpoints, *options, "-o", arguments.output)
-    charted = chart(networks, target, data, grid, budgets, folder, energy=energy, command=command, **sweep)
+    charted = chart(networks, target, data, grid, budgets, folder, energy=energy, command=command, jobs=arguments.jobs)
     write_chart(folder, charted)
     return Outcome(charted, partial(printed, folder=str(folder)), 0 if charted.budget.fits else 1)

@@ -14,7 +14,7 @@ from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_graph, load_network
 from spikeloom.runtime.inputs.recordings import recordings, require_splits
 from spikeloom.runtime.report.console import progress
-from spikeloom.runtime.report.encode import encode, write_json
+from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.pruning.results import sections
 from spikeloom.runtime.studies.pruning.study import study
@@ -38,7 +38,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--differ", type=float, default=DIFFER, metavar="X", help=what)
     parser.add_argument("-o", "--output", metavar="OUT.loom", help="write the netlist without what may go")
     parser.add_argument("--network", metavar="OUT.pt", help="write the float network without dense neurons that may go")
-    parser.add_argument("--report", metavar="OUT.json", help="write the result")
     parser.epilog = NOTES
 
 
@@ -47,7 +46,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if not 0 <= arguments.differ < 1:
         raise OptionError(f"--differ {arguments.differ:g}: not a share; give a number from 0 to below 1")
     require_place(arguments.output, "-o", arguments)
-    require_place(arguments.report, "--report", arguments)
     require_place(arguments.network, "--network", arguments)
     loaded = load_network(arguments.checkpoint, arguments)
     plain = loaded.checkpoint is not None and loaded.checkpoint.forms is None and loaded.checkpoint.towers == 1
@@ -79,5 +77,4 @@ def run(arguments: argparse.Namespace) -> Outcome:
         made = {"command": repeat.command("lean", Path(arguments.checkpoint).name, *typed)}
         less = narrowed(replace(given, graph=loaded.graph, edges=edges), spared)
         save_again(arguments.network, less, training=made | {"pruned_from": loaded.sha256})
-    write_json(arguments.report, result)
     return Outcome(result, sections)

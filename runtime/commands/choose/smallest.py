@@ -46,7 +46,7 @@ Candidates are counting networks of many sizes and a few that are trained by gra
 the training split, in three rungs: what a cheaper one beats is dropped early. Taken is the cheapest whose accuracy is
 at most a standard error below the best, recording by recording; it is trained on the whole training split, compiled and
 verified, and read on the test split once. Results are kept in the store; the same command goes on from there, other
-budgets ask it again. The exit code is 1 if no candidate fits a budget.
+budgets ask it again; delete it to measure anew. The exit code is 1 if no candidate fits a budget.
 """
 
 
@@ -58,10 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--levels", type=int, metavar="N", help=LEVELS)
     what = "of an inference: energy=5uJ, time=5ms, operations=25000, cores=1, accuracy=88; all of them hold"
     parser.add_argument("--budget", action="append", default=[], metavar="WHAT=LIMIT[,…]", help=what)
-    sweeps = parser.add_argument_group("search")
-    sweeps.add_argument("--store", metavar="FILE", help="what is measured (default: NET.sqlite, beside the netlist)")
-    sweeps.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
-    sweeps.add_argument("--fresh", action="store_true", help="measure anew what an earlier search left")
+    parser.add_argument("--store", metavar="FILE", help="what is measured (default: NET.sqlite, beside the netlist)")
+    parser.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
     parser.add_argument("--html", metavar="PAGE.html", help="write a page, too")
     parser.add_argument("-o", "--output", required=True, metavar="NET.loom", help="netlist; NET.pt is the network")
     parser.epilog = NOTES
@@ -98,7 +96,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
         sensor=sensor,
         command=_command(arguments),
         jobs=arguments.jobs,
-        fresh=arguments.fresh,
     )
     if arguments.html is not None:
         with write_atomically(arguments.html) as file:

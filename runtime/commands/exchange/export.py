@@ -29,9 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", metavar="NET.loom", help="a netlist")
     what = "; ".join(f"{name}: {each.title}" for name, each in FORMATS.items())
     parser.add_argument("--to", required=True, choices=tuple(FORMATS), help=what)
-    parser.add_argument(
-        "--form", choices=FORMS, help="onnx: one step with its state, or whole recordings (default: scan)"
-    )
+    parser.add_argument("--form", choices=FORMS, help="onnx: a step and its state, or whole recordings (default: scan)")
     what = f"ranc: a recording to add; netx: those on which spikes that move are counted; {DATA_HELP}"
     parser.add_argument("--data", metavar="PATH", help=what)
     parser.add_argument("--split", help="ranc, netx: split to read (default: test)")

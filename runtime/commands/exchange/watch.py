@@ -248,9 +248,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
     add_netlist(parser)
     parser.add_argument("--input", default="-", metavar="FILE", help="event lines (default: -, standard input)")
-    parser.add_argument(
-        "--bin", default="0.02", metavar="SECONDS", help="length of a bin of the recordings (default: 0.02)"
-    )
+    parser.add_argument("--bin", default="0.02", metavar="SECONDS", help="bin of the recordings (default: 0.02)")
     parser.add_argument(
         "--bins", type=int, metavar="N", help="steps of every grasp: shorter ones are filled up, longer ones cut"
     )
@@ -268,9 +266,7 @@ def _opened(name: str) -> io.FileIO:
     try:
         return io.FileIO(0 if name == "-" else name, closefd=name != "-")
     except OSError as error:
-        raise DataError(
-            f"--input {name}: {error.strerror}; give a file of event lines, or - for standard input"
-        ) from error
+        raise DataError(f"--input {name}: {error.strerror}; give event lines, or - for standard input") from error
 
 
 def _duration(text: str) -> Decimal:

@@ -75,9 +75,7 @@ class CountingFacts:
     @classmethod
     def of(cls, found: Counters, sha256: str) -> Self:
         """Those of a file."""
-        same = {
-            name: getattr(found, name) for name in ("taxels", "classes", "bins", "steps", "parts", "ramp", "training")
-        }
+        same = {name: getattr(found, name) for name in ("taxels", "classes", *CLOCKING, "training")}
         thresholds = np.unique(found.counter[:, 2]).tolist()
         return cls(**same, counters=len(found.counter), thresholds=thresholds, sha256=sha256)
 

@@ -122,9 +122,7 @@ def sections(found: Decisions) -> Iterator[Section]:
         without = f", {len(unknown)} more without a label" if unknown else ""
         blocks.append(Text(f"chip accuracy: {percent(known - len(wrong), known)}{without}"))
     if wrong:
-        cells = [
-            [file, *map(str, (label, chosen, votes[label], votes[chosen]))] for file, label, chosen, votes in wrong
-        ]
+        cells = [[file, *map(str, (label, made, votes[label], votes[made]))] for file, label, made, votes in wrong]
         blocks.append(Table(["decided wrongly", "label", "decision", "votes for label", "for decision"], cells))
     if unknown:
         cells = [[file, str(chosen), str(votes[chosen])] for file, _, chosen, votes in unknown]

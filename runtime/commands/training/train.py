@@ -66,9 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     counting = group(parser, "counters")
     counting.add_argument("--thresholds", metavar="K[,K]", help="events at which counters spike (default: 1,4,16,64)")
-    counting.add_argument(
-        "--parts", type=int, metavar="N", help="equal parts of a recording, counted apart (default: 1)"
-    )
+    counting.add_argument("--parts", type=int, metavar="N", help="parts of a recording, counted apart (default: 1)")
     counting.add_argument("--ramp", type=int, metavar="N", help="silent steps of the read-out (default: 32)")
     counting.add_argument(
         "--levels", type=int, metavar="N", help="so many classes in a row are levels of one thing (default: 1)"

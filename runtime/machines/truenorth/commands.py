@@ -289,9 +289,7 @@ def sections(found: Verdict) -> list[Section]:
         blocks.append(Table(["layer", "partial sums", "saturated", "largest"], sums))
     if found.network is not None:
         same, moved = found.network.decisions_equal, found.network.votes_different
-        blocks.append(
-            Text(f"E3 network of the file: {same} of {found.samples} decisions equal; votes moved: {moved:,}")
-        )
+        blocks += [Text(f"E3 network of the file: {same} of {found.samples} decisions equal; votes moved: {moved:,}")]
     return [Section("Verdict", [*blocks, Text(accuracy)])]
 
 

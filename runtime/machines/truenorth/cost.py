@@ -197,9 +197,7 @@ def sections(found: Estimate) -> list[Section]:
         "two readings of one measurement: take one, never their sum",
         f"a data step takes {si(pace.step_s, 's')}: {'keeps' if pace.real_time else 'does not keep'} the sensor's pace "
         f"of {1000 * pace.bin_s:g} ms a step",
-        dominant(
-            [watts * seconds for watts in found.static_w.values()], [reading.events_j for reading in found.energy]
-        ),
+        dominant([watts * seconds for watts in found.static_w.values()], [each.events_j for each in found.energy]),
         *(f"not priced: {line}" for line in found.not_priced),
     ]
     return [

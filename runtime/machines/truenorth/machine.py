@@ -74,9 +74,7 @@ class TrueNorth(Machine):
 
     def stream(self) -> NoReturn:
         """Whole recordings only."""
-        raise OptionError(
-            f"{self.target.title}: runs whole recordings, not bin after bin; give a netlist for another chip"
-        )
+        raise OptionError(f"{self.target.title}: runs whole recordings, not bin after bin; give one for another chip")
 
 
 machine_of = TrueNorth

@@ -39,7 +39,6 @@ def chart(
     energy: str,
     command: str,
     jobs: int | None = None,
-    fresh: bool = False,
 ) -> Chart:
     """Measure a grid, as far as a folder does not hold it, and choose by a table of energy.
 
@@ -52,7 +51,7 @@ def chart(
     ]
     kind = Mapping[str, work.Built]
     own = (folder, folder / "netlists")
-    found = sweep(works, work.measure, folder / STORE, jobs=jobs, fresh=fresh, label="measuring", kind=kind, own=own)
+    found = sweep(works, work.measure, folder / STORE, jobs=jobs, label="measuring", kind=kind, own=own)
     points: list[Point] = []
     refused: list[Refused] = []
     for each in works:

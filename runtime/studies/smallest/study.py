@@ -60,7 +60,6 @@ def smallest(
     sensor: Sensor,
     command: str,
     jobs: int | None = None,
-    fresh: bool = False,
 ) -> Smallest:
     """Search as far as the store does not know, choose, and `make` the choice: train, compile and verify it.
 
@@ -68,7 +67,7 @@ def smallest(
     """
     trial = partial(work.trial, data=data, sensor=sensor, target=target.name)
     on = partial(going_on, budgets=budgets)
-    beside = search(baselines(), most_accurate, trial, store, jobs=jobs, fresh=fresh)
+    beside = search(baselines(), most_accurate, trial, store, jobs=jobs)
     tried = search(candidates, on, trial, store, jobs=jobs)
     taken = choose(tried, budgets)
     best = tried[taken.best - 1]
@@ -98,7 +97,6 @@ def search(
     store: Path,
     *,
     jobs: int | None,
-    fresh: bool = False,
 ) -> list[Tried]:
     """All candidates, as far as each came; `going_on` chooses those that go on from a rung."""
     known: dict[str, Tried] = {}
@@ -106,8 +104,7 @@ def search(
     alive: dict[str, tuple[Candidate, float | None]] = {each.name: (each, None) for each in candidates}
     for rung in range(1, RUNGS + 1):
         works = [trial(each, rung, setting) for each, setting in alive.values()]
-        anew, label = fresh and rung == 1, f"rung {rung} of {RUNGS}"
-        found = sweep(works, work.measure, store, jobs=jobs, fresh=anew, label=label, kind=Measured)
+        found = sweep(works, work.measure, store, jobs=jobs, label=f"rung {rung} of {RUNGS}", kind=Measured)
         for job in works:
             number = known[job.label].number if job.label in known else len(known) + 1
             known[job.label] = _tried(number, job, found[job.key])

@@ -40,7 +40,7 @@ def study(arguments: argparse.Namespace, names: Sequence[str], requirements: Seq
         for seed in range(arguments.seeds if NAMES[name].seeded else 1)
     ]
     measured: dict[str, dict[Level, list[Run]]] = {}
-    for (name, level, _), run in zip(points, _measured(points, bench, reference, arguments.jobs), strict=True):
+    for (name, level, _), run in zip(points, _runs(points, bench, reference, arguments.jobs), strict=True):
         measured.setdefault(name, {}).setdefault(level, []).append(run)
     curves = {name: curve(name, each, undisturbed, recordings, classes) for name, each in measured.items()}
     return Stress(
@@ -67,9 +67,7 @@ def study(arguments: argparse.Namespace, names: Sequence[str], requirements: Seq
     )
 
 
-def _measured(
-    points: Sequence[tuple[str, Level, int]], bench: Bench, reference: Outcome, jobs: int | None
-) -> list[Run]:
+def _runs(points: Sequence[tuple[str, Level, int]], bench: Bench, reference: Outcome, jobs: int | None) -> list[Run]:
     """The run of each point, several at a time in threads: kernels let go of the interpreter's lock."""
     work = Parallel(jobs or os.cpu_count(), backend="threading", return_as="generator")
     runs, progress = [], Progress(len(points))

@@ -121,9 +121,7 @@ def prepare(netlist: Netlist, target: Target, by: Literal["layer", "core", "whol
         BETWEEN_CHIPS: caused(leaves, source, group[sender]),
         "zeros": caused(netlist.synapse_weight == 0, *entries),
     }
-    return Meter(
-        target=target, names=tuple(amounts), caused=np.concatenate(list(amounts.values()), axis=1), neurons=neurons
-    )
+    return Meter(target=target, names=tuple(amounts), caused=np.hstack(list(amounts.values())), neurons=neurons)
 
 
 def count(meter: Meter, counts: Counts, chip_steps: int | IntArray) -> dict[str, FloatArray]:
