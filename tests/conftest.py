@@ -10,10 +10,14 @@ from pathlib import Path
 
 import commands
 import pytest
+from hypothesis import HealthCheck, settings
 from made_files import own_file, recordings_folder
 
 from spikeloom.runtime import cli
 
+SLOW = (HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.function_scoped_fixture)
+settings.register_profile("ours", deadline=None, max_examples=25, suppress_health_check=SLOW)
+settings.load_profile("ours")
 SHARED = Path(os.environ.get("SPIKELOOM_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
 

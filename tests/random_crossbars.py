@@ -125,7 +125,6 @@ def assert_same(one, other) -> None:
     np.testing.assert_array_equal(one.spikes, other.spikes, "spikes")
 
 
-# -- networks of whole numbers, before they are placed -----------------------------------------------------------------
 def random_stage(rng, name, inputs, size, depth, *, copies, clocks) -> Stage:
     blocks, width = inputs.shape
     most = highest_level(copies)

@@ -30,24 +30,20 @@ from made_files import torch_bytes
 from made_modules import NETS, example_of, one_step
 from made_onnx import two_layers
 from onnx import ModelProto, defs
-from random_crossbars import random_network
-from random_networks import LOIHI, compiled, integer_chain
+from random_networks import LOIHI
+from zoo import specimen
 
 from spikeloom.compiler import archive
-from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import CapacityError, SpikeloomError
 from spikeloom.compiler.formats.checkpoint_reader import content_digest, read_checkpoint
-from spikeloom.compiler.formats.counters import read_network, write_counters
+from spikeloom.compiler.formats.counters import read_network
 from spikeloom.compiler.formats.hdf5 import hdf5_bytes, tree_of
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.formats.nir.reader import read_nir
 from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.targets.base import with_tables
-from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes
-from spikeloom.compiler.targets.truenorth.builder import Draft, history_free
-from spikeloom.compiler.targets.truenorth.native_file import read_trained, write_trained
-from spikeloom.compiler.targets.truenorth.netlist import crossbar_bytes
+from spikeloom.compiler.targets.truenorth.native_file import read_trained
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.networks.networks import Architecture
 from spikeloom.models.recordings.events import load_data
@@ -94,34 +90,9 @@ def written(write: Callable[[Path], Any]) -> bytes:
     return content
 
 
-def netlists() -> list[bytes]:
-    net = integer_chain([[2, 4, 0, 0, 8, -6], [6, 8, 254, 2, 2, 2]], [[2, 4], [-2, -256]], polarities=2)
-    return [netlist_bytes(compiled(net, provenance={"graph": "manual", "options": {"weight_bits": 8}}))]
-
-
-def crossbars() -> list[bytes]:
-    draft = Draft()
-    core = draft.core(3, 4)
-    for taxel in range(2):
-        draft.axon(core, taxel, [draft.neuron(core, history_free((1, 1, 0, 0), 1), layer="out", number=taxel)])
-        draft.feed(2 * taxel, core, taxel)
-        draft.vote((core, taxel), taxel)
-    return [crossbar_bytes(draft.netlist(taxels=3, polarities=2, classes=2, provenance={}))]
-
-
-def trained() -> list[bytes]:
-    sets = {"last": random_network(0, hidden=(), blocks=1), "best": random_network(1, hidden=(), blocks=1)}
-    return [written(lambda path: write_trained(path, sets, graph="ring", edges=np.array([[0, 1]]), training={}))]
-
-
-def counters() -> list[bytes]:
-    made = Counters(
-        **{"taxels": 3, "polarities": 2, "classes": 2, "bins": 1, "steps": 20, "parts": 2, "ramp": 9},
-        **{"slope": 0.5, "threshold": 9.0, "training": {"seen": 3}},
-        counter=np.array([[0, 0, 1], [3, 1, 2]]),
-        weight=np.array([[3, -4], [-1, 5]]),
-    )
-    return [written(lambda path: write_counters(path, made))]
+def of_zoo(name: str, file: str = "network") -> Callable[[], list[bytes]]:
+    """A file of a network of the zoo."""
+    return lambda: [getattr(specimen(name), file).read_bytes()]
 
 
 def small_weights(seed: int = 0) -> dict[str, np.ndarray]:
@@ -369,10 +340,10 @@ table = partial(Reader, ".csv", apart=cells, together=lines_of, words=CELLS)
 nir = partial(network, partial(read_nir, dt=1e-4, convention="exponential"))
 
 READERS = {
-    "netlist": signed(".loom", netlists, runs, share=0.25),
-    "netlist of crossbars": signed(".loom", crossbars, runs, share=0.25),
-    "network for crossbars": signed(".pt", trained, partial(values, read_trained)),
-    "counting network": signed(".pt", counters, partial(network, read_network)),
+    "netlist": signed(".loom", of_zoo("netx", "netlist"), runs, share=0.25),
+    "netlist of crossbars": signed(".loom", of_zoo("counters-crossbars", "netlist"), runs, share=0.25),
+    "network for crossbars": signed(".pt", of_zoo("native"), partial(values, read_trained)),
+    "counting network": signed(".pt", of_zoo("counters"), partial(network, read_network)),
     "own checkpoint": Reader(".pt", own, checkpoint, parts_of_checkpoint, checkpoint_of, sealed=True),
     "released checkpoint": pickled(".pt", partial(torch_files, True), together=torch_bytes, sealed=True),
     "released checkpoint, older form": pickled(

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_files import events, own_file, recordings_folder, weights
 from numpy.testing import assert_allclose, assert_array_equal
@@ -136,19 +136,6 @@ def test_held_out_recordings_calibrate_by_their_decisions(as_json, report, place
     assert report["rules"][1]["factor"] == exits.calibrate(races, 0.0).factor != factors[0]
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--differ", "0.1"], "--differ 0.1: |add --calibrate"),
-        (["--held-out"], "--held-out: |add --calibrate"),
-        (["--calibrate", "data", "--differ", "1"], "--differ 1: |from 0 to below 1"),
-    ],
-)
-def test_mistakes(refusal, words, said):
-    line = refusal(*WORDS, *words)
-    assert all(word in line for word in said.split("|"))
-
-
 @st.composite
 def gains(draw):
     """Votes of each step: (samples, steps, classes) 0 or 1, and the steps of each recording."""
@@ -200,19 +187,6 @@ def test_no_factor_from_the_turning_point_on_changes_a_decision(drawn):
             assert at.leader[i, end] != at.decision[i]
 
 
-def test_a_small_vote_step_by_step():
-    gained = np.array([[[0, 1], [0, 1], [0, 1], [0, 0], [1, 0]], [[1, 0], [0, 0], [0, 1], [0, 0], [0, 0]]])
-    at, sure = settled(np.cumsum(gained, axis=1), np.array([5, 4]))
-    assert at.leader.tolist() == [[1, 1, 1, 1, 1], [0, 0, 0, 0, 0]]
-    assert at.lead.tolist() == [[1, 2, 3, 3, 2], [1, 1, 0, 0, 0]]
-    assert at.left.tolist() == [[4, 3, 2, 1, 0], [3, 2, 1, 0, 0]]
-    # class 1 needs more than can come; class 0 wins ties
-    assert sure.tolist() == [[False, False, True, True, True], [False, False, False, True, True]]
-    assert exits.exits(sure, at).tolist() == [2, 3]
-    assert exits.exits(sure, at, 0.7).tolist() == [1, 1]
-    assert at.confidence[0].round(3).tolist() == [0.5, 1.155, 2.121, 3.0, np.inf]
-
-
 def test_races_are_for_second_place():
     gained = np.array([[[1, 0, 1], [1, 1, 0], [1, 1, 0]]])
     at = exits.races(np.cumsum(gained, axis=1), np.array([3]))
@@ -260,7 +234,6 @@ def test_how_often_an_output_neuron_can_spike():
     assert integer_machine(machine_of(quiet)).least_intervals.tolist() == [LONGEST, 1]  # looked at only so far
 
 
-@settings(deadline=None)
 @given(st.data())
 def test_no_output_neuron_spikes_more_often(data):
     netlist = data.draw(netlists())
@@ -302,21 +275,3 @@ def test_a_vote_that_never_ceases_is_a_proof():
     assert np.all(ends < exits.exits(exits.proven(ran.votes, at, most), at))
     netlist = large_netlist(10, proved=True)
     assert not integer_machine(machine_of(netlist)).steady.any()
-
-
-def test_live_and_recorded_votes_end_alike():
-    netlist = large_netlist(10, proved=True)
-    netlist = replace(netlist, classes=3, readout_class=read_only(np.arange(netlist.n_compartments) % 4 - 1))
-    events = (np.random.default_rng(1).random((6, netlist.n_inputs, 40)) < 0.3).astype(np.uint8)
-    lengths = np.full(6, 40)
-    machine = integer_machine(machine_of(netlist))
-    votes, depth = machine.cumulative(events[:, :, None], lengths).votes, machine.read_out_lag
-    at = exits.standing(votes, lengths)
-    sure = exits.proven(votes, at, exits.most_votes(machine, 40))
-    assert depth == 3
-    for factor in (np.inf, 2.0, 0.0):
-        may_end = exits.live(machine, 40, factor)
-        assert not may_end(depth - 1, votes[0, 0])
-        for i, end in enumerate(exits.exits(sure, at, factor)):
-            ended = [may_end(step + depth, votes[i, step]) for step in range(40)]
-            assert ended.index(True) == end

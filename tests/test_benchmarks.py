@@ -42,12 +42,6 @@ def channels_first(events):
     return np.ascontiguousarray(events.transpose(0, 2, 1)).view(np.uint8)
 
 
-def test_recurrence_by_hand(workload):
-    # 100 stays; 100 * 819 / 4096 = 19 and 82 are 101: spike, zero; -7 decays to -1, toward zero
-    current = np.array([[[100], [82], [-7], [101], [101]]])
-    assert workload.recurrence(current, 100)[0, :, 0].tolist() == [False, True, False, False, True]
-
-
 def test_our_spikes_are_those_of_the_reference(workload, busy):
     events, _, netlist = busy
     trace = simulate(netlist, channels_first(events), threads=1, spikes=True)

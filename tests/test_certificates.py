@@ -62,7 +62,6 @@ def shuffled(checkpoint, adjacency, recordings, seed):
     return found
 
 
-# -- soundness ---------------------------------------------------------------------------------------------------------
 def runs(checkpoint, adjacency, recordings, seed=0):
     """The float model in five arithmetics."""
     network, inputs = expand(checkpoint, adjacency), channels_last(recordings)
@@ -73,7 +72,7 @@ def runs(checkpoint, adjacency, recordings, seed=0):
     yield shuffled(checkpoint, adjacency, recordings, seed)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 10_000), gain=st.sampled_from([0.4, 1.6, 5.0]), beta=st.sampled_from([0.0, 0.2, 0.9, 0.99]))
 def test_certain_spikes_are_those_of_every_run(folder, seed, gain, beta):
     checkpoint, adjacency = small_checkpoint(folder, last=weights(seed, gain=gain), beta=beta)
@@ -87,7 +86,7 @@ def test_certain_spikes_are_those_of_every_run(folder, seed, gain, beta):
     assert np.mean([doubt.mean() for _, doubt in certainty]) < 0.05
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 10_000), step=st.sampled_from([0.125, 0.25, 0.5]), decimal=st.booleans())
 def test_certain_spikes_among_many_ties(folder, seed, step, decimal):
     """Weights on a grid hit the threshold all the time; a grid of tenths does so up to a rounding."""
@@ -197,7 +196,6 @@ def test_roundings_and_magnitudes_of_the_released_operator_are_those_of_its_loop
         )
 
 
-# -- against the chip --------------------------------------------------------------------------------------------------
 def by_hand(checkpoint, adjacency, recordings, chip, kept, lengths):
     """Equal and different entries per layer, entry by entry."""
     found = []
@@ -284,7 +282,6 @@ def test_registers_without_a_proof_are_named(tmp_path):
     assert found.unproven == ("conv1", "fc1", "fc2", "fc3")
 
 
-# -- votes -------------------------------------------------------------------------------------------------------------
 @given(st.data())
 def test_wins_is_whether_every_vote_agrees(data):
     counts = st.lists(st.integers(0, 2), min_size=3, max_size=3)

@@ -64,7 +64,6 @@ def made(as_json, place):
     return json.loads((place / "out" / "chart.json").read_text())
 
 
-# -- points ------------------------------------------------------------------------------------------------------------
 def test_every_point_of_the_grid_is_there(made, place):
     found = [(p["bits"], p["cores"], p["window"]) for p in made["points"]]
     assert found == [(b, c, w) for b in ([4], [8]) for c in ("cores", "fc1:2") for w in (50, 100)]
@@ -109,7 +108,6 @@ def test_the_commands_of_a_point_give_its_netlist_and_its_figures(made, as_json,
     assert found["decision_agreement"] == point["test"]["equal"] / 8
 
 
-# -- again -------------------------------------------------------------------------------------------------------------
 def test_once_more_nothing_is_measured_and_one_more_width_nothing_else(made, spikeloom, place, monkeypatch):
     worked, measure = [], chart_work.measure
     monkeypatch.setattr(chart_work, "measure", lambda work: worked.append(work) or measure(work))
@@ -193,7 +191,6 @@ def points():
     return study.with_fronts(study.with_expectations(made, [made_network()]), BY)
 
 
-# -- fronts and the choice ---------------------------------------------------------------------------------------------
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), max_size=12))
 def test_the_front_is_what_no_other_point_beats(pairs):
     gains, costs = [float(gain) for gain, _ in pairs], [float(cost) for _, cost in pairs]
@@ -256,7 +253,6 @@ def test_the_nearest_point_of_budgets_that_nothing_fits(points, budgets, number)
         study.pick(points, fronts.parse_budgets(["latency=1ms"]), replace(BY, time=None))
 
 
-# -- budgets -----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("words", "limit"),
     [

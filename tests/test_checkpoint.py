@@ -75,7 +75,6 @@ def rebuilt(content: bytes, change: object, *, sign: bool = True, compression: i
     return zipped(members | {"manifest.json": json.dumps(manifest)}, compression)
 
 
-# --- the released layout -------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("new", [True, False], ids=["zip", "pre-1.6"])
 @pytest.mark.parametrize("old", [False, True], ids=["lins", "lin"])
 def test_every_released_layout_gives_the_same_weights(tmp_path, old, new):
@@ -141,7 +140,6 @@ def test_the_released_checkpoint(released_checkpoint):
     assert (read.training["epochs"], read.training["last_acc"], read.training["best_acc"]) == (100, 88.1944, 90.2778)
 
 
-# --- refusals ------------------------------------------------------------------------------------------------------
 def changed(*, old: bool = False, **tensors_too: object) -> bytes:
     """A state dict with other tensors; None stands for one that is missing."""
     state = tensors(old=old) | {key.replace("__", "."): value for key, value in tensors_too.items()}
@@ -206,7 +204,6 @@ def test_every_fault_of_the_tensors_is_listed(tmp_path):
     ]
 
 
-# --- our own format ------------------------------------------------------------------------------------------------
 def test_own_format_round_trip(tmp_path):
     path = tmp_path / "x.pt"
     save_checkpoint(path, {"last": weights(), "best": weights(2)}, ring(), beta=0.25, theta=0.75, training={"seed": 4})

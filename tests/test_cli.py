@@ -7,20 +7,16 @@ import os
 import subprocess
 import sys
 import types
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file, state_dict
+from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file
 from made_files import weights as made_weights
 from numpy.testing import assert_array_equal
-from random_netlists import Axon, Neuron, build, large_netlist
 
 from spikeloom.__main__ import main as start
 from spikeloom.compiler import __version__, lift
-from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.targets.base import EVENTS, load_target
@@ -32,13 +28,12 @@ from spikeloom.runtime.equivalence import reference
 from spikeloom.runtime.inputs import network
 from spikeloom.runtime.inputs import recordings as recordings_input
 from spikeloom.runtime.machines import base
-from spikeloom.runtime.machines.loihi1 import blocks, engine
+from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import estimate
 
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
 
 
-# -- compile and inspect -----------------------------------------------------------------------------------------------
 def test_compile_counts_and_says_what_was_realised(as_json, tmp_path, place):
     report = as_json("compile", "net.pt", "--calibrate", "data", "--weight-bits", 8, "-o", tmp_path / "out.loom")
     content = (tmp_path / "out.loom").read_bytes()
@@ -83,18 +78,6 @@ def test_dumps_go_to_standard_error(spikeloom, tmp_path):
     assert "\nLayout\n" in err
 
 
-def test_the_graph_of_a_released_file_comes_from_the_user(as_json, tmp_path):
-    torch.save(state_dict(made_weights(taxels=39, sizes=(6, 5, 4))), tmp_path / "net.pt")
-    report = as_json("compile", tmp_path / "net.pt", "--graph", "knn:2", "-o", tmp_path / "out.loom")
-    assert report["provenance"]["graph"] == "knn:2"
-    step = np.eye(39, dtype=int)
-    edges = build_graph("knn:2").edges
-    step[edges[:, 1], edges[:, 0]] = 1  # eye plus one step, three times: all paths of up to three
-    structural = 2 * FEATURES * np.count_nonzero(np.linalg.matrix_power(step, 3))
-    assert report["layers"][0]["synapses"] == structural
-
-
-# -- run ---------------------------------------------------------------------------------------------------------------
 def test_limit_and_split_choose_the_recordings(as_json):
     everything = as_json("run", "net.loom", "--data", "data")
     assert everything["files"] == [f"sample_{i}_label_{i % CLASSES}.npy" for i in range(6)]
@@ -123,7 +106,6 @@ def test_spikes_are_written_aligned_with_the_data(as_json, tmp_path, place):
         assert archive["fc3"].sum(axis=1).tolist() == report["counts"]
 
 
-# -- verify and estimate -----------------------------------------------------------------------------------------------
 def test_verify_fails_when_decisions_agree_too_rarely(spikeloom, tmp_path):
     coarse = tmp_path / "coarse.loom"
     assert spikeloom("compile", "net.pt", "--weight-bits", "3", "-o", coarse)[0] == 0
@@ -166,7 +148,6 @@ def test_a_table_of_ones_own_prices_alone(as_json, tmp_path):
     assert report["per_inference"]["energy_j"]["mine"] > known["per_inference"]["energy_j"]["davies2018"]
 
 
-# -- demo, and everything around a command -----------------------------------------------------------------------------
 @pytest.fixture
 def shipped_grasps(monkeypatch, tmp_path):
     """A made-up network in place of the shipped one, and few grasps."""
@@ -300,7 +281,6 @@ def test_a_terminal_without_greek_letters(spikeloom, monkeypatch):
     assert "?" in out
 
 
-# -- recordings without a label ----------------------------------------------------------------------------------------
 def test_labelled_recordings_are_scored_and_a_table_scores_the_rest(as_json, tmp_path):
     for index, name in enumerate(("a_label_0", "b_label_1", "c", "d")):
         rows = [f"0.{step:02d},{(step + index) % TAXELS},{step % 2}" for step in range(0, 60, 2)]
@@ -402,17 +382,3 @@ def test_a_rung_that_is_proven_is_what_it_would_be(as_json, monkeypatch):
     report = as_json(*VERIFYING, "--explain-cost", codes=(0, 1))
     assert report["ladder"] == proven
     assert "ladder: rounding" in [entry["part"] for entry in report["explained_cost"] if entry["ran"]]
-
-
-def test_why_a_netlist_runs_step_by_step(place):
-    netlist = read_netlist(place / "net.loom")
-    axon = Axon(source=0, targets=((0, 254),), exponent=7)
-    one, two = (build([Neuron()], [axon] * axons, n_inputs=1, depths=[0]) for axons in (1, 2))
-    slow = replace(netlist, decay_v=read_only(np.zeros(netlist.n_compartments)))
-    wiring = "a layer is recurrent or receives from others than the one before it"
-    assert blocks.lay_out_blocks(large_netlist(1, proved=True)) == wiring
-    for each, large in ((netlist, False), (one, False), (two, True), (slow, True)):
-        why = blocks.lay_out_blocks(each)
-        assert (
-            (why == "a sum may leave 16 bits, or a membrane or current its register") == isinstance(why, str) == large
-        )

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import as_json, refusal, run
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from made_files import recordings_folder
 from random_crossbars import IN_RANCS_TERMS, crossbars, events
@@ -132,7 +132,7 @@ def built(netlist, rtl, folder, ticks):
     return cosimulation.build(machine_of(netlist), folder, cosimulation.sources_in(str(rtl)), "iverilog", ticks)
 
 
-@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8)
 @given(crossbars(IN_RANCS_TERMS), st.integers(0, 2**31))
 def test_any_network(rtl, tmp_path, netlist, seed):
     recording = events(seed, 3, 12)

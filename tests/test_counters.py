@@ -13,8 +13,7 @@ from spikeloom.compiler import compile_network
 from spikeloom.compiler.archive import read_members
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.formats.counters import BLOCK, counting_network, read_counters, write_counters
-from spikeloom.compiler.interpret import channels_last, float_simulation, run_integer
-from spikeloom.compiler.passes.range_proof import prove_ranges
+from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds, held_out, linear_rules
@@ -236,32 +235,3 @@ def test_commands_take_a_counting_network(monkeypatch, tmp_path):
     assert chart["points"][0]["test"]["correct"] == right
     assert chart["points"][1]["test"]["correct"] == record["test_correct"]
     assert json.loads(str(read_members(tmp_path / "c.pt")["manifest"]))["training"]["strength"] == record["strength"]
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--system", "counters", "--epochs", "3"], "--epochs 3: counters are trained without; omit it"),
-        (["--system", "counters", "--window", "50"], "--window 50: counters see what comes later; give --parts 2"),
-        (["--system", "counters", "--seed", "3"], "omit --recipe, --seed and --seeds"),
-        (["--system", "mlp", "--parts", "3"], "--parts 3: is for --system counters; omit it"),
-        (["--system", "mlp", "--hops", "2"], "--hops 2: an MLP has no hops to choose; omit it"),
-        (["--system", "mlp", "--hidden", "0"], "--hidden 0: allowed are 1 to 1024"),
-    ],
-)
-def test_options_of_others_are_refused(words, said):
-    code, _, err = run("train", "--data", "synthetic", *words, "-o", "x.pt")
-    assert (code, said in err) == (2, True)
-
-
-@pytest.mark.parametrize("rate", [0.1, 0.5, 1.0])
-@pytest.mark.parametrize("plan", PLANS, ids=str)
-def test_no_recording_leaves_the_proven_range(plan, rate):
-    data = counted(made(), plan)
-    counters = counters_of(data, fit(data, CLASSES), made(), CLASSES)
-    integer = compile_network(counting_network(counters)).integer
-    steps = of_length(joined_bins(made(seed=3, rate=rate), plan.bins), counters.clocks.length)
-    membranes = run_integer(integer, channels_last(steps.events, counters.clocks), membranes=True).membranes
-    for proof, found in zip(prove_ranges(integer), membranes, strict=True):
-        assert proof.holds
-        assert np.abs(found).max() <= proof.membrane

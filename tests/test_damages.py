@@ -63,7 +63,6 @@ def moved(before, after):
     return ours
 
 
-# -- weights -----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("packing", [None, (Packing(bits=4),), (Packing(planes=2),)])
 def test_float_weights_move_as_the_stored_ones_do(packing):
     pair = made(packing=packing)
@@ -106,7 +105,6 @@ def test_fewer_bits_round_to_a_coarser_grid_and_hold_the_rest():
     assert_array_equal(damages.fewer_bits(pair, 8).netlist.synapse_weight, pair.netlist.synapse_weight)
 
 
-# -- neurons -----------------------------------------------------------------------------------------------------------
 def both_spikes(pair, events):
     """Whether each neuron of each side fires in each step: of the chip, and of the float network by layer."""
     trace = engine.simulate(pair.netlist, events, spikes=True)

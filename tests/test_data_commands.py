@@ -44,15 +44,13 @@ def own(tmp_path, monkeypatch):
     return tmp_path
 
 
-# describe
-
-
 def test_describe(own):
     report, _, code = start("describe", "own", "--split", "train", "--taxels", "coords.csv")
     counted = {"events": 7, "out_of_order": 1, "duplicates": 1, "gaps": 1, "gap_s": 0.5, "shorter": 1}
     assert (code, report["found"]) == (0, counted)
     assert (report["recordings"], report["taxels"], report["events"], report["hot"]) == (2, 4, 6, [])
     assert (report["dead"], report["one_sided"], report["labels"]) == ([3], [0, 1, 2], {"0": 1, "1": 1})
+    assert report["duration_s"] == {"shortest": 0.52, "median": 0.62, "longest": 0.72}
     rates = [(0, 3 / 1.24), (1 / 1.24, 0), (0, 2 / 1.24), (0, 0)]
     for found, (falling, rising) in zip(report["rate"]["taxels"], rates, strict=True):
         assert found == {"falling": pytest.approx(falling), "rising": pytest.approx(rising)}
@@ -63,9 +61,6 @@ def test_describe_one_recording_without_a_label(own):
     report, _, _ = start("describe", "grasp.csv", "--bin", "0.05")
     assert (report["recordings"], report["events"], report["bin_s"]) == (1, 3, 0.05)
     assert (report["labels"], report["unlabelled"]) == ({}, 1)
-
-
-# convert
 
 
 @pytest.mark.parametrize("output", ["out", "out.zip"])
@@ -145,9 +140,6 @@ def test_convert_mistakes(own, words, error, told):
     (own / "own" / "train" / "c.csv").write_text("0,0,1\n0,0,up\n")
     refused(error, told, start, "convert", *words)
     assert sorted(path.name for path in own.iterdir()) == ["a.csv", "coords.csv", "own"]
-
-
-# fetch
 
 
 CONTENT = b"recordings" * 1000

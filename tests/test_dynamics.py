@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import load_weights, refused
 from timed_networks import GRAPH, SMALL, TIMING, louder, written
@@ -17,7 +15,6 @@ from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, cloc
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.graphs import normalised_adjacency
-from spikeloom.models.networks.layers import lasting_current, lif
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
@@ -65,36 +62,6 @@ def neurons_step_by_step(drive, bias, alpha, beta, theta, surrogate):
     return torch.stack(found)
 
 
-# --- one layer -----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
-    "surrogate", [RECTANGLE, SIGMOID, replace(SIGMOID, reset=True), replace(RECTANGLE, reset=False)]
-)
-@given(seed=st.integers(0, 2**31), steps=st.integers(1, 30), alpha=st.sampled_from([0.0, 0.5, 0.95]))
-@settings(max_examples=10, deadline=None)
-def test_gradients_equal_plain_autograd(surrogate, seed, steps, alpha):
-    draw = torch.Generator().manual_seed(seed)
-    drive = 0.4 * torch.randn(steps, 2, 5, generator=draw, dtype=torch.float64)
-    above = torch.randn(drive.shape, generator=draw, dtype=torch.float64)
-    beta, theta, found = 0.7, 0.5, []
-
-    def kernels(drive, bias):
-        return lif(lasting_current(drive, alpha) + bias, beta, theta, surrogate)[0]
-
-    def plain(drive, bias):
-        return neurons_step_by_step(drive, bias, alpha, beta, theta, surrogate)
-
-    for function in (kernels, plain):
-        inputs = drive.clone().requires_grad_(), torch.full((5,), 0.1, dtype=torch.float64, requires_grad=True)
-        spikes = function(*inputs)
-        (spikes * above).sum().backward()
-        found.append((spikes.detach(), *(tensor.grad for tensor in inputs)))
-    assert torch.equal(found[0][0], found[1][0])
-    for ours, theirs in zip(found[0][1:], found[1][1:], strict=True):
-        assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12)
-    assert found[0][1].abs().max() > 0 or surrogate.shape != FAST_SIGMOID
-
-
-# --- clocks --------------------------------------------------------------------------------------------------------
 def test_a_clock_ticks_in_every_step_of_its_part_and_none_after_the_last():
     assert clocks_over(8, 250) == Clocks(channels=8, steps=32)
     assert clocks_over(0, 250) == NO_CLOCKS
@@ -113,7 +80,6 @@ def test_recordings_get_the_clocks_after_their_own_channels():
     assert with_clocks(events, NO_CLOCKS).shape == (2, 6, 5)
 
 
-# --- the whole network ---------------------------------------------------------------------------------------------
 def network_step_by_step(network, events, surrogate):
     """The network of the docs in plain autograd code; spikes of the last layer."""
     sizes = network.architecture
@@ -139,7 +105,9 @@ def network_step_by_step(network, events, surrogate):
     return spikes
 
 
-@pytest.mark.parametrize("surrogate", [RECTANGLE, SIGMOID])
+@pytest.mark.parametrize(
+    "surrogate", [RECTANGLE, SIGMOID, replace(SIGMOID, reset=True), replace(RECTANGLE, reset=False)]
+)
 @pytest.mark.parametrize("dynamics", [TIMING, replace(TIMING, alphas=()), Dynamics(alphas=(0.6, 0.0, 0.0, 0.9)), PLAIN])
 def test_gradients_of_a_whole_network_equal_plain_autograd(surrogate, dynamics):
     sizes = replace(SMALL, dynamics=dynamics)
@@ -160,7 +128,6 @@ def test_gradients_of_a_whole_network_equal_plain_autograd(surrogate, dynamics):
         assert plain.abs().max() > 0
 
 
-# --- files ---------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("system", ["tactilesgnet", "gcn", "mlp", "grid-cnn"])
 def test_a_checkpoint_holds_the_dynamics_and_its_float_model_is_the_network(tmp_path, system):
     network, seen = written(tmp_path / "x.pt", system)
@@ -197,7 +164,6 @@ def test_what_a_file_cannot_have_is_refused(tmp_path):
         read_checkpoint(path)
 
 
-# --- recipes -------------------------------------------------------------------------------------------------------
 def test_the_released_recipe_is_the_released_code():
     assert RECIPES == {"released": RELEASED, "timed": TIMED}
     assert RELEASED == Recipe(

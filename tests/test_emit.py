@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 from commands import refusal
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from oracles import assert_same_network, refused
 from random_netlists import Axon, Neuron, build
@@ -39,7 +39,6 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 
 
-@settings(deadline=None, max_examples=25)
 @given(integer_networks(), tight_targets())
 def test_the_netlist_holds_exactly_the_network(network, target):
     netlist = seated(network, legal_partition(network, target), target)
@@ -77,7 +76,6 @@ def test_the_netlist_holds_exactly_the_network(network, target):
             np.testing.assert_array_equal(dense[pre, post], weight)
 
 
-@settings(deadline=None, max_examples=25)
 @given(integer_networks(), tight_targets())
 def test_layers_and_votes_are_those_of_the_network(network, target):
     parts = legal_partition(network, target)
@@ -124,16 +122,11 @@ def test_a_network_of_zeros_has_cores_but_no_axons():
     require_legal(netlist, LOIHI)
 
 
-# --- reading a netlist back -------------------------------------------------------------------------------------------
-MANY = settings(max_examples=30, deadline=None, derandomize=True)
-
-
 def lower(network: IntegerNetwork, **limits: int) -> Netlist:
     """Netlist of a network on cores of these limits."""
     return compiled(network, small_target(**limits))
 
 
-@MANY
 @given(integer_networks(), st.sampled_from([1, 3, 1024]))
 def test_emit_and_back(network, compartments):
     try:

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from random_netlists import (
     KEPT,
@@ -28,8 +28,6 @@ from spikeloom.runtime.machines.loihi1 import engine, kernel, spec
 from spikeloom.runtime.machines.loihi1.block_kernel import Blocks
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.trace import Charges, Trace, pack, unpack
-
-REPEATABLE = settings(max_examples=40, deadline=None, derandomize=True)
 
 
 def outcome(simulate, *arguments, **options) -> Trace | str:
@@ -62,7 +60,6 @@ def assert_twins_agree(netlist, events, *, gated=True) -> Trace | str:
     [((-1, 0, 0, 0, 1, 3, 7), 10, True), ((-1, 0, 0, 0, 1, 3, 7), 10, False), ((-1, 0), 20, True)],
     ids=["any", "without windows", "small exponents"],
 )
-@REPEATABLE
 @given(data=st.data())
 def test_any_network(data, exponents, length, gated):
     netlist = data.draw(netlists(weight_exponents=exponents))
@@ -83,32 +80,6 @@ def test_large_networks_reach_every_regime():
         assert neuron_steps // 2 < trace.counts.updates.sum() < neuron_steps
         saturations += trace.counts.saturations.sum()
     assert saturations > 0
-
-
-def test_ties_at_the_threshold():
-    # weights and thresholds from the same few numbers, no bias: a membrane often lands on its threshold
-    rng = np.random.default_rng(5)
-    neurons = [Neuron(decay_v=4095, threshold=int(rng.choice([2, 4, 6]))) for _ in range(40)]
-    axons = [
-        Axon(source=s, targets=tuple((int(t), int(rng.choice([-2, 2, 4]))) for t in rng.permutation(40)[:10]))
-        for s in range(50)
-    ]
-    netlist = build(neurons, axons, n_inputs=10, depths=[0])
-    trace = assert_twins_agree(netlist, random_batch(6, 10, size=1, length=200)[0])
-    ties = trace.membranes == 64 * netlist.threshold
-    assert np.count_nonzero(ties) > 100
-    assert not trace.spikes[ties].any()
-
-
-def test_sums_that_would_not_fit_beside_each_other():
-    # all 2000 synapses at once overflow by far, the few that are hit at once do not
-    axons = [Axon(source=i, exponent=7, targets=((0, 254 if i % 2 else -254), (1, 2))) for i in range(2000)]
-    netlist = build([Neuron(threshold=1000), Neuron(decay_u=100)], axons, n_inputs=2000, depths=[0])
-    events = np.zeros((2000, 60), np.uint8)
-    events[np.random.default_rng(0).integers(2000, size=50), np.arange(50)] = 1
-    assert isinstance(assert_twins_agree(netlist, events), Trace)
-    events[:, 30] = 1
-    assert isinstance(assert_twins_agree(netlist, events), str)
 
 
 def test_threads_and_batches_do_not_matter():
@@ -136,7 +107,6 @@ def test_only_what_is_asked_for_is_kept():
     assert engine.simulate(netlist, events[:0], spikes=True).spikes.shape == (0, 33, 300)
 
 
-@settings(REPEATABLE, max_examples=25)
 @given(st.lists(st.integers(0, 33), max_size=8), st.integers(0, 100))
 @example(list(range(34)), 11)
 def test_any_split_into_steps_is_the_batch(cuts, seed):
@@ -174,7 +144,6 @@ def test_the_kernel_compiles_where_nothing_can_be_cached(monkeypatch):
     assert layer_kernel.compiled_and_cached(len) == (len, layer_kernel._KERNEL)
 
 
-# --- the kernel of layers ---------------------------------------------------------------------------------------------
 def pipeline(
     seed: int,
     *,
@@ -249,7 +218,6 @@ def assert_kernels_agree(netlist: Netlist, events: np.ndarray) -> None:
 SHAPES = (((3,),), ((64,), (65,)), ((70, 5), (1,), (130,)), ((20,), (2, 3, 4), (6,)))
 
 
-@REPEATABLE
 @given(
     st.integers(0, 10**6),
     st.sampled_from([1, 3, 64, 65, 130]),
@@ -276,21 +244,6 @@ def test_the_random_pipelines_reach_every_way_of_storage():
     assert any(blocks.restful.any() for blocks in found)
     whole = lay_out_blocks(build([Neuron()] * 70, [Axon(source=0, targets=((0, 1),))], n_inputs=1, depths=[0])).whole
     assert whole.tolist() == [0, 64]
-
-
-@pytest.mark.parametrize("rate", [0.0, 0.3])
-def test_whole_blocks_beside_others(rate):
-    """Neurons 0 to 69 of each layer on one core: 64 and six that follow each other."""
-    rng = np.random.default_rng(1)
-    neurons = [Neuron(layer=i // 70, threshold=20, bias=int(rng.integers(-9, 9))) for i in range(140)]
-    axons = [
-        Axon(source=source, targets=tuple((c, int(rng.integers(-9, 9))) for c in range(70 * layer, 70 * layer + 70)))
-        for layer, sources in ((0, range(5)), (1, range(5, 75)))
-        for source in sources
-    ]
-    netlist = build(neurons, axons, n_inputs=5, depths=[0, 1])
-    assert lay_out_blocks(netlist).whole.tolist() == [0, 64, 70, 134]
-    assert_kernels_agree(netlist, (rng.random((5, 20)) < rate).astype(np.uint8))
 
 
 def test_recordings_of_any_length_together():
@@ -320,7 +273,6 @@ def test_events_of_any_type_and_layout(stepwise):
         assert_equal(engine.simulate(prepared, same, **KEPT), expected)
 
 
-# --- the ends of the ranges ------------------------------------------------------------------------------------------
 def one_neuron(weights: list[int], **neuron) -> Netlist:
     axons = [Axon(source=i, targets=((0, weight),), exponent=0) for i, weight in enumerate(weights)]
     return build([Neuron(**neuron)], axons, n_inputs=len(weights), depths=[0])
@@ -343,7 +295,7 @@ def test_sums_at_the_end_of_sixteen_bits(sign, threshold):
 
 def test_a_sum_beyond_sixteen_bits_takes_the_other_kernel():
     netlist = one_neuron([*FULL, 1])
-    assert isinstance(lay_out_blocks(netlist), str)
+    assert lay_out_blocks(netlist).startswith("a sum may leave 16 bits")
     events = np.ones((131, 2), np.uint8)
     for simulate in (spec.simulate, by_engine):
         with pytest.raises(NumericRangeError, match="synaptic sum"):
@@ -379,7 +331,7 @@ def test_what_receives_more_than_the_depth_before_takes_the_other_kernel():
     for source, depths in ((1, [0, 0]), (0, [0, 1]), (2, [0, 1]), (1, [0, 2])):  # same depth, input, itself, skipped
         axons = [Axon(source=0, targets=((0, 10),)), Axon(source=source, targets=((1, 10),))]
         netlist = build(neurons, axons, n_inputs=1, depths=depths)
-        assert isinstance(lay_out_blocks(netlist), str)
+        assert lay_out_blocks(netlist).startswith("a layer is recurrent or receives from others")
         events = np.ones((1, 9), np.uint8)
         assert_equal(by_engine(netlist, events), spec.simulate(netlist, events))
 

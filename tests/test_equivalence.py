@@ -110,7 +110,6 @@ def test_the_first_divergence_is_the_first(tmp_path, seed, bits):
     assert not found.ill_posed
 
 
-# -- the ladder --------------------------------------------------------------------------------------------------------
 def test_the_ladder_ends_at_the_chip(verdict):
     assert tuple(rung.stage for rung in verdict.ladder) == LADDER
     ladder = rungs(verdict)
@@ -177,7 +176,6 @@ def test_ill_posed_spikes_are_told_from_faults(tmp_path):
     assert (first.layer, first.step, first.neuron, first.ill_posed) == ("fc2", 0, 0, True)
 
 
-# -- specification and engine ------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("field", ["spikes", "membranes", "inputs", "counted spikes", "updates", "saturations"])
 def test_a_single_wrong_bit_is_found_out(small, monkeypatch, field):
     checkpoint, adjacency, netlist = small
@@ -214,7 +212,6 @@ def test_the_ladder_carries_thresholds_that_differ(small):
     assert not moved[2:].any()
 
 
-# -- votes and intervals -----------------------------------------------------------------------------------------------
 def test_votes_of_several_neurons_add_up():
     netlist = build([Neuron()] * 5, [], n_inputs=1, depths=[0])
     netlist = dataclasses.replace(netlist, classes=3, readout_class=read_only([2, 0, -1, 2, 1]))

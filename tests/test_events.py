@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import refused
 
@@ -94,7 +94,6 @@ def test_taxels_and_bins_have_limits(write):
         assert f"--bin {bin_s:g}: not a duration" in refused(OptionError, "", load_data, path, bin_s=bin_s)
 
 
-# Labels
 @pytest.mark.parametrize(
     ("name", "text", "label"),
     [
@@ -136,9 +135,6 @@ def test_who_needs_labels_says_so(write):
     assert need_labels(recordings, "training") is recordings
 
 
-# npz
-
-
 @pytest.mark.parametrize("dtype", ["f8", "f4", "i4", ">i2", "u1"])
 def test_npz(save, dtype):
     path = save("a.npz", time_s=np.array([0.5, 0.1]), taxel=np.array([2, 0], dtype), polarity=np.array([1, 0], dtype))
@@ -164,7 +160,6 @@ def test_npz_that_cannot_be(save, change, words):
     assert message(load_data, path).startswith(words)
 
 
-# Folders
 def test_flat_folders_stand_for_any_split(write, save, tmp_path):
     write("d/b_label_1.csv", "0.1,1,1\n")
     write("d/a_label_0.CSV", "0.5,0,0\n")
@@ -238,8 +233,7 @@ def test_the_released_layout_goes_its_own_way(tmp_path):
     assert (tmp_path / "d.zip").read_bytes() == (tmp_path / "again.zip").read_bytes()
 
 
-# Any events
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60)
 @given(data=st.data())
 def test_any_recording_survives_as_events(tmp_path, data):
     """Bins to event lines, in any order and with repeats, and back."""
@@ -263,21 +257,6 @@ def test_any_recording_survives_as_events(tmp_path, data):
     assert (counts.events, counts.duplicates) == (len(rows), len(found) // 2)
 
 
-# What recordings hold
-def test_description():
-    grid = np.zeros((2, 5, 2, 10), dtype=np.uint8)
-    grid[:, :4, :, ::5] = 1
-    grid[:, 1] = 0
-    grid[:, 2, 1] = 0
-    grid[1, :, :, 5:] = 0  # the second recording has 5 steps
-    found = describe(made(grid, labels=np.array([3, -1]), lengths=np.array([10, 5])), 0.1)
-    assert found.duration_s == {"shortest": 0.5, "median": 0.75, "longest": 1.0}
-    assert (found.recordings, found.events, found.labels, found.unlabelled) == (2, 15, {3: 1}, 1)
-    rates = [[*taxel.values()] for taxel in found.rate.taxels]
-    assert rates == [[2, 2], [0, 0], [2, 0], [2, 2], [0, 0]]  # 3 events in 1.5 s
-    assert (found.dead, found.one_sided, found.hot) == ((1, 4), (2,), ())
-
-
 def test_hot_taxels_exceed_five_times_the_median_and_silence_is_dead():
     grid = np.zeros((1, 6, 2, 100), dtype=np.uint8)
     grid[0, :3, :, :5] = 1
@@ -289,7 +268,6 @@ def test_hot_taxels_exceed_five_times_the_median_and_silence_is_dead():
     assert (found.dead, found.hot, found.events) == ((0, 1, 2), (), 0)
 
 
-# Writing
 def test_the_table_of_sources_holds_no_formula(tmp_path):
     made = Recordings(
         events=np.ones((1, 2, 2, 3), np.uint8), labels=np.zeros(1, np.int64), files=("=1+1.csv",), split="a", source="x"
@@ -316,7 +294,6 @@ def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-# What is worth a second look
 def warned(path, **options) -> tuple[str, ...]:
     return load_data(path, **options).counts.notes
 
@@ -338,7 +315,6 @@ def test_times_in_another_unit_are_noticed(write, factor):
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.5, 600), st.integers(1, 2000))
-@settings(deadline=None)
 def test_a_touch_of_several_events_a_second_is_never_taken_for_another_unit(seed, duration, count):
     times = np.random.default_rng(seed).random(max(count, int(4 * duration))) * duration
     nothing = np.zeros(len(times), np.int64)
@@ -359,7 +335,6 @@ def test_taxels_that_count_from_one(write):
     assert warned(path.parent) == ()
 
 
-# A table of labels
 @pytest.fixture
 def listed(write):
     write("own/a.csv", HEADER + "0,0,1\n")

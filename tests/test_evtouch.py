@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from made_files import events, zipped
@@ -51,31 +51,6 @@ def refuse(tmp_path: Path, data: bytes, **options) -> str:
     return from_folder.removeprefix(f"data: test/{SAMPLE}: ")
 
 
-# The released recordings
-@pytest.mark.recordings
-@pytest.mark.parametrize(
-    ("data", "split", "shape", "classes", "mean"),
-    [
-        ("objects_zip", "train", (576, 39, 2, 250), 36, 0.12793296),
-        ("objects_zip", "test", (144, 39, 2, 250), 36, 0.12723967),
-        ("containers_zip", "train", (240, 39, 2, 325), 20, 0.10159073),
-        ("containers_zip", "test", (60, 39, 2, 325), 20, 0.09943787),
-    ],
-)
-def test_the_released_recordings(request, data, split, shape, classes, mean):
-    path = request.getfixturevalue(data)
-    recordings = load_data(path, split, classes=classes, taxels=39)
-    assert recordings.events.shape == shape
-    assert recordings.events.dtype == np.uint8
-    assert recordings.events.flags.c_contiguous
-    assert recordings.events.max() == 1
-    assert recordings.events.mean() == pytest.approx(mean, abs=1e-8)
-    assert np.bincount(recordings.labels).tolist() == [shape[0] // classes] * classes
-    assert (len(recordings), recordings.taxels, recordings.steps) == (shape[0], shape[1], shape[3])
-    assert (recordings.split, recordings.source) == (split, path.name)
-
-
-# What is accepted
 def test_files_sort_as_strings_and_limit_takes_the_first(tmp_path):
     names = [f"sample_{n}_label_{n % 7}.npy" for n in (2, 10, 1, 100)]
     path = archive(tmp_path / "my.zip", {f"top/train/{name}": GOOD for name in names})
@@ -109,7 +84,6 @@ def test_other_files_are_left_alone(tmp_path):
     dtype=st.sampled_from(["<f4", "<f8", "u1", "?", ">i2"]),
     order=st.sampled_from("CF"),
 )
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 def test_what_was_written_is_read(tmp_path, events, method, dtype, order):
     files = {f"train/sample_{n}_label_{n}.npy": npy(sample.astype(dtype, order)) for n, sample in enumerate(events)}
     recordings = load_data(archive(tmp_path / "any.zip", files, method), "train")
@@ -117,7 +91,6 @@ def test_what_was_written_is_read(tmp_path, events, method, dtype, order):
     assert recordings.labels.tolist() == list(range(len(events)))
 
 
-# What is refused: the data set
 @pytest.mark.parametrize(
     ("names", "split", "words"),
     [
@@ -138,7 +111,6 @@ def test_data_sets_that_cannot_be(tmp_path, names, split, words):
         assert words in message(path, split, classes=36)
 
 
-# What is refused: one recording
 def pickled() -> bytes:
     content = io.BytesIO()
     np.save(content, np.array([[[None]]]), allow_pickle=True)
@@ -183,13 +155,10 @@ def test_arrays_that_are_no_recording(tmp_path, data, words):
     [
         b"",
         pickled(),
-        *(GOOD[:length] for length in (10, 100, len(GOOD) - 1, len(GOOD) - 120)),
-        b"\x93NUMPY\x07\x00" + GOOD[8:],
+        GOOD[:-1],
         GOOD.replace(b"False", b"open(", 1),
         GOOD.replace(b"(3, 2, 5), }" + b" " * 16, b"(99999999, 2, 9999999), }   "),
-        GOOD.replace(b"(3, 2, 5), }" + b" " * 13, b"(3, -2, -5), }           "),
         b"\x93NUMPY\x01\x00" + struct.pack("<H", 4000) + b"(" * 4000,
-        b"\x93NUMPY\x02\x00" + struct.pack("<I", 50000) + b" " * 50000,
     ],
 )
 def test_what_is_no_array(tmp_path, data):
@@ -210,7 +179,6 @@ def test_sizes_are_bounded(tmp_path, monkeypatch):
     assert f"recordings of {3 * len(GOOD)} bytes, limit" in message(archive(tmp_path / "three.zip", files))
 
 
-# What is refused: hostile archives
 @pytest.mark.parametrize("size", [64, 128])
 def test_a_bomb_is_read_no_further_than_it_announces(tmp_path, size):
     path = archive(tmp_path / "bomb.zip", {f"test/{SAMPLE}": GOOD + bytes(16 << 20)})
@@ -221,7 +189,6 @@ def test_a_bomb_is_read_no_further_than_it_announces(tmp_path, size):
     assert message(path).startswith(f"bomb.zip: test/{SAMPLE}: ")
 
 
-# --- the first part of recordings -------------------------------------------------------------------------------------
 def made(lengths=None, *, samples=3, steps=10):
     return Recordings(
         events=events(samples=samples, steps=steps),

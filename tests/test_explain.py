@@ -26,7 +26,6 @@ from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
 
-# -- roots -------------------------------------------------------------------------------------------------------------
 def steps(*words):
     """Booleans (steps, neurons or channels) from one word a step."""
     return np.array([[letter == "x" for letter in word] for word in words])
@@ -110,7 +109,6 @@ def test_one_pass_finds_what_the_definition_says(graph):
     assert list(found) == sorted(found, key=lambda r: (-r.dragged, r.step, r.layer, r.neuron))
 
 
-# -- causes: one neuron and one deviation at a time --------------------------------------------------------------------
 def stored_as(network, thresholds, exponents=(0,)):
     """Integer network with given thresholds, one for each population."""
     forms = [
@@ -231,8 +229,6 @@ def test_a_neuron_that_was_left_out():
     assert (root.cause, root.layer, root.neuron, root.dragged) == (LEFT_OUT, "fc1", 1, 1)
     assert explained(network, integer, steps("x"), absent=absent, unread=absent).layers[0].different == 0
 
-
-# -- the command -------------------------------------------------------------------------------------------------------
 
 EXPLAIN = ("explain", "net.loom", "--checkpoint", "net.pt", "--data", "data")
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}

@@ -154,9 +154,6 @@ def test_bad_arrays(check, values, words):
 RASTER = "x,y\n" + "".join(f"{4 * (i % 5)},{4 * (i // 5)}\n" for i in range(25))
 
 
-# Tables
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -196,9 +193,6 @@ def test_tables_name_the_fault(write, text, telling):
     assert all(part in line for part in telling.split("|"))
 
 
-# Taxels
-
-
 def test_positions(write):
     assert read_taxels(write("c.csv", "0,0\n1.5,-2\n")).tolist() == [[0, 0], [1.5, -2]]
     assert read_taxels(write("c.csv", "z,y,x\n1,2,3\n")).tolist() == [[3, 2, 1]]
@@ -232,9 +226,6 @@ def test_numbers_of_taxels_that_cannot_be(word):
     )
 
 
-# Edges
-
-
 def test_edges_count_in_both_directions(write):
     path = write("e.csv", "source,target\n2,0\n0,1\n1,0\n")
     assert read_edges(path, 3).tolist() == [[0, 1], [0, 2], [1, 0], [2, 0]]
@@ -262,9 +253,6 @@ def test_repeated_edges_count_once(write, directed):
 def test_edges_to_nowhere(write, row, found):
     path = write("e.csv", f"source,target\n0,1\n{row}\n")
     assert refused(DataError, "", read_edges, path, 3).startswith(f"e.csv: line 3: {found}")
-
-
-# Graphs
 
 
 def test_named_graph_on_another_sensor(write):

@@ -106,16 +106,3 @@ def test_the_command_says_what_cheaper_storage_lost_and_what_helps(spikeloom, as
         assert f"{trial['equal']} of {trial['decisions']}" in shown
     helped = "spikeloom finetune net.pt --data data --weight-bits 8" in shown
     assert helped == ("finetune" in found) == (best["equal"] < best["decisions"])
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (["--calibrate", "data", "--keep", "2"], "--keep 2: not a share"),
-        (["--keep", "0.9"], "--keep 0.9: no recordings to hold out; give --calibrate"),
-        (["--calibrate", "data", "--keep", "0.9", "--planes", "2"], "--keep 0.9: chooses storage; omit it, or"),
-        (["--calibrate", "data", "--keep", "0.9", "--spike-exact"], "--keep 0.9: chooses storage; omit it, or"),
-    ],
-)
-def test_a_share_that_cannot_be_kept_is_refused(refusal, words, line):
-    assert line in refusal("compile", "net.pt", *words, "-o", "out.loom")

@@ -13,22 +13,15 @@ from test_checkpoint import rebuilt
 from timed_networks import GRAPH, TIMING, events_of, written
 from zoo import specimen, stored, tuned
 
-from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.checkpoint import SHARED, towers_of
-from spikeloom.compiler.dynamics import PLAIN, Clocks, Dynamics, with_clocks
+from spikeloom.compiler.dynamics import PLAIN, Clocks, Dynamics
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.tensors import arrays_of, join, members
-from spikeloom.compiler.interpret import channels_last, run_integer
-from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
 from spikeloom.models.graphs import build_graph
-from spikeloom.models.networks.quantised import quantised_spikes
 from spikeloom.models.networks.reference import float_membranes, float_spikes
-from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.trace import aligned
-from spikeloom.runtime.machines.votes import class_counts, readout_counts
+from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.studies import yardsticks
 
 CASES = pytest.mark.parametrize(
@@ -72,7 +65,6 @@ def one_by_one(single_runs, wide, name, kind=bool):
     return found
 
 
-# --- files ---------------------------------------------------------------------------------------------------------
 @CASES
 def test_a_file_holds_its_towers_and_nothing_between_them(tmp_path, system, dynamics):
     singles, wide, _ = joined(tmp_path, system, dynamics)
@@ -119,7 +111,6 @@ def test_signed_but_wrong(tmp_path, change, expected):
     refused(ModelError, f"{path}: |{expected}|; copy or train it again", read_checkpoint, path)
 
 
-# --- the float network ---------------------------------------------------------------------------------------------
 @CASES
 def test_towers_spike_as_the_single_networks_bit_for_bit(tmp_path, system, dynamics):
     singles, wide, seen = joined(tmp_path, system, dynamics)
@@ -159,55 +150,6 @@ def test_the_expanded_network_is_sparse_in_blocks(tmp_path, system, dynamics):
     assert network.readout.label.tolist() == [0, 1, 2, 3] * 3
 
 
-# --- the chip ------------------------------------------------------------------------------------------------------
-@CASES
-def test_towers_spike_on_the_chip_as_their_members_with_the_same_storage(tmp_path, system, dynamics):
-    """Rounding looks at one neuron at a time, so that equal scales give equal integers."""
-    singles, wide, seen = joined(tmp_path, system, dynamics)
-    shared = [Form(bits=8, exponents=(0,), threshold=np.full(n, 40, np.int64)) for n in wide.neurons.values()]
-    events = channels_last(events_of(9, samples=6, steps=25), dynamics.clocks)
-    one = [
-        tuple(
-            replace(form, threshold=form.threshold[: single.neurons[name]])
-            for form, name in zip(shared, wide.neurons, strict=True)
-        )
-        for single in singles
-    ]
-    alone = [
-        dict(zip(wide.neurons, run_integer(round_to_forms(expand(s, seen), f)[0], events).spikes, strict=True))
-        for s, f in zip(singles, one, strict=True)
-    ]
-    found = run_integer(round_to_forms(expand(wide, seen), shared)[0], events).spikes
-    for name, spikes in zip(wide.neurons, found, strict=True):
-        assert_array_equal(spikes, one_by_one(alone, wide, name), err_msg=name)
-    assert found[-1].any()
-
-
-@pytest.mark.parametrize("system", ["tactilesgnet", "grid-cnn"])
-def test_fine_tuned_networks_keep_every_spike(tmp_path, system):
-    singles, _, seen = joined(tmp_path, system, PLAIN)
-    singles = [tuned(single, seed) for seed, single in enumerate(singles)]
-    wide = stored(tmp_path / "tuned.pt", join(singles, ["a", "b", "c"]))
-    events = events_of(10, samples=5, steps=25)
-    parts = [compile_network(expand(s, seen), Options(forms=s.forms, keep_all=True)).netlist for s in singles]
-    netlist = compile_network(expand(wide, seen), Options(forms=wide.forms, keep_all=True)).netlist
-    flat = with_clocks(events, wide.dynamics.clocks)
-    traces = [engine.simulate(part, flat, spikes=True) for part in parts]
-    alone = [
-        {name: aligned(part, trace.spikes, layer) for layer, name in enumerate(wide.neurons)}
-        for part, trace in zip(parts, traces, strict=True)
-    ]
-    trace = engine.simulate(netlist, flat, spikes=True)
-    torch_model = quantised_spikes(wide, seen, events)
-    for layer, name in enumerate(wide.neurons):
-        found = aligned(netlist, trace.spikes, layer)
-        assert_array_equal(found, one_by_one(alone, wide, name), err_msg=name)
-        assert_array_equal(torch_model[name], found, err_msg=name)
-    summed = sum(class_counts(part, t.counts.spikes) for part, t in zip(parts, traces, strict=True))
-    assert_array_equal(class_counts(netlist, trace.counts.spikes), summed)
-    assert summed.any()
-
-
 def test_yardsticks_count_no_weights_between_towers(tmp_path):
     singles, wide, seen = joined(tmp_path, dynamics=PLAIN)
     events = events_of(3, samples=4)
@@ -222,7 +164,6 @@ def test_yardsticks_count_no_weights_between_towers(tmp_path):
         assert getattr(found.synaptic_operations, name) == pytest.approx(summed, rel=1e-12), name
 
 
-# --- commands ------------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     """Three networks, each with a record and two sets of weights; joined."""

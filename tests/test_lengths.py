@@ -149,7 +149,6 @@ def place(tmp_path_factory):
     return folder
 
 
-# --- training and files -----------------------------------------------------------------------------------------------
 def test_it_is_the_network_of_recordings_in_longer_bins(place):
     own, plain = (read_checkpoint(place / f"{name}.pt") for name in ("x", "plain"))
     assert (own.bins, plain.bins) == (BINS, 1)
@@ -200,7 +199,6 @@ def test_other_bins_are_refused(refusal, words, told):
     assert all(part in line for part in told.split("|"))
 
 
-# --- every command that reads recordings ------------------------------------------------------------------------------
 @pytest.mark.usefixtures("spikeloom")
 def test_it_decides_on_the_recordings_what_the_other_does_on_longer_bins():
     ours, theirs = (
@@ -255,7 +253,6 @@ def test_what_is_done_to_recordings_is_done_before_they_are_joined():
     assert late.lengths.tolist() == [3]
 
 
-# --- what else is made of them ----------------------------------------------------------------------------------------
 def test_joined_networks_and_fine_tuned_ones_keep_them(refusal, place):
     as_json("join", "x.pt", "x.pt", "-o", "both.pt")
     assert (read_checkpoint(place / "both.pt").bins, read_checkpoint(place / "both.pt").towers) == (BINS, 2)

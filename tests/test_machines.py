@@ -1,5 +1,6 @@
 """The one interface of all chips: what it returns is the simulator's, and a further chip is a folder."""
 
+import json
 import sys
 from importlib import resources
 
@@ -80,17 +81,6 @@ def test_simulators_are_held_against_their_specifications(made, monkeypatch):
         machine.require_sensor(np.zeros((1, 3, 3, 12), np.uint8))
 
 
-def test_what_is_compared_with_a_float_model():
-    made = specimen("timed")
-    found, events = integer_machine(made.machine), made.events
-    sizes = [layer.neurons for layer in found.netlist.layers]
-    assert [len(out) for out in found.absent] == [len(out) for out in found.unread] == sizes
-    ran = found.cumulative(events, LENGTHS)
-    np.testing.assert_array_equal(ran.votes[:, -1], found.run(events, lengths=LENGTHS).votes)
-    price = found.price(events, lengths=LENGTHS, bin_s=0.02)[1]
-    np.testing.assert_array_equal(ran.operations[:, -1], price.synaptic_operations)
-
-
 PASSES = """
 import numpy as np
 from dataclasses import replace
@@ -156,61 +146,22 @@ def test_a_third_chip_is_a_folder_of_the_compiler_and_one_of_the_machines(tmp_pa
             del sys.modules[name]
 
 
-def table(text):
-    """Values by name, a line of each kind."""
-    words = text.split()
-    return {name: float(value) for name, value in zip(words[::2], words[1::2], strict=True)}
+@pytest.mark.parametrize("name", ["loihi1", "truenorth"])
+def test_every_number_of_a_chip_is_as_published(golden, name):
+    golden(f"{name}.chip.json", json.dumps(encode(base.load_target(name)), indent=1) + "\n")
 
 
-# 16,384 words of 64 bits are 128 KiB
-LIMITS = table("""
-    core.compartments 1024  core.axons_in 4096  core.axons_out 4096  core.synapse_words 16384  core.threshold_slots 8
-    core.synapse_formats 7  core.compartment_configs 32  core.dense_base 256  chip.cores 128
-    synapse.block 64  synapse.block_header_bits 10  synapse.word_bits 64
-    mesh.tile_cores 4  mesh.width 8  mesh.height 4
-""")
-CHOICES = {
-    "synapse.weight_bits": (2, 3, 4, 5, 6, 8),
-    "synapse.index_bits": (0, 6, 7, 8, 9, 10, 11, 12),
-    "synapse.exponent": (-1, 0, 1, 2, 3, 4, 5, 6, 7),
-}
-TIME = table("""
-    neuron_access 6  neuron_update 3.7  spike 30  axon_out 5.1  axon_in 16  synaptic_operation_dense 3.8
-    synaptic_operation_sparse 4.7  hop_east_west 4.1  hop_north_south 6.5
-""")
-BARRIERS = {1: 600, 2: 1000, 4: 1400, 29: 1800}
-
-
-def test_limits_are_the_published_ones():
-    target = base.load_target("loihi1")
-    assert (target.name, target.title) == ("loihi1", "Intel Loihi 1")
-    assert {rule: entry.value for rule, entry in target.limits.items()} == LIMITS
-    assert [target.limit(rule) for rule in LIMITS] == list(LIMITS.values())
-    assert dict(target.choices) == CHOICES
-    assert {name: power.value for name, power in target.static.items()} == {"frady2020": 104.4, "blouw2019": 29.0}
-    assert LIMITS["mesh.width"] * LIMITS["mesh.height"] * LIMITS["mesh.tile_cores"] == LIMITS["chip.cores"]
-    assert set(REMEDIES) == {rule for rule in LIMITS if rule.startswith(("core.", "chip."))}
-
-
-def test_latencies_are_the_published_ones():
-    (table,) = base.load_target("loihi1").time
-    assert table.name == "sanafe"
-    assert set(TIME) == set(base.LATENCIES)
-    assert {event: entry.value for event, entry in table.latencies.items()} == TIME
-    assert {least: entry.value for least, entry in table.barriers.items()} == BARRIERS
-    assert {entry.unit for entry in (*table.latencies.values(), *table.barriers.values())} == {"ns"}
-    assert (table.link_buffer.value, table.link_buffer.unit) == (16, "messages per link")
-    assert [table.picoseconds(event) for event in TIME] == [round(1000 * nanoseconds) for nanoseconds in TIME.values()]
-    barriers = [table.barrier(tiles) for tiles in (1, 2, 3, 4, 28, 29, 32)]
+def test_a_barrier_is_that_of_the_fewest_tiles_it_is_known_for():
+    chip = base.load_target("loihi1")
+    barriers = [chip.time[0].barrier(tiles) for tiles in (1, 2, 3, 4, 28, 29, 32)]
     assert barriers == [600_000, *[1_000_000] * 2, *[1_400_000] * 2, *[1_800_000] * 2]
+    assert set(REMEDIES) == {rule for rule in chip.limits if rule.startswith(("core.", "chip."))}
 
 
 def test_known_targets_are_the_folders():
     assert base.known_targets() == ("loihi1", "truenorth")
     assert base.known_targets(base.CROSSBARS) == ("truenorth",)
 
-
-# -- files that are wrong ----------------------------------------------------------------------------------------------
 
 TEXT = (resources.files("spikeloom.compiler.targets") / "loihi1" / "chip.toml").read_text("utf-8")
 
@@ -246,8 +197,6 @@ def test_a_file_that_is_not_there(tmp_path):
     refused(OptionError, "no such file", base.read_target, tmp_path / "no.toml")
 
 
-# -- tables of one's own -----------------------------------------------------------------------------------------------
-
 MINE = """
 [energy.mine]
 title = "Measured in our lab"
@@ -277,32 +226,3 @@ def test_tables_that_are_not_there_or_wrong(tmp_path):
     refused(OptionError, "energy.mine.neuron_active: value is -80.0", base.with_tables, chip, str(path))
     path.write_text(MINE.replace("[energy.mine]", "[energy.mine]\nhopp = 1"))
     refused(OptionError, "energy.mine.hopp: unknown", base.with_tables, chip, str(path))
-
-
-# -- crossbars ---------------------------------------------------------------------------------------------------------
-
-TRUENORTH = table("""
-    core.axons 256  core.neurons 256  core.axon_types 4  chip.cores 4096  mesh.width 64  mesh.height 64  mesh.reach 255
-    neuron.weight_bits 9  neuron.leak_bits 9  neuron.threshold_bits 18  neuron.reset_bits 9
-    neuron.membrane_bits 20  neuron.targets 1  neuron.delay 15  tick.length 1000
-""")
-UNVERIFIED = {"neuron.leak_bits", "neuron.threshold_bits", "neuron.reset_bits"}
-
-
-def test_truenorth_limits_with_source_and_confidence():
-    target = base.load_target("truenorth")
-    assert {rule: target.limit(rule) for rule in target.limits} == TRUENORTH
-    assert all(entry.source and entry.confidence for entry in target.limits.values())
-    assert {rule for rule, entry in target.limits.items() if entry.confidence == "unverified"} == UNVERIFIED
-    assert not target.choices
-    assert not target.time
-
-
-def test_truenorth_energy_has_two_readings_and_only_one_has_a_floor():
-    target = base.load_target("truenorth")
-    read = {table.name: (table.joule("synaptic_event"), table.floor_w) for table in target.energy}
-    assert read == {
-        "all_in": (pytest.approx(26e-12), None),
-        "marginal": (pytest.approx(2.3e-12), pytest.approx(0.0644)),
-    }
-    assert {name: power.value for name, power in target.static.items()} == {"idle_0v70": 42.0, "typical_0v75": 65.0}

@@ -243,7 +243,6 @@ def test_every_damage_to_a_crossbar_has_a_name(tmp_path):
         assert re.search(f"EN NOT what the network of the file is lowered to: {named}", out)
 
 
-# -- what need not be said again ---------------------------------------------------------------------------------------
 def test_a_netlist_remembers_bins_and_data(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for split in ("train", "test"):

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_files import events as made_events
 from made_files import small_checkpoint
@@ -51,7 +51,6 @@ def adjacency_of(name="manual"):
     return normalised_adjacency(build_graph(name).edges, 39)
 
 
-# --- the recurrence ------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
 @given(
     seed=st.integers(0, 2**31),
@@ -60,7 +59,6 @@ def adjacency_of(name="manual"):
     beta=st.sampled_from([0.0, 0.2, 0.9]),
     theta=st.sampled_from([0.25, 0.5, 1.0]),
 )
-@settings(max_examples=40, deadline=None)
 def test_spikes_and_membranes_equal_a_step_by_step_loop(kind, seed, steps, neurons, beta, theta):
     generator = torch.Generator().manual_seed(seed)
     current = torch.randn(steps, neurons, generator=generator, dtype=kind) * 0.8
@@ -72,7 +70,6 @@ def test_spikes_and_membranes_equal_a_step_by_step_loop(kind, seed, steps, neuro
     assert spikes.dtype == membrane.dtype == kind
 
 
-# --- the dense layer -----------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("rate", [0.0, 0.2, 1.0])
 def test_spike_linear_equals_a_dense_product_and_its_gradient(rate):
     generator = torch.Generator().manual_seed(5)
@@ -101,8 +98,6 @@ def test_a_product_is_the_same_by_either_library(inputs):
     assert_allclose(times(rows, weight), rows.double() @ weight.double().t(), rtol=0, atol=1e-4)
 
 
-# --- the network ---------------------------------------------------------------------------------------------------
-
 SMALL = Architecture(taxels=39, classes=4, hops=2, features=3, hidden=(8, 6, 5), beta=0.3, theta=0.4)
 
 
@@ -121,7 +116,6 @@ def test_initial_weights_follow_the_seed_and_leave_the_global_random_state_alone
         assert 0.7 * bound < np.abs(first[name]).max() <= bound
 
 
-# --- the reference of a checkpoint ------------------------------------------------------------------------------------
 def test_recordings_do_not_influence_each_other(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     recordings = made_events(4, samples=BATCH + 3)  # two batches
@@ -132,7 +126,6 @@ def test_recordings_do_not_influence_each_other(tmp_path):
             assert_array_equal(alone[layer][0], spikes[sample])
 
 
-# -- the released checkpoint -------------------------------------------------------------------------------------------
 @pytest.mark.recordings
 def test_every_released_spike_count(released_checkpoint, objects_zip, shared_dir):
     checkpoint = read_checkpoint(released_checkpoint)
@@ -181,7 +174,6 @@ def saved(tmp_path, network, *, padding="none", weights=None, **more):
     return read_checkpoint(tmp_path / "x.pt")
 
 
-# --- plain code, as a script with torch's own layers would have it ---------------------------------------------------
 def plain_first(system, state, *, padding="none"):
     """Current of the first layer of one step, a function of (taxels, channels), from a released-style state dict."""
     if system == MLP:
@@ -255,7 +247,6 @@ def plain_run(system, state, events, *, padding="none", beta=0.2, theta=0.5):
     return [[torch.stack([step[kind][layer] for step in trace]) for layer in range(4)] for kind in (0, 1)]
 
 
-# --- the first layer -------------------------------------------------------------------------------------------------
 @given(
     kernel=st.integers(1, 4),
     stride=st.integers(1, 3),
@@ -264,7 +255,6 @@ def plain_run(system, state, events, *, padding="none", beta=0.2, theta=0.5):
     columns=st.integers(4, 6),
     seed=st.integers(0, 99),
 )
-@settings(max_examples=40, deadline=None)
 def test_a_window_over_a_grid_equals_torchs_convolution(kernel, stride, padding, rows, columns, seed):
     rng = np.random.default_rng(seed)
     cells = rng.integers((rows, columns), size=(6, 2))
@@ -345,7 +335,6 @@ def test_spikes_and_membranes_are_those_of_plain_torch(tmp_path, system, padding
     assert all(0 < spikes[layer].mean() < 1 for layer in ("conv1", "fc1"))
 
 
-# --- to the chip -----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("system", NEW)
 def test_expansion_equals_probing_the_layer(tmp_path, system):
     """The general way: any affine stage, here plain torch code, by its responses to unit vectors."""

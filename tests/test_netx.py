@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from commands import as_json
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_netx import conv, dense, even, events, flatten, given_input, neuron, write
 from numpy.testing import assert_array_equal
@@ -66,7 +66,6 @@ def test_files_that_cannot_be_used(tmp_path, words, layers):
     refused(ModelError, f"{tmp_path}/bad.net: {words}", read_netx, write(tmp_path / "bad.net", *layers))
 
 
-# --- reading ----------------------------------------------------------------------------------------------------------
 def lif(weight, bias, spikes, *, u=4096, v=1024, threshold=25, own=None):
     """A second reading of a block: spikes of (steps, inputs) integers, in plain Python arithmetic."""
     rows = [np.zeros(len(weight), bool)]
@@ -199,10 +198,6 @@ def test_spikes_that_lava_dl_recorded():
     assert_array_equal(ours[1][0], out[1:])
 
 
-# --- writing ----------------------------------------------------------------------------------------------------------
-SETTINGS = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-
-
 @st.composite
 def whole_networks(draw):
     """Networks that the format holds as they are."""
@@ -226,7 +221,6 @@ def whole_networks(draw):
     return blocks, rng
 
 
-@SETTINGS
 @given(whole_networks())
 def test_what_the_format_holds_comes_back_exactly(drawn):
     blocks, rng = drawn

@@ -6,7 +6,7 @@ from pathlib import Path
 import nir
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from made_nir import affine, chain, cuba, graph_with, lif, lowered, simulate, stepped
 from numpy.testing import assert_allclose, assert_array_equal
 from random_networks import chain as network_chain
@@ -270,8 +270,7 @@ def test_groups_of_neurons_vote_for_a_class():
     assert network.readout.label.tolist() == [0, 1, 1, 0, 0, 1]
 
 
-# --- writing ----------------------------------------------------------------------------------------------------------
-@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=10)
 @given(float_networks(betas=(0.0, 0.2, 0.9)))
 def test_the_nir_file_alone_has_the_integers_and_the_decays(tmp_path_factory, network):
     path = tmp_path_factory.mktemp("nir") / "net.nir"

@@ -6,7 +6,7 @@ import numpy as np
 import onnx
 import pytest
 from commands import as_json
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from onnx.reference import ReferenceEvaluator
@@ -23,8 +23,6 @@ from spikeloom.compiler.targets.loihi1.netlist import reach, read_netlist
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine, spec
-
-SETTINGS = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 def by_scan(netlist, events, **options):
@@ -71,7 +69,6 @@ def assert_as_specified(netlist, events, expected=None):
     assert counts[0].tolist() == votes[0].tolist() == due
 
 
-@SETTINGS
 @given(st.data())
 def test_random_networks_are_the_specification(data):
     netlist = data.draw(netlists(weight_exponents=(-1, 0, 1, 3)))
@@ -96,17 +93,6 @@ def three_neurons():
     return replace(netlist, bias_mantissa=read_only([0, -7, 0]), classes=2, readout_class=read_only([-1, -1, 1]))
 
 
-def test_a_run_by_hand():
-    # neuron 0: 60 + 50 = 110 > 80 spikes, then 60, 60 * 819/4096 + 50 = 61; neuron 1: 60, then -30 ..., 90 spikes
-    events = np.array([[[1, 1, 0], [1, 0, 1]]], np.uint8)
-    stepped, membranes, votes = by_steps(three_neurons(), events)
-    for spikes, counts in ((stepped, votes), by_scan(three_neurons(), events)):
-        assert spikes[0].astype(int).tolist() == [[1, 0, 0], [0, 0, 1], [0, 1, 0], [0, 0, 0]]
-        assert counts.tolist() == [[0, 1]]
-    assert membranes[0, :2, :2].tolist() == [[0, 3833], [3840, -1161]]
-    assert membranes[0, 3].tolist() == [0, 0, 4480]
-
-
 def test_verify_finds_an_engine_that_strays(monkeypatch):
     plain = onnx_engine.simulate
 
@@ -124,7 +110,6 @@ def test_verify_finds_an_engine_that_strays(monkeypatch):
     assert report["engine_different"] == 2
 
 
-# --- every recording --------------------------------------------------------------------------------------------------
 PART = 48
 SETS = {"objects_zip": ("objects", (576, 144)), "containers_zip": ("containers", (240, 60))}
 
@@ -152,7 +137,6 @@ def test_all_recordings(fixture, bits, request, tmp_path):
         assert total > 1_000_000
 
 
-# -- digits and widths -------------------------------------------------------------------------------------------------
 @given(
     arrays.arrays(np.int64, st.tuples(st.integers(1, 4), st.integers(1, 4)), elements=st.integers(-(2**22), 2**22)),
     st.integers(0, 6),
@@ -204,7 +188,6 @@ def test_registers_that_may_overflow_are_refused():
         refused(ModelError, "onnx: some input may overflow a register of layer0", overflowing)
 
 
-# -- files -------------------------------------------------------------------------------------------------------------
 def test_the_reference_of_the_format_computes_the_same():
     netlist = three_neurons()
     given = np.random.default_rng(2).integers(0, 2, (2, 2, 12), np.uint8)

@@ -220,7 +220,6 @@ def test_the_released_network_by_torch_geometric(released_checkpoint, tmp_path):
         assert_same_network(lift(found), lift(read_netlist(tmp_path / "t7.loom")))
 
 
-# --- each operator as numbers and as coefficients ---------------------------------------------------------------------
 RNG = np.random.default_rng(0)
 EDGES = np.array([0, 2, 2, 1])
 

@@ -2,7 +2,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from oracles import refused
 from random_networks import (
@@ -33,15 +33,6 @@ def sizes(parts):
     return [[(chunk.population, chunk.first, chunk.last) for chunk in core] for core in parts]
 
 
-# --- words
-def test_the_published_size_of_fc1():
-    assert 2496 * int(list_words(np.array(128), 8, 0, LOIHI)) == 44_928
-    assert 2496 * int(list_words(np.array(43), 8, 0, LOIHI)) == 14_976
-    # 58 bits in one word, 66 in two; full blocks of 64
-    assert list_words(np.array([0, 1, 6, 7, 64, 65, 128]), 8, 0, LOIHI).tolist() == [0, 1, 1, 2, 9, 10, 18]
-    assert list_words(np.array([3, 4]), 8, 10, LOIHI).tolist() == [1, 2]
-
-
 @given(st.integers(0, 1024), st.sampled_from([2, 3, 4, 5, 6, 8]), st.sampled_from([0, 6, 7, 8, 9, 10, 11, 12]))
 def test_words_of_any_list(entries, weight_bits, index):
     words = int(list_words(np.array(entries), weight_bits, index, LOIHI))
@@ -55,7 +46,6 @@ def test_a_sparse_index_is_as_narrow_as_it_can_be(highest, bits):
     assert index_bits(highest, LOIHI) == bits
 
 
-# --- splitting
 @pytest.mark.parametrize(("neurons", "cores"), [(1024, 1), (1025, 2), (2048, 2), (2496, 3)])
 def test_a_layer_is_split_at_1024_compartments(neurons, cores):
     network = integer_chain(np.full((neurons, 1), 2))
@@ -109,8 +99,6 @@ def test_seven_formats_fit_a_core_and_eight_do_not():
     refused(CapacityError, words, partition, fan_in_of_formats(range(-1, 7)), LOIHI)
 
 
-# --- every limit
-@settings(deadline=None, max_examples=30)
 @given(integer_networks(), tight_targets())
 def test_every_limit_is_kept(network, target):
     parts = legal_partition(network, target)
@@ -141,7 +129,7 @@ def groupings(items):
             yield [*rest[:i], [head, *group], *rest[i + 1 :]]
 
 
-@settings(deadline=None, max_examples=15, suppress_health_check=[HealthCheck.filter_too_much])
+@settings(max_examples=15)
 @given(integer_networks(exponents=(0,), bits=(8,)), roomy_targets())
 def test_no_grouping_of_the_chunks_needs_fewer_cores(network, target):
     parts = legal_partition(network, target)
@@ -174,7 +162,6 @@ def test_among_equal_packings_the_one_with_least_traffic_is_taken():
     assert sizes(partition(network, target, rates(0.1, 0.9))) == [[(0, 0, 3)], [(1, 0, 3), (2, 0, 3)]]
 
 
-# --- what does not fit
 def test_the_neuron_that_breaks_a_rule_most_is_named():
     weights = np.full((4, 9), 2)
     weights[0, 5:] = weights[1, 2:] = weights[3, 7:] = 0
@@ -248,7 +235,7 @@ KINDS = {
 }
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(
     st.integers(1, 5),
     st.sampled_from([(3, 2, 1), (3, 3, 2), (2, 2, 2), (5, 1, 1), (1, 5, 2)]),
@@ -295,7 +282,6 @@ def test_many_cores_are_placed_well(cores, kind):
     assert placement.spike_hops <= cost(traffic, np.arange(cores) // 4, 8) * (1 + 1e-9)
 
 
-@settings(deadline=None, max_examples=20)
 @given(integer_networks(), st.integers(1, 8), st.integers(0, 2**32 - 1))
 def test_traffic_is_a_packet_per_listening_axon(network, compartments, seed):
     rng = np.random.default_rng(seed)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_files import events, small_checkpoint
 from oracles import probed, refused
@@ -31,13 +31,11 @@ from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.pipeline import run
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
-from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.passes import start
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.runtime.equivalence.verify import verify
 
 
-# --- a toy
 def test_the_passes_run_in_order_and_hand_on_what_they_make():
     seen = {}
     source = Factored(checkpoint=random_checkpoint(), propagation=ring(5))
@@ -84,18 +82,6 @@ def test_a_pass_that_breaks_a_rule_is_named_at_once(name, change):
     seen = []
     refused(VerifyError, "", run, passes, work, lambda name, _: seen.append(name))
     assert name not in seen
-
-
-def test_the_proof_covers_the_netlist():
-    """Bounds of the network and of the netlist are counted in two places and agree."""
-    done = compile_network(expand(random_checkpoint(seed=2), ring(5)))
-    positive, negative = one_step_bounds(done.netlist)
-    for layer, proof in enumerate(done.proofs):
-        ids = done.netlist.compartments_of(layer)
-        assert proof.accumulator == 64 * max(positive[ids].max(), negative[ids].max())
-
-
-# --- expand -----------------------------------------------------------------------------------------------------------
 
 
 # Pairs of taxels within three hops times 64 features and 2 polarities. The hand-drawn graph, the tree and 1, 3 and 4
@@ -149,7 +135,6 @@ def graphs(draw):
     return normalised_adjacency(np.array(edges, np.int64).reshape(-1, 2), taxels)
 
 
-@settings(deadline=None, max_examples=40)
 @given(graphs(), st.integers(1, 5), st.integers(1, 3), st.integers(1, 3), st.integers(0, 2**32 - 1))
 def test_the_expanded_convolution_is_the_probed_one(adjacency, n_hops, features, channels, seed):
     hops = np.random.default_rng(seed).normal(size=(n_hops, features, channels))
@@ -157,13 +142,6 @@ def test_the_expanded_convolution_is_the_probed_one(adjacency, n_hops, features,
     weight, bias = probed(factored(adjacency, hops), len(adjacency) * channels)
     np.testing.assert_allclose(expanded.toarray(), weight, rtol=0, atol=1e-12)
     assert not bias.any()
-
-
-def test_two_taxels_by_hand():
-    adjacency = np.array([[0.0, 1.0], [1.0, 0.0]])
-    hops = np.array([[[1.0, 2.0]], [[10.0, 20.0]], [[100.0, 200.0]]])
-    # even hops come back to the taxel, odd ones end on the other
-    assert convolution(adjacency, hops).toarray().tolist() == [[101, 202, 10, 20], [10, 20, 101, 202]]
 
 
 @pytest.mark.parametrize("name", CONV_SYNAPSES)
@@ -186,7 +164,6 @@ def test_structure_does_not_depend_on_the_weights():
     assert fan_in(network, 1).tolist() == [15] * 6
 
 
-# --- whole checkpoints
 def test_a_checkpoint_becomes_a_chain_of_populations():
     network = expand(random_checkpoint(taxels=39, features=64, sizes=(128, 256, 36)), adjacency_of("manual"))
     invariants.verify(network)
@@ -199,8 +176,6 @@ def test_a_checkpoint_becomes_a_chain_of_populations():
     assert network.readout.label.tolist() == list(range(36))
 
 
-# --- prune ------------------------------------------------------------------------------------------------------------
-@settings(deadline=None, max_examples=40)
 @given(float_networks(), st.data())
 def test_what_never_fires_never_fires(network, data):
     recordings = data.draw(recordings_for(network.input.size))
@@ -212,7 +187,6 @@ def test_what_never_fires_never_fires(network, data):
     assert_same_layers(*(run_float(each, recordings).spikes for each in (disconnect(network, silent), network)))
 
 
-@settings(deadline=None, max_examples=40)
 @given(integer_networks(), st.data())
 def test_leaving_out_moves_no_spike_that_is_left(network, data):
     recordings = data.draw(recordings_for(network.input.size))

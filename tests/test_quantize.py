@@ -57,7 +57,6 @@ def noisy_layer(seed=0, *, inputs=40, outputs=30, outlier=0.0):
     return chain(weight, biases=[rng.normal(0, 0.05, outputs)])
 
 
-# --- registers
 def test_decays_are_the_nearest_registers():
     assert [decay_registers(beta)[1] for beta in (0.0, 1.0, 0.5, 0.9, 819 / 4096)] == [4095, 0, 2048, 410, 3277]
     population = choose_storage(noisy_layer(), LOIHI)[0].populations[0]
@@ -65,7 +64,7 @@ def test_decays_are_the_nearest_registers():
     assert (population.decay_u, population.decay_v) == (4095, 3277)
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(st.data())
 def test_no_input_brings_more_than_the_stated_worst_case(data):
     network = data.draw(float_networks())
@@ -155,7 +154,6 @@ def test_a_large_bias_takes_the_finest_scale_that_its_register_holds():
     assert choice.scale == 2 * threshold
 
 
-# --- calibration
 @pytest.mark.parametrize(("bits", "seed"), [(2, 0), (4, 1), (8, 2)])
 def test_the_scale_that_keeps_most_spikes_is_chosen_of_those_that_did_best_on_a_sample(bits, seed, monkeypatch):
     monkeypatch.setattr(choice_module, "compensated", lambda *_: None)
@@ -231,7 +229,6 @@ def test_recordings_are_evenly_spaced(samples, picked):
     assert len(evenly_spaced(np.zeros((576, 1, 1), bool))) == 32
 
 
-# --- proofs of ranges ------------------------------------------------------------------------------------------------
 def with_registers(network, **changes):
     return dataclasses.replace(
         network, populations=tuple(dataclasses.replace(p, **changes) for p in network.populations)
@@ -297,14 +294,12 @@ def check(network, events, proofs):
         assert np.abs(activity.membranes[post]).max() <= proof.membrane
 
 
-@settings(deadline=None, max_examples=20)
 @given(st.data())
 def test_bounds_hold_on_random_registers(data):
     network = data.draw(integer_networks())
     check(network, data.draw(recordings_for(network.input.size, most=30)), prove_ranges(network))
 
 
-@settings(deadline=None, max_examples=20)
 @given(st.data())
 def test_a_proof_means_that_saturation_changes_nothing(data):
     network = data.draw(integer_networks())
@@ -314,12 +309,6 @@ def test_a_proof_means_that_saturation_changes_nothing(data):
         if proof.membrane > 2**23 - 1:
             break  # later layers may hear other spikes
         assert np.abs(membranes).max() <= 2**23 - 1
-
-
-# --- rounding to registers --------------------------------------------------------------------------------------------
-
-LARGEST = {2: 128, 3: 192, 4: 224, 5: 240, 6: 248, 8: 254}
-"""Mantissa of each storage width."""
 
 
 def mantissas(weight, scale, bits):
@@ -339,17 +328,7 @@ def test_decay_rounds_the_exact_product_toward_zero(x, lost):
     assert decayed(x, lost) == int(Fraction(x * (4096 - lost), 4096))  # int of a fraction truncates
 
 
-@pytest.mark.parametrize(("bits", "largest"), LARGEST.items())
-def test_weights_at_the_ends_of_each_width_and_half_a_step_off(bits, largest):
-    step = weight_step(bits)
-    assert step == 2 ** (9 - bits)
-    ends = np.array([largest, largest + step / 2, largest + step, 1e6])
-    assert mantissas(ends, 1.0, bits).tolist() == [largest] * 4
-    values = np.array([step / 2, -step / 2, step / 2 + 1e-6, -step / 2 - 1e-6])
-    assert mantissas(values, 1.0, bits).tolist() == [0, 0, step, -step]
-
-
-@given(st.sampled_from([*LARGEST]), st.lists(st.floats(-3, 3), min_size=1, max_size=5), st.floats(0.1, 300))
+@given(st.sampled_from(BITS), st.lists(st.floats(-3, 3), min_size=1, max_size=5), st.floats(0.1, 300))
 def test_weights_are_the_nearest_of_their_grid_and_symmetric(bits, weights, scale):
     step, weight = weight_step(bits), np.array(weights)
     mantissa = mantissas(weight, scale, bits)
@@ -358,25 +337,6 @@ def test_weights_are_the_nearest_of_their_grid_and_symmetric(bits, weights, scal
     assert np.array_equal(mantissas(-weight, scale, bits), -mantissa)
     nearest = np.abs(grid[:, None] - weight * scale).min(axis=0)
     np.testing.assert_allclose(np.abs(mantissa - weight * scale), nearest, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("bias", "mantissa", "exponent"),
-    [
-        (0.0, 0, 0),
-        (0.5, 0, 0),
-        (-1.5, -2, 0),
-        (4095.5, 2048, 1),
-        (4096.0, 2048, 1),
-        (8191.0, 2048, 2),
-        (4095.0 * 128, 4095, 7),
-        (4095.49 * 128, 4095, 7),
-    ],
-)
-def test_bias_takes_the_smallest_exponent(bias, mantissa, exponent):
-    found = encode_bias(np.array([bias]))
-    assert [part.tolist() for part in found] == [[mantissa], [exponent]]
-    assert all(part.dtype == np.int64 for part in found)
 
 
 @pytest.mark.parametrize("bias", [4095.5 * 128, -4095.5 * 128, 1e9])

@@ -84,6 +84,11 @@ RUN = "run net.loom --data {}"
 EXPLAIN = "explain net.loom --checkpoint net.pt --data data {}"
 REPORT = "report net.loom --checkpoint net.pt --data data -o x.html {}"
 VERIFY = "verify net.loom --checkpoint net.pt --data data {}"
+STRESS = "stress net.loom --checkpoint net.pt --data data {}"
+ANYTIME = "anytime net.loom --data data {}"
+WATCH = "watch net.loom --input flat/tap_0_label_0.csv {}"
+TRAIN = "train --data synthetic {} -o x.pt"
+SEEDS = "train --data synthetic --graph manual {}"
 
 TABLE = [
     # commands and options
@@ -154,6 +159,57 @@ TABLE = [
     (COMPILE.format("net.pt --optimize speed"), "--optimize speed: no such goal; give one of cores, latency"),
     (COMPILE.format("net.pt --optimize latency"), "--optimize latency: needs firing rates; give --calibrate"),
     (COMPILE.format("net.pt --optimize latency --calibrate data --cores-for fc1=2"), "latency|omit --cores-for"),
+    (COMPILE.format("net.pt --calibrate data --keep 2"), "--keep 2: not a share"),
+    (COMPILE.format("net.pt --keep 0.9"), "--keep 0.9: no recordings to hold out; give --calibrate"),
+    *(
+        (COMPILE.format(f"net.pt --calibrate data --keep 0.9 {more}"), "--keep 0.9: chooses storage; omit it, or")
+        for more in ("--planes 2", "--spike-exact")
+    ),
+    # formats
+    ("export x.loom -o x --to sanafe --data x", "--data x: is for netx and ranc"),
+    ("export x.loom -o x --to onnx --recording 0", "--recording 0: is for ranc"),
+    ("export x.loom -o x --to ranc --limit 1 --data x", "--limit 1: is for netx"),
+    ("export x.loom -o x --to netx --limit 2", "--limit 2: says which recording of --data"),
+    ("export x.loom -o x --to nir --form step", "--form step: is for onnx"),
+    ("export x.loom -o x --to sanafe --dt 1", "--dt 1.0: is for nir"),
+    # studies
+    (ANYTIME.format("--differ 0.1"), "--differ 0.1: |add --calibrate"),
+    (ANYTIME.format("--held-out"), "--held-out: |add --calibrate"),
+    (ANYTIME.format("--calibrate data --differ 1"), "--differ 1: |from 0 to below 1"),
+    (STRESS.format("--only taxels_ded"), "choose from taxels_dead, "),
+    (STRESS.format("--only events_lost --require taxels_dead:3>=0.5"), "--only leaves taxels_dead out"),
+    (STRESS.format("--seeds 0"), "allowed are 1 or more"),
+    *(
+        (STRESS.format(f"--require {words}"), telling)
+        for words, telling in (
+            ("taxels_ded:3>=0.5", "'taxels_ded' is no perturbation; choose from taxels_dead, "),
+            ("taxels_dead>=0.5", "is not NAME:LEVEL>=SHARE"),
+            ("taxels_dead:3>=85", "'85' is no share; give a number from 0 to 1"),
+            ("taxels_dead:2.5>=0.5", "'2.5' is no level of it; give a whole number from 0 (taxels)"),
+            ("events_lost:many>=0.5", "'many' is no level of it; give a number from 0 to 1 (probability)"),
+            ("taxels_dead:7>=0.5", "the sensor has 6 taxels"),
+        )
+    ),
+    # streams
+    ("watch net.loom --input none.csv", "none.csv: No such file"),
+    ("watch net.loom --input empty.pt", "empty.pt: empty stream"),
+    (WATCH.format("--until-sure"), "--until-sure: |--bins"),
+    (WATCH.format("--bins 5 --until-sure -1"), "--until-sure -1: "),
+    *((WATCH.format(words), f"{words}: ") for words in ("--bin nan", "--bins 0")),
+    # training
+    (TRAIN.format("--system counters --epochs 3"), "--epochs 3: counters are trained without; omit it"),
+    (TRAIN.format("--system counters --window 50"), "--window 50: counters see what comes later; give --parts 2"),
+    (TRAIN.format("--system counters --seed 3"), "omit --recipe, --seed and --seeds"),
+    (TRAIN.format("--system mlp --parts 3"), "--parts 3: is for --system counters; omit it"),
+    (TRAIN.format("--system mlp --hops 2"), "--hops 2: an MLP has no hops to choose; omit it"),
+    (TRAIN.format("--system mlp --hidden 0"), "--hidden 0: allowed are 1 to 1024"),
+    (SEEDS.format("-o x.pt --seeds 0"), "--seeds 0: at least 1 is needed"),
+    (SEEDS.format("-o x.pt --robust 1"), "--robust 1: allowed are numbers from 0 to below 1"),
+    (SEEDS.format(f"-o x.pt --seed {10**22}"), f"--seed {10**22}: allowed are 0 to {2**63 - 1}"),
+    (SEEDS.format("-o x.pt --picture none/x.png"), "--picture none/x.png: the folder does not exist"),
+    (SEEDS.format("--picture ./x-seed1.png --seeds 2 -o x.png"), "--picture ./x-seed1.png: is what -o names"),
+    (SEEDS.format("--picture x.png -o x.png"), "--picture x.png: is what -o names"),
+    (SEEDS.format("-o x.pt --epochs 1 --resume"), "nothing was interrupted, neither x.pt nor x.pt.state.validation"),
     # prices
     ("estimate net.loom --data data --detail spikes", "argument --detail: invalid choice|counts|cycle"),
     # places to write

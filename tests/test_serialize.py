@@ -13,7 +13,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from made_files import zipped
 from random_networks import compiled, integer_chain, integer_networks
 
@@ -90,8 +90,6 @@ def rewrite_manifest(path, **changes):
     rewrite(path, manifest=np.array(json.dumps(dropped)))
 
 
-# --- round trip
-@settings(deadline=None, max_examples=25)
 @given(integer_networks())
 def test_every_netlist_comes_back_whole(tmp_path_factory, network):
     try:
@@ -132,7 +130,6 @@ def test_a_netlist_is_told_from_other_files(path, tmp_path):
     assert not is_netlist(tmp_path / "missing")
 
 
-# --- files that are no netlist
 def unsigned(name, changed):
     def change(path):
         members = archive.read_members(path)
@@ -229,7 +226,6 @@ def test_members_of_another_type(path, change):
     assert all(f"{name} is no list of integers" in refused(path) for name in names)
 
 
-# --- files that match their hash and are nonsense all the same
 def lengthened(name):
     return lambda netlist: {name: np.append(getattr(netlist, name), 0)}
 
@@ -271,7 +267,6 @@ def test_indices_that_point_nowhere(path, netlist, change, message):
     assert message in refused(path)
 
 
-# --- files are written whole or not at all ----------------------------------------------------------------------------
 def interrupted_at(line: int, write):
     """Run `write`; an interrupt strikes at that line of all that it runs (0: none). How many lines there were."""
     seen = 0

@@ -12,6 +12,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit
 from spikeloom.runtime.commands.choose import smallest
+from spikeloom.runtime.inputs import recordings as recordings_input
 from spikeloom.runtime.studies.counting import decisions_of
 from spikeloom.runtime.studies.fronts import parse_budgets
 from spikeloom.runtime.studies.pruning.results import Costs
@@ -145,9 +146,12 @@ def test_candidates_can_all_be_trained():
 
 @pytest.fixture
 def few(monkeypatch, tmp_path):
-    """A small space, in a folder of its own."""
-    for name, values in {"JOINS": (5, 10), "PARTS": (1,), "THRESHOLDS": ((1,), (1, 4)), "WINDOWS": (100,)}.items():
+    """A small space and few recordings, in a folder of its own."""
+    small = {"JOINS": (10,), "PARTS": (1,), "THRESHOLDS": ((1,), (1, 4)), "WINDOWS": (100,), "RAMPS": (16,)}
+    for name, values in small.items():
         monkeypatch.setattr(space, name, values)
+    monkeypatch.setattr(recordings_input, "synthetic_split", lambda split, **_: synthetic_split(split, limit=90))
+    monkeypatch.setattr(work, "PRICED", 12)
     monkeypatch.setattr(space, "NETWORKS", ())
     monkeypatch.setattr(baselines, "PARTS", (1,))
     monkeypatch.setattr(work, "ROUNDS", 2)
@@ -161,7 +165,7 @@ def test_the_command(few, monkeypatch, target, table):
     found = as_json(*words)
     names = [each["name"] for each in found["tried"]]
     bits = "" if target == "loihi1" else " weight_bits=5"
-    for name in ("counters 1 join=5", "counters 1 ramp=16 join=5"):
+    for name in ("counters 1 join=10", "counters 1 ramp=16 join=10"):
         assert f"{name}{bits}" in names
     assert any("weight_bits=4" in name for name in names)
     chosen = found["tried"][found["choice"]["cheapest"][table] - 1]

@@ -32,33 +32,6 @@ def spikes(trace: Trace, compartment: int = 0) -> list[int]:
     return np.flatnonzero(trace.spikes[:, compartment]).tolist()
 
 
-@pytest.mark.parametrize(
-    ("value", "kept"),
-    [
-        *((1, 0), (5, 0), (6, 1), (-5, 0), (-6, -1), (64, 12), (-64, -12)),
-        *((3840, 767), (-1920, -383), (8128, 1625), (-8191, -1637)),
-    ],
-)
-def test_membrane_decay_vectors(simulate, value, kept):
-    # the bias and one event make `value` in the first step; in the second one only the bias is added
-    bias = value if abs(value) <= 4095 else value % 64
-    weight = (value - bias) // 64
-    neuron = Neuron(decay_v=3277, bias=bias, threshold=NEVER)
-    first, second = membranes(simulate(single(neuron, (weight, 0)), events("10")))
-    assert first == value
-    assert second - bias == kept
-
-
-def test_decay_of_a_saturated_membrane(simulate):
-    # a current that hardly decays drives the membrane to its limit; then it is pushed back below it
-    neuron = Neuron(decay_u=0, decay_v=3277, threshold=NEVER)
-    trace = simulate(single(neuron, (-254, 7), (254, 7)), events("11110", "00001"))
-    last_current = -6237224  # x -> -floor(|x| * 4095 / 4096) - 2080768 four times, then + 2080768
-    assert membranes(trace)[3] == -8388607
-    assert membranes(trace)[4] - last_current == -1677311
-    assert trace.counts.saturations.tolist() == [1]
-
-
 def test_the_published_six_step_run(simulate):
     # Inputs i0, i1 drive h0, h1, which drive o. The published run counts steps from 1 and its inputs are neurons: an
     # input of published step s acts on h in s + 1. Ours are channels, whose events act in their own step, so a
@@ -94,14 +67,6 @@ def test_compare_is_strict(simulate, bias, expected):
     trace = simulate(single(Neuron(threshold=100, bias=bias), (100, 0)), events("1"))
     assert membranes(trace) == [6400 + bias]
     assert spikes(trace) == expected
-
-
-def test_threshold_at_zero_and_at_its_largest(simulate):
-    assert spikes(simulate(single(Neuron(threshold=0)), events("000"))) == []
-    assert spikes(simulate(single(Neuron(threshold=0, bias=1)), events("000"))) == [0, 1, 2]
-    # a saturated membrane, 8388607, is above the largest threshold, 64 * 131071 = 8388544
-    neuron = Neuron(threshold=NEVER, decay_u=0, decay_v=0, bias=4095, bias_exponent=7)
-    assert spikes(simulate(single(neuron, (254, 7)), events("1110"))) == [2]
 
 
 PLAIN = -4095 * 128

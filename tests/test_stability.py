@@ -32,7 +32,7 @@ from spikeloom.runtime.studies.stability.neighbours import KINDS, cells_of, chan
 from spikeloom.runtime.studies.stability.results import Stability
 from spikeloom.runtime.studies.stability.study import stability
 
-REPEATABLE = settings(max_examples=40, deadline=None, derandomize=True)
+REPEATABLE = settings(max_examples=40, derandomize=True)
 
 
 def small_netlist(seed, taxels=TAXELS):
@@ -59,7 +59,6 @@ def kept(netlist, recordings):
     return trace.spikes, trace.membranes
 
 
-# -- what a change brings about ----------------------------------------------------------------------------------------
 @REPEATABLE
 @given(st.data())
 def test_changed_runs_are_whole_runs_on_networks_of_any_kind(data):
@@ -126,7 +125,6 @@ def test_what_is_known_again_is_so_after_any_past(seed):
     assert known.quiet[:20].max() < steps or seed == 0  # it does forget
 
 
-# -- proofs ------------------------------------------------------------------------------------------------------------
 def study_of(netlist, given, **options):
     count = len(given)
     data = Recordings(
@@ -296,7 +294,6 @@ def test_an_attack_alters_the_decision_with_the_events_that_it_names():
         assert (decided(netlist, changed[None])[0] != found.decision) == (found.at_most is not None)
 
 
-# -- the command -------------------------------------------------------------------------------------------------------
 def test_the_command(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_netlist(small_netlist(1), "net.loom")

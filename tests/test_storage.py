@@ -52,8 +52,6 @@ def uneven_layer(seed=0):
     return one_layer(weight, seed=seed, biases=[rng.normal(0, 0.05, 24)])
 
 
-# --- planes
-@settings(max_examples=30)
 @given(storages())
 def test_planes_hold_every_step_and_the_coarser_only_what_the_finer_do_not_reach(storage):
     bits, exponents = storage
@@ -76,7 +74,6 @@ def test_the_distance_of_planes_is_the_largest_without_a_gap(bits):
         assert (np.abs(planes[0]).max() > 256 - weight_step(bits)) == gap
 
 
-@settings(deadline=None, max_examples=30)
 @given(float_networks(), storages(), st.data())
 def test_a_rounded_population_is_the_nearest_of_its_grid(network, storage, data):
     bits, exponents = storage
@@ -109,7 +106,6 @@ def test_planes_are_stored_where_they_are_used():
     assert (high.weight.toarray().tolist(), high.weight.nnz) == ([[4, 0], [0, 0]], 1)
 
 
-# --- scales
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=7), st.integers(1, 4))
 def test_grouping_by_fineness_is_optimal(finest, groups):
     shared = group_by_fineness(np.array(finest), groups)
@@ -144,7 +140,7 @@ def test_the_finest_scales_are_legal_and_hardly_more_is(bits, exponents):
     assert abs(units[0] - finest.min()) <= max(1, units[0] // SCALE_STEPS)
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(float_networks(), st.sampled_from(BITS), st.integers(1, 3), st.integers(1, 8), st.booleans(), st.data())
 def test_every_recipe_gives_a_proven_legal_network(network, bits, planes, groups, calibrated, data):
     calibration = calibrate(network, data.draw(recordings_for(network.input.size))) if calibrated else None
@@ -184,7 +180,6 @@ def test_groups_of_scales_are_proven_after_the_last_rounding(seed):
     assert choice.groups > 1
 
 
-# --- compensation
 def test_each_error_is_made_up_for_as_well_as_the_inputs_to_come_can():
     """Input after input, with the least squares of those to come solved anew each time; more than a block of them."""
     rng = np.random.default_rng(3)
@@ -240,7 +235,6 @@ def test_a_neuron_that_would_overflow_is_rounded_to_nearest():
     assert ONE_STEP_SUM_MAX * 0.99 < stored.reached <= ONE_STEP_SUM_MAX
 
 
-# --- planes and scales until the spikes are equal, or the limit that is in the way
 def two_layers(seed, *, samples=40, outlier=0.0):
     rng = np.random.default_rng(seed)
     weight = rng.normal(0, 0.1, (20, 30))

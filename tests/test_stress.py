@@ -12,7 +12,6 @@ from timed_networks import events_of, written
 from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.tensors import join
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.models.networks.reference import float_spikes
@@ -60,7 +59,6 @@ def bench(small):
     return replace(made, labels=found.decisions("float"))
 
 
-# -- both sides --------------------------------------------------------------------------------------------------------
 def test_clean_recordings_are_what_reference_and_engine_say(bench, small):
     found, counted = clean(bench)
     flat = with_clocks(bench.events, bench.pair.netlist.clocks)
@@ -155,7 +153,6 @@ def test_an_overflow_stops_its_recording_and_no_other(bench):
     assert not found.votes["chip"][0].any()
 
 
-# -- every perturbation ------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", NAMES)
 def test_every_perturbation_runs_at_its_mildest_and_harshest_the_same_for_a_seed(bench, name):
     reference, undisturbed = clean(bench)
@@ -183,28 +180,6 @@ def test_levels_are_in_order_and_make_sense():
     assert NAMES["taxels_dead"].level_of("3") == 3
 
 
-@pytest.mark.parametrize("system", ["tactilesgnet", "mlp"])
-def test_all_systems_timed_and_joined(tmp_path, system):
-    """Every network runs the whole battery; so do those with clocks, and joined ones."""
-    members = []
-    for seed in (1, 2):
-        _, seen = written(tmp_path / f"{seed}.pt", system, seed=seed)
-        members.append(read_checkpoint(tmp_path / f"{seed}.pt"))
-    joined = join(members, ["1.pt", "2.pt"])
-    recordings = events_of(3, samples=2)
-    for checkpoint in (members[0], joined):
-        network = expand(checkpoint, seen)
-        made = bench_of(network, compile_network(network).netlist, recordings)
-        reference, _ = clean(made)
-        spikes = list(float_spikes(checkpoint, seen, recordings).values())[-1]
-        assert_array_equal(reference.votes["float"], readout_counts(network.readout, network.classes, spikes))
-        for name, each in NAMES.items():
-            assert each.why_not(made.pair) is None
-            run = measure(made, name, each.levels_of(39)[0], 0, reference)
-            assert run.stopped in range(3)
-
-
-# -- rules -------------------------------------------------------------------------------------------------------------
 def run_of(right, *, equal=100, spikes=(1000, 1000, 100, 10000), signs=None, most=10, stopped=0, seed=0):
     model, chip = (right, right) if isinstance(right, int) else right
     return Run(
@@ -310,7 +285,6 @@ def test_spikes_in_common_and_requirements():
     assert unmet([kept, missed], found) == ("taxels_dead:3>=0.86: 0.8500 reached",)
 
 
-# -- the command -------------------------------------------------------------------------------------------------------
 def test_any_number_of_threads_says_the_same(spikeloom, place):
     words = (*STRESS, "--seeds", "2", "--only", FEW)
     code, out, err = spikeloom(*words, "-o", "one.json")
@@ -336,24 +310,6 @@ def test_requirements_decide_about_the_exit_code(as_json):
     assert [point["level"] for point in levels] == [1, 2, 3, 5]
     missed = [f"taxels_dead:2>=1: {levels[1]['chip']['mean']:.4f} reached"]
     assert as_json(*words, "--require", "taxels_dead:2>=1", codes=(1,))["missed"] == missed
-
-
-@pytest.mark.parametrize(
-    ("words", "telling"),
-    [
-        ("--only taxels_ded", "choose from taxels_dead, "),
-        ("--require taxels_ded:3>=0.5", "'taxels_ded' is no perturbation; choose from taxels_dead, "),
-        ("--require taxels_dead>=0.5", "is not NAME:LEVEL>=SHARE"),
-        ("--require taxels_dead:3>=85", "'85' is no share; give a number from 0 to 1"),
-        ("--require taxels_dead:2.5>=0.5", "'2.5' is no level of it; give a whole number from 0 (taxels)"),
-        ("--require events_lost:many>=0.5", "'many' is no level of it; give a number from 0 to 1 (probability)"),
-        ("--require taxels_dead:7>=0.5", "the sensor has 6 taxels"),
-        ("--only events_lost --require taxels_dead:3>=0.5", "--only leaves taxels_dead out"),
-        ("--seeds 0", "allowed are 1 or more"),
-    ],
-)
-def test_what_is_refused(refusal, words, telling):
-    assert telling in refusal(*STRESS, *words.split())
 
 
 def test_what_does_not_apply(bench):

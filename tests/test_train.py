@@ -330,7 +330,6 @@ def test_what_is_lost_and_comes_has_its_chance():
     assert events.dtype == found.dtype
 
 
-# --- fine-tuning
 def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     train, test = drawn(checkpoint, 0), drawn(checkpoint, 1)
@@ -370,7 +369,6 @@ def test_a_loss_that_is_no_number(tmp_path, monkeypatch, loss, name, found):
     refused(DataError, words, finetune, checkpoint, adjacency, data, data, LOIHI, bits=[4], epochs=2)
 
 
-# --- files
 @pytest.mark.parametrize(
     "change",
     [
@@ -396,7 +394,6 @@ def test_forms_that_cannot_be_used(tmp_path, change):
     refused(ModelError, f"{path}: the manifest has no usable forms", read_checkpoint, path)
 
 
-# --- the command
 @pytest.mark.slow
 @pytest.mark.recordings
 def test_the_model_is_the_chip_on_every_recording(tmp_path, objects_zip, containers_zip):

@@ -18,7 +18,6 @@ from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NON
 from spikeloom.runtime.machines.truenorth import engine, spec
 
 
-# -- one neuron --------------------------------------------------------------------------------------------------------
 def lives(neuron: Neuron, arrivals: list[int]) -> tuple[list[int], list[int]]:
     """Membranes at the ends of ticks and ticks with spikes of a neuron to which weights of type 0 arrive."""
     state = spec.Neuron(**{each.name: getattr(neuron, each.name, neuron.initial) for each in fields(spec.Neuron)})
@@ -69,7 +68,6 @@ def test_a_register_that_some_order_would_leave_is_counted():
     assert spec.neuron_tick(neuron, 7, 10, 20) == (True, False)
 
 
-# -- ticks, delays, clocks ---------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("delay", [1, 2, 15])
 def test_when_spikes_arrive(delay):
     netlist = relays(delay=delay, tick=2, first=20).netlist(taxels=1, polarities=1, classes=1, bin_ticks=3)
@@ -95,15 +93,14 @@ def test_spikes_that_meet_on_an_axon_are_one():
     assert trace.membranes[:, 0].tolist() == [1, 0, 0, 1]
 
 
-# -- engine = specification --------------------------------------------------------------------------------------------
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(crossbars(), st.integers(0, 2**31))
 def test_engine_equals_specification(netlist, seed):
     assert faults(netlist, CHIP) == ()
     both(netlist, events(seed, 3, 20))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(crossbars(), st.integers(0, 2**31))
 def test_recordings_of_a_batch_do_not_depend_on_each_other(netlist, seed):
     recordings, lengths = events(seed, 3, 12, samples=3), np.array([12, 7, 1])
@@ -150,7 +147,6 @@ def test_a_membrane_that_climbs_to_the_end_of_its_register():
     assert [engine.prepare(netlist, careful=careful).wiring.steady.shape[1] for careful in (False, True)] == [1, 0]
 
 
-# -- rules -------------------------------------------------------------------------------------------------------------
 SOURCE = "core 0, neuron 0"
 
 
@@ -254,7 +250,6 @@ def test_limits_are_parameters():
     assert broken(made(with_neuron(leak=2047)), with_limit("neuron.leak_bits", 12)) == []
 
 
-# -- needs of float networks -------------------------------------------------------------------------------------------
 def wide(inputs: int, *sizes: int, beta=0.0):
     """A chain of full layers of equal weights."""
     return chain(*(np.ones((after, before)) for before, after in pairwise((inputs, *sizes))), beta=beta)

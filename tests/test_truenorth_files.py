@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import as_json, refusal, run
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from made_files import recordings_folder
 from random_crossbars import IN_RANCS_TERMS, alone, crossbars, events
@@ -57,7 +57,7 @@ def path(tmp_path):
     return tmp_path / "net.loom"
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(crossbars())
 def test_round_trip(tmp_path_factory, netlist):
     path = tmp_path_factory.mktemp("crossbars") / "x.loom"
@@ -108,7 +108,6 @@ def test_files_that_mean_nothing(path, changes, line):
         read_crossbars(path)
 
 
-# -- commands ----------------------------------------------------------------------------------------------------------
 @pytest.fixture
 def place(path, tmp_path):
     """A folder with the network and four recordings of its sensor: touches of taxel 0, 1, 1 and 2."""
@@ -157,7 +156,6 @@ def test_every_broken_rule_is_named(place, name):
     assert "core 0, neuron 1: reset value 300, -256 … 255 allowed (truenorth.neuron.reset_bits)" in reset
 
 
-# -- RANC --------------------------------------------------------------------------------------------------------------
 def small(**changes):
     """Two cores with a corner of the mesh at (5, 2); the second neuron votes, the third has no target."""
     draft = Draft()
@@ -215,7 +213,7 @@ def test_the_file_says_how_long_it_is_exact():
     assert json.loads("\n".join(ranc.export(small())))["exact_ticks"] is None
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50)
 @given(crossbars(IN_RANCS_TERMS), st.integers(0, 2**31))
 def test_neurons_in_the_terms_of_ranc_spike_the_same(netlist, seed):
     recording = events(seed, 3, 20)
@@ -266,7 +264,7 @@ def outputs_of(text, voters):
     return np.array(rows[1:], np.bool_).reshape(-1, voters + 1)[:, :voters]
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60)
 @given(crossbars(IN_RANCS_TERMS), st.integers(0, 2**31))
 def test_ranc_spikes_the_same(simulator, tmp_path, netlist, seed):
     recording = events(seed, 3, 20)

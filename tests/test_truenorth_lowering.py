@@ -61,7 +61,6 @@ def test_axons_of_an_input_make_every_level(weights):
     np.testing.assert_array_equal(points @ np.array(weights), levels)
 
 
-@settings(max_examples=25, deadline=None)
 @given(NETWORKS, st.integers(0, 2**31))
 def test_chip_and_model_and_definition_agree_in_every_spike(network, seed):
     assert native.faults(network) == []
@@ -142,8 +141,6 @@ def test_what_contradicts_itself_is_named():
         f"{stage.name}: receives 2 clocks of 0" for stage in rest
     ]
 
-
-# -- sums that travel in time ------------------------------------------------------------------------------------------
 
 NARROW = with_limit("core.axons", 60)
 """The same chip with few axons, so that small layers are split."""
@@ -231,12 +228,10 @@ def test_what_cannot_be_in_levels():
             in_levels(replace(network, **changes), 3, CHIP)
 
 
-# -- on the chip -------------------------------------------------------------------------------------------------------
-
 SHAPES = st.sampled_from([(9, 12, 4), (24, 30, 12, 3), (30, 4), (25, 26, 5), (8, 40, 33, 6)])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 2**31), shape=SHAPES, copies=st.sampled_from(COPIES), bias=st.sampled_from([0.0, 0.3, 2.0]))
 def test_every_spike_on_the_chip_is_the_models(seed, shape, copies, bias):
     levels = in_levels(forgetful(seed, *shape, bias=bias), copies, NARROW)

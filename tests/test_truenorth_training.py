@@ -133,7 +133,6 @@ def test_groups_fill_the_axons_of_a_core():
         truenorth.sized(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(60, 325))
 
 
-# -- files -------------------------------------------------------------------------------------------------------------
 def written(path, networks=None):
     networks = networks or {"last": random_network(0), "best": random_network(1)}
     record = {"command": "spikeloom train", "seed": 0}
@@ -186,8 +185,6 @@ def test_files_that_are_refused(tmp_path, change, said):
     change(path)
     refused(ModelError, f"{said}|; copy or train it again", read_trained, path)
 
-
-# -- commands ----------------------------------------------------------------------------------------------------------
 
 TRAIN = "train --system tactilesgnet-truenorth --data data --graph manual --features 2 --epochs 1"
 

@@ -25,7 +25,6 @@ from spikeloom.runtime.equivalence.verdict import (
 from spikeloom.runtime.equivalence.verify import verify
 
 
-# -- levels ------------------------------------------------------------------------------------------------------------
 def layer(float_: int, chip: int, different: int) -> LayerSpikes:
     return LayerSpikes(float=float_, chip=chip, different=different, ill_posed=0)
 
@@ -98,8 +97,6 @@ def test_gates_that_cannot_be_read(words, why):
     with pytest.raises(OptionError, match=f"^--require {words}: '{words.split(',')[-1]}': .*{why}"):
         parse_requirements(words)
 
-
-# -- breakdowns --------------------------------------------------------------------------------------------------------
 
 FILES = tuple("abcdef")
 LABELS = np.arange(6) % CLASSES

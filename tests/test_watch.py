@@ -14,7 +14,7 @@ from pathlib import Path
 import commands
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from oracles import refused
 from random_netlists import Axon, Neuron, build, lively, netlists, recordings, voting
@@ -251,21 +251,6 @@ def test_bad_lines(lively_file, lines, content, line, said):
     assert said in told
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--input", "none.csv"], "none.csv: No such file"),
-        (["--until-sure"], "--until-sure: | --bins"),
-        (["--bins", 5, "--until-sure", "-1"], "--until-sure -1: "),
-        *(([f"--{name}", value], f"--{name} {value}: ") for name, value in (("bin", "nan"), ("bins", "0"))),
-        ([], "events.csv: empty stream"),
-    ],
-)
-def test_what_cannot_be_watched(lively_file, lines, words, said):
-    told = commands.refusal("watch", lively_file, lines("0,0,1\n" if words else "# nothing\n"), *words)
-    assert all(part in told for part in said.split("|"))
-
-
 def test_a_reader_that_goes_away_ends_it(pair_file, lines, monkeypatch):
     class Gone(io.StringIO):
         def write(self, _text: str) -> int:
@@ -354,7 +339,6 @@ def assert_is_run(netlist: Netlist, steps: list[Step], events: np.ndarray) -> No
     assert [step.decision for step in steps] == votes.argmax(axis=1).tolist()
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
 @given(st.data())
 def test_any_network(data):
     netlist = voting(data.draw(netlists(weight_exponents=(-1, 0, 0, 3))), data.draw(st.integers(1, 3)))

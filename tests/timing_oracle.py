@@ -18,7 +18,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray
 from spikeloom.runtime.machines.base import EventArray
 from spikeloom.runtime.machines.loihi1.costs import cost
-from spikeloom.runtime.machines.loihi1.timing import SimpleTimes, simple_times
+from spikeloom.runtime.machines.loihi1.timing import SimpleTimes, charges, simple_times
 from spikeloom.runtime.machines.loihi1.timing_kernel import Tables
 
 Link = tuple[int, int, str]
@@ -202,31 +202,13 @@ class Chip:
         return times
 
 
-def simple(tables: Tables, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps=None) -> SimpleTimes:
-    """Times of the simple model from spikes and updates (samples, chip steps, compartments), as matrix products."""
-    length, n = spikes.shape[1:]
-    cores, channels = len(tables.start) - 1, len(tables.channel_first) - 1
-    ran = np.full(len(spikes), length) if steps is None else steps
-    within = np.arange(length) < ran[:, None]
-    seen = np.zeros((*spikes.shape[:2], channels), np.int64)
-    fired, works = spikes.astype(np.int64), updated.astype(np.int64)
-    now = (events[:, :, :length] != 0).transpose(0, 2, 1)
-    seen[:, : now.shape[1]] = now
-
-    def by(sender, receiver, cost, size):
-        matrix = np.zeros((size, cores), np.int64)
-        np.add.at(matrix, (sender, receiver), cost)
-        return matrix
-
-    own = np.arange(n)
-    generation = fired @ by(own, tables.sender, tables.sending, n)
-    generation += works @ by(own, tables.sender, tables.update, n)
-    sender = np.repeat(own, np.diff(tables.first))
-    processing = fired @ by(sender, tables.destination, tables.processing, n)
-    channel = np.repeat(np.arange(channels), np.diff(tables.channel_first))
-    processing += seen @ by(channel, tables.channel_destination, tables.channel_processing, channels)
-    sums = np.concatenate([generation, processing], axis=2) * within[..., None]
-    return simple_times(tables, sums, ran)
+def simple(tables: Tables, spikes: BoolArray, updated: BoolArray, events: EventArray) -> SimpleTimes:
+    """Times of the simple model from spikes and updates (samples, chip steps, compartments), by what they add up to."""
+    charged, channels = charges(tables), len(tables.channel_first) - 1
+    sums = spikes.astype(np.int64) @ charged.sources[channels:] + updated.astype(np.int64) @ charged.updates
+    now = (events[:, :, : spikes.shape[1]] != 0).transpose(0, 2, 1).astype(np.int64)
+    sums[:, : now.shape[1]] += now @ charged.sources[:channels]
+    return simple_times(tables, sums, np.full(len(spikes), spikes.shape[1]))
 
 
 def parts_of_energy(netlist, target, counts, updates, steps, tiles, dense=None):
