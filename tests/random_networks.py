@@ -113,6 +113,11 @@ def integer_chain(*weights, bits=8, exponent=0, thresholds=None, polarities=1) -
     )
 
 
+def varied(*shape):
+    """Weights of which no two lists are alike."""
+    return 2 * np.random.default_rng(0).integers(1, 120, shape)
+
+
 def with_population(network, index, **changes):
     """The network with another population there."""
     populations = list(network.populations)
@@ -280,18 +285,33 @@ def words_of_list(entries, weight_bits, index):
     return total
 
 
-def counted(netlist):
-    """Use of each limit by each core, counted one compartment and one axon at a time."""
+def counted(netlist, target=LOIHI, chunks=None):
+    """Use of each limit by each core, counted one compartment and one axon at a time.
+
+    Lists that are alike but for a base of up to 256 are one; given the `chunks` of each core, only from a
+    layer into a chunk.
+    """
+    reach = target.limit("core.dense_base") + 1
     cores = []
     for core in range(netlist.n_cores):
         compartments = range(*netlist.core_compartments[core : core + 2])
         axons = range(*netlist.core_axons[core : core + 2])
-        words, formats, base = 0, set(), 0
+        memory, formats, base = {}, set(), 0
+        starts = np.cumsum([chunk.size for chunk in chunks[core]]) if chunks else []
         for axon in axons:
             first, last = (int(bound) for bound in netlist.axon_synapses[axon : axon + 2])
             form = int(netlist.axon_format[axon])
             index = int(netlist.format_index_bits[form])
-            words += words_of_list(last - first, int(netlist.format_weight_bits[form]), index)
+            places, weights = netlist.synapse_target[first:last].tolist(), netlist.synapse_weight[first:last].tolist()
+            low, source = min(places, default=0), int(netlist.axon_source[axon]) - netlist.n_inputs
+            layer = int(netlist.layer[source]) if source >= 0 else -1
+            where = (layer, sum(low >= start for start in starts)) if chunks else ()
+            content = (
+                form,
+                low // reach,
+                *((place - low, weight) for place, weight in zip(places, weights, strict=True)),
+            )
+            memory[where, content] = words_of_list(last - first, int(netlist.format_weight_bits[form]), index)
             formats.add(form)
             if index == 0:
                 base = max(base, int(netlist.synapse_target[first]))
@@ -300,7 +320,7 @@ def counted(netlist):
                 "core.compartments": len(compartments),
                 "core.axons_in": len(axons),
                 "core.axons_out": sum(int(s) - netlist.n_inputs in compartments for s in netlist.axon_source),
-                "core.synapse_words": words,
+                "core.synapse_words": sum(memory.values()),
                 "core.threshold_slots": len({int(netlist.threshold[c]) for c in compartments}),
                 "core.synapse_formats": len(formats),
                 "core.compartment_configs": len(

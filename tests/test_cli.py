@@ -52,6 +52,8 @@ def test_compile_counts_and_says_what_was_realised(as_json, tmp_path, place):
         assert (layer["theta"], layer["beta"], layer["beta_realised"]) == (0.5, 0.2, 819 / 4096)
         assert layer["theta_realised"] == layer["threshold"] / layer["scale"]
     assert report["synapses"] >= report["synapses_stored"] >= report["synapses_nonzero"] > 0
+    words = sum(limit["used"] for limit in report["limits"] if limit["name"] == "core.synapse_words")
+    assert report["synapse_words_unrolled"] >= report["synapse_words"] == words
     assert {limit["name"] for limit in report["limits"]} <= set(load_target("loihi1").limits)
     assert [limit for limit in report["limits"] if limit["name"] == "chip.cores"] == [
         {"name": "chip.cores", "used": report["cores"], "allowed": 128, "core": None}

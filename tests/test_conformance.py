@@ -56,9 +56,9 @@ anytime:
 chart:
     budget chosen_by command data format grid networks points refused spikeloom tables target
 compile:
-    chips classes compartments cores layers limits neurons provenance sha256 synapses synapses_nonzero
-    synapses_stored target taxels tiles bins? calibration? clocks? core_bound? exactness? facts? layout? path?
-    placement? proofs? removals? keep? trials? finetune?
+    chips classes compartments cores layers limits neurons provenance sha256 synapse_words synapse_words_unrolled
+    synapses synapses_nonzero synapses_stored target taxels tiles bins? calibration? clocks? core_bound? exactness?
+    facts? layout? path? placement? proofs? removals? keep? trials? finetune?
 compile, crossbars:
     axons classes cores crossing_points drain_ticks feeds layers limits max_crossing_points_of_an_axon neurons
     provenance sha256 target taxels tick_clocks ticks_per_step wires bins? clocks?
@@ -88,8 +88,8 @@ inspect checkpoint:
 inspect checkpoint, crossbars:
     classes clocks copies edges graph layers levels sets sha256 system taxels towers training weights
 inspect netlist:
-    chips classes compartments cores layers limits neurons provenance sha256 synapses synapses_nonzero
-    synapses_stored target taxels tiles bins? clocks?
+    chips classes compartments cores layers limits neurons provenance sha256 synapse_words synapse_words_unrolled
+    synapses synapses_nonzero synapses_stored target taxels tiles bins? clocks?
 join:
     classes command file graph layers sha256 system towers
 lean:

@@ -23,6 +23,7 @@ from random_networks import (
     seated,
     small_target,
     tight_targets,
+    varied,
 )
 
 from spikeloom.compiler import Options, Packing, compile_network, lift, write_netlist
@@ -195,7 +196,7 @@ def calibrating(shape):
 
 
 def full(*sizes):
-    return integer_chain(*[np.full((post, pre), 2) for pre, post in itertools.pairwise(sizes)])
+    return integer_chain(*[varied(post, pre) for pre, post in itertools.pairwise(sizes)])
 
 
 def laying_out(sizes, target=LOIHI, **cores_for):
@@ -245,8 +246,8 @@ CAPACITIES = [
     ("fc1 neuron 0: 4097 used, 4096 allowed (loihi1.core.axons_in)", cutting((4097, 1))),
     (
         "neuron 0: 16385 used, 4096 allowed (loihi1.core.axons_in)|\n"
-        "fc1 neuron 0: 16385 used, 16384 allowed (loihi1.core.synapse_words)",
-        cutting((16385, 1)),
+        "fc1 neuron 0: 119 used, 118 allowed (loihi1.core.synapse_words)",
+        cutting((16385, 1), core_synapse_words=118),
     ),
     (
         "fc1 neuron 0: 5 used, 4 allowed (loihi1.core.axons_out); split the layers that it feeds",

@@ -18,6 +18,7 @@ from random_networks import (
     small_target,
     stored,
     tight_targets,
+    varied,
     words_of_list,
 )
 
@@ -26,7 +27,14 @@ from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerProjectio
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, index_bits
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound, partition
 from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place
-from spikeloom.compiler.targets.loihi1.legalize import REMEDIES, LimitUse, list_words, measure, require_legal
+from spikeloom.compiler.targets.loihi1.legalize import (
+    REMEDIES,
+    LimitUse,
+    list_words,
+    measure,
+    require_legal,
+    words_of_axons,
+)
 
 
 def sizes(parts):
@@ -61,7 +69,7 @@ def with_thresholds(count):
     ("network", "target", "cores"),
     [
         # 128 neurons of fan-in 2496 need 44,928 words; up to 46 cost 6 words a list (46 * 8 + 10 bits), 47 cost 7
-        (integer_chain(np.full((128, 2496), 2)), LOIHI, [[(0, 0, 46)], [(0, 46, 92)], [(0, 92, 128)]]),
+        (integer_chain(varied(128, 2496)), LOIHI, [[(0, 0, 46)], [(0, 46, 92)], [(0, 92, 128)]]),
         # nine thresholds are one too many for a core
         (with_thresholds(8), LOIHI, [[(0, 0, 20)]]),
         (with_thresholds(9), LOIHI, [[(0, 0, 8)], [(0, 8, 20)]]),
@@ -103,7 +111,7 @@ def test_seven_formats_fit_a_core_and_eight_do_not():
 def test_every_limit_is_kept(network, target):
     parts = legal_partition(network, target)
     netlist = seated(network, parts, target)
-    used = counted(netlist)
+    used = counted(netlist, target)
     for core, uses in enumerate(used):
         for rule, amount in uses.items():
             assert amount <= target.limit(rule), (core, rule)
@@ -142,7 +150,7 @@ def test_no_grouping_of_the_chunks_needs_fewer_cores(network, target):
         if frozenset(group) not in known:
             cores = (tuple(group), *((chunk,) for chunk in chunks if chunk not in group))
             netlist = seated(network, cores, target)
-            used = counted(netlist)[0]
+            used = counted(netlist, target, cores)[0]
             known[frozenset(group)] = all(amount <= target.limit(rule) for rule, amount in used.items())
         return known[frozenset(group)]
 
@@ -162,6 +170,17 @@ def test_among_equal_packings_the_one_with_least_traffic_is_taken():
     assert sizes(partition(network, target, rates(0.1, 0.9))) == [[(0, 0, 3)], [(1, 0, 3), (2, 0, 3)]]
 
 
+def test_what_a_convolution_repeats_is_stored_once_for_every_257_compartments():
+    """Three lists of three synapses start below 257, 514 and 771; two of one and two of two are cut by the ends."""
+    weights = sum(np.eye(600, 602, k, int) * weight for k, weight in enumerate((2, -4, 6)))
+    network = integer_chain(weights)
+    netlist = seated(network, partition(network, LOIHI), LOIHI)
+    words = [use.used for use in measure(netlist, LOIHI) if use.name == "core.synapse_words"]
+    assert (words, words_of_axons(netlist, LOIHI).sum()) == ([7], 602)
+    assert len(partition(network, small_target(core_synapse_words=7))) == 1
+    assert len(partition(network, small_target(core_synapse_words=6))) == 2
+
+
 def test_the_neuron_that_breaks_a_rule_most_is_named():
     weights = np.full((4, 9), 2)
     weights[0, 5:] = weights[1, 2:] = weights[3, 7:] = 0
@@ -170,7 +189,7 @@ def test_the_neuron_that_breaks_a_rule_most_is_named():
 
 
 def test_an_illegal_netlist_is_refused_with_every_violation():
-    network = integer_chain(np.full((4, 3), 2), np.full((2, 4), 2), thresholds=[[1, 2, 3, 4], 5])
+    network = integer_chain(varied(4, 3), varied(2, 4), thresholds=[[1, 2, 3, 4], 5])
     used = {
         "core.compartments": 6,
         "core.axons_in": 7,

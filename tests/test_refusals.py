@@ -325,17 +325,14 @@ def test_overflow_on_the_chip_names_neuron_step_and_recording(refusal, tmp_path)
         assert part in line
 
 
-@pytest.mark.parametrize(("features", "limits"), [(128, ["axons_in"]), (424, ["axons_in", "synapse_words"])])
-def test_every_violated_limit_is_listed(place, tmp_path, features, limits):
-    arrays = made_weights(taxels=39, features=features, sizes=(2, 2, 2))
+def test_a_violated_limit_is_named(place, tmp_path):
+    arrays = made_weights(taxels=39, features=128, sizes=(2, 2, 2))
     signs = {name: np.where(array >= 0, 0.5, -0.5).astype(np.float32) for name, array in arrays.items()}
     torch.save(state_dict(signs), tmp_path / "wide.pt")
     words = ["compile", f"{tmp_path}/wide.pt", "--graph", "mst:0", "--keep-all", "-o", f"{tmp_path}/out.loom"]
-    lines = commands.run(*words)[2].splitlines()
-    assert len(lines) == len(limits)
-    for line, limit in zip(lines, limits, strict=True):
-        assert f"fc1 neuron 0: {39 * features} used" in line
-        assert f"(loihi1.core.{limit})" in line
+    (line,) = commands.run(*words)[2].splitlines()
+    assert f"fc1 neuron 0: {39 * 128} used" in line
+    assert "(loihi1.core.axons_in)" in line
     assert not (tmp_path / "out.loom").exists()
 
 

@@ -25,6 +25,10 @@ REMEDIES = {
 }
 
 
+WEIGHT_BITS = 9
+"""Of a signed mantissa."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LimitUse:
     """Amount of one limit that one core (or the chip, core None) uses."""
@@ -57,6 +61,51 @@ def list_words(entries: IntArray, weight_bits: IntArray | int, index_bits: IntAr
     return np.asarray(full * whole + part)
 
 
+def stored_once(form: IntArray, lengths: IntArray, place: IntArray, weight: IntArray, target: Target) -> IntArray:
+    """Which lists of a core synaptic memory holds: a list that several axons share is there once; (stored lists,).
+
+    An input axon points to a list and adds a base to its places, so axons share a list if format and weights are the
+    same and all places are shifted alike. The base has an end: for lists that start farther up, memory holds another,
+    with a part of the shift in its places (nengo-loihi, ``conv.py`` and ``hardware/builder.py``). `form` and `lengths`
+    (lists,) are formats and numbers of entries, `place` (compartment on the core) and `weight` (entries,) those of all
+    lists in turn.
+
+    Examples
+    --------
+    >>> from spikeloom.compiler.targets.base import load_target
+    >>> place, weight = np.array([0, 2, 5, 7, 3, 300, 302]), np.array([8, -4, 8, -4, 8, 8, -4])
+    >>> stored_once(np.ones(4, int), np.array([2, 2, 1, 2]), place, weight, load_target("loihi1")).tolist()
+    [0, 2, 3]
+    """
+    bounds = np.append(0, np.cumsum(lengths))
+    place = place.astype(np.int32)
+    first = np.minimum.reduceat(np.append(place, np.int32(1 << 30)), bounds[:-1])  # Of an empty list anything
+    alike = (place - np.repeat(first, lengths) << WEIGHT_BITS) + weight
+    content, size = alike.astype(np.int32).tobytes(), 4 * bounds
+    seen: dict[tuple[int, int, bytes], int] = {}
+    copy = first // (target.limit("core.dense_base") + 1)
+    columns = (form, copy, size[:-1], size[1:])
+    for i, (kind, above, begin, end) in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
+        seen.setdefault((kind, above, content[begin:end]), i)
+    return np.array([*seen.values()], np.int64)
+
+
+def words_of_axons(netlist: Netlist, target: Target) -> IntArray:
+    """Words of the list of each axon, (axons,): the memory that a netlist would take if no axons shared any."""
+    form = netlist.axon_format
+    widths = netlist.format_weight_bits[form], netlist.format_index_bits[form]
+    return list_words(np.diff(netlist.axon_synapses), *widths, target)
+
+
+def _stored_on(netlist: Netlist, core: int, target: Target) -> IntArray:
+    """Axons of a core whose lists its memory holds, for themselves and for others."""
+    axons = slice(*netlist.core_axons[core : core + 2].tolist())
+    ends = netlist.axon_synapses[axons.start : axons.stop + 1]
+    place, weight = (column[ends[0] : ends[-1]] for column in (netlist.synapse_target, netlist.synapse_weight))
+    stored: IntArray = axons.start + stored_once(netlist.axon_format[axons], np.diff(ends), place, weight, target)
+    return stored
+
+
 def _distinct_per_core(netlist: Netlist, *columns: IntArray) -> IntArray:
     """Number of distinct rows of `columns` among the compartments of each core."""
     rows = np.unique(np.stack([netlist.core_of_compartment(), *columns]), axis=1)
@@ -71,7 +120,8 @@ def measure(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
     source_core = netlist.core_of_compartment()[netlist.axon_source[from_compartment] - netlist.n_inputs]
     entries = np.diff(netlist.axon_synapses)
     index_bits = netlist.format_index_bits[netlist.axon_format]
-    words = list_words(entries, netlist.format_weight_bits[netlist.axon_format], index_bits, target)
+    words = words_of_axons(netlist, target)
+    stored = np.concatenate([_stored_on(netlist, core, target) for core in range(cores)])
     dense = (index_bits == 0) & (entries > 0)
     base = np.zeros(cores, np.int64)
     np.maximum.at(base, core_of_axon[dense], netlist.synapse_target[netlist.axon_synapses[:-1][dense]])
@@ -80,7 +130,7 @@ def measure(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
         "core.compartments": np.diff(netlist.core_compartments),
         "core.axons_in": np.diff(netlist.core_axons),
         "core.axons_out": np.bincount(source_core, minlength=cores),
-        "core.synapse_words": np.bincount(core_of_axon, words, cores).astype(np.int64),
+        "core.synapse_words": np.bincount(core_of_axon[stored], words[stored], cores).astype(np.int64),
         "core.threshold_slots": _distinct_per_core(netlist, netlist.threshold),
         "core.synapse_formats": np.bincount(formats[0], minlength=cores),
         "core.compartment_configs": _distinct_per_core(netlist, netlist.decay_u, netlist.decay_v),

@@ -13,7 +13,8 @@ compartment are the axons that name it as source; they are not stored a second t
 A synapse targets compartment ``synapse_target`` *of its core* (0-based within the core) with the signed mantissa
 ``synapse_weight``; it adds ``mantissa * 2**exponent`` of its list's format, shifted left by six, to the target's
 synaptic sum. A list whose format has ``index_bits == 0`` is dense: it stores one weight for every compartment from
-its first target to its last, zeros included.
+its first target to its last, zeros included. Lists are written out for every axon; those of a core that differ by a
+shift alone are one in its memory, which :func:`legalize.stored_once` finds again.
 
 Time
 ----

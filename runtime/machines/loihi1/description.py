@@ -12,11 +12,14 @@ from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.fixedpoint import kept_shares
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count
-from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure
+from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, words_of_axons
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
+
+SHARED = 0.9
+"""Shared lists are spoken of when memory is at most this share of what the unrolled network would take."""
 
 OneOrMany = float | Sequence[float]
 """One value where all neurons of a layer share it, else the different ones, ascending."""
@@ -49,7 +52,10 @@ class LayerFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetlistFacts:
-    """A netlist; synapses are counted in the network, as stored on cores, and as stored and not zero."""
+    """A netlist; synapses are counted in the network, as stored on cores, and as stored and not zero.
+
+    Words of synaptic memory are those of all cores; unrolled are those that it would take if no axons shared a list.
+    """
 
     target: str
     taxels: int
@@ -61,6 +67,8 @@ class NetlistFacts:
     synapses: int
     synapses_stored: int
     synapses_nonzero: int
+    synapse_words: int
+    synapse_words_unrolled: int
     cores: int
     chips: int
     tiles: Sequence[int]
@@ -78,6 +86,7 @@ def inspect(path: str | os.PathLike[str]) -> Outcome:
 
 def describe(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> NetlistFacts:
     """Facts of a netlist whose file has a hash; `uses` as :func:`legalize.measure` counts them."""
+    target = load_target(netlist.target)
     return NetlistFacts(
         target=netlist.target,
         taxels=netlist.taxels,
@@ -89,8 +98,10 @@ def describe(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Netlist
         synapses=sum(layer.synapses for layer in netlist.layers),
         synapses_stored=netlist.n_synapses,
         synapses_nonzero=int(np.count_nonzero(netlist.synapse_weight)),
+        synapse_words=sum(use.used for use in uses if use.name == "core.synapse_words"),
+        synapse_words_unrolled=int(words_of_axons(netlist, target).sum()),
         cores=netlist.n_cores,
-        chips=chip_count(netlist.core_tile, load_target(netlist.target)),
+        chips=chip_count(netlist.core_tile, target),
         tiles=netlist.core_tile.tolist(),
         layers=[_layer(netlist, index) for index in range(len(netlist.layers))],
         limits=uses,
@@ -146,6 +157,9 @@ def sections(facts: NetlistFacts) -> Iterator[Section]:
         lines.append(f"  {channels} clocks of {steps} steps each, {channels * steps} in all, beside the sensor")
     if facts.clocks is not None and facts.clocks.length is not None:
         lines.append(f"  a recording is run for {facts.clocks.length} steps, whatever its own length")
+    if facts.synapse_words < SHARED * facts.synapse_words_unrolled:
+        words = f"{facts.synapse_words:,} words of synaptic memory, {facts.synapse_words_unrolled:,} if it did not"
+        lines.append(f"  what a convolution repeats is stored once a core: {words}")
     if facts.bins is not None:
         lines.append(f"  a step joins {facts.bins} bins of the recordings")
     yield Section("", [*map(Text, lines), _layer_table(facts.layers)])

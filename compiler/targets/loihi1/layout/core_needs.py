@@ -10,7 +10,7 @@ import numpy as np
 
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.legalize import list_words
+from spikeloom.compiler.targets.loihi1.legalize import list_words, stored_once
 from spikeloom.compiler.types import IntArray
 
 SPARSE_SHARE = 0.75
@@ -126,7 +126,8 @@ class Needs:
             for lists in self.lists(chunk):
                 projection = self.network.projections[lists.projection]
                 dense, taken = choose_dense(lists, projection, base, chunk.size, lean=lean, target=self.target)
-                words += int(taken.sum())
+                held = stored_once(dense, lists.nonzero, lists.row + base, lists.mantissa, self.target)
+                words += int(taken[held].sum())
                 index = index_bits(base + chunk.size - 1, self.target)
                 formats |= {(projection.bits, projection.exponent, 0 if flag else index) for flag in np.unique(dense)}
             self._stored[key] = words, frozenset(formats)

@@ -65,8 +65,8 @@ def _fill(needs: Needs, population: int) -> list[Chunk]:
             needs.drop(tried)
             return broken
 
-        # A larger chunk needs more of every limit but synapse formats (all its lists may be dense); there a smaller
-        # chunk than the largest may come out, which fits as well.
+        # A larger chunk needs more of every limit but synapse formats (all its lists may be dense) and memory (more of
+        # them may be alike); there a smaller chunk than the largest may come out, which fits as well.
         ends = range(first + 1, min(size, first + needs.target.limit("core.compartments")) + 1)
         fitting = bisect_left(ends, True, key=exceeds)
         if not fitting:
@@ -99,12 +99,16 @@ def order_on_core(needs: Needs, chunks: Core) -> Core:
 
 
 def core_bound(network: IntegerNetwork, target: Target) -> int:
-    """Cores that compartments and synaptic memory need at least, however the network is cut."""
+    """Cores that compartments and input axons need at least, however the network is cut.
+
+    Memory sets no bound: any lists may turn out to be alike, the shorter they are cut the more.
+    """
     compartments = sum(population.size for population in network.populations)
-    # Cutting a list elsewhere moves header and index bits, so memory is bounded by the mantissas alone.
-    payload = sum(int(p.weight.count_nonzero()) * p.bits for p in network.projections)
-    memory = target.limit("synapse.word_bits") * target.limit("core.synapse_words")
-    return max(-(-compartments // target.limit("core.compartments")), -(-payload // memory))
+    axons = sum(int((abs(p.weight).sum(axis=0) > 0).sum()) for p in network.projections)
+    return max(
+        -(-compartments // target.limit("core.compartments")),
+        -(-axons // target.limit("core.axons_in")),
+    )
 
 
 def _pack(needs: Needs, chunks: list[Chunk], rates: tuple[FloatArray, ...] | None) -> list[Core]:
