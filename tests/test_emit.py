@@ -5,26 +5,12 @@ import itertools
 
 import numpy as np
 import pytest
+import random_networks as nets
 from commands import refusal
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from oracles import assert_same_network, refused
 from random_netlists import Axon, Neuron, build
-from random_networks import (
-    LOIHI,
-    chain,
-    compiled,
-    dense_weights,
-    integer_chain,
-    integer_networks,
-    legal_partition,
-    random_checkpoint,
-    ring,
-    seated,
-    small_target,
-    tight_targets,
-    varied,
-)
 
 from spikeloom.compiler import Options, Packing, compile_network, lift, write_netlist
 from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError, OptionError
@@ -40,9 +26,9 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 
 
-@given(integer_networks(), tight_targets())
+@given(nets.integer_networks(), nets.tight_targets())
 def test_the_netlist_holds_exactly_the_network(network, target):
-    netlist = seated(network, legal_partition(network, target), target)
+    netlist = nets.seated(network, nets.legal_partition(network, target), target)
     sizes = {INPUT: network.input.size} | {i: p.size for i, p in enumerate(network.populations)}
     dense = {(p.pre, p.post): np.zeros((sizes[p.post], sizes[p.pre]), np.int64) for p in network.projections}
     nonzero = 0
@@ -73,14 +59,14 @@ def test_the_netlist_holds_exactly_the_network(network, target):
                 dense[pre, post][row, column] += weight * 2**exponent if exponent >= 0 else weight // 2
     assert nonzero == sum(np.count_nonzero(p.weight.data) for p in network.projections)
     for post in range(len(network.populations)):
-        for pre, weight in dense_weights(network, post).items():
+        for pre, weight in nets.dense_weights(network, post).items():
             np.testing.assert_array_equal(dense[pre, post], weight)
 
 
-@given(integer_networks(), tight_targets())
+@given(nets.integer_networks(), nets.tight_targets())
 def test_layers_and_votes_are_those_of_the_network(network, target):
-    parts = legal_partition(network, target)
-    netlist = seated(network, parts, target, {"seed": 1})
+    parts = nets.legal_partition(network, target)
+    netlist = nets.seated(network, parts, target, {"seed": 1})
     for index, population in enumerate(network.populations):
         ids = netlist.compartments_of(index)
         assert netlist.neuron[ids].tolist() == list(range(population.size))
@@ -103,8 +89,8 @@ def test_lists_are_sparse_where_that_saves_visits():
     few, many = np.zeros((10, 1), int), np.full((10, 1), 2)
     few[[0, 3, 6, 9]] = 2
     many[[4, 5]] = 0
-    assert compiled(integer_chain(few)).n_synapses == 4
-    netlist = compiled(integer_chain(many))
+    assert nets.compiled(nets.integer_chain(few)).n_synapses == 4
+    netlist = nets.compiled(nets.integer_chain(many))
     assert netlist.synapse_weight.tolist() == [2, 2, 2, 2, 0, 0, 2, 2, 2, 2]
 
 
@@ -112,23 +98,23 @@ def test_lists_are_dense_where_memory_is_short():
     """48 of 64 neurons: 11 words sparse, 9 dense."""
     weights = np.full((64, 1), 2)
     weights[1:33:2] = 0
-    network = integer_chain(weights)
-    assert compiled(network).n_synapses == 48
-    assert compiled(network, small_target(core_synapse_words=9)).n_synapses == 64
+    network = nets.integer_chain(weights)
+    assert nets.compiled(network).n_synapses == 48
+    assert nets.compiled(network, nets.small_target(core_synapse_words=9)).n_synapses == 64
 
 
 def test_a_network_of_zeros_has_cores_but_no_axons():
-    netlist = compiled(integer_chain(np.zeros((3, 2)), np.zeros((2, 3))))
+    netlist = nets.compiled(nets.integer_chain(np.zeros((3, 2)), np.zeros((2, 3))))
     assert (netlist.n_cores, netlist.n_compartments, netlist.n_axons, netlist.n_synapses) == (1, 5, 0, 0)
-    require_legal(netlist, LOIHI)
+    require_legal(netlist, nets.LOIHI)
 
 
 def lower(network: IntegerNetwork, **limits: int) -> Netlist:
     """Netlist of a network on cores of these limits."""
-    return compiled(network, small_target(**limits))
+    return nets.compiled(network, nets.small_target(**limits))
 
 
-@given(integer_networks(), st.sampled_from([1, 3, 1024]))
+@given(nets.integer_networks(), st.sampled_from([1, 3, 1024]))
 def test_emit_and_back(network, compartments):
     try:
         netlist = lower(network, core_compartments=compartments)
@@ -149,7 +135,7 @@ def test_emit_and_back(network, compartments):
 def test_a_layer_without_synapses_keeps_its_projection(empty):
     weights = [np.full((3, 4), 50), np.full((2, 3), 60), np.full((2, 2), 70)]
     weights[empty] = np.zeros_like(weights[empty])
-    network = integer_chain(*weights)
+    network = nets.integer_chain(*weights)
     found = lift(lower(network))
     verify(found)
     assert_same_network(found, network)
@@ -184,27 +170,29 @@ WIDTHS = "2, 3, 4, 5, 6, 8"
 
 
 def compiling(target="loihi1", graph=5, **options):
-    return lambda: compile_network(expand(random_checkpoint(), ring(graph)), Options(**options), target=target)
+    return lambda: compile_network(
+        expand(nets.random_checkpoint(), nets.ring(graph)), Options(**options), target=target
+    )
 
 
 def rounding(weight=1.0, **options):
-    return lambda: choose_storage(chain([[weight]]), LOIHI, **options)
+    return lambda: choose_storage(nets.chain([[weight]]), nets.LOIHI, **options)
 
 
 def calibrating(shape):
-    return lambda: calibrate(chain([[1.0, 1.0]]), np.zeros(shape, bool))
+    return lambda: calibrate(nets.chain([[1.0, 1.0]]), np.zeros(shape, bool))
 
 
 def full(*sizes):
-    return integer_chain(*[varied(post, pre) for pre, post in itertools.pairwise(sizes)])
+    return nets.integer_chain(*[nets.varied(post, pre) for pre, post in itertools.pairwise(sizes)])
 
 
-def laying_out(sizes, target=LOIHI, **cores_for):
+def laying_out(sizes, target=nets.LOIHI, **cores_for):
     return lambda: lay_out(full(*sizes), target, cores_for=cores_for)
 
 
 def cutting(sizes, **limits):
-    return lambda: partition(full(*sizes), small_target(**limits))
+    return lambda: partition(full(*sizes), nets.small_target(**limits))
 
 
 OPTIONS = [
@@ -217,15 +205,21 @@ OPTIONS = [
     *((f"--planes {planes}|1 to 3", rounding(packings=(Packing(planes=planes),))) for planes in (0, 4)),
     *((f"--scale-groups {n}|8 thresholds|1 to 8", rounding(packings=(Packing(groups=n),))) for n in (0, 9)),
     ("--weight-bits: 2 layers|the network has 1", rounding(packings=(Packing(), Packing()))),
-    ("--optimize latency|no time", lambda: lay_out(full(2, 2), dataclasses.replace(LOIHI, time=()), goal="latency")),
+    (
+        "--optimize latency|no time",
+        lambda: lay_out(full(2, 2), dataclasses.replace(nets.LOIHI, time=()), goal="latency"),
+    ),
     (
         "--optimize latency|links between chips|--chips",
         lambda: Options(optimize="latency", chips=2).require_consistent(calibrated=True),
     ),
     ("--cores-for fc1=2|3 cores at least", laying_out((2496, 128), fc1=2)),
     # four neurons of seven output axons a core: three listening cores each let two of them sit together
-    ("--cores-for fc1=1|2 cores at least", laying_out((1, 4, 9), small_target(core_axons_out=7), fc1=1, fc2=3)),
-    ("--cores-for fc1=7|3 chips|6 cores", lambda: least_cores(full(6, 8), {"fc1": 7}, small_target(chip_cores=2), 3)),
+    ("--cores-for fc1=1|2 cores at least", laying_out((1, 4, 9), nets.small_target(core_axons_out=7), fc1=1, fc2=3)),
+    (
+        "--cores-for fc1=7|3 chips|6 cores",
+        lambda: least_cores(full(6, 8), {"fc1": 7}, nets.small_target(chip_cores=2), 3),
+    ),
 ]
 NETWORKS = [("fc1|6 bits|32767 units|more bits", rounding(1e6, packings=(Packing(bits=6),)))]
 RECORDINGS = [
@@ -236,12 +230,12 @@ RECORDINGS = [
 CAPACITIES = [
     (
         "fc1 neuron 0: 8 used, 7 allowed (loihi1.core.axons_out)",
-        laying_out((1, 1, 8), small_target(core_axons_out=7), fc2=8),
+        laying_out((1, 1, 8), nets.small_target(core_axons_out=7), fc2=8),
     ),
     ("chip: 129 used, 128 allowed (loihi1.chip.cores)", laying_out((3, 100, 100), fc1=100, fc2=29)),
     (
         "2 chips: 5 used, 4 allowed (loihi1.chip.cores)|--chips",
-        lambda: partition(full(1, 5), small_target(core_compartments=1, chip_cores=2), chips=2),
+        lambda: partition(full(1, 5), nets.small_target(core_compartments=1, chip_cores=2), chips=2),
     ),
     ("fc1 neuron 0: 4097 used, 4096 allowed (loihi1.core.axons_in)", cutting((4097, 1))),
     (
@@ -268,9 +262,9 @@ def test_what_cannot_be_had_is_refused(error, words, call):
 
 
 def test_what_is_just_allowed():
-    assert least_cores(full(2496, 128), {"fc1": 3}, LOIHI) == {0: 3}
-    assert least_cores(full(6, 8), {"fc1": 6}, small_target(chip_cores=2), 3) == {0: 6}
-    assert len(partition(full(4096, 1), LOIHI)) == 1
-    assert len(partition(full(1, 128 * 8), small_target(core_compartments=8))) == 128
+    assert least_cores(full(2496, 128), {"fc1": 3}, nets.LOIHI) == {0: 3}
+    assert least_cores(full(6, 8), {"fc1": 6}, nets.small_target(chip_cores=2), 3) == {0: 6}
+    assert len(partition(full(4096, 1), nets.LOIHI)) == 1
+    assert len(partition(full(1, 128 * 8), nets.small_target(core_compartments=8))) == 128
     assert len(cutting((1, 1, 5), core_axons_out=5, core_compartments=1)()) == 6
-    assert len(partition(full(1, 4, 9), small_target(core_axons_out=7), cores_for={1: 3})) == 5
+    assert len(partition(full(1, 4, 9), nets.small_target(core_axons_out=7), cores_for={1: 3})) == 5

@@ -5,21 +5,11 @@ from itertools import pairwise
 import networkx as nx
 import numpy as np
 import pytest
+import random_networks as nets
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from oracles import refused
-from random_networks import (
-    chain,
-    compiled,
-    dense_weights,
-    float_networks,
-    integer_chain,
-    integer_networks,
-    recordings_for,
-    stored,
-    with_population,
-)
 from scipy import sparse
 
 import spikeloom.runtime.studies.stress.pair
@@ -88,20 +78,20 @@ def simulate_integer(network, events):
         fired = v > 64 * int(population.threshold[i])
         return (u, 0 if fired else v), v, fired
 
-    return simulate(network, events, lambda post: dense_weights(network, post), step)
+    return simulate(network, events, lambda post: nets.dense_weights(network, post), step)
 
 
 @pytest.mark.parametrize(
     ("networks", "run", "slowly"),
     [
-        (float_networks(), run_float, simulate_float),
-        (integer_networks(exponents=(-1, 0, 1, 3, 7)), run_integer, simulate_integer),
+        (nets.float_networks(), run_float, simulate_float),
+        (nets.integer_networks(exponents=(-1, 0, 1, 3, 7)), run_integer, simulate_integer),
     ],
 )
 @given(data=st.data())
 def test_a_run_is_the_step_by_step_loop(networks, run, slowly, data):
     network = data.draw(networks)
-    events = data.draw(recordings_for(network.input.size))
+    events = data.draw(nets.recordings_for(network.input.size))
     activity = run(network, events, membranes=True)
     for sample in range(len(events)):
         spikes, membranes = slowly(network, events[sample])
@@ -113,8 +103,8 @@ def test_a_run_is_the_step_by_step_loop(networks, run, slowly, data):
 @settings(max_examples=5)
 @given(st.data())
 def test_a_recording_runs_the_same_alone_and_in_another_batch(data):
-    network = data.draw(integer_networks())
-    events = data.draw(recordings_for(network.input.size, samples=20, most=4))
+    network = data.draw(nets.integer_networks())
+    events = data.draw(nets.recordings_for(network.input.size, samples=20, most=4))
     together = run_integer(network, events).spikes
     for sample in range(len(events)):
         alone = run_integer(network, events[sample : sample + 1]).spikes
@@ -124,13 +114,13 @@ def test_a_recording_runs_the_same_alone_and_in_another_batch(data):
 def test_a_membrane_that_dies_away_is_flushed():
     events = np.zeros((1, 64, 1), bool)
     events[0, 0] = True
-    membranes = run_float(chain([[0.4]]), events, membranes=True).membranes[0][0, :, 0]
+    membranes = run_float(nets.chain([[0.4]]), events, membranes=True).membranes[0][0, :, 0]
     assert membranes[40] == pytest.approx(0.4 * 0.2**40)
     assert membranes[48] == 0  # 0.2**47 is below 1e-30
 
 
 def test_saturation_can_be_left_out():
-    network = integer_chain([[-256]], exponent=7)
+    network = nets.integer_chain([[-256]], exponent=7)
     still = dataclasses.replace(network.populations[0], decay_v=0)
     network = dataclasses.replace(network, populations=(still,))
     events = np.ones((1, 6, 1), bool)
@@ -155,7 +145,9 @@ def test_the_lowest_class_wins_a_tie():
 def lively(weights=3, seed=0, sizes=(8, 6, 5, 4)):
     rng = np.random.default_rng(seed)
     matrices = [rng.normal(0, 1.0, (after, before)) for before, after in pairwise(sizes)]
-    return chain(*matrices[:weights], biases=[rng.normal(0, 0.1, len(m)) for m in matrices[:weights]], polarities=2)
+    return nets.chain(
+        *matrices[:weights], biases=[rng.normal(0, 0.1, len(m)) for m in matrices[:weights]], polarities=2
+    )
 
 
 def random_inputs(channels, seed=0, samples=4, steps=30, rate=0.3):
@@ -174,7 +166,7 @@ def float_spikes(network, events):
 
 def test_neurons_that_the_chip_leaves_out_are_compared_if_others_receive_them():
     network = lively(seed=2)
-    never = with_population(network, 0, bias=np.where(np.arange(6) == 4, -100, network.populations[0].bias))
+    never = nets.with_population(network, 0, bias=np.where(np.arange(6) == 4, -100, network.populations[0].bias))
     netlist = compile_network(never).netlist
     assert 4 not in netlist.neuron[netlist.compartments_of(0)]
     events = random_inputs(network.input.size, 2)
@@ -212,7 +204,7 @@ def test_a_window_that_opens_late_misses_the_first_steps():
     late = replace(netlist, layers=(netlist.layers[0], replace(netlist.layers[1], depth=netlist.layers[1].depth + 3)))
     events = random_inputs(network.input.size, 6)
     first, second = float_spikes(network, events)
-    alone = chain(network.projections[1].weight.toarray(), biases=[network.populations[1].bias])
+    alone = nets.chain(network.projections[1].weight.toarray(), biases=[network.populations[1].bias])
     missed = np.zeros_like(first)
     missed[:, :-3] = first[:, 3:]
     wanted = run_float(alone, missed).spikes[0]
@@ -223,7 +215,7 @@ def test_a_window_that_opens_late_misses_the_first_steps():
 
 def small() -> Network:
     """Two layers, 3 -> 2 -> 2."""
-    return chain([[1, 2, 3], [4, 5, 6]], [[1, 0], [0, 1]])
+    return nets.chain([[1, 2, 3], [4, 5, 6]], [[1, 0], [0, 1]])
 
 
 def with_projection(network, index, **changes):
@@ -232,7 +224,7 @@ def with_projection(network, index, **changes):
     return replace(network, projections=tuple(projections))
 
 
-@pytest.mark.parametrize("make", [chain, integer_chain])
+@pytest.mark.parametrize("make", [nets.chain, nets.integer_chain])
 def test_a_sound_network_passes(make):
     verify(make([[2, 4, 6], [8, 10, 12]], [[2, 0], [0, 2]]))
 
@@ -251,7 +243,7 @@ def projected(index, **changes):
 def more(*arguments):
     """Add a projection of ones: from, to, shape."""
     pre, post, shape = arguments
-    added = Projection(pre=pre, post=post, weight=stored(np.ones(shape)))
+    added = Projection(pre=pre, post=post, weight=nets.stored(np.ones(shape)))
     return lambda network: replace(network, projections=(*network.projections, added))
 
 
@@ -260,17 +252,17 @@ def voting(population, *label):
 
 
 def populated(index, **changes):
-    return lambda network: with_population(network, index, **changes)
+    return lambda network: nets.with_population(network, index, **changes)
 
 
 TWICE = sparse.csr_array((np.ones(2), np.array([1, 1]), np.array([0, 2, 2])), shape=(2, 3))
 FLOATS = [
     (populated(1, name="fc1"), "two populations are called 'fc1'"),
-    (projected(0, weight=stored(np.ones((2, 4)))), "projection 0 has shape (2, 4)|(2, 3)"),
+    (projected(0, weight=nets.stored(np.ones((2, 4)))), "projection 0 has shape (2, 4)|(2, 3)"),
     (projected(1, pre=7), "projection 1 has shape (2, 2)|(2, None)"),
     (projected(1, pre=-2), "projection 1 has shape (2, 2)|(2, None)"),
     (projected(1, post=2), "projection 1 has shape (2, 2)|(None, 2)"),
-    (projected(1, post=INPUT, weight=stored(np.ones((3, 2)))), "projection 1 runs from population 0 to -1"),
+    (projected(1, post=INPUT, weight=nets.stored(np.ones((3, 2)))), "projection 1 runs from population 0 to -1"),
     (projected(0, weight=TWICE), "projection 0 has unsorted or repeated synapses"),
     (more(1, 0, (2, 2)), "projection 2 runs from population 1 to 0, not forward; projection 0 skips a layer|1 early"),
     (more(INPUT, 1, (2, 3)), "projection 2 skips a layer|1 early"),
@@ -281,14 +273,14 @@ FLOATS = [
     (voting(1, 0, 1, 2), "3 labels"),
     (voting(1, 0, 2), "outside 0 … 1"),
     (voting(1, -1, 0), "outside 0 … 1"),
-    (lambda n: with_population(populated(1, name="fc1")(n), 1, theta=0.0), "two populations|theta 0.0"),
+    (lambda n: nets.with_population(populated(1, name="fc1")(n), 1, theta=0.0), "two populations|theta 0.0"),
     *((populated(0, bias=np.array([0.0, value])), "'fc1' has biases") for value in (np.nan, np.inf)),
     *((populated(0, beta=beta), f"'fc1' has beta {beta}") for beta in (-0.1, 1.1, np.nan)),
     *((populated(0, theta=theta), f"theta {theta} out of range") for theta in (0.0, -1.0, np.nan)),
     *((populated(0, alpha=alpha), f"'fc1' has alpha {alpha}") for alpha in (-0.1, 1.0)),
-    (projected(0, weight=stored(np.full((2, 3), np.nan))), "projection 0 has weights that are not finite float64"),
-    (projected(0, weight=stored(np.ones((2, 3), np.float32))), "projection 0 has weights"),
-    (projected(0, weight=stored(np.ones((2, 3), int))), "projection 0 has weights"),
+    (projected(0, weight=nets.stored(np.full((2, 3), np.nan))), "projection 0 has weights that are not finite float64"),
+    (projected(0, weight=nets.stored(np.ones((2, 3), np.float32))), "projection 0 has weights"),
+    (projected(0, weight=nets.stored(np.ones((2, 3), int))), "projection 0 has weights"),
 ]
 
 
@@ -308,10 +300,10 @@ def test_a_float_network_that_breaks_a_rule(change, words):
     ],
 )
 def test_registers_at_their_ends_and_one_past_them(field, good, bad, words):
-    network = integer_chain([[2, 4]])
+    network = nets.integer_chain([[2, 4]])
 
     def changed(value):
-        return with_population(network, 0, **{field: value if field.startswith("decay") else np.array([value])})
+        return nets.with_population(network, 0, **{field: value if field.startswith("decay") else np.array([value])})
 
     for value in good:
         verify(changed(value))
@@ -325,33 +317,33 @@ def test_registers_at_their_ends_and_one_past_them(field, good, bad, words):
 )
 def test_mantissas_of_each_width(bits, good, bad):
     for value in good:
-        verify(integer_chain([[value]], bits=bits, exponent=-1))
+        verify(nets.integer_chain([[value]], bits=bits, exponent=-1))
     for value in bad:
-        refused(VerifyError, f"projection 0|{bits} bits", verify, integer_chain([[value]], bits=bits))
-    floats = with_projection(integer_chain([[2]]), 0, weight=stored(np.array([[2.0]])))
+        refused(VerifyError, f"projection 0|{bits} bits", verify, nets.integer_chain([[value]], bits=bits))
+    floats = with_projection(nets.integer_chain([[2]]), 0, weight=nets.stored(np.array([[2.0]])))
     refused(VerifyError, "projection 0|8 bits", verify, floats)
-    refused(VerifyError, "exponent -2|below -1", verify, integer_chain([[0]], exponent=-2))
+    refused(VerifyError, "exponent -2|below -1", verify, nets.integer_chain([[0]], exponent=-2))
 
 
 def test_fan_in_counts_stored_zeros():
-    weight = stored([[1.0, 0.0, 2.0], [0.0, 0.0, 0.0]], np.array([[1, 1, 1], [0, 1, 0]]))
+    weight = nets.stored([[1.0, 0.0, 2.0], [0.0, 0.0, 0.0]], np.array([[1, 1, 1], [0, 1, 0]]))
     network = with_projection(small(), 0, weight=weight)
     assert fan_in(network, 0).tolist() == [3, 1]
     assert fan_in(network, 1).tolist() == [2, 2]
     # and a synapse once, whatever its planes
-    again = Projection(pre=INPUT, post=0, weight=stored(np.ones((2, 3)), np.array([[1, 0, 0], [1, 1, 0]])))
+    again = Projection(pre=INPUT, post=0, weight=nets.stored(np.ones((2, 3)), np.array([[1, 0, 0], [1, 1, 0]])))
     twice = replace(small(), projections=(*small().projections, again))
     assert fan_in(twice, 0).tolist() == [3, 3]
 
 
 def test_texts_are_as_recorded(golden):
-    golden("float.txt", text(chain([[0.5, -0.25, 0.0]], [[1.0], [-1.0]], biases=[[0.125], [0.0, 0.5]])))
+    golden("float.txt", text(nets.chain([[0.5, -0.25, 0.0]], [[1.0], [-1.0]], biases=[[0.125], [0.0, 0.5]])))
     layers = [[2, -4, 0], [6, 8, 254]], [[2, 4]]
-    golden("integer.txt", text(integer_chain(*layers, thresholds=[[3, 5], 7], exponent=1)))
-    golden("netlist.txt", text(compiled(integer_chain(*layers, thresholds=[[3, 5], 7]))))
+    golden("integer.txt", text(nets.integer_chain(*layers, thresholds=[[3, 5], 7], exponent=1)))
+    golden("netlist.txt", text(nets.compiled(nets.integer_chain(*layers, thresholds=[[3, 5], 7]))))
 
 
-@given(integer_networks())
+@given(nets.integer_networks())
 def test_depths_are_the_longest_paths(network):
     graph = nx.DiGraph((p.pre, p.post) for p in network.projections if p.pre != p.post)
     assert max(depths(network)) == nx.dag_longest_path_length(graph) - 1

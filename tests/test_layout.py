@@ -6,21 +6,11 @@ import itertools
 
 import numpy as np
 import pytest
+import random_networks as nets
 import timing_oracle
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 from oracles import refused
-from random_networks import (
-    LOIHI,
-    assert_same_layers,
-    integer_chain,
-    integer_networks,
-    legal_partition,
-    recordings_for,
-    seated,
-    small_target,
-    tight_targets,
-)
 
 from spikeloom.compiler.errors import CapacityError, NumericRangeError, OptionError
 from spikeloom.compiler.formats import sanafe
@@ -54,7 +44,7 @@ def spikes_for(network, events, rng, rate=0.4):
 def busy(sizes, *, steps=60, seed=0, rates=None):
     """A chain of dense layers, and recordings on which it fires at these rates."""
     rng = np.random.default_rng(seed)
-    network = integer_chain(*[np.full((post, pre), 2) for pre, post in itertools.pairwise(sizes)])
+    network = nets.integer_chain(*[np.full((post, pre), 2) for pre, post in itertools.pairwise(sizes)])
     rates = [0.3] * len(sizes) if rates is None else rates
     return network, Calibration(
         events=rng.random((2, steps, sizes[0])) < rates[0],
@@ -66,17 +56,17 @@ def chunks_per_layer(layout, layers):
     return [sum(chunk.population == i for core in layout.cores for chunk in core) for i in range(layers)]
 
 
-def netlist_of(network, layout, target=LOIHI):
+def netlist_of(network, layout, target=nets.LOIHI):
     return emit(network, layout.cores, layout.placement.tiles, target, {})
 
 
 @given(st.data())
 def test_expectations_are_the_simple_model_of_the_same_spikes(data):
-    network = data.draw(integer_networks())
-    target = data.draw(tight_targets())
+    network = data.draw(nets.integer_networks())
+    target = data.draw(nets.tight_targets())
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
-    parts = legal_partition(network, target)
-    events = data.draw(recordings_for(network.input.size))
+    parts = nets.legal_partition(network, target)
+    events = data.draw(nets.recordings_for(network.input.size))
     calibration = spikes_for(network, events, rng)
     layout, _ = lay_out(network, target, calibration=calibration)
     assert layout.cores == parts
@@ -97,14 +87,14 @@ def test_expectations_are_the_simple_model_of_the_same_spikes(data):
 def test_a_layer_gets_more_cores_than_asked_for_if_even_parts_do_not_fit():
     """Nine thresholds in the first half, one in the second: two even halves are one threshold too many."""
     thresholds = [[*range(1, 10), *[1] * 9]]
-    network = integer_chain(np.full((18, 1), 2), thresholds=thresholds)
-    parts = partition(network, LOIHI, cores_for={0: 2})
+    network = nets.integer_chain(np.full((18, 1), 2), thresholds=thresholds)
+    parts = partition(network, nets.LOIHI, cores_for={0: 2})
     assert [core[0].size for core in parts] == [6, 6, 6]
 
 
-@given(integer_networks(), tight_targets(), st.data())
+@given(nets.integer_networks(), nets.tight_targets(), st.data())
 def test_every_partition_is_legal_and_holds_every_neuron_once(network, target, data):
-    legal_partition(network, target)
+    nets.legal_partition(network, target)
     asked = {
         i: data.draw(st.integers(1, population.size))
         for i, population in enumerate(network.populations)
@@ -124,25 +114,25 @@ def test_every_partition_is_legal_and_holds_every_neuron_once(network, target, d
         assert all(len(core) == 1 for core in mine)
         sizes = [core[0].size for core in mine]
         assert max(sizes) - min(sizes) <= 1
-    require_legal(seated(network, parts, target), target)
+    require_legal(nets.seated(network, parts, target), target)
     assert partition(network, target, cores_for=asked) == parts
     assert partition(network, target, cores_for={}) == partition(network, target)
 
 
 def test_a_busy_layer_gets_more_cores():
     network, calibration = busy([60, 200, 100, 10], rates=[0.5, 0.4, 0.3, 0.1])
-    fast, usual = lay_out(network, LOIHI, goal="latency", calibration=calibration)
+    fast, usual = lay_out(network, nets.LOIHI, goal="latency", calibration=calibration)
     before, after = chunks_per_layer(usual, 3), chunks_per_layer(fast, 3)
     assert after[0] > before[0]
     assert after[1] > before[1]
     assert fast.expected.step_ns < 0.5 * usual.expected.step_ns
-    require_legal(netlist_of(network, fast), LOIHI)
+    require_legal(netlist_of(network, fast), nets.LOIHI)
 
 
 def test_a_network_that_does_little_stays_on_one_tile():
     """A second tile would lengthen the barrier by more than there is to gain."""
     network, calibration = busy([3, 60, 40], rates=[0.1, 0.1, 0.1])
-    fast, usual = lay_out(network, LOIHI, goal="latency", calibration=calibration)
+    fast, usual = lay_out(network, nets.LOIHI, goal="latency", calibration=calibration)
     assert (len(usual.cores), len(fast.cores)) == (1, 4)
     assert len(set(fast.placement.tiles)) == 1
 
@@ -153,7 +143,7 @@ def test_the_search_comes_near_the_best_cut(seed):
     rng = np.random.default_rng(seed)
     sizes = [30, int(rng.integers(20, 40)), int(rng.integers(10, 20))]
     network, calibration = busy(sizes, seed=seed, rates=rng.uniform(0.1, 0.9, 3))
-    target = small_target(chip_cores=24)
+    target = nets.small_target(chip_cores=24)
     everyone = tuple(np.arange(population.size) for population in network.populations)
     forecast = Forecast(Needs(network, target), sample(network, calibration, everyone), target.time[0])
     found = fastest(forecast)
@@ -176,11 +166,11 @@ def test_the_search_comes_near_the_best_cut(seed):
 @settings(max_examples=6, phases=WITHOUT_SHRINKING)
 @given(st.data())
 def test_spikes_are_the_same_whatever_the_layout(data):
-    network = data.draw(integer_networks(exponents=(-1, 0)))
-    target = data.draw(tight_targets())
-    legal_partition(network, target)
+    network = data.draw(nets.integer_networks(exponents=(-1, 0)))
+    target = data.draw(nets.tight_targets())
+    nets.legal_partition(network, target)
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
-    events = data.draw(recordings_for(network.input.size))
+    events = data.draw(nets.recordings_for(network.input.size))
     calibration = spikes_for(network, events, rng)
     most = {p.name: int(rng.integers(1, p.size + 1)) for p in network.populations}
     layouts = [lay_out(network, target, goal=goal, calibration=calibration)[0] for goal in GOALS]
@@ -195,22 +185,22 @@ def test_spikes_are_the_same_whatever_the_layout(data):
         except NumericRangeError:
             assume(False)
         traces.append([aligned(netlist, spikes, layer) for layer in range(len(netlist.layers))])
-    assert_same_layers(*traces)
+    nets.assert_same_layers(*traces)
 
 
 @settings(max_examples=10)
 @given(st.data())
 def test_a_goal_is_never_missed_by_more_than_the_usual_layout(data):
-    network = data.draw(integer_networks())
-    target = data.draw(tight_targets())
-    legal_partition(network, target)
-    events = data.draw(recordings_for(network.input.size))
+    network = data.draw(nets.integer_networks())
+    target = data.draw(nets.tight_targets())
+    nets.legal_partition(network, target)
+    events = data.draw(nets.recordings_for(network.input.size))
     calibration = spikes_for(network, events, np.random.default_rng(0))
     layout, usual = lay_out(network, target, goal="latency", calibration=calibration)
     assert layout.expected.step_ns <= usual.expected.step_ns
 
 
-SMALL = small_target(core_compartments=4, chip_cores=2, mesh_width=2, mesh_height=1, mesh_tile_cores=1)
+SMALL = nets.small_target(core_compartments=4, chip_cores=2, mesh_width=2, mesh_height=1, mesh_tile_cores=1)
 """Two cores of four neurons a chip, one on each tile."""
 
 
@@ -218,7 +208,7 @@ def net():
     """Three layers of 8, 8 and 4 neurons that need five cores of ``SMALL``."""
     rng = np.random.default_rng(3)
     weights = [2 * rng.integers(-20, 60, shape) for shape in ((8, 6), (8, 8), (4, 8))]
-    return integer_chain(*weights, thresholds=[60, 200, 200])
+    return nets.integer_chain(*weights, thresholds=[60, 200, 200])
 
 
 @pytest.fixture(scope="module")
@@ -240,8 +230,8 @@ def test_a_network_takes_as_few_chips_as_hold_it(netlist, tmp_path):
     assert np.bincount(chip).tolist() == [2, 2, 1]
     assert chip_count(netlist.core_tile, SMALL) == 3
     assert len(set(netlist.core_tile.tolist())) == 5
-    one, _ = lay_out(net(), LOIHI, chips=9)
-    assert chip_count(np.array(one.placement.tiles), LOIHI) == 1
+    one, _ = lay_out(net(), nets.LOIHI, chips=9)
+    assert chip_count(np.array(one.placement.tiles), nets.LOIHI) == 1
     write_netlist(netlist, tmp_path / "net.loom")
     assert read_netlist(tmp_path / "net.loom").core_tile.tolist() == netlist.core_tile.tolist()
 
@@ -316,7 +306,7 @@ def test_what_is_refused_of_several_chips(netlist, recordings):
 
 
 def test_the_traffic_of_the_page_has_the_axons_that_the_limits_count_and_the_hops_of_the_placement():
-    target = small_target(core_compartments=4, mesh_tile_cores=1)
+    target = nets.small_target(core_compartments=4, mesh_tile_cores=1)
     layout, _ = lay_out(net(), target)
     made = emit(net(), layout.cores, layout.placement.tiles, target, {})
     ways = page._traffic(made, target, np.full(made.n_inputs + made.n_compartments, 2.0))

@@ -6,34 +6,11 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+import random_networks as nets
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_networks import (
-    BITS,
-    LOIHI,
-    chain,
-    dense_weights,
-    float_networks,
-    integer_chain,
-    integer_networks,
-    recordings_for,
-)
 
-from spikeloom.compiler import Packing
-from spikeloom.compiler.fixedpoint import (
-    ACCUMULATOR_MAX,
-    BIAS_EXPONENT_MAX,
-    BIAS_MANTISSA_MAX,
-    CURRENT_MAX,
-    MEMBRANE_MAX,
-    MEMBRANE_SHIFT,
-    ONE_STEP_SUM_MAX,
-    THRESHOLD_MANTISSA_MAX,
-    decay_registers,
-    encode_bias,
-    round_steps,
-    weight_step,
-)
+from spikeloom.compiler import Packing, fixedpoint
 from spikeloom.compiler.interpret import run_float, run_integer
 from spikeloom.compiler.ir import Form, one_sided
 from spikeloom.compiler.passes.calibrate import calibrate, evenly_spaced
@@ -54,12 +31,18 @@ def noisy_layer(seed=0, *, inputs=40, outputs=30, outlier=0.0):
     rng = np.random.default_rng(seed)
     weight = rng.normal(0, 0.1, (outputs, inputs))
     weight[0, 0] = outlier
-    return chain(weight, biases=[rng.normal(0, 0.05, outputs)])
+    return nets.chain(weight, biases=[rng.normal(0, 0.05, outputs)])
 
 
 def test_decays_are_the_nearest_registers():
-    assert [decay_registers(beta)[1] for beta in (0.0, 1.0, 0.5, 0.9, 819 / 4096)] == [4095, 0, 2048, 410, 3277]
-    population = choose_storage(noisy_layer(), LOIHI)[0].populations[0]
+    assert [fixedpoint.decay_registers(beta)[1] for beta in (0.0, 1.0, 0.5, 0.9, 819 / 4096)] == [
+        4095,
+        0,
+        2048,
+        410,
+        3277,
+    ]
+    population = choose_storage(noisy_layer(), nets.LOIHI)[0].populations[0]
     assert (population.beta, population.realised_beta) == (0.2, 819 / 4096)
     assert (population.decay_u, population.decay_v) == (4095, 3277)
 
@@ -67,34 +50,36 @@ def test_decays_are_the_nearest_registers():
 @settings(max_examples=10)
 @given(st.data())
 def test_no_input_brings_more_than_the_stated_worst_case(data):
-    network = data.draw(float_networks())
-    integer, choices = choose_storage(network, LOIHI, packings=(Packing(bits=data.draw(st.sampled_from(BITS))),))
+    network = data.draw(nets.float_networks())
+    integer, choices = choose_storage(
+        network, nets.LOIHI, packings=(Packing(bits=data.draw(st.sampled_from(nets.BITS))),)
+    )
     proofs = prove_ranges(integer)
     for post, (proof, choice) in enumerate(zip(proofs, choices, strict=True)):
-        weights = np.concatenate(list(dense_weights(integer, post).values()), axis=1)
-        events = data.draw(recordings_for(weights.shape[1]))
+        weights = np.concatenate(list(nets.dense_weights(integer, post).values()), axis=1)
+        events = data.draw(nets.recordings_for(weights.shape[1]))
         sums = np.abs(events.reshape(-1, weights.shape[1]).astype(np.int64) @ weights.T)
         assert 64 * sums.max() <= proof.accumulator <= 2**21 - 1
         # The worst case is reached by the input that hits just the positive or just the negative synapses.
         worst = max(np.abs((sign * weights[i] > 0) @ weights[i]) for i in range(len(weights)) for sign in (1, -1))
         assert proof.accumulator == 64 * worst
-        assert choice.headroom == pytest.approx(1 - worst / ONE_STEP_SUM_MAX, abs=1e-12)
+        assert choice.headroom == pytest.approx(1 - worst / fixedpoint.ONE_STEP_SUM_MAX, abs=1e-12)
 
 
 def test_a_large_layer_gives_up_scale_for_the_proof():
     """2000 equal weights: only their sum, not the largest of them, limits the scale."""
-    integer, (choice,) = choose_storage(chain(np.full((1, 2000), 0.5)), LOIHI)
+    integer, (choice,) = choose_storage(nets.chain(np.full((1, 2000), 0.5)), nets.LOIHI)
     assert choice.headroom >= 0
-    assert int(integer.projections[0].effective().sum()) <= ONE_STEP_SUM_MAX
+    assert int(integer.projections[0].effective().sum()) <= fixedpoint.ONE_STEP_SUM_MAX
     # One unit of threshold more would not fit.
-    network = chain(np.full((1, 2000), 0.5))
+    network = nets.chain(np.full((1, 2000), 0.5))
     form = Form(bits=8, exponents=(choice.exponent,), threshold=integer.populations[0].threshold + 1)
     _, finer = round_population(network.populations[0], network.projections, form)
-    assert np.maximum(*one_sided(finer, 1))[0] > ONE_STEP_SUM_MAX
+    assert np.maximum(*one_sided(finer, 1))[0] > fixedpoint.ONE_STEP_SUM_MAX
 
 
 def test_a_small_layer_uses_the_full_range():
-    integer, (choice,) = choose_storage(chain([[0.5, -0.25, 0.125]]), LOIHI)
+    integer, (choice,) = choose_storage(nets.chain([[0.5, -0.25, 0.125]]), nets.LOIHI)
     assert integer.projections[0].weight.toarray().tolist() == [[254, -128, 64]]
     # the largest exponent that the positive sum of 318 allows: threshold and bias are finest there
     assert (choice.exponent, choice.scale, choice.clipped) == (6, 508 * 64, 0)
@@ -105,8 +90,8 @@ def test_an_outlier_is_clipped_if_that_saves_spikes():
     network = noisy_layer(outlier=20.0)
     calibration = calibrate(network, recordings(network, 1))
     packings = (Packing(bits=4),)
-    unclipped, (plain,) = choose_storage(network, LOIHI, packings=packings)
-    chosen, (choice,) = choose_storage(network, LOIHI, packings=packings, calibration=calibration)
+    unclipped, (plain,) = choose_storage(network, nets.LOIHI, packings=packings)
+    chosen, (choice,) = choose_storage(network, nets.LOIHI, packings=packings, calibration=calibration)
     assert plain.clipped == 0
     assert choice.clipped == 1
     assert choice.scale > plain.scale
@@ -116,7 +101,9 @@ def test_an_outlier_is_clipped_if_that_saves_spikes():
 
 @pytest.mark.parametrize(("bits", "theta"), [(8, 0.5), (2, 49.0)])
 def test_a_layer_of_zeros_is_silent(bits, theta):
-    integer, (choice,) = choose_storage(chain(np.zeros((2, 3)), theta=theta), LOIHI, packings=(Packing(bits=bits),))
+    integer, (choice,) = choose_storage(
+        nets.chain(np.zeros((2, 3)), theta=theta), nets.LOIHI, packings=(Packing(bits=bits),)
+    )
     assert not integer.projections[0].weight.data.any()
     assert choice.headroom == 1
     assert integer.populations[0].threshold.tolist() in [[127, 127], [128, 128]]
@@ -124,16 +111,16 @@ def test_a_layer_of_zeros_is_silent(bits, theta):
 
 
 def test_a_layer_of_zeros_with_biases_spikes_by_them():
-    network = chain(np.zeros((3, 2)), biases=[[0.6, 0.45, 0.3]])
+    network = nets.chain(np.zeros((3, 2)), biases=[[0.6, 0.45, 0.3]])
     events = np.ones((1, 20, 2), bool)
-    integer, _ = choose_storage(network, LOIHI)
+    integer, _ = choose_storage(network, nets.LOIHI)
     np.testing.assert_array_equal(run_integer(integer, events).spikes[0], run_float(network, events).spikes[0])
 
 
 @pytest.mark.parametrize("weight", [100.0, 300.0, 4000.0])
 @pytest.mark.parametrize("bits", [2, 8])
 def test_weights_far_above_the_threshold_take_a_larger_exponent(weight, bits):
-    integer, (choice,) = choose_storage(chain([[weight, -weight / 2]]), LOIHI, packings=(Packing(bits=bits),))
+    integer, (choice,) = choose_storage(nets.chain([[weight, -weight / 2]]), nets.LOIHI, packings=(Packing(bits=bits),))
     assert choice.exponent > 0
     assert integer.populations[0].threshold[0] >= 1
     largest = integer.projections[0].weight.data[0] * 2**choice.exponent / choice.scale
@@ -142,13 +129,13 @@ def test_weights_far_above_the_threshold_take_a_larger_exponent(weight, bits):
 
 
 def test_tiny_weights_take_the_largest_threshold():
-    integer, (choice,) = choose_storage(chain([[1e-9, -1e-12]]), LOIHI)
+    integer, (choice,) = choose_storage(nets.chain([[1e-9, -1e-12]]), nets.LOIHI)
     assert integer.populations[0].threshold.tolist() == [131071]
     assert choice.exponent == -1
 
 
 def test_a_large_bias_takes_the_finest_scale_that_its_register_holds():
-    integer, (choice,) = choose_storage(chain([[0.5, -0.5]], biases=[[100.0]]), LOIHI)
+    integer, (choice,) = choose_storage(nets.chain([[0.5, -0.5]], biases=[[100.0]]), nets.LOIHI)
     (threshold,) = integer.populations[0].threshold.tolist()
     assert threshold / 0.5 * 64 * 100 <= 4095 * 2**7 < (threshold + 1) / 0.5 * 64 * 100
     assert choice.scale == 2 * threshold
@@ -159,7 +146,7 @@ def test_the_scale_that_keeps_most_spikes_is_chosen_of_those_that_did_best_on_a_
     monkeypatch.setattr(choice_module, "compensated", lambda *_: None)
     network = noisy_layer(seed, outlier=1.0)
     calibration, packing = calibrate(network, recordings(network, seed, samples=24)), Packing(bits=bits)
-    layer, exponents = layer_of(network, 0, calibration), LOIHI.choices["synapse.exponent"]
+    layer, exponents = layer_of(network, 0, calibration), nets.LOIHI.choices["synapse.exponent"]
     made = (candidate(layer, packing, factor, exponents)[0] for factor in choice_module.CLIPPING)
     found = {(c.form.exponents, c.form.threshold[0]): c for c in made}.values()
     runs = [assemble(network, [c]) for c in found]
@@ -182,13 +169,13 @@ def lost(integer, calibration, post, rows=slice(None)):
 
 def test_a_layer_is_judged_on_the_rounded_spikes_of_the_one_before_and_nudged_only_where_that_helps():
     rng, packing = np.random.default_rng(3), Packing(bits=3)
-    network = chain(rng.normal(0, 0.2, (20, 12)), rng.normal(0, 0.3, (9, 20)))
+    network = nets.chain(rng.normal(0, 0.2, (20, 12)), rng.normal(0, 0.3, (9, 20)))
     calibration = calibrate(network, recordings(network, 4, samples=12))
-    integer, choices = choose_storage(network, LOIHI, packings=(packing,), calibration=calibration)
+    integer, choices = choose_storage(network, nets.LOIHI, packings=(packing,), calibration=calibration)
     for post, choice in enumerate(choices):  # the whole network runs as each layer was judged
         assert choice.flips == lost(integer, calibration, post)[0].sum() > 0
     layer = layer_of(network, 0, calibration)
-    before = best_scale(layer, packing, LOIHI.choices["synapse.exponent"])
+    before = best_scale(layer, packing, nets.LOIHI.choices["synapse.exponent"])
     after = nudged(layer, before, calibration)
     scores = [np.abs(stored.moved).sum(axis=0) for stored in (before, after)]
     changed = before.population.bias != after.population.bias
@@ -201,10 +188,10 @@ def test_a_layer_is_judged_on_the_rounded_spikes_of_the_one_before_and_nudged_on
 def test_a_relay_keeps_no_bias():
     weight = np.random.default_rng(5).normal(0, 0.2, (20, 12))
     weight[-1] = np.eye(12)[-1]
-    network = chain(weight)
+    network = nets.chain(weight)
     network = dataclasses.replace(network, populations=(dataclasses.replace(network.populations[0], relays=1),))
     calibration = calibrate(network, recordings(network, 6, samples=12))
-    integer, _ = choose_storage(network, LOIHI, packings=(Packing(bits=3),), calibration=calibration)
+    integer, _ = choose_storage(network, nets.LOIHI, packings=(Packing(bits=3),), calibration=calibration)
     assert integer.populations[0].bias[:-1].any()
     assert integer.populations[0].bias[-1] == 0
     assert not lost(integer, calibration, 0)[0][-1]
@@ -213,10 +200,10 @@ def test_a_relay_keeps_no_bias():
 @pytest.mark.parametrize("planes", [(2, 1), (1, 2)])
 def test_layers_of_several_planes_and_no_others_are_rounded_on_more_recordings(planes, monkeypatch):
     rng, more = np.random.default_rng(3), []
-    network = chain(rng.normal(0, 0.2, (8, 12)), rng.normal(0, 0.3, (4, 8)))
+    network = nets.chain(rng.normal(0, 0.2, (8, 12)), rng.normal(0, 0.3, (4, 8)))
     monkeypatch.setattr(choice_module, "round_with_more", lambda layer, chosen, _: more.append(layer.post) or chosen)
     packings = [Packing(planes=each) for each in planes]
-    choose_storage(network, LOIHI, packings=packings, calibration=calibrate(network, recordings(network, 4)))
+    choose_storage(network, nets.LOIHI, packings=packings, calibration=calibrate(network, recordings(network, 4)))
     assert more == [planes.index(2)]
 
 
@@ -236,7 +223,7 @@ def with_registers(network, **changes):
 
 
 def test_one_neuron_by_hand():
-    network = integer_chain([[254, -100, 6]], thresholds=[90])
+    network = nets.integer_chain([[254, -100, 6]], thresholds=[90])
     (proof,) = prove_ranges(network)
     assert proof.layer == "fc1"
     assert proof.accumulator == proof.current == 64 * 260
@@ -245,22 +232,22 @@ def test_one_neuron_by_hand():
 
 
 def test_negative_input_adds_up_as_far_as_the_leak_lets_it():
-    network = with_registers(integer_chain([[-200]]), bias_mantissa=np.array([-64]), decay_v=2048)
+    network = with_registers(nets.integer_chain([[-200]]), bias_mantissa=np.array([-64]), decay_v=2048)
     (proof,) = prove_ranges(network)
     assert proof.membrane == 2 * (64 * 200 + 64)
 
 
 def test_a_current_with_memory_adds_up():
-    network = with_registers(integer_chain([[100]]), decay_u=2047)
+    network = with_registers(nets.integer_chain([[100]]), decay_u=2047)
     (proof,) = prove_ranges(network)
     assert proof.accumulator == 6400
     assert proof.current == 2 * 6400
 
 
 def test_without_a_leak_only_the_positive_side_is_bounded():
-    rising = with_registers(integer_chain([[100]]), decay_v=0)
+    rising = with_registers(nets.integer_chain([[100]]), decay_v=0)
     assert prove_ranges(rising)[0].membrane == 100 * 64 + 6400
-    falling = with_registers(integer_chain([[-2]]), decay_v=0)
+    falling = with_registers(nets.integer_chain([[-2]]), decay_v=0)
     (proof,) = prove_ranges(falling)
     assert proof.membrane == np.inf
     assert not proof.holds
@@ -270,7 +257,7 @@ def test_without_a_leak_only_the_positive_side_is_bounded():
     ("weights", "holds"), [([254] * 129, True), ([254] * 129 + [2], False), ([-254] * 129 + [254] * 129, True)]
 )
 def test_the_accumulator_holds_129_full_weights(weights, holds):
-    (proof,) = prove_ranges(integer_chain([weights]))
+    (proof,) = prove_ranges(nets.integer_chain([weights]))
     assert proof.holds is holds
 
 
@@ -280,7 +267,7 @@ def check(network, events, proofs):
     for post, proof in enumerate(proofs):
         sources = {-1: events} | dict(enumerate(activity.spikes))
         sums = up = down = 0
-        for pre, weight in dense_weights(network, post).items():
+        for pre, weight in nets.dense_weights(network, post).items():
             active = sources[pre].astype(np.int64)
             sums = sums + active @ weight.T
             up = up + active @ np.maximum(weight, 0).T
@@ -296,14 +283,14 @@ def check(network, events, proofs):
 
 @given(st.data())
 def test_bounds_hold_on_random_registers(data):
-    network = data.draw(integer_networks())
-    check(network, data.draw(recordings_for(network.input.size, most=30)), prove_ranges(network))
+    network = data.draw(nets.integer_networks())
+    check(network, data.draw(nets.recordings_for(network.input.size, most=30)), prove_ranges(network))
 
 
 @given(st.data())
 def test_a_proof_means_that_saturation_changes_nothing(data):
-    network = data.draw(integer_networks())
-    events = data.draw(recordings_for(network.input.size, most=30))
+    network = data.draw(nets.integer_networks())
+    events = data.draw(nets.recordings_for(network.input.size, most=30))
     free = run_integer(network, events, membranes=True, saturates=False)
     for proof, membranes in zip(prove_ranges(network), free.membranes, strict=True):
         if proof.membrane > 2**23 - 1:
@@ -313,14 +300,18 @@ def test_a_proof_means_that_saturation_changes_nothing(data):
 
 def mantissas(weight, scale, bits):
     """Weights rounded to one plane of a width."""
-    return round_steps(weight, scale, bits, (0,)) * weight_step(bits)
+    return fixedpoint.round_steps(weight, scale, bits, (0,)) * fixedpoint.weight_step(bits)
 
 
 def test_registers_have_their_published_widths():
-    assert (ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX) == (2097151, 8388607, 8388607)
-    assert (BIAS_MANTISSA_MAX, BIAS_EXPONENT_MAX, THRESHOLD_MANTISSA_MAX) == (4095, 7, 131071)
-    assert MEMBRANE_SHIFT == 6
-    assert 64 * ONE_STEP_SUM_MAX <= ACCUMULATOR_MAX < 64 * (ONE_STEP_SUM_MAX + 1)
+    assert (fixedpoint.ACCUMULATOR_MAX, fixedpoint.CURRENT_MAX, fixedpoint.MEMBRANE_MAX) == (2097151, 8388607, 8388607)
+    assert (fixedpoint.BIAS_MANTISSA_MAX, fixedpoint.BIAS_EXPONENT_MAX, fixedpoint.THRESHOLD_MANTISSA_MAX) == (
+        4095,
+        7,
+        131071,
+    )
+    assert fixedpoint.MEMBRANE_SHIFT == 6
+    assert 64 * fixedpoint.ONE_STEP_SUM_MAX <= fixedpoint.ACCUMULATOR_MAX < 64 * (fixedpoint.ONE_STEP_SUM_MAX + 1)
 
 
 @given(st.integers(-(2**24), 2**24), st.integers(0, 4096))
@@ -328,9 +319,9 @@ def test_decay_rounds_the_exact_product_toward_zero(x, lost):
     assert decayed(x, lost) == int(Fraction(x * (4096 - lost), 4096))  # int of a fraction truncates
 
 
-@given(st.sampled_from(BITS), st.lists(st.floats(-3, 3), min_size=1, max_size=5), st.floats(0.1, 300))
+@given(st.sampled_from(nets.BITS), st.lists(st.floats(-3, 3), min_size=1, max_size=5), st.floats(0.1, 300))
 def test_weights_are_the_nearest_of_their_grid_and_symmetric(bits, weights, scale):
-    step, weight = weight_step(bits), np.array(weights)
+    step, weight = fixedpoint.weight_step(bits), np.array(weights)
     mantissa = mantissas(weight, scale, bits)
     grid = np.arange(-(256 - step), 256, step)
     assert set(mantissa.tolist()) <= set(grid.tolist())
@@ -343,12 +334,12 @@ def test_weights_are_the_nearest_of_their_grid_and_symmetric(bits, weights, scal
 def test_a_bias_beyond_the_register_is_refused(bias):
     message = f"bias of magnitude {abs(bias):.6g} exceeds 4095 * 2**7 membrane units"
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
-        encode_bias(np.array([0.0, bias]))
+        fixedpoint.encode_bias(np.array([0.0, bias]))
 
 
 @given(st.lists(st.floats(-4095 * 128, 4095 * 128), min_size=1, max_size=4))
 def test_a_bias_is_off_by_half_a_unit_of_its_exponent_at_most(bias):
-    mantissa, exponent = encode_bias(np.array(bias))
+    mantissa, exponent = fixedpoint.encode_bias(np.array(bias))
     assert np.all(np.abs(mantissa) <= 4095)
     assert np.all((exponent >= 0) & (exponent <= 7))
     assert np.all(np.abs(mantissa * 2.0**exponent - bias) <= 2.0**exponent / 2)

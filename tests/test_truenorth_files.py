@@ -23,23 +23,14 @@ from spikeloom.compiler.errors import FormatError, ModelError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import ranc
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
+from spikeloom.compiler.targets.truenorth import netlist as crossbar
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
-from spikeloom.compiler.targets.truenorth.netlist import (
-    FILE,
-    RESET_LINEAR,
-    RESET_NONE,
-    CrossbarNetlist,
-    crossbar_bytes,
-    inconsistencies,
-    read_crossbars,
-    write_crossbars,
-)
 from spikeloom.runtime.machines.truenorth import spec
 
-ARRAYS = FILE.arrays
+ARRAYS = crossbar.FILE.arrays
 
 
-def network() -> CrossbarNetlist:
+def network() -> crossbar.CrossbarNetlist:
     """Two of three taxels; a neuron each receives one and votes for its own class."""
     draft = Draft()
     core = draft.core(3, 4)
@@ -53,7 +44,7 @@ def network() -> CrossbarNetlist:
 
 @pytest.fixture
 def path(tmp_path):
-    write_crossbars(network(), tmp_path / "net.loom")
+    crossbar.write_crossbars(network(), tmp_path / "net.loom")
     return tmp_path / "net.loom"
 
 
@@ -61,18 +52,18 @@ def path(tmp_path):
 @given(crossbars())
 def test_round_trip(tmp_path_factory, netlist):
     path = tmp_path_factory.mktemp("crossbars") / "x.loom"
-    write_crossbars(netlist, path)
-    again = read_crossbars(path)
-    assert crossbar_bytes(again) == crossbar_bytes(netlist) == path.read_bytes()
+    crossbar.write_crossbars(netlist, path)
+    again = crossbar.read_crossbars(path)
+    assert crossbar.crossbar_bytes(again) == crossbar.crossbar_bytes(netlist) == path.read_bytes()
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(again, name), getattr(netlist, name), name)
-    assert inconsistencies(again) == []
+    assert crossbar.inconsistencies(again) == []
 
 
 def test_numpy_alone_reads_it_and_a_reader_of_other_files_names_it(path):
     with np.load(path) as members:
         manifest = json.loads(str(members["manifest"]))
-        assert (manifest["format"], manifest["provenance"]) == (FILE.format, {"made": "by hand"})
+        assert (manifest["format"], manifest["provenance"]) == (crossbar.FILE.format, {"made": "by hand"})
         assert members["weight"].tolist() == [[1, 1, 0, 0]] * 2
     assert is_netlist(path)
     with pytest.raises(FormatError, match=r"holds crossbar cores \(TrueNorth\), this is for .* \(Loihi\)"):
@@ -105,7 +96,7 @@ def test_files_that_mean_nothing(path, changes, line):
     manifest = json.loads(str(members["manifest"])) | changes.get("manifest", {})
     path.write_bytes(archive.archive_bytes(manifest, {name: changes.get(name, members[name]) for name in ARRAYS}))
     with pytest.raises(FormatError, match=re.escape(line)):
-        read_crossbars(path)
+        crossbar.read_crossbars(path)
 
 
 @pytest.fixture
@@ -149,7 +140,9 @@ def test_four_touches_counted_by_hand(place):
 
 @pytest.mark.parametrize("name", ["inspect", "run", "estimate"])
 def test_every_broken_rule_is_named(place, name):
-    write_crossbars(replace(network(), leak=read_only([300, 0]), reset=read_only([0, 300])), place / "net.loom")
+    crossbar.write_crossbars(
+        replace(network(), leak=read_only([300, 0]), reset=read_only([0, 300])), place / "net.loom"
+    )
     data = [] if name == "inspect" else ["--data", place / "data"]
     leak, reset = run(name, place / "net.loom", *data)[2].splitlines()
     assert "core 0, neuron 0: leak 300, -256 … 255 allowed (truenorth.neuron.leak_bits)" in leak
@@ -163,7 +156,7 @@ def small(**changes):
     draft.core(6, 3)
     draft.neuron(0, Neuron(weights=(0, 4, 0, 0), threshold=3, negative_threshold=2, **changes), layer="layer0")
     for number in range(2):
-        draft.neuron(1, Neuron(weights=(0, 0, 0, 1), reset_mode=RESET_LINEAR), layer="layer1", number=number)
+        draft.neuron(1, Neuron(weights=(0, 0, 0, 1), reset_mode=crossbar.RESET_LINEAR), layer="layer1", number=number)
     draft.axon(0, 1, [0])
     draft.axon(1, 3, [0, 1], line=2)
     draft.feed(0, 0, 0, tick=1)
@@ -198,8 +191,11 @@ def test_the_schema_of_ranc():
     ("changes", "what"),
     [
         ({"leak": -1, "leak_reversal": True}, "no leak with reversal (1 neurons)"),
-        ({"leak": -1, "reset_mode": RESET_NONE}, "1 neurons might reach theirs after 2 ticks"),
-        ({"leak": -1, "reset_mode": RESET_LINEAR, "negative_saturates": True}, "1 neurons might reach theirs after 2"),
+        ({"leak": -1, "reset_mode": crossbar.RESET_NONE}, "1 neurons might reach theirs after 2 ticks"),
+        (
+            {"leak": -1, "reset_mode": crossbar.RESET_LINEAR, "negative_saturates": True},
+            "1 neurons might reach theirs after 2",
+        ),
     ],
 )
 def test_what_ranc_has_not(changes, what):
@@ -208,7 +204,7 @@ def test_what_ranc_has_not(changes, what):
 
 
 def test_the_file_says_how_long_it_is_exact():
-    kept = json.loads("\n".join(ranc.export(small(leak=-1, reset_mode=RESET_NONE))))
+    kept = json.loads("\n".join(ranc.export(small(leak=-1, reset_mode=crossbar.RESET_NONE))))
     assert kept["exact_ticks"] == 2
     assert json.loads("\n".join(ranc.export(small())))["exact_ticks"] is None
 
@@ -222,7 +218,7 @@ def test_neurons_in_the_terms_of_ranc_spike_the_same(netlist, seed):
     except ModelError:
         assume(False)
     assert not terms.netlist.negative_saturates.any()
-    assert not (terms.netlist.reset_mode == RESET_NONE).any()
+    assert not (terms.netlist.reset_mode == crossbar.RESET_NONE).any()
     expected, found = spec.simulate(netlist, recording), spec.simulate(terms.netlist, recording)
     np.testing.assert_array_equal(found.spikes, expected.spikes)
     np.testing.assert_array_equal(found.membranes, expected.membranes * terms.scale + terms.shift)
@@ -233,7 +229,7 @@ def test_the_command_for_ranc(tmp_path, monkeypatch):
     draft = alone(Neuron(), channels=0)
     draft.feed(3, 0, 0)
     draft.vote((0, 0), 0, first=2)
-    write_crossbars(draft.netlist(taxels=2, polarities=2, classes=2), "net.loom")
+    crossbar.write_crossbars(draft.netlist(taxels=2, polarities=2, classes=2), "net.loom")
     recordings = np.zeros((2, 2, 2, 5), np.uint8)
     recordings[0, 1, 1, [0, 4]] = recordings[1, 1, 1, [1, 4]] = 1
     recordings_folder(tmp_path / "data", train=recordings, test=recordings)
