@@ -194,8 +194,26 @@ def stored(session: Session, network: str, data: str) -> Json:
         "equal": round(verdict["decision_agreement"] * verdict["samples"]),
         "p": binomtest(lost, lost + gained).pvalue if lost + gained else 1.0,
         "spikes_moved": sum(each["different"] for each in verdict["spikes"].values()),
+        **{key: verdict[key] for key in ("row_different",) if key in verdict},
         **session.costs(data),
     }
+
+
+def free_running(session: Session) -> Json:
+    """What a chip that nobody resets decides and costs, beside one whose layers have windows."""
+    found: Json = {}
+    for name in ("objects_manual", "objects", "containers"):
+        network, data, _ = SHIPPED[name]
+        rows, decided = {}, []
+        for row, option in {"windows": "", "free-running": "--free-running "}.items():
+            made = session.run(f"compile {network} --calibrate {data} {option}-o net.loom")
+            trained = session.run(f"run net.loom --data {data} --split train")
+            decided.append(trained["predictions"])
+            right = sum(a == b for a, b in zip(trained["predictions"], trained["labels"], strict=True))
+            rows[row] = {"train_right": right, "left": made.get("free_running"), **stored(session, network, data)}
+        equal = sum(a == b for a, b in zip(*decided, strict=True))
+        found[name] = rows | {"train_equal": equal, "train_samples": trained["samples"]}
+    return found
 
 
 def layouts(session: Session) -> Json:
@@ -372,6 +390,7 @@ def processor(session: Session, data: str) -> Json:
 
 STUDIES: dict[str, Callable[[Session], Json]] = {
     "storage": storage,
+    "free-running": free_running,
     "stress-objects": lambda session: stress(session, f"{MANUAL} --graph manual", f"--calibrate {OBJECTS} "),
     "stress-counters": lambda session: stress(session, "pretrained:objects-counters"),
     "truenorth": truenorth,

@@ -77,7 +77,9 @@ def test_all_figures_of_a_stopped_chip(report, place, monkeypatch):
             engine.advance(stepped, state, flat[i], length=STEPS, steps=ends)
             updates = np.bincount(netlist.layer, state.updates)[None].astype(np.int64)
             counts = Counts(
-                inputs=state.inputs[None], spikes=state.spikes[None], updates=updates, saturations=0 * updates
+                inputs=state.inputs[None],
+                **dict.fromkeys(("spikes", "votes"), state.spikes[None]),
+                **{"updates": updates, "saturations": 0 * updates},
             )
             assert rule["samples"]["decisions"][i] == predictions(netlist, counts.spikes)[0]
             found = cost.price(meter, counts, ends)

@@ -58,7 +58,7 @@ chart:
 compile:
     chips classes compartments cores layers limits neurons provenance sha256 synapse_words synapse_words_unrolled
     synapses synapses_nonzero synapses_stored target taxels tiles bins? calibration? clocks? core_bound? exactness?
-    facts? layout? path? placement? proofs? removals? keep? trials? finetune?
+    facts? free_running? layout? path? placement? proofs? removals? keep? trials? finetune?
 compile, crossbars:
     axons classes cores crossing_points drain_ticks feeds layers limits max_crossing_points_of_an_axon neurons
     provenance sha256 target taxels tick_clocks ticks_per_step wires bins? clocks?
@@ -89,7 +89,7 @@ inspect checkpoint, crossbars:
     classes clocks copies edges graph layers levels sets sha256 system taxels towers training weights
 inspect netlist:
     chips classes compartments cores layers limits neurons provenance sha256 synapse_words synapse_words_unrolled
-    synapses synapses_nonzero synapses_stored target taxels tiles bins? clocks?
+    synapses synapses_nonzero synapses_stored target taxels tiles bins? clocks? free_running?
 join:
     classes command file graph layers sha256 system towers
 lean:
@@ -105,6 +105,7 @@ train:
 verify:
     accuracy breakdowns certificate decision_agreement engine engine_different first_divergence ladder levels missed
     not_compared quantised_different same_checkpoint samples spec_equals_engine spec_samples spikes weights
+    row_different?
 verify, crossbars:
     E0 E1 EN correct exact membranes_saturated samples target E3? spec_steps? sums?
 watch bin:

@@ -1,6 +1,7 @@
 """The fast simulator, step by step and layer by layer, is the plain one, bit for bit, on networks of any kind."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -41,8 +42,8 @@ def random_batch(seed: int, channels: int, *, size: int = 6, length: int = 30) -
     return (np.random.default_rng(seed).random((size, channels, length)) < 0.15).astype(np.uint8)
 
 
-def assert_twins_agree(netlist, events, *, gated=True) -> Trace | str:
-    netlist = netlist if gated else ungated(netlist)
+def assert_twins_agree(netlist, events, *, gated=True, blank=0) -> Trace | str:
+    netlist = replace(netlist if gated else ungated(netlist), blank=blank and netlist.max_depth + blank)
     expected = outcome(spec.simulate, netlist, events)
     for options in ({}, {"stepwise": True}):
         found = outcome(by_engine, netlist, events, **options)
@@ -55,16 +56,16 @@ def assert_twins_agree(netlist, events, *, gated=True) -> Trace | str:
 
 
 @pytest.mark.parametrize(
-    ("exponents", "length", "gated"),
+    ("exponents", "length", "gated", "blank"),
     # few with small exponents overflow, so traces are compared and not messages
-    [((-1, 0, 0, 0, 1, 3, 7), 10, True), ((-1, 0, 0, 0, 1, 3, 7), 10, False), ((-1, 0), 20, True)],
-    ids=["any", "without windows", "small exponents"],
+    [(None, 10, True, 0), (None, 10, False, 0), (None, 10, True, 1), ((-1, 0), 20, True, 0), ((-1, 0), 20, True, 3)],
+    ids=["any", "without windows", "free-running", "small exponents", "free-running, small exponents"],
 )
 @given(data=st.data())
-def test_any_network(data, exponents, length, gated):
-    netlist = data.draw(netlists(weight_exponents=exponents))
+def test_any_network(data, exponents, length, gated, blank):
+    netlist = data.draw(netlists(weight_exponents=exponents or (-1, 0, 0, 0, 1, 3, 7)))
     events = data.draw(recordings(netlist, max_length=length))
-    assert_twins_agree(netlist, events, gated=gated)
+    assert_twins_agree(netlist, events, gated=gated, blank=blank)
 
 
 def test_large_networks_reach_every_regime():

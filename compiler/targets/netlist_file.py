@@ -12,7 +12,7 @@ Equal netlists give equal bytes: members are stored, not compressed, in a fixed 
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -93,6 +93,7 @@ class NetlistFile(Generic[N]):
     entries: dict[str, archive.Kind]  # Of the manifest, beside the common ones; ``layers`` among them
     layer: Callable[[Any], Any]  # Makes a layer of its entry
     inconsistencies: Callable[[N], list[str]]  # What in a netlist points nowhere
+    optional: dict[str, archive.Kind] = field(default_factory=dict)  # Entries that are left out where they are zero
     floats: frozenset[str] = frozenset()  # Arrays of real numbers
     tables: frozenset[str] = frozenset()  # Arrays of two axes
     as_stored: frozenset[str] = frozenset()  # Large arrays that stay in the type that they are stored in
@@ -101,7 +102,7 @@ class NetlistFile(Generic[N]):
     def arrays(self) -> tuple[str, ...]:
         """Array members in file order."""
         kind: Any = self.netlist
-        return tuple(field.name for field in fields(kind) if field.name not in COMMON | self.entries)
+        return tuple(each.name for each in fields(kind) if each.name not in COMMON | self.entries | self.optional)
 
     def verify(self, made: object) -> None:
         """Check every rule of what a pass made, a network or a netlist; VerifyError if it broke one."""
@@ -113,6 +114,7 @@ class NetlistFile(Generic[N]):
     def content(self, netlist: N) -> bytes:
         """File content of a netlist; equal netlists give equal bytes."""
         manifest = {name: getattr(netlist, name) for name in COMMON | self.entries}
+        manifest |= {name: value for name in self.optional if (value := getattr(netlist, name))}
         manifest |= {
             "format": self.format,
             "version": self.version,
@@ -138,12 +140,14 @@ class NetlistFile(Generic[N]):
         with reading(path, FormatError, "write it with spikeloom compile"):
             kinds = COMMON | self.entries
             manifest, members = archive.read_archive(path, self.format, self.version, kinds, lambda _: self.arrays)
+            further = {name: kind for name, kind in self.optional.items() if name in manifest}
+            archive.require_none(archive.entry_faults(manifest, further))
             if manifest["taxels"] * manifest["polarities"] > MOST:
                 raise FileFault(f"has more than {MOST} input channels")
             archive.require_none(archive.array_faults(members, dict.fromkeys(self.tables, 2), self.floats))
             if manifest["target"] not in (known := known_targets(self.cores)):
                 raise FileFault(f"is for {manifest['target'][:40]!r}, this program knows {', '.join(known)}")
-            values = {name: manifest[name] for name in kinds}
+            values = {name: manifest[name] for name in kinds | further}
             values |= {"clocks": Clocks(**values["clocks"]), "layers": tuple(map(self.layer, values["layers"]))}
             netlist = self.netlist(**values, **{name: self._held(name, members[name]) for name in self.arrays})
             archive.require_none(self.inconsistencies(netlist))

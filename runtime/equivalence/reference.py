@@ -6,7 +6,7 @@
 ``weights``        rounded weights
 ``bias_threshold`` rounded biases and thresholds
 ``rounding``       integer registers, whose decay drops fractions, but without limits
-``saturation``     the limits of the registers: the chip
+``saturation``     the limits of the registers: the chip; ``free_running`` where its layers have no windows
 =================  ===================================================================
 """
 
@@ -154,9 +154,9 @@ def _rows_scaled(weight: Sparse, factor: FloatArray) -> Sparse:
     return scaled
 
 
-def rungs(network: Network, integer: IntegerNetwork) -> dict[str, Simulation | None]:
-    """The rungs below the chip, ready to run; None for one that is proven to be the chip itself."""
-    proven = all(proof.holds for proof in prove_ranges(integer))
+def rungs(network: Network, integer: IntegerNetwork, *, windows: bool) -> dict[str, Simulation | None]:
+    """The rungs below the chip, ready to run; None for one that is proven to be the chip itself, one with windows."""
+    proven = windows and all(proof.holds for proof in prove_ranges(integer))
     stages = map(float_simulation, (network, *realised(network, integer)))
     # where no register leaves its range on any input, the chip is the same without limits
     unlimited = None if proven else integer_simulation(integer, saturates=False)

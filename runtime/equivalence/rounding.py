@@ -132,6 +132,8 @@ def check_rounding(machine: IntegerMachine, network: Network, *, fine_tuned: boo
             other=[what for what, digest in held[name].items() if known.get(what) != digest],
         )
     whole = [*_broken_limits(machine)]
+    if (found_blank := machine.netlist.blank) != (due := machine.blank_due):
+        whole.append(f"it has {found_blank} blank steps instead of {due}")
     if recorded is None and provenance.get("calibrated") and any(layer.faults for layer in found.values()):
         whole.append("it does not record how it was rounded on recordings: compile it again")
     return Rounding(layers=found, whole=tuple(whole))

@@ -99,9 +99,10 @@ class Verdict:
     """Everything that verify finds.
 
     Predictions are (samples,) int64 and votes (samples, classes) int64. The specification ran beside the engine on
-    `spec_samples` recordings; `spec_equals_engine` says whether every spike, membrane and count was equal there, and,
-    with onnxruntime beside, whether its spikes and votes are our engine's on all recordings: `engine_different` counts
-    those that are not. `quantised_different` counts spikes in
+    `spec_samples` recordings, of a free-running netlist also in a row; `spec_equals_engine` says whether every spike,
+    membrane and count was equal there, and, with onnxruntime beside, whether its spikes and votes are our engine's on
+    all recordings: `engine_different` counts those that are not. `row_different` are decisions that differ where all
+    follow each other on a free-running chip. `quantised_different` counts spikes in
     which a fine-tuned checkpoint's torch model, on chip integers, and the chip differ. `not_compared` are neurons of
     each layer that the chip omits because their spikes reach no neuron. Of the levels the shares `required` have to be
     reached, and EN always.
@@ -126,6 +127,7 @@ class Verdict:
     engine: str
     engine_different: int | None
     required: Mapping[str, float] = field(metadata=HIDDEN)
+    row_different: int | None = field(default=None, metadata=OPTIONAL)
     same_checkpoint: bool = True
     explained_cost: tuple[Part, ...] | None = field(default=None, metadata=OPTIONAL)
 
@@ -222,6 +224,8 @@ def levels_of(verdict: Verdict) -> tuple[Level, ...]:
     if verdict.engine_different is not None:
         where = f"{verdict.engine_different:,} differing spikes on {len(verdict.files)} recordings"
         further = f"; {verdict.engine} beside it, {where}"
+    if verdict.row_different is not None:
+        further += f", alone and in a row; there {verdict.row_different} of {len(verdict.files)} decisions are others"
     exact = "not applicable: the checkpoint was not fine-tuned on the chip's integers"
     if tuned is not None:
         spikes = sum(layer.chip for layer in verdict.spikes.values())

@@ -90,7 +90,7 @@ def verify(
     begin("specification", 0)
     equal = machine.check(events[:checked], lengths=lengths) == 0
     engine_different = None if beside is None else beside(events, lengths)
-    reference_spikes, ladder = reference_of(model), rungs(network, integer)
+    reference_spikes, ladder = reference_of(model), rungs(network, integer, windows=not machine.free_running)
     fine_tuned_spikes = _fine_tuned(source) if tuned else None
     certifier = Certifier(model, integer, kept)
     neurons = [np.arange(each.size)[keep] for each, keep in zip(integer.populations, kept, strict=True)]
@@ -145,10 +145,14 @@ def verify(
         },
         spec_samples=checked,
         spec_equals_engine=equal and not engine_different,
+        row_different=_others(machine.in_a_row(events, lengths), chip_votes) if machine.free_running else None,
         weights=rounding or check_rounding(machine, origin, fine_tuned=tuned),
         first_divergence=divergence,
         ladder=tuple(
-            Rung(stage=stage, different=dict(zip(names, counts.tolist(), strict=True)))
+            Rung(
+                stage="free_running" if machine.free_running and stage == LADDER[-1] else stage,
+                different=dict(zip(names, counts.tolist(), strict=True)),
+            )
             for stage, counts in different.items()
         ),
         quantised_different=quantised_different,
@@ -174,6 +178,11 @@ def _fine_tuned(source: Factored | Network) -> Callable[[npt.NDArray[np.uint8]],
 
     assert isinstance(source, Factored), "networks are not fine-tuned"
     return lambda events: list(quantised_spikes(source.checkpoint, source.propagation, events).values())
+
+
+def _others(votes: IntArray, theirs: IntArray) -> int:
+    """Decisions that are not theirs."""
+    return int(np.count_nonzero(vote(votes) != vote(theirs)))
 
 
 def _differences(ours: Layers, theirs: Layers) -> IntArray:

@@ -16,8 +16,8 @@ NETWORK = ("graph", "taxels", "edges", "directed", "run", "weights", "beta", "th
 ROUNDING = ("weight_bits", "planes", "scale_groups", "spike_exact", "prune_unused", "keep")
 """Options of ``compile`` that say how a float network is stored."""
 
-PLACING = ("keep_all", "cores_for", "chips", "optimize")
-"""Options of ``compile`` that say where integers go."""
+PLACING = ("keep_all", "cores_for", "chips", "optimize", "free_running")
+"""Options of ``compile`` that say where integers go, and who resets them."""
 
 USUAL: Mapping[str, object] = {
     "run": 0,
@@ -26,7 +26,7 @@ USUAL: Mapping[str, object] = {
     "chips": 1,
     "optimize": "cores",
     "engine": "spikeloom",
-    **dict.fromkeys(("directed", "spike_exact", "prune_unused", "keep_all"), False),
+    **dict.fromkeys(("directed", "spike_exact", "prune_unused", "keep_all", "free_running"), False),
 }
 """What options are where they are not given; others are None."""
 

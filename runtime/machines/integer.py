@@ -85,6 +85,25 @@ class IntegerMachine(Machine):
         """What a price looks like, for the page of the netlist."""
 
     @property
+    def free_running(self) -> bool:
+        """Whether nobody resets the chip: layers have no windows, and blank steps follow a recording."""
+        return bool(self.netlist.blank)
+
+    @property
+    @abstractmethod
+    def blank_due(self) -> int:
+        """Blank steps after which a free-running chip forgets no more; 0 for others."""
+
+    @abstractmethod
+    def in_a_row(self, events: EventArray, lengths: IntArray | None) -> IntArray:
+        """Votes (samples, classes) of recordings that follow each other on a free-running chip, as for :meth:`run`."""
+
+    def require_windows(self) -> None:
+        """Refuse a free-running netlist: an OptionError."""
+        if self.free_running:
+            raise OptionError("netlist: is free-running, which this cannot take; compile it without --free-running")
+
+    @property
     def absent(self) -> tuple[BoolArray, ...]:
         """Neurons of each layer, (neurons,) bool, that the chip does not hold."""
         return tuple(

@@ -105,9 +105,11 @@ def digits(weight: IntArray) -> tuple[Digit, ...]:
 def plan(netlist: Netlist) -> tuple[Layer, ...]:
     """Layers that have compartments, in the order of their depth.
 
-    Raises ModelError if their weights as dense matrices are more than a file holds, or some input may overflow a sum
-    or a current, where the chip is not defined.
+    Raises ModelError if the netlist is free-running, their weights as dense matrices are more than a file holds, or
+    some input may overflow a sum or a current, where the chip is not defined.
     """
+    if netlist.blank:
+        raise ModelError("onnx: a free-running netlist has no windows; compile it without --free-running")
     reached = reach(netlist)
     if np.any(over := (reached.sums > ACCUMULATOR_MAX) | (reached.current > CURRENT_MAX)):
         name = netlist.layers[netlist.layer[np.argmax(over)]].name

@@ -20,7 +20,8 @@ Time
 ----
 At chip step ``t`` an axon carries a spike if its input channel has an event in data step ``t``, or if its source
 compartment spiked in chip step ``t - 1``. A compartment of a layer of depth ``d`` integrates in the steps
-``d … d + T - 1`` of a recording of ``T`` steps and is held at zero, silent, outside them.
+``d … d + T - 1`` of a recording of ``T`` steps and is held at zero, silent, outside them. Where the netlist has blank
+steps, all compartments always integrate, and a recording is followed by so many steps without input.
 """
 
 from collections.abc import Mapping
@@ -36,6 +37,9 @@ from spikeloom.compiler.targets import netlist_file
 from spikeloom.compiler.targets.base import COMPARTMENTS
 from spikeloom.compiler.targets.netlist_file import MOST, NetlistFile, column_faults, is_outside, part_of
 from spikeloom.compiler.types import FloatArray, IntArray
+
+MOST_BLANK = 4096
+"""Blank steps after a recording."""
 
 PER_COMPARTMENT = (
     *("neuron", "decay_u", "decay_v", "threshold", "bias_mantissa", "bias_exponent", "scale", "readout_class"),
@@ -99,6 +103,7 @@ class Netlist(netlist_file.Netlist):
     provenance: Mapping[str, Any]  # checkpoint hash, graph, options, version
     clocks: Clocks = NO_CLOCKS
     bins: int = 1
+    blank: int = 0  # Blank steps after each recording; 0 where layers have windows
 
     @property
     def n_cores(self) -> int:
@@ -124,6 +129,16 @@ class Netlist(netlist_file.Netlist):
     def max_depth(self) -> int:
         """Steps that the slowest layer lags behind the data."""
         return max(layer.depth for layer in self.layers)
+
+    @property
+    def drain(self) -> int:
+        """Chip steps of a recording after those of its data."""
+        return self.blank or self.max_depth
+
+    @property
+    def begins(self) -> IntArray:
+        """Chip step of a recording from which each layer integrates, before 0 where all always do; (layers,)."""
+        return np.array([-self.blank or layer.depth for layer in self.layers])
 
     def compartments_of(self, layer: int) -> IntArray:
         """Compartment ids of a layer, ordered by neuron; shape (compartments of the layer,)."""
@@ -246,6 +261,8 @@ def inconsistencies(netlist: Netlist) -> list[str]:
     on_core = np.diff(netlist.core_compartments)[netlist.core_of_axon()][netlist.axon_of_synapse()]
     if is_outside(netlist.synapse_target, 0, 2**31) or np.any(netlist.synapse_target >= on_core):
         found.append("synapse_target points beyond its core")
+    if 0 < netlist.blank < netlist.max_depth:
+        found.append(f"{netlist.blank} blank steps follow a recording, layers lag up to {netlist.max_depth}")
     for index, layer in enumerate(netlist.layers):
         if layer.depth >= len(netlist.layers):
             found.append(f"layer {layer.name} lags {layer.depth} steps behind, with {len(netlist.layers)} layers")
@@ -269,6 +286,7 @@ FILE = NetlistFile(
     cores=COMPARTMENTS,
     netlist=Netlist,
     entries={"layers": [LAYER, ...], "bins": (1, MOST_STEPS)},
+    optional={"blank": (1, MOST_BLANK)},
     layer=_layer,
     inconsistencies=inconsistencies,
     floats=frozenset({"scale"}),

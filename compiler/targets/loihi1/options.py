@@ -50,6 +50,8 @@ class Options:
     chips: int = 1  # Number of chips at most; as few are used as hold the cores
     # One of ``GOALS``: what the layout is chosen for, see :mod:`layout.choose`; latency needs training events
     optimize: str = "cores"
+    # No layer has a window, and blank steps follow each recording, see :mod:`loihi1.idle`
+    free_running: bool = False
     provenance: Mapping[str, Any] = field(default_factory=dict)  # JSON values to store with the netlist
 
     @property

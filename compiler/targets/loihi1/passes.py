@@ -17,6 +17,7 @@ from spikeloom.compiler.passes.range_proof import RangeProof, prove_ranges
 from spikeloom.compiler.pipeline import LATER, Pass, run, step
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.idle import forgotten
 from spikeloom.compiler.targets.loihi1.layout.choose import Layout, lay_out
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, require_legal
@@ -240,7 +241,8 @@ def _emit(done: Compilation) -> Compilation:
         identity=done.identity,
         unread=done.unread,
     )
-    return replace(done, netlist=made)
+    blank = forgotten(made).steps if done.options.free_running else 0
+    return replace(done, netlist=replace(made, blank=blank))
 
 
 @step("measures every limit again on the netlist and refuses one that breaks any", keeps="the netlist")

@@ -72,6 +72,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     layout.add_argument("--chips", type=int, default=1, metavar="N", help="use up to N chips (default: 1)")
     what = f"choose the layout for {' or '.join(GOALS)}, which needs --calibrate (default: cores)"
     layout.add_argument("--optimize", default="cores", metavar="GOAL", help=what)
+    what = "no host resets the chip: layers always integrate, blank steps after each recording clear them"
+    layout.add_argument("--free-running", action="store_true", help=what)
     output.add_argument(
         "--dump-after", action="append", default=[], metavar="PASS", help="print the network after a pass, on stderr"
     )
@@ -100,6 +102,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         cores_for=parse_cores(arguments.cores_for),
         chips=arguments.chips,
         optimize=arguments.optimize,
+        free_running=arguments.free_running,
     )
     options.require_consistent(calibrated=arguments.calibrate is not None)
     asked = load_network(arguments.checkpoint, arguments)
@@ -170,7 +173,8 @@ def _compile_integers(arguments: argparse.Namespace) -> Outcome:
         **({"cores_for": cores_for} if cores_for else {}),
         **({"chips": arguments.chips} if arguments.chips != 1 else {}),
     }
-    options = Options(keep_all=arguments.keep_all, cores_for=cores_for, chips=arguments.chips, provenance=provenance)
+    layout = {"keep_all": arguments.keep_all, "cores_for": cores_for, "free_running": arguments.free_running}
+    options = Options(**layout, chips=arguments.chips, provenance=provenance)
     done = compile_network(read.network, options, target=arguments.target)
     sha256 = write_netlist(done.netlist, arguments.output)
     described = describe(arguments.output)

@@ -40,6 +40,8 @@ def _in_range(netlist: Netlist) -> bool:
 
 def lay_out_blocks(netlist: Netlist) -> Blocks | str:
     """Make blocks of a netlist, or say why there are none."""
+    if netlist.blank:
+        return "no layer has a window"
     depth = np.array([layer.depth for layer in netlist.layers])[netlist.layer]
     sent = np.append(np.full(netlist.n_inputs, -1), depth)[netlist.axon_source[netlist.axon_of_synapse()]]
     if np.any(sent != depth[netlist.synapse_compartment()] - 1):  # else no layer has to wait for another

@@ -11,6 +11,7 @@ from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
 from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.fixedpoint import kept_shares
 from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.idle import Forgotten, forgotten
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, words_of_axons
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
@@ -61,6 +62,7 @@ class NetlistFacts:
     taxels: int
     clocks: Clocks | None = field(default=None, metadata=OPTIONAL)
     bins: int | None = field(default=None, metadata=OPTIONAL)
+    free_running: Forgotten | None = field(default=None, metadata=OPTIONAL)
     classes: int
     neurons: int
     compartments: int
@@ -92,6 +94,7 @@ def describe(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Netlist
         taxels=netlist.taxels,
         clocks=None if netlist.clocks == NO_CLOCKS else netlist.clocks,
         bins=netlist.bins if netlist.bins > 1 else None,
+        free_running=forgotten(netlist) if netlist.blank else None,
         classes=netlist.classes,
         neurons=sum(layer.neurons for layer in netlist.layers),
         compartments=netlist.n_compartments,
@@ -162,6 +165,8 @@ def sections(facts: NetlistFacts) -> Iterator[Section]:
         lines.append(f"  what a convolution repeats is stored once a core: {words}")
     if facts.bins is not None:
         lines.append(f"  a step joins {facts.bins} bins of the recordings")
+    if facts.free_running is not None:
+        lines.append(f"  free-running: {facts.free_running.text}")
     yield Section("", [*map(Text, lines), _layer_table(facts.layers)])
     fullest: dict[str, LimitUse] = {}
     for use in facts.limits:

@@ -35,6 +35,9 @@ from spikeloom.runtime.machines.loihi1.trace import (
 
 WordArray = npt.NDArray[np.uint64]
 
+NO_END = 2**62
+"""Length of a recording of which nobody knows yet where it ends."""
+
 PART = 4
 """Recordings that a thread takes at a time."""
 
@@ -59,6 +62,16 @@ def prepare(netlist: Netlist, *, stepwise: bool = False) -> Engine:
     return Engine(netlist=netlist, blocks=blocks, tables=None)
 
 
+def start(engine: Engine) -> State:
+    """State before a recording: at rest, or what a free-running chip comes to in blank steps."""
+    state = state_of(engine.netlist)
+    if engine.netlist.blank:
+        advance(engine, state, np.zeros((engine.netlist.n_inputs, 0), np.uint8), length=0, steps=engine.netlist.blank)
+        for counts in (state.spikes, state.updates, state.saturations):
+            counts[:] = 0
+    return state
+
+
 def advance(
     engine: Engine,
     state: State,
@@ -72,9 +85,9 @@ def advance(
 ) -> None:
     """Run some chip steps, by default one per column; any split of a recording into calls gives the same result.
 
-    Column 0 of `events` (n_inputs, columns) belongs to the next step of `state`, see :func:`kernel.state_of`; steps
-    beyond the last column have no events. `length` are the data steps of the whole recording, which close each layer's
-    window; any large number if it has no end. `spikes`, `membranes`, `updated` (steps, compartments) are filled, see
+    Column 0 of `events` (n_inputs, columns) belongs to the next step of `state`, see :func:`start`; steps beyond the
+    last column have no events. `length` are the data steps of the whole recording, which close each layer's window if
+    it has one, ``NO_END`` if nobody knows. `spikes`, `membranes`, `updated` (steps, compartments) are filled, see
     :class:`trace.Trace`. Raises DataError and NumericRangeError as :func:`spec.simulate` does, with the same message;
     after that the state is of no further use.
     """
@@ -86,12 +99,12 @@ def advance(
         state,
         np.ascontiguousarray(events != 0).view(np.uint8),
         events.shape[1] if steps is None else steps,
-        length,
+        NO_END if engine.netlist.blank else length,
         np.zeros((0, n), np.bool_) if spikes is None else spikes,
         np.zeros((0, n), np.int32) if membranes is None else membranes,
         np.zeros((0, n), np.bool_) if updated is None else updated,
     )
-    if step >= 0:
+    if compartment >= 0:
         raise range_error(engine.netlist, tuple(REGISTER_LIMITS)[register], compartment, step, value)
 
 
@@ -123,11 +136,13 @@ def simulate(
     netlist = engine.netlist
     require_channels(netlist, events.shape[1])
     recordings, _, length = events.shape
-    shape = (recordings, length + netlist.max_depth, netlist.n_compartments)
+    shape = (recordings, length + netlist.drain, netlist.n_compartments)
+    fired = np.zeros((recordings, netlist.n_compartments), np.int64)
     trace = Trace(
         counts=Counts(
             inputs=np.zeros((recordings, netlist.n_inputs), np.int64),
-            spikes=np.zeros((recordings, netlist.n_compartments), np.int64),
+            spikes=fired,
+            votes=np.zeros_like(fired) if netlist.blank else fired,
             updates=np.zeros((recordings, len(netlist.layers)), np.int64),
             saturations=np.zeros((recordings, len(netlist.layers)), np.int64),
         ),
@@ -168,7 +183,7 @@ def _run_layers(
     blocks, nothing = engine.blocks, (0, 0, 0)
     assert blocks is not None, "laid out for the kernel of steps"
     n = engine.netlist.n_compartments
-    words = len(events), events.shape[2] + engine.netlist.max_depth, -(-n // 64)
+    words = len(events), events.shape[2] + engine.netlist.drain, -(-n // 64)
     spikes, updated = (
         np.zeros(words if trace.charged is not None or kept is not None else nothing, np.uint64)
         for kept in (trace.spikes, trace.updated)
@@ -199,21 +214,24 @@ def _run_steps(
 ) -> tuple[WordArray, WordArray]:
     """Run the one recording of a part step after step; its spikes and updates at a bit each."""
     netlist, index, length = engine.netlist, part.start, int(ends[0])
-    state, window = state_of(netlist), length + engine.netlist.max_depth
-    size = events.shape[2] + engine.netlist.max_depth, netlist.n_compartments
+    state, steps = start(engine), length + netlist.max_depth
+    size = events.shape[2] + netlist.drain, netlist.n_compartments
     fired = np.zeros(size, np.bool_) if trace.spikes is None else trace.spikes[index]
     worked = np.zeros(size, np.bool_) if trace.updated is None else trace.updated[index]
     try:
-        advance(
-            engine,
-            state,
-            events[0, :, :length],
-            length=length,
-            steps=window,
-            spikes=fired[:window],
-            membranes=None if trace.membranes is None else trace.membranes[index, :window],
-            updated=worked[:window],
-        )
+        for begin, end in ((0, steps), (steps, length + netlist.drain)):
+            advance(
+                engine,
+                state,
+                events[0, :, begin:length],
+                length=length,
+                steps=end - begin,
+                spikes=fired[begin:end],
+                membranes=None if trace.membranes is None else trace.membranes[index, begin:end],
+                updated=worked[begin:end],
+            )
+            if begin == 0:
+                trace.counts.votes[index] = state.spikes
     except NumericRangeError as error:
         error.add_note(f"recording {index} of {len(trace.counts.inputs)}, counted from 0")
         raise

@@ -34,7 +34,7 @@ class Tables(NamedTuple):
     # weights of compartment c is 2 * c, that of the negative ones follows
     sum_of: AnyArray
     magnitude: AnyArray
-    depth: AnyArray  # (compartments,) int32; of the layer of each
+    begin: AnyArray  # (compartments,) int32; chip step from which the layer of each integrates
     # keep_u, keep_v, threshold, bias: (compartments,) int32; decays in 1/4096, the others in membrane units
     keep_u: AnyArray
     keep_v: AnyArray
@@ -67,12 +67,11 @@ def tables_of(netlist: Netlist) -> Tables:
     source = netlist.axon_source[netlist.axon_of_synapse()]
     order = np.argsort(source, kind="stable")
     weight = netlist.effective_weight()[order]
-    depth = np.array([layer.depth for layer in netlist.layers], np.int32)
     return Tables(
         first=np.searchsorted(source[order], np.arange(netlist.n_inputs + netlist.n_compartments + 1)),
         sum_of=(2 * netlist.synapse_compartment()[order] + (weight < 0)).astype(np.uint32),
         magnitude=np.abs(weight).astype(np.uint16),
-        depth=depth[netlist.layer],
+        begin=netlist.begins[netlist.layer].astype(np.int32),
         keep_u=(2**DECAY_BITS - 1 - netlist.decay_u).astype(np.int32),
         keep_v=(2**DECAY_BITS - netlist.decay_v).astype(np.int32),
         threshold=(netlist.threshold << MEMBRANE_SHIFT).astype(np.int32),
@@ -81,13 +80,13 @@ def tables_of(netlist: Netlist) -> Tables:
 
 
 def state_of(netlist: Netlist) -> State:
-    """State of a chip before the first chip step of a recording."""
+    """State of a chip before the first step: that of a recording, or the blank ones before the first."""
     n, channels = netlist.n_compartments, netlist.n_inputs
     current, membrane = np.zeros((2, n), np.int32)
     spikes, updates, saturations = np.zeros((3, n), np.int64)
     worked, flags = np.zeros((2, n), np.bool_)
     return State(
-        counter=np.zeros(2, np.int64),
+        counter=np.array([-netlist.blank, 0]),
         fired=np.zeros(n + 1, np.int64),
         current=current,
         membrane=membrane,
@@ -140,11 +139,11 @@ def _deliver(tables: Tables, state: State, sources: IntArray) -> None:
 @compiled
 def _integrate(tables: Tables, state: State, step: int, length: int) -> bool:
     """Let all compartments whose window is open integrate, and say whether a register overflows."""
-    depth, keep_u, keep_v, bias, threshold = tables.depth, tables.keep_u, tables.keep_v, tables.bias, tables.threshold
+    begin, keep_u, keep_v, bias, threshold = tables.begin, tables.keep_u, tables.keep_v, tables.bias, tables.threshold
     current, membrane, sums, flags, worked = state.current, state.membrane, state.sums, state.flags, state.worked
     saturations, any_overflow = state.saturations, False
-    for c in range(depth.size):
-        is_open = (depth[c] <= step) & (step - depth[c] < length)
+    for c in range(begin.size):
+        is_open = (begin[c] <= step) & (step - begin[c] < length)
         arrived = (sums[2 * c] | sums[2 * c + 1]) != 0
         worked[c] = is_open & (arrived | ((current[c] | membrane[c] | bias[c]) != 0))
         # the current decays, and the sums are added
@@ -161,10 +160,10 @@ def _integrate(tables: Tables, state: State, step: int, length: int) -> bool:
 
 
 @compiled
-def _first_overflow(state: State, depth: AnyArray, step: int, length: int) -> tuple[Any, int, Any]:
+def _first_overflow(state: State, begin: AnyArray, step: int, length: int) -> tuple[Any, int, Any]:
     """Lowest compartment that overflows: its id, its register (0 sum, 1 current) and the value."""
     for c in range(state.current.size):
-        if depth[c] <= step and step - depth[c] < length:
+        if begin[c] <= step and step - begin[c] < length:
             positive, negative = state.sums[2 * c] >> ARRIVAL_BITS, state.sums[2 * c + 1] >> ARRIVAL_BITS
             if positive > SUM_MAX:
                 return c, 0, positive << MEMBRANE_SHIFT
@@ -204,14 +203,14 @@ def chip_steps(
     """Run chip steps; column 0 of `events`, 0 or 1, belongs to the first of them.
 
     `spikes`, `membranes` and `updated` have one row per step, or none where they are not wanted. Returns chip step,
-    compartment, register and value of the first overflow; the chip step is -1 if there is none.
+    compartment, register and value of the first overflow; the compartment is -1 if there is none.
     """
     for t in range(steps):
         step = state.counter[0]
         n = _list_sources(state, events, t, length)
         _deliver(tables, state, state.active[:n])
         if _integrate(tables, state, step, length):
-            compartment, register, value = _first_overflow(state, tables.depth, step, length)
+            compartment, register, value = _first_overflow(state, tables.begin, step, length)
             return step, compartment, register, value
         if spikes.shape[0]:
             copy(state.flags, spikes[t])
@@ -220,4 +219,4 @@ def chip_steps(
         if updated.shape[0]:
             copy(state.worked, updated[t])
         _reset_and_count(state)
-    return -1, 0, 0, 0
+    return -1, -1, 0, 0

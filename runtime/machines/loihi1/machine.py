@@ -15,16 +15,18 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.idle import forgotten
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import BoolArray, IntArray
-from spikeloom.runtime.machines.base import Done, EventArray, Price, T
+from spikeloom.runtime.machines.base import Done, EventArray, Price, T, differences, one_by_one
 from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.stream import Stream
 from spikeloom.runtime.machines.loihi1.trace import Trace, aligned, unpack
+from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Block, Outcome
 
 if TYPE_CHECKING:
@@ -88,6 +90,31 @@ class Loihi(IntegerMachine):
         fast = engine.simulate(self._engine, channels[None], spikes=True, membranes=True, updated=True)
         return spec.simulate(self.netlist, channels), fast
 
+    def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
+        """On a free-running chip also in a row."""
+        found = super().check(events, lengths=lengths)
+        if self.free_running:
+            pause = np.zeros((self.netlist.n_inputs, self.netlist.blank), events.dtype)
+            each = one_by_one(with_clocks(events, self.netlist.clocks), lengths)
+            row = np.concatenate([part for channels in each for part in (channels, pause)], axis=1)
+            found += differences(*self.twice(row))
+        return found
+
+    @property
+    def blank_due(self) -> int:
+        """By bounds on its registers."""
+        return forgotten(self.netlist).steps if self.free_running else 0
+
+    def in_a_row(self, events: EventArray, lengths: IntArray | None) -> IntArray:
+        """Registers are carried over from one to the next."""
+        state, lag, counts = engine.start(self._stepwise), self.netlist.max_depth, []
+        for channels in one_by_one(with_clocks(events, self.netlist.clocks), lengths):
+            before, steps = state.spikes.copy(), channels.shape[1]
+            engine.advance(self._stepwise, state, channels, length=steps, steps=steps + lag)
+            counts.append(state.spikes - before)
+            engine.advance(self._stepwise, state, channels[:, :0], length=steps, steps=self.netlist.blank - lag)
+        return class_counts(self.netlist, np.array(counts))
+
     def beside(self, engine: str) -> Callable[[EventArray, IntArray | None], int] | None:
         """The integer graph in onnxruntime."""
         if engine != "onnx":
@@ -110,6 +137,7 @@ class Loihi(IntegerMachine):
         """Sums that the engine adds up itself: no spike is kept."""
         from spikeloom.runtime.machines.loihi1.costs import cumulative
 
+        self.require_windows()
         channels = with_clocks(events, self.netlist.clocks)
         return cumulative.run(self._engine, self.target, channels, lengths, lag=self.read_out_lag)
 
@@ -137,10 +165,11 @@ class Loihi(IntegerMachine):
 
     @cached_property
     def _chip(self) -> Chip | None:
-        """For changed runs; None where a register may overflow."""
+        """For changed runs; None where a register may overflow, or no layer has a window."""
         from spikeloom.runtime.machines.loihi1.changes import kernel
 
-        return None if kernel.overflows(self.netlist) else kernel.chip_of(self.netlist)
+        unknown = self.free_running or kernel.overflows(self.netlist)
+        return None if unknown else kernel.chip_of(self.netlist)
 
     def effects(self, channels: EventArray, changes: Changes) -> Effects:
         """Only what a change reaches is simulated again."""
@@ -195,7 +224,7 @@ class Loihi(IntegerMachine):
 
     def batch(self, steps: int) -> int:
         """As many recordings as keep the sums of the time model small."""
-        held = (steps + self.netlist.max_depth) * 2 * self.netlist.n_cores * max(1, len(self.target.time))
+        held = (steps + self.netlist.drain) * 2 * self.netlist.n_cores * max(1, len(self.target.time))
         return max(1, SUMS // held)
 
     def stream(self) -> Stream:

@@ -11,6 +11,10 @@ Outside this window current and membrane are zero and it is silent; what arrives
 integrates before data arrives and nothing leaks into the next recording. On silicon the management core does this
 between two steps: it resets a layer when its window begins and again when it ends.
 
+Nobody resets a free-running chip. All its layers always integrate, ``blank`` steps without input follow the ``T`` of a
+recording, and as many come before the first one. Votes are counted until the last data step has come through, in chip
+steps ``0 … T + max_depth - 1``. So this module takes several recordings in a row, blank steps between them, as one.
+
 Registers
 ---------
 A membrane counts 1/64 of a weight unit: weights and thresholds are shifted left by six, biases are not. Positive and
@@ -81,19 +85,20 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trac
     """
     require_channels(netlist, events.shape[0])
     n_inputs, length = events.shape
-    neurons, chip_steps = netlist.n_compartments, length + netlist.max_depth
+    neurons, chip_steps = netlist.n_compartments, length + netlist.drain
     synapses = read_synapses(netlist)
-    depth = np.array([layer.depth for layer in netlist.layers])[netlist.layer]
+    begin = netlist.begins[netlist.layer]
+    end = begin + length if not netlist.blank else chip_steps
     threshold, bias = UNIT * netlist.threshold, netlist.bias_mantissa * 2**netlist.bias_exponent
 
     spikes, updated = np.zeros((2, chip_steps, neurons), np.bool_)
     membranes = np.zeros((chip_steps, neurons), np.int32)
     saturated = np.zeros((chip_steps, neurons), np.bool_)
     current, membrane = np.zeros((2, neurons), np.int64)
-    for t in range(chip_steps):
+    fired: list[int] = []
+    for t in range(-netlist.blank, chip_steps):  # what is kept of steps before 0 the last ones overwrite
         # active sources: channels with an event now, compartments that spiked one step ago
-        channels = np.flatnonzero(events[:, t]).tolist() if t < length else []
-        fired = (n_inputs + np.flatnonzero(spikes[t - 1])).tolist() if t else []
+        channels = np.flatnonzero(events[:, t]).tolist() if 0 <= t < length else []
 
         # gather input: positive and negative weights apart
         target, weight = _joined([synapses[source] for source in (*channels, *fired)])
@@ -102,7 +107,7 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trac
         np.add.at(negative, target, np.maximum(-weight, 0))
 
         # only neurons whose window is open integrate
-        window = (depth <= t) & (t < depth + length)
+        window = (begin <= t) & (t < end)
         worked = (membrane != 0) | (current != 0) | (bias != 0)
         worked[target] = True
 
@@ -121,11 +126,13 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trac
 
         # reset: the membrane only
         membrane[spikes[t]] = 0
+        fired = (n_inputs + np.flatnonzero(spikes[t])).tolist()
 
     layers = len(netlist.layers)
     counts = Counts(
         inputs=np.count_nonzero(events, axis=1),
         spikes=np.count_nonzero(spikes, axis=0),
+        votes=np.count_nonzero(spikes[: length + netlist.max_depth], axis=0),
         updates=np.bincount(netlist.layer, np.count_nonzero(updated, axis=0), layers).astype(np.int64),
         saturations=np.bincount(netlist.layer, np.count_nonzero(saturated, axis=0), layers).astype(np.int64),
     )

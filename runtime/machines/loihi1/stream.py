@@ -20,12 +20,8 @@ import numpy.typing as npt
 from spikeloom.compiler.errors import DataError, NumericRangeError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.base import Step
-from spikeloom.runtime.machines.loihi1.engine import Engine, advance
-from spikeloom.runtime.machines.loihi1.kernel import state_of
+from spikeloom.runtime.machines.loihi1.engine import NO_END, Engine, advance, start
 from spikeloom.runtime.machines.votes import class_counts
-
-NO_END = 2**62
-"""Length of a recording of which nobody knows yet where it ends."""
 
 
 class Stream:
@@ -44,7 +40,7 @@ class Stream:
         self._place = np.array([0, *ends[:-1]])[netlist.layer] + netlist.neuron
         self._bounds = tuple(zip([0, *ends[:-1]], ends, strict=True))
         self._column = np.zeros((engine.netlist.n_inputs, 1), np.uint8)
-        self._state = state_of(netlist)
+        self._state = start(engine)
         self._ended = False
         # loads or compiles the kernel now, not within the first bin
         advance(engine, self._state, self._column, length=NO_END, steps=0)
@@ -87,7 +83,7 @@ class Stream:
 
     def reset(self) -> None:
         """Begin the next grasp, from rest; whatever was left of the last one is dropped."""
-        self._state = state_of(self._engine.netlist)
+        self._state = start(self._engine)
         self._ended = False
 
     def _advance(self, length: int) -> Step:

@@ -1,6 +1,6 @@
 """What a simulation hands back: spikes, membranes, counts. Shared by both simulators; nobody else counts.
 
-Chip steps run from 0 to ``T + netlist.max_depth - 1`` for a recording of ``T`` data steps. Compartments are in the
+Chip steps run from 0 to ``T + netlist.drain - 1`` for a recording of ``T`` data steps. Compartments are in the
 order of the netlist's ids. A batch of recordings adds one leading axis to every array.
 """
 
@@ -33,11 +33,7 @@ class Counts:
     # (whatever the weight), or its bias is not zero
     updates: IntArray
     saturations: IntArray  # (…, layers) int64; compartment-steps whose membrane was clipped to its register
-
-    @property
-    def votes(self) -> IntArray:
-        """Spikes that count where a compartment votes: all."""
-        return self.spikes
+    votes: IntArray  # (…, compartments) int64; spikes that count where a compartment votes: not those of blank steps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -95,7 +91,7 @@ def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArra
     not hold.
     """
     depth = netlist.layers[layer].depth
-    length = array.shape[-2] - netlist.max_depth
+    length = array.shape[-2] - netlist.drain
     ids = netlist.compartments_of(layer)
     held = array[..., depth : depth + length, ids]
     if len(ids) == netlist.layers[layer].neurons:

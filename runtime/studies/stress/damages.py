@@ -184,7 +184,12 @@ def ties_fire(pair: Pair, units: int) -> Pair:
     return with_thresholds(pair, pair.netlist.threshold - units)
 
 
-@perturbation("steps", (1, 2, 5, 25), most=1000)
+def no_windows(pair: Pair) -> str | None:
+    """Why layers cannot be late."""
+    return "its layers have no windows" if pair.netlist.blank else None
+
+
+@perturbation("steps", (1, 2, 5, 25), most=1000, unless=no_windows)
 def layers_late(pair: Pair, steps: int) -> Pair:
     """Layers after the first open their windows late, off by one and more.
 

@@ -30,8 +30,8 @@ HELD = 1 << 27
 class Estimate:
     """Costs of a batch of recordings.
 
-    Events and energies by layer; data steps; times by table; and, in detail ``cycle`` only, detailed times and joules
-    by table and core.
+    Events and energies by layer; steps at the sensor's pace, blank ones too; times by table; and, in detail ``cycle``
+    only, detailed times and joules by table and core.
     """
 
     costs: Costs
@@ -65,12 +65,12 @@ def estimate(
     latencies = timing.tables_of(netlist, target)
     charges = side_by_side([timing.charges(each) for each in latencies.values()]) if latencies else None
     steps = np.full(len(events), events.shape[2]) if lengths is None else np.asarray(lengths, np.int64)
-    chip_steps = steps + netlist.max_depth
+    chip_steps = steps + netlist.drain
     simple: dict[str, list[SimpleTimes]] = {name: [] for name in latencies}
     detailed: dict[str, list[DetailedTimes]] = {name: [] for name in latencies if deep}
     counts, updates = [], []
     held = 2 * netlist.n_compartments if deep else 8 * max(1, 0 if charges is None else charges.sources.shape[1])
-    size = max(1, HELD // (held * (events.shape[2] + netlist.max_depth)))
+    size = max(1, HELD // (held * (events.shape[2] + netlist.drain)))
     for first in range(0, max(1, len(events)), size):
         part = slice(first, first + size)
         trace = engine.simulate(prepared, events[part], lengths=steps[part], spikes=deep, updated=deep, charges=charges)
@@ -93,7 +93,7 @@ def estimate(
         cores = cost.price(cost.prepare(netlist, target, "core"), by_core, chip_steps).energy
     return Trace(counts=whole, spikes=None, membranes=None), Estimate(
         costs=cost.price(cost.prepare(netlist, target), whole, chip_steps),
-        steps=steps,
+        steps=steps + netlist.blank,
         simple={name: _joined(SimpleTimes, times) for name, times in simple.items()},
         detailed={name: _joined(DetailedTimes, times) for name, times in detailed.items()},
         cores=cores,

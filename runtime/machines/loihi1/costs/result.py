@@ -149,7 +149,7 @@ class CostReport:
     pace: Pace
     static: tuple[Static, ...]
     not_modelled: tuple[str, ...]
-    not_priced: tuple[str, ...] = NOT_PRICED
+    not_priced: tuple[str, ...]
 
 
 def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: float) -> CostReport:
@@ -200,6 +200,7 @@ def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: flo
             *_links(chips, costs),
             *([INPUTS] if found.simple else []),
         ),
+        not_priced=tuple(line for line in NOT_PRICED if not (netlist.blank and line.startswith("reset"))),
     )
 
 
