@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from random_netlists import SIMULATORS, Axon, Neuron, build, by_engine, netlists, recordings
@@ -44,7 +44,6 @@ def test_what_blank_steps_leave():
             forgotten(one(**registers))
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
 @given(data=st.data())
 def test_where_nothing_is_left_a_row_is_each_alone(data):
     netlist = data.draw(netlists(weight_exponents=(-1, 0)))
