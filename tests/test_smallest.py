@@ -99,8 +99,16 @@ def test_budgets(words, chosen, fits):
     assert (found.cheapest["one"], found.fits, found.budgets) == (chosen, fits, tuple(words))
 
 
+def test_decisions_that_no_event_alters_are_a_budget():
+    pool = [replace(each, certified=share) for each, share in zip(POOL, (0.96, 0.8, 0.9, 0.5, None), strict=True)]
+    for words, chosen, fits in (("certified=85", 3, True), ("certified=95", 1, True), ("certified=97", 1, False)):
+        found = study.choose(pool, budgets(words))
+        assert (found.cheapest["one"], found.fits) == (chosen, fits)
+    assert study.going_on(pool, 1, budgets("certified=99")) == study.going_on(pool, 1)  # it is known on the last rung
+
+
 def test_budgets_that_are_none():
-    for words in ("energy=5", "latency=5ms", "cores=none", "operations=0"):
+    for words in ("energy=5", "latency=5ms", "cores=none", "operations=0", "certified=101"):
         with pytest.raises(OptionError, match="--budget"):
             budgets(words)
     timeless = replace(POOL[0], costs=replace(POOL[0].costs, time_s={}))
@@ -179,6 +187,11 @@ def test_the_command(few, monkeypatch, target, table):
     assert found["checked"]["different"] == {"train": 0, "test": 0}
     assert "static power dominates" in found["checked"]["pace"]
 
+    if target == "loihi1":
+        certified = as_json(*words, "--budget", "certified=1")["tried"]
+        last = [each.pop("certified") for each in certified if each["rung"] == 3]
+        assert (len(set(last)) > 1, min(last) >= 0, certified) == (True, True, found["tried"])
+
     # once more from the store alone, and the same by hand
     files = {name: (few / name).read_bytes() for name in ("a.pt", "a.loom")}
     monkeypatch.setattr(work, "measure", lambda _: pytest.fail("it is known"))
@@ -194,8 +207,11 @@ def test_a_network_that_is_trained_by_gradients(few, monkeypatch):
     monkeypatch.setattr(smallest, "counting", lambda *_: [])
     monkeypatch.setattr(space, "NETWORKS", (("mlp", 10, 4, "8,8"),))
     monkeypatch.setattr(space, "EPOCHS", 2)
-    found = as_json("smallest", "--data", "synthetic", "--jobs", "1", "-o", "a.loom", "--html", "a.html")
+    words = ["smallest", "--data", "synthetic", "--jobs", "1", "-o", "a.loom", "--html", "a.html"]
+    found = as_json(*words, "--budget", "certified=1")
     network, stored = found["tried"]
+    assert all(0.01 < each["certified"] <= 1 for each in found["tried"])
+    assert "no single event alters" in (few / "a.html").read_text()
     assert (network["system"], network["rung"], "storage" in network, stored["storage"]) == ("mlp", 3, False, 4)
     assert network["costs"]["operations"] <= network["whole"]["operations"]
     assert len(found["baselines"]) in (0, 4)

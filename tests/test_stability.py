@@ -30,7 +30,8 @@ from spikeloom.runtime.studies.stability.bounds import lower_bound, needed
 from spikeloom.runtime.studies.stability.counting import least, tally_of
 from spikeloom.runtime.studies.stability.neighbours import KINDS, cells_of, channels_of
 from spikeloom.runtime.studies.stability.results import Stability
-from spikeloom.runtime.studies.stability.study import stability
+from spikeloom.runtime.studies.stability.sections import hanging_on
+from spikeloom.runtime.studies.stability.study import bearing, stability
 
 REPEATABLE = settings(max_examples=40, derandomize=True)
 
@@ -216,6 +217,8 @@ def test_counters_bear_exactly_so_many_events(plan):
             assert found.at_most == (broken if broken < 3 else None)
             exact.add(broken)
     assert {1, 2} <= exact
+    verdicts = study_of(machine.netlist, given[:5], most=1, shift=0).verdicts
+    assert bearing(machine, data.part(slice(5))) == np.mean([each.at_least for each in verdicts])
 
 
 @pytest.mark.parametrize(("bins", "clocks"), [(1, Clocks()), (3, Clocks(length=12))])
@@ -305,7 +308,7 @@ def test_the_command(tmp_path, monkeypatch):
     result = decode(Stability, found)
     assert len(result.verdicts) == 4
     assert result.unaltered("dead") == sum(not each.taxels["dead"] for each in result.verdicts)
-    assert sum(result.hanging("dead")) == sum(each.kinds["dead"].alter for each in result.verdicts)
+    assert sum(hanging_on(result)["dead"]) == sum(each.kinds["dead"].alter for each in result.verdicts)
     code, out, _ = run(*words)
     assert code == 0
     assert f"no single event alters the decision: {25 * result.certified(1):.2f} %" in out

@@ -27,29 +27,24 @@ def front(gains: Sequence[float], costs: Sequence[float]) -> list[bool]:
 
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
 
-UNITS = {
-    "energy": {"J": 1.0, "mJ": 1e-3, "uJ": 1e-6, "µJ": 1e-6, "μJ": 1e-6, "nJ": 1e-9, "pJ": 1e-12},
-    "latency": _SECONDS,
-    "time": _SECONDS,
-    "accuracy": {"": 0.01, "%": 0.01},
-    "operations": {"": 1.0},
-    "cores": {"": 1.0},
-}
-"""What can be limited, and its units; both letters for micro are in use."""
+_SHARE = {"": 0.01, "%": 0.01}
+_NUMBER = {"": 1.0}
 
-SHOWN = {
-    "energy": "as in 0.1mJ",
-    "latency": "as in 5ms",
-    "time": "as in 5ms",
-    "accuracy": "in per cent, as in 88",
-    "operations": "as in 25000",
-    "cores": "as in 1",
+LIMITED = {
+    "energy": ({"J": 1.0, "mJ": 1e-3, "uJ": 1e-6, "µJ": 1e-6, "μJ": 1e-6, "nJ": 1e-9, "pJ": 1e-12}, "as in 0.1mJ"),
+    "latency": (_SECONDS, "as in 5ms"),
+    "time": (_SECONDS, "as in 5ms"),
+    "accuracy": (_SHARE, "in per cent, as in 88"),
+    "certified": (_SHARE, "in per cent, as in 90"),
+    "operations": (_NUMBER, "as in 25000"),
+    "cores": (_NUMBER, "as in 1"),
 }
+"""What can be limited, its units and how it is written; both letters for micro are in use."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Budget:
-    """One limit of a mean inference, as typed: joules or seconds on the chip at most, or share of right ones at least.
+    """One limit of a mean inference, as typed: joules or seconds on the chip at most, or share at least.
 
     Of operations and cores their number at most.
     """
@@ -79,15 +74,16 @@ def parse_budgets(
         if what in budgets:
             raise OptionError(f"--budget {words}: {what} is limited twice; give it once")
         number = re.fullmatch(r"([0-9]+\.?[0-9]*|\.[0-9]+)(?:e([+-]?[0-9]{1,2}))?\s*([^0-9.\s]*)", value)
-        unit = None if number is None else UNITS[what].get(number[3])
+        units, example = LIMITED[what]
+        unit = None if number is None else units.get(number[3])
         if number is None or unit is None:
-            units = ", ".join(u for u in UNITS[what] if u and u.isascii())
+            names = ", ".join(u for u in units if u and u.isascii())
             raise OptionError(
-                f"--budget {words}: {value or 'nothing'} is no {what}; write it {SHOWN[what]}"
-                + (f" ({units})" if units else "")
+                f"--budget {words}: {value or 'nothing'} is no {what}; write it {example}"
+                + (f" ({names})" if names else "")
             )
         limit = float(f"{number[1]}e{number[2] or 0}") * unit
-        if limit <= 0 or (what == "accuracy" and limit > 1):
-            raise OptionError(f"--budget {words}: allowed is {'0 to 100' if what == 'accuracy' else 'more than 0'}")
+        if limit <= 0 or (units is _SHARE and limit > 1):
+            raise OptionError(f"--budget {words}: allowed is {'0 to 100' if units is _SHARE else 'more than 0'}")
         budgets[what] = Budget(what=what, limit=limit, words=words)
     return tuple(budgets.values())

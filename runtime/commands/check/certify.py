@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from spikeloom.compiler import __version__
+from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import sha256_of
 from spikeloom.runtime.commands.options import add_netlist, add_picture, add_recordings
@@ -53,9 +51,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
             raise OptionError(f"--{name} {count}: allowed are {least} or more; choose another")
     machine = machine_for(arguments.netlist)
     data = load_recordings(arguments, machine.netlist, labels_for="certify", joined=False)
-    digest = hashlib.sha256()
-    for array in data.identity().values():
-        digest.update(np.ascontiguousarray(array).tobytes())
     found = stability(machine, data, shift=arguments.shift, most=arguments.most, jobs=arguments.jobs)
     result = replace(
         found,
@@ -64,7 +59,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             netlist=Path(arguments.netlist).name,
             netlist_sha256=sha256_of(arguments.netlist),
             data=Path(arguments.data).name,
-            data_sha256=digest.hexdigest(),
+            data_sha256=arrays_digest(data.identity()),
             split=arguments.split,
         ),
     )

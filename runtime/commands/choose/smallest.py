@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_graph_options(parser, f"of the built-in sensor (default: {GRAPH})")
     parser.add_argument("--target", default=DEFAULT_TARGET, help=f"chip (default: {DEFAULT_TARGET})")
     parser.add_argument("--levels", type=int, metavar="N", help=LEVELS)
-    what = "of an inference: energy=5uJ, time=5ms, operations=25000, cores=1, accuracy=88; all of them hold"
+    what = "energy=5uJ, time=5ms, operations=25000, cores=1, accuracy=88, certified=90; all of them hold"
     parser.add_argument("--budget", action="append", default=[], metavar="WHAT=LIMIT[,…]", help=what)
     parser.add_argument("--store", metavar="FILE", help="what is measured (default: NET.sqlite, beside the netlist)")
     parser.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")

@@ -33,8 +33,11 @@ NEAR = 1e-9
 POINT = 0.01
 """Accuracy whose price is told."""
 
-LIMITS = ("energy", "time", "operations", "cores", "accuracy")
+LIMITS = ("energy", "time", "operations", "cores", "accuracy", "certified")
 """What ``--budget`` limits."""
+
+SHARES = ("accuracy", "certified")
+"""Those of which there is to be as much at least; the second is known on the last rung."""
 
 KEPT = {1: 20, 2: 14}
 """Candidates that go on from a rung."""
@@ -65,7 +68,8 @@ def smallest(
 
     `command` repeats it; `make` also gives the commands that do what it does.
     """
-    trial = partial(work.trial, data=data, sensor=sensor, target=target.name)
+    certify = any(budget.what == "certified" for budget in budgets)
+    trial = partial(work.trial, data=data, sensor=sensor, target=target.name, certify=certify)
     on = partial(going_on, budgets=budgets)
     beside = search(baselines(), most_accurate, trial, store, jobs=jobs)
     tried = search(candidates, on, trial, store, jobs=jobs)
@@ -171,7 +175,7 @@ def going_on(tried: Iterable[Tried], rung: int, budgets: Sequence[Budget] = ()) 
     Where budgets are nearly met by any, those alone go on.
     """
     priced = [each for each in tried if each.costs is not None]
-    limits = [budget for budget in budgets if budget.what != "accuracy"]
+    limits = [budget for budget in budgets if budget.what not in SHARES]
     able = [each for each in priced if all(excess(each, budget) <= SLACK for budget in limits)] or priced
     top = max((each.accuracy for each in able), default=0.0)
 
@@ -233,8 +237,9 @@ def excess(tried: Tried, budget: Budget) -> float:
     """Factor by which a candidate misses a budget; at most 1 where it fits."""
     costs = tried.costs
     assert costs is not None, "what the chip does not hold has no price"
-    if budget.what == "accuracy":
-        return budget.limit / tried.accuracy if tried.accuracy else float("inf")
+    if budget.what in SHARES:
+        share = tried.accuracy if budget.what == "accuracy" else tried.certified
+        return budget.limit / share if share else float("inf")
     if budget.what == "time":
         if not costs.time_s:
             raise OptionError(f"--budget {budget.words}: the chip has no time table, nothing is timed; omit it")

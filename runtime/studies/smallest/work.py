@@ -42,6 +42,7 @@ from spikeloom.runtime.studies.smallest import baselines
 from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF
 from spikeloom.runtime.studies.smallest.space import Candidate
 from spikeloom.runtime.studies.smallest.trained import Sensor, plan_of, without
+from spikeloom.runtime.studies.stability.study import bearing
 
 FORMAT = 3
 """Of what is measured; goes up when a figure means something else."""
@@ -66,6 +67,7 @@ class Trial(Job):
     data: Data
     sensor: Sensor
     target: str
+    certify: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,15 +84,20 @@ class Measured:
     whole: Costs | None = field(default=None, metadata=OPTIONAL)
     refused: str | None = field(default=None, metadata=OPTIONAL)  # Why the chip does not hold it
     processor: Processor | None = field(default=None, metadata=OPTIONAL)  # Costs of a baseline
+    certified: float | None = field(default=None, metadata=OPTIONAL)  # Share that no event alters, of some left out
 
 
-def trial(candidate: Candidate, rung: int, setting: float | None, data: Data, sensor: Sensor, target: str) -> Trial:
-    """Work whose key is of everything that decides the result."""
+def trial(
+    candidate: Candidate, rung: int, setting: float | None, data: Data, sensor: Sensor, target: str, *, certify: bool
+) -> Trial:
+    """Work whose key is of everything that decides the result; on the last rung it may `certify`."""
     graph = arrays_digest({"edges": sensor.graph.edges, "coordinates": sensor.graph.coordinates})
     about = {"format": FORMAT, "spikeloom": __version__, "data": data.sha256, "bin_s": data.bin_s, "graph": graph}
     about |= {"target": target, "candidate": encode(candidate), "rung": rung, "setting": setting}
+    if certify := certify and rung == RUNGS:
+        about |= {"certified": True}
     own: dict[str, Any] = {"candidate": candidate, "rung": rung, "setting": setting, "data": data, "sensor": sensor}
-    return Trial(key=content_key(about), label=candidate.name, target=target, **own)
+    return Trial(key=content_key(about), label=candidate.name, target=target, certify=certify, **own)
 
 
 def measure(work: Trial) -> JsonObject:
@@ -119,17 +126,25 @@ def _counting(work: Trial, training: Recordings) -> Measured:
     for seed in seeds:
         decided, strength, lowest = cross_validated(data, classes, training, seed)
         right += decided == training.labels
-    rule = linear_rules(data, classes, [strength])[strength]
-    made = counters_of(data, Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest), training, classes)
-    costs: dict[str, Any]
-    try:
+
+    def compiled(data: Counted) -> tuple[Counters, Any]:
+        rule = linear_rules(data, classes, [strength])[strength]
+        made = counters_of(data, Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest), training, classes)
         source = chip_module(work.target, "machine").counting_source(made)
-        netlist = compile_network(source, target=work.target).netlist
+        return made, compile_network(source, target=work.target).netlist
+
+    costs: dict[str, Any]
+    certified, held = None, folds(data.labels, FOLDS, np.random.default_rng(0)) == 0
+    try:
+        made, netlist = compiled(data)
+        if work.certify:
+            certified = bearing(machine_of(compiled(data.part(~held))[1]), some(training.part(held)))
     except (CapacityError, ModelError, DataError) as error:
         costs = {"refused": str(error).splitlines()[0]}
     else:
         costs = costs_of(netlist, of_length(joined_bins(some(training), made.bins), made.clocks.length))
-    return Measured(right=tuple(right.tolist()), tried=(len(seeds),) * len(right), setting=strength, **costs)
+    rounds = (len(seeds),) * len(right)
+    return Measured(right=tuple(right.tolist()), tried=rounds, setting=strength, certified=certified, **costs)
 
 
 def _network(work: Trial, training: Recordings) -> Measured:
@@ -139,6 +154,7 @@ def _network(work: Trial, training: Recordings) -> Measured:
     fold = folds(training.labels, FOLDS, np.random.default_rng(0))
     right, tried = np.zeros((2, len(training)), np.int64)
     costs: dict[str, Any] = {}
+    certified = None
     steps = joined_bins(training, plan.bins)
     for part in range(FOLDS if work.rung == RUNGS else 1):
         held = fold == part
@@ -148,8 +164,11 @@ def _network(work: Trial, training: Recordings) -> Measured:
             right[:], tried[:], costs = 0, 0, {"refused": str(error).splitlines()[0]}
             break
         costs = costs or costs_of(netlist, some(steps))
+        if work.certify and not part:
+            certified = bearing(machine_of(netlist), some(training.part(held)))
         right[held], tried[held] = decisions_on_chip(netlist, steps.part(held)) == training.labels[held], 1
-    return Measured(right=tuple(right.tolist()), tried=tuple(tried.tolist()), setting=epochs, **costs)
+    decided, rounds = tuple(right.tolist()), tuple(tried.tolist())
+    return Measured(right=decided, tried=rounds, setting=epochs, certified=certified, **costs)
 
 
 def _baseline(work: Trial, training: Recordings) -> Measured:

@@ -40,10 +40,6 @@ class Tally:
     part: int  # Steps of a part
     steps: int
 
-    def sums(self, events: IntArray) -> IntArray:
-        """Sums after so many events of each group, (…, groups); (…, classes)."""
-        return self.of(slice(None), events[..., self.group])
-
     def of(self, those: IntArray | slice, events: IntArray) -> IntArray:
         """What some counters add to the sums after so many events of each, (…, counters); (…, classes)."""
         count = self.count[those]
@@ -67,7 +63,7 @@ class Tally:
     def crossings(self, recording: BoolArray) -> tuple[IntArray, IntArray]:
         """Membranes of the sums without a reset, (steps, classes), and the step in which each first crosses."""
         ramp = self.slope * np.arange(1, self.steps + 1)
-        membranes = self.sums(self.events(recording)) + ramp[:, None]
+        membranes = self.of(slice(None), self.events(recording)[:, self.group]) + ramp[:, None]
         above = membranes > self.threshold
         return membranes, np.where(above.any(axis=0), above.argmax(axis=0), self.steps)
 

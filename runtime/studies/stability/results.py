@@ -78,11 +78,3 @@ class Stability:
     def unaltered(self, kind: str) -> int:
         """Recordings whose decision no change of a kind alters."""
         return sum(not verdict.kinds[kind].alter for verdict in self.verdicts)
-
-    def hanging(self, kind: str) -> list[int]:
-        """Decisions that hang on each taxel, for a kind of change."""
-        found = [0] * self.taxels
-        for verdict in self.verdicts:
-            for taxel in verdict.taxels[kind]:
-                found[taxel] += 1
-        return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 
@@ -86,10 +87,11 @@ def _row(verdict: Verdict) -> list[str]:
 
 def hanging_on(result: Stability) -> dict[str, IntArray]:
     """Decisions that hang on each taxel: on its failure, and on any of its events."""
-    single = [set(each.taxels["removed"]) | set(each.taxels["added"]) for each in result.verdicts]
-    events = [sum(taxel in taxels for taxels in single) for taxel in range(result.taxels)]
-    failed = {kind: np.array(result.hanging(kind)) for kind in ("dead", "stuck")}
-    return failed | {"event": np.array(events)}
+    kinds = {"dead": ("dead",), "stuck": ("stuck",), "event": ("removed", "added")}
+    found = {name: np.zeros(result.taxels, np.int64) for name in kinds}
+    for (name, of), verdict in product(kinds.items(), result.verdicts):
+        found[name][list({taxel for kind in of for taxel in verdict.taxels[kind]})] += 1
+    return found
 
 
 def _places(taxels: int) -> FloatArray:

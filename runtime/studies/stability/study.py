@@ -6,11 +6,11 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from itertools import islice
+from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
 
-from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.machines.changes import PART, joined, single
@@ -71,17 +71,8 @@ def verdict(
 ) -> Verdict:
     """What is known of one recording (taxels, polarities, bins); `tally` is that of a counting network."""
     netlist = machine.netlist
-    channels = channels_of(events[None], netlist)[0]
-    votes = machine.votes(channels[None])[0]
+    channels, votes, cells, counted, effects, decided = _singly(machine, events, most, tally)
     decision, gaps = needed(votes)
-    cells = cells_of(events, netlist)
-    counted = None if tally is None else least(tally, channels != 0, votes, cells, most)
-    alike = np.arange(len(cells.cells))
-    if tally is not None and counted is not None:
-        alike = 2 * tally.groups(*cells.cells.T) + cells.there
-    _, one, those = np.unique(alike, return_index=True, return_inverse=True)
-    effects = machine.effects(channels, single(cells.cells[one]))
-    decided = (effects.votes + votes).argmax(axis=1)[those]
     altering = (decided != decision) & (cells.cost == 1)
     kinds, taxels = _failures(machine, events, decision, shift)
     for kind, there in (("removed", True), ("added", False)):
@@ -100,7 +91,7 @@ def verdict(
     elif not len(taken) and (known := machine.forgetting(channels)) is not None:
         at_least = max(1, lower_bound(votes, cells, effects, known, most))
         taken = attack(machine, channels, votes, cells, effects)
-    if len(taken) and not _alters(machine, channels, votes, cells.cells[taken]):
+    if len(taken) and (machine.effects(channels, joined([cells.cells[taken]])).votes + votes).argmax() == decision:
         taken = taken[:0]
     at_most = int(cells.cost[taken].sum()) or None
     phase = cells.cells[altering, 1] * PHASES // max(int(cells.cells[-1, 1]) + 1, 1)
@@ -117,6 +108,27 @@ def verdict(
         taxels=taxels,
         phases=tuple(np.bincount(phase, minlength=PHASES).tolist()),
     )
+
+
+def _singly(machine: Machine, events: Events, most: int, tally: Tally | None) -> tuple[Any, ...]:
+    """Channels, votes and entries of a recording, what :func:`least` knows of it; effects, and decisions by entry."""
+    channels = channels_of(events[None], machine.netlist)[0]
+    votes, cells = machine.votes(channels[None])[0], cells_of(events, machine.netlist)
+    counted, alike = None, np.arange(len(cells.cells))
+    if tally is not None and (counted := least(tally, channels != 0, votes, cells, most)) is not None:
+        alike = 2 * tally.groups(*cells.cells.T) + cells.there
+    _, first, those = np.unique(alike, return_index=True, return_inverse=True)
+    effects = machine.effects(channels, single(cells.cells[first]))
+    return channels, votes, cells, counted, effects, (effects.votes + votes).argmax(axis=1)[those]
+
+
+def bearing(machine: Machine, data: Recordings) -> float:
+    """Share of recordings, in their own bins, whose decision no single event alters."""
+    found, tally = 0, tally_of(machine)
+    for events, length in zip(data.events, data.step_counts.tolist(), strict=True):
+        _, votes, cells, *_, decided = _singly(machine, events[..., :length], 1, tally)
+        found += not np.any((decided != votes.argmax()) & (cells.cost == 1))
+    return found / len(data)
 
 
 def _failures(
@@ -146,9 +158,3 @@ def _batched(changes: Iterator[Failure]) -> Iterator[list[Failure]]:
     """Some at a time."""
     while part := list(islice(changes, PART)):
         yield part
-
-
-def _alters(machine: Machine, channels: Events, votes: IntArray, cells: IntArray) -> bool:
-    """Whether flips together alter the decision."""
-    found = machine.effects(channels, joined([cells])).votes[0] + votes
-    return bool(found.argmax() != votes.argmax())

@@ -223,19 +223,6 @@ def _record(chip: Chip, known: Known, run: Any) -> None:
 
 
 @compiled
-def _list_moved(chip: Chip, run: Any, moved: Any, fired: Any, part: Any, channels: Any, come: Any, gone: Any) -> Any:
-    """List whose spikes differ, and let them vote."""
-    for c in range(part[0], part[1]):
-        if run.other[c]:
-            sign = 1 - 2 * np.int64(fired[c])
-            run.moved[moved], run.sign[moved] = channels + c, sign
-            moved += 1
-            if chip.label[c] >= 0:
-                (gone if fired[c] else come)[chip.label[c]] += 1
-    return moved
-
-
-@compiled
 def _span(chip: Chip, known: Known, run: Any, t: Any, begin: Any) -> Any:
     """End of the neighbouring blocks from `begin` on that are looked at together; their registers are held."""
     block = begin
@@ -260,8 +247,12 @@ def _part(chip: Chip, known: Known, run: Any, t: Any, moved: Any, span: Any, com
         return moved, False
     _step(chip, run, known.sums[t], first, places)
     if _compare(run.other, run.membrane, chip.threshold, known.fired[t], first, places):
-        part = begin * LANES, end * LANES
-        moved = _list_moved(chip, run, moved, known.fired[t], part, channels, come, gone)
+        for c in range(begin * LANES, end * LANES):
+            if run.other[c]:  # its spike differs, and votes
+                run.moved[moved], run.sign[moved] = channels + c, 1 - 2 * np.int64(known.fired[t, c])
+                moved += 1
+                if chip.label[c] >= 0:
+                    (gone if known.fired[t, c] else come)[chip.label[c]] += 1
     _reset(run.membrane, chip.threshold, first, places)
     any_held = False
     for block in range(begin, end):
