@@ -60,13 +60,6 @@ class Tally:
         np.add.at(found, (step[inside], group[inside]), 1)
         return found.cumsum(axis=0)
 
-    def crossings(self, recording: BoolArray) -> tuple[IntArray, IntArray]:
-        """Membranes of the sums without a reset, (steps, classes), and the step in which each first crosses."""
-        ramp = self.slope * np.arange(1, self.steps + 1)
-        membranes = self.of(slice(None), self.events(recording)[:, self.group]) + ramp[:, None]
-        above = membranes > self.threshold
-        return membranes, np.where(above.any(axis=0), above.argmax(axis=0), self.steps)
-
 
 def tally_of(machine: Machine) -> Tally | None:
     """What a counting network (:mod:`formats.counters`) is on the chip; None where a network is none."""
@@ -120,7 +113,10 @@ def least(
     hold events, and those that hold none, do the same.
     """
     recording = recording[: tally.channels]  # without clocks
-    membranes, crossing = tally.crossings(recording)
+    ramp = tally.slope * np.arange(1, tally.steps + 1)
+    membranes = tally.of(slice(None), tally.events(recording)[:, tally.group]) + ramp[:, None]  # without a reset
+    above = membranes > tally.threshold
+    crossing = np.where(above.any(axis=0), above.argmax(axis=0), tally.steps)
     last, decision = int(cells.cells[-1, 1]), int(np.argmax(votes))
     early = _early(tally, recording, np.delete(membranes, decision, axis=1)[: last + 1], decision, most)
     if np.any(tally.steps - crossing != votes) or crossing[decision] <= last or early < 2:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator
 from itertools import islice
 from typing import Any
 
@@ -137,7 +136,8 @@ def _failures(
     """Run all changes that are no single events: what is said of each kind, and taxels of single failures."""
     tried: Counter[str] = Counter()
     alter: dict[str, list[tuple[Failure, int]]] = {kind: [] for kind in KINDS}
-    for part in _batched(failures(events, shift)):
+    changes = failures(events, shift)
+    while part := list(islice(changes, PART)):
         changed = channels_of(np.stack([each.events for each in part]), machine.netlist)
         decided = machine.votes(changed).argmax(axis=1).tolist()
         tried.update(each.kind for each in part)
@@ -152,9 +152,3 @@ def _failures(
         if kind in ("dead", "stuck"):
             taxels[kind] = tuple(each.numbers[0] for each, _ in altering)
     return found, taxels
-
-
-def _batched(changes: Iterator[Failure]) -> Iterator[list[Failure]]:
-    """Some at a time."""
-    while part := list(islice(changes, PART)):
-        yield part
