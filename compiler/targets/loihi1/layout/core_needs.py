@@ -105,7 +105,7 @@ class Needs:
         self.target = target
         self.forget()
         self._lists: dict[Chunk, tuple[Lists, ...]] = {}
-        self._stored: dict[tuple[Chunk, int, bool], tuple[int, frozenset[SynapseFormat]]] = {}
+        self._stored: dict[tuple[Chunk, int, bool, bool], tuple[int, frozenset[SynapseFormat]]] = {}
         self._lean: dict[Core, bool] = {}
 
     def lists(self, chunk: Chunk) -> tuple[Lists, ...]:
@@ -118,29 +118,35 @@ class Needs:
         """Forget the lists of a chunk that was only tried."""
         self._lists.pop(chunk, None)
 
-    def stored(self, chunk: Chunk, base: int, *, lean: bool = False) -> tuple[int, frozenset[SynapseFormat]]:
-        """Words and synapse formats of a chunk's lists if it starts at compartment `base` of its core."""
-        key = (chunk, base, lean)
+    def stored(
+        self, chunk: Chunk, base: int, *, lean: bool = False, unrolled: bool = False
+    ) -> tuple[int, frozenset[SynapseFormat]]:
+        """Words and synapse formats of a chunk's lists if it starts at compartment `base` of its core.
+
+        `unrolled` are words as if no axons shared a list, which is counted faster.
+        """
+        key = (chunk, base, lean, unrolled)
         if key not in self._stored:
             words, formats = 0, set()
             for lists in self.lists(chunk):
                 projection = self.network.projections[lists.projection]
                 dense, taken = choose_dense(lists, projection, base, chunk.size, lean=lean, target=self.target)
-                held = stored_once(dense, lists.nonzero, lists.row + base, lists.mantissa, self.target)
-                words += int(taken[held].sum())
+                if not unrolled:
+                    taken = taken[stored_once(dense, lists.nonzero, lists.row + base, lists.mantissa, self.target)]
+                words += int(taken.sum())
                 index = index_bits(base + chunk.size - 1, self.target)
                 formats |= {(projection.bits, projection.exponent, 0 if flag else index) for flag in np.unique(dense)}
             self._stored[key] = words, frozenset(formats)
         return self._stored[key]
 
-    def uses(self, chunks: Core, *, lean: bool = False) -> dict[str, int]:
+    def uses(self, chunks: Core, *, lean: bool = False, unrolled: bool = False) -> dict[str, int]:
         """Use of each limit by a core that holds these chunks in this order."""
         base = words = 0
         thresholds: set[int] = set()
         decays: set[tuple[int, int]] = set()
         formats: set[SynapseFormat] = set()
         for chunk in chunks:
-            more, used = self.stored(chunk, base, lean=lean)
+            more, used = self.stored(chunk, base, lean=lean, unrolled=unrolled)
             words += more
             formats |= used
             base += chunk.size
@@ -157,10 +163,15 @@ class Needs:
             "core.compartment_configs": len(decays),
         }
 
-    def excess(self, chunks: Core, *, lean: bool = False) -> dict[str, int]:
+    def excess(self, chunks: Core, *, lean: bool = False, unrolled: bool = False) -> dict[str, int]:
         """Use of the limits that such a core breaks."""
-        uses = self.uses(chunks, lean=lean).items()
+        uses = self.uses(chunks, lean=lean, unrolled=unrolled).items()
         return {rule: used for rule, used in uses if used > self.target.limit(rule)}
+
+    def fits(self, chunks: Core) -> bool:
+        """Whether such a core keeps every limit; shared lists are looked for only where all depends on them."""
+        broken = self.excess(chunks, unrolled=True).keys()
+        return not broken or (broken == {"core.synapse_words"} and not self.excess(chunks))
 
     def lean(self, chunks: Core) -> bool:
         """Whether such a core has room for lists of few visited synapses; its output axons do not matter."""

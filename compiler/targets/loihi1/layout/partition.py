@@ -61,7 +61,7 @@ def _fill(needs: Needs, population: int) -> list[Chunk]:
 
         def exceeds(last: int, first: int = first) -> bool:
             tried = Chunk(population=population, first=first, last=last)
-            broken = bool(needs.excess((tried,)))
+            broken = not needs.fits((tried,))
             needs.drop(tried)
             return broken
 
@@ -118,12 +118,12 @@ def _pack(needs: Needs, chunks: list[Chunk], rates: tuple[FloatArray, ...] | Non
     def fits(group: Core) -> bool:
         key = frozenset(group)
         if key not in known:
-            known[key] = not needs.excess(order_on_core(needs, group))
+            known[key] = needs.fits(order_on_core(needs, group))
         return known[key]
 
     if len(chunks) > EXACT_CHUNKS:
         cores: list[Core] = []
-        for chunk in sorted(chunks, key=lambda c: (-needs.stored(c, 0)[0], c)):
+        for chunk in sorted(chunks, key=lambda c: (-needs.stored(c, 0, unrolled=True)[0], c)):
             for i, core in enumerate(cores):
                 if fits((*core, chunk)):
                     cores[i] = (*core, chunk)
@@ -161,7 +161,7 @@ def _spread(needs: Needs, population: int, least: int) -> list[Chunk]:
     for parts in range(least, size + 1):
         bounds = [i * size // parts for i in range(parts + 1)]
         chunks = [Chunk(population=population, first=first, last=last) for first, last in pairwise(bounds)]
-        if not any(needs.excess((chunk,)) for chunk in chunks):
+        if all(needs.fits((chunk,)) for chunk in chunks):
             return chunks
         if parts == least < (fewest := len(_fill(needs, population))):
             raise OptionError(
