@@ -4,6 +4,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 from hypothesis import strategies as st
+from random_netlists import assert_equal
 
 from spikeloom.compiler.dynamics import clocks_over
 from spikeloom.compiler.targets.base import load_target
@@ -113,16 +114,8 @@ def both(netlist, recording) -> Trace:
     """What the specification makes of a recording, after the engine made the same of it."""
     expected = spec.simulate(netlist, recording)
     found = engine.simulate(netlist, recording[None], spikes=True, membranes=True)
-    assert_same(expected, recording_of(found))
+    assert_equal(expected, recording_of(found))
     return expected
-
-
-def assert_same(one, other) -> None:
-    """Every spike, membrane and count of two traces is equal."""
-    for field in fields(one.counts):
-        np.testing.assert_array_equal(getattr(one.counts, field.name), getattr(other.counts, field.name), field.name)
-    np.testing.assert_array_equal(one.membranes, other.membranes, "membranes")
-    np.testing.assert_array_equal(one.spikes, other.spikes, "spikes")
 
 
 def random_stage(rng, name, inputs, size, depth, *, copies, clocks) -> Stage:

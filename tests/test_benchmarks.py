@@ -166,20 +166,3 @@ def test_every_planned_cell_is_there_and_adds_up(module, cells):
     for cell in cells.values():
         for which in ("last", "best", "clean"):
             assert cell[which]["accuracy"] == cell[which]["correct"] / cell["test_samples"]
-
-
-def test_statistics(module):
-    spreads = module("spreads")
-    spread = spreads.Spread((90.0, 88.0))
-    assert (spread.mean, spread.std, spread.interval) == (
-        89.0,
-        pytest.approx(1.4142136),
-        (pytest.approx(76.2938, abs=1e-4), 100.0),
-    )
-    assert spreads.Spread((90.0, 90.0)).interval is None
-    found = spreads.variance([[6, 8, 4, 5, 3, 4], [8, 12, 9, 11, 6, 8], [13, 9, 11, 8, 7, 12]])
-    assert (found.rows, round(found.f, 2), round(found.p, 4)) == (3, 9.26, 0.0024)
-    assert spreads.variance([[1.0, 2.0], [3.0]]) is None
-    rho, p = spreads.rank_correlation([1, 2, 3, 4, 5], [5, 6, 7, 8, 7])
-    assert (round(rho, 2), round(p, 2)) == (0.82, 0.09)
-    assert spreads.rank_correlation([1, 2, 3], [1, 2, 3]) is None

@@ -64,15 +64,12 @@ def test_the_netlist_holds_exactly_the_network(network, target):
 
 
 @given(nets.integer_networks(), nets.tight_targets())
-def test_layers_and_votes_are_those_of_the_network(network, target):
+def test_layers_are_those_of_the_network(network, target):
     parts = nets.legal_partition(network, target)
     netlist = nets.seated(network, parts, target, {"seed": 1})
     for index, population in enumerate(network.populations):
         ids = netlist.compartments_of(index)
         assert netlist.neuron[ids].tolist() == list(range(population.size))
-        voting = index == network.readout.population
-        expected = network.readout.label.tolist() if voting else [-1] * population.size
-        assert netlist.readout_class[ids].tolist() == expected
         layer = netlist.layers[index]
         into = [p for p in network.projections if p.post == index]
         assert (layer.name, layer.neurons) == (population.name, population.size)

@@ -16,7 +16,7 @@ import spikeloom.runtime.studies.stress.pair
 from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.formats.text import text
-from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
+from spikeloom.compiler.interpret import run_float, run_integer, vote
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent
 from spikeloom.runtime.machines.base import machine_of
@@ -128,14 +128,6 @@ def test_saturation_can_be_left_out():
     free = run_integer(network, events, membranes=True, saturates=False).membranes[0][0, :, 0]
     assert held.tolist() == [-2097152, -4194304, -6291456, -8388607, -8388607, -8388607]
     assert free.tolist() == [-2097152 * k for k in range(1, 7)]
-
-
-def test_channels_are_taxel_major():
-    events = np.zeros((1, 3, 2, 5))
-    events[0, 2, 1, 4] = 1
-    found = channels_last(events)
-    assert (found.shape, found.dtype) == ((1, 5, 6), np.bool_)
-    assert np.argwhere(found).tolist() == [[0, 4, 5]]
 
 
 def test_the_lowest_class_wins_a_tie():

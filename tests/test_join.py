@@ -221,6 +221,10 @@ def test_graphs_and_storage_must_agree(tmp_path):
     one = read_checkpoint(tmp_path / "a.pt")
     turned = replace(one, edges=one.edges[::-1], graph="the same, listed the other way round")
     assert join([one, turned], ["a", "b"]).towers == 2
+    pair = [tuned(one, seed) for seed in (1, 2)]
+    for member, single in zip(members(join(pair, ["a", "b"])), pair, strict=True):
+        for ours, theirs in zip(member.forms, single.forms, strict=True):
+            assert_array_equal(ours.threshold, theirs.threshold)
     another = replace(one, edges=build_graph("knn:1").edges, graph="knn:1")
     for other, what in ((another, "graph"), (tuned(one, 1), "storage")):
         with pytest.raises(ModelError, match=rf"differ from a in {what} \(b\);"):

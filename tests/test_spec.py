@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from random_netlists import MEMORYLESS, SIMULATORS, Axon, Neuron, build
+from random_netlists import SIMULATORS, Axon, Neuron, build
 
 from spikeloom.compiler.errors import DataError, NumericRangeError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
@@ -30,36 +30,6 @@ def membranes(trace: Trace) -> list[int]:
 
 def spikes(trace: Trace, compartment: int = 0) -> list[int]:
     return np.flatnonzero(trace.spikes[:, compartment]).tolist()
-
-
-def test_the_published_six_step_run(simulate):
-    # Inputs i0, i1 drive h0, h1, which drive o. The published run counts steps from 1 and its inputs are neurons: an
-    # input of published step s acts on h in s + 1. Ours are channels, whose events act in their own step, so a
-    # channel's data step t is published step t + 1 and a compartment's chip step t is published step t + 2.
-    n_inputs = 2
-    h = Neuron(layer=0, core=0, decay_u=MEMORYLESS, decay_v=3277, threshold=80)
-    o = Neuron(layer=1, core=1, decay_u=MEMORYLESS, decay_v=3277, threshold=80)
-    netlist = build(
-        [h, h, o],
-        [
-            Axon(core=0, source=0, targets=((0, 60), (1, -30))),
-            Axon(core=0, source=1, targets=((0, 50), (1, 90))),
-            Axon(core=1, source=n_inputs + 0, targets=((0, 100),)),
-            Axon(core=1, source=n_inputs + 1, targets=((0, 70),)),
-        ],
-        n_inputs=n_inputs,
-        depths=[0, 1],
-    )
-    inputs = events("110100", "100110")
-    trace = simulate(netlist, inputs)
-    assert trace.membranes[:4, 1].tolist() == [3840, -1153, -230, 3795]  # published steps 2 to 5
-
-    fired: dict[int, set[str]] = {step: set() for step in range(1, 7)}
-    for channel, t in np.argwhere(inputs).tolist():
-        fired[t + 1].add(("i0", "i1")[channel])
-    for t, compartment in np.argwhere(trace.spikes).tolist():
-        fired[t + 2].add(("h0", "h1", "o")[compartment])
-    assert fired == {1: {"i0", "i1"}, 2: {"i0", "h0"}, 3: {"o"}, 4: {"i0", "i1"}, 5: {"i1", "h0"}, 6: {"h1", "o"}}
 
 
 @pytest.mark.parametrize(("bias", "expected"), [(0, []), (1, [0]), (-1, [])])
@@ -143,40 +113,6 @@ def test_what_arrives_outside_the_window_is_dropped(simulate):
     assert trace.membranes[:, 0].tolist() == [1, 129, 129, 129, 0, 0]
 
 
-def test_aligned_orders_neurons(simulate):
-    # the two neurons of layer 0 sit on two cores, behind one of layer 1
-    neurons = [Neuron(layer=0, core=1, bias=7), Neuron(layer=0, core=0, bias=8), Neuron(layer=1, core=0, bias=9)]
-    netlist = build(neurons, [], n_inputs=1, depths=[0, 1])
-    trace = simulate(netlist, np.zeros((1, 1), np.uint8))
-    assert netlist.neuron.tolist() == [1, 0, 0]
-    assert aligned(netlist, trace.membranes, 0).tolist() == [[7, 8]]
-    assert aligned(netlist, trace.membranes, 1).tolist() == [[9]]
-
-
-def test_counts(simulate):
-    neurons = [
-        Neuron(layer=0, decay_v=2048, threshold=NEVER),  # driven once by a weight of 2: 128, 64, … 1, 0
-        Neuron(layer=0, threshold=NEVER),  # reached by zero weights only
-        Neuron(layer=1, bias=1, threshold=0),  # works and spikes in every step of its window
-        Neuron(layer=0, decay_u=2047, decay_v=4095, threshold=NEVER),  # its current takes longer than its membrane
-    ]
-    axons = [Axon(source=0, targets=((0, 2), (1, 0), (3, 2))), Axon(source=1, targets=((1, 0),))]
-    netlist = build(neurons, axons, n_inputs=2, depths=[0, 1])
-    trace = simulate(netlist, events("100000000000", "001100000000"))
-    assert trace.counts.inputs.tolist() == [1, 2]
-    assert trace.counts.spikes.tolist() == [0, 0, 12, 0]
-    # neuron 0 starts nine steps with work (an event, then 128, 64, … 1), neuron 1 three, neuron 3 nine (128 … 1)
-    assert trace.counts.updates.tolist() == [9 + 3 + 9, 12]
-    assert trace.counts.saturations.tolist() == [0, 0]
-    assert all(count.dtype == np.int64 for count in (trace.counts.inputs, trace.counts.spikes, trace.counts.updates))
-
-
-def test_an_empty_recording(simulate):
-    trace = simulate(build([Neuron(bias=1)], [], n_inputs=1, depths=[2]), np.zeros((1, 0), np.uint8))
-    assert trace.spikes.shape == (2, 1)
-    assert trace.counts.updates.tolist() == [0]
-
-
 def two_layers() -> Netlist:
     """254 * 128 + 254 is 32766, the largest even sum that holds; the other 2 of channel 1 are too many."""
     axons = [
@@ -210,27 +146,6 @@ def two_layers() -> Netlist:
 def test_overflows(simulate, netlist, channels, found):
     with pytest.raises(NumericRangeError, match=f"layer0 neuron 0 on {found}.*smaller scale for layer0"):
         simulate(netlist, events(*channels))
-
-
-def test_first_overflow_is_reported(simulate):
-    # In step 4 compartments 1, 2 and 3 overflow: 1 in its current, 2 and 3 in their sum. Compartment 0 would in step
-    # 5. Positions of the fast simulator run the other way round: by layer.
-    neurons = [Neuron(layer=3 - i, decay_u=0 if i == 1 else MEMORYLESS, threshold=NEVER) for i in range(4)]
-    axons = [
-        Axon(source=0, exponent=7, targets=((1, 254),)),
-        Axon(source=1, exponent=7, targets=((2, 254), (2, 254), (3, 254), (3, 254))),
-        Axon(source=2, exponent=7, targets=((0, 254), (0, 254))),
-    ]
-    netlist = build(neurons, axons, n_inputs=3, depths=[0, 0, 0, 0])
-    for channels, layer, step, found in (
-        (("111110", "000010", "000001"), 2, 4, "current 10398760"),
-        (("011110", "000010", "000001"), 1, 4, "synaptic sum 4161536"),
-        (("011110", "000001", "000001"), 3, 5, "synaptic sum 4161536"),
-    ):
-        with pytest.raises(
-            NumericRangeError, match=f"layer{layer} neuron 0 on core 0, chip step {step}: {found} found"
-        ):
-            simulate(netlist, events(*channels))
 
 
 def test_wrong_number_of_channels(simulate):

@@ -55,8 +55,6 @@ def test_round_trip(tmp_path_factory, netlist):
     crossbar.write_crossbars(netlist, path)
     again = crossbar.read_crossbars(path)
     assert crossbar.crossbar_bytes(again) == crossbar.crossbar_bytes(netlist) == path.read_bytes()
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(again, name), getattr(netlist, name), name)
     assert crossbar.inconsistencies(again) == []
 
 

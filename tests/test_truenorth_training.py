@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from commands import as_json, refusal
-from made_files import CLASSES, STEPS, TAXELS, events, own_file, recordings_folder
+from made_files import CLASSES, TAXELS, own_file
 from oracles import refused
 from random_crossbars import random_network
-from zoo import specimen
+from zoo import STEPS, specimen
 
 from spikeloom.compiler.archive import archive_bytes, read_members
 from spikeloom.compiler.dynamics import clocks_over
@@ -261,26 +261,10 @@ def test_a_spike_that_differs_fails():
     assert not report["exact"]
 
 
-NATIVE = "native.pt"
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    """A folder with recordings and a network."""
-    folder = tmp_path_factory.mktemp("parts")
-    recordings_folder(folder / "data", test=events(2, samples=8))
-    network = random_network(4, taxels=TAXELS, classes=CLASSES, steps=STEPS)
-    write_trained(folder / NATIVE, {"last": network}, graph="ring", edges=np.zeros((0, 2), int), training={})
-    return folder
-
-
-@pytest.mark.parametrize("command", ["run n.loom", "estimate n.loom", f"verify n.loom --checkpoint {NATIVE}"])
-def test_a_part_of_every_recording(spikeloom, command):
-    assert spikeloom("compile", NATIVE, "--target", "truenorth", "-o", "n.loom")[0] == 0
-    words = [*command.split(), "--data", "data", "--json", "--window"]
-    code, out, _ = spikeloom(*words, "50%")
-    assert code == 0
-    assert "per_inference" not in out or json.loads(out)["per_inference"]["ticks"] == STEPS // 2 + 3
-    code, out, err = spikeloom(*words, "0%")
-    assert (code, out) == (2, "")
-    assert "--window 0%: not a part of a recording" in err
+@pytest.mark.parametrize("command", ["run net.loom", "estimate net.loom", "verify net.loom --checkpoint net.pt"])
+@pytest.mark.usefixtures("native")
+def test_a_part_of_every_recording(command):
+    words = [*command.split(), "--data", "data", "--window"]
+    found = as_json(*words, "50%")
+    assert "per_inference" not in found or found["per_inference"]["ticks"] == STEPS // 2 + 3
+    assert "--window 0%: not a part of a recording" in refusal(*words, "0%")
