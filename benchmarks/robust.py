@@ -63,8 +63,9 @@ def main() -> None:
                     continue
                 machine = trained(seen, asked, arguments.join, arguments.epochs, seed, chance)
                 found[part].append(about | certified(machine, asked))
-                found["together"] = {name: together(found[name]) for name in parts}
-                arguments.output.write_text(json.dumps(found, indent=1) + "\n")
+                arguments.output.write_text(json.dumps(found))
+    found["together"] = {name: together(found[name]) for name in parts}
+    arguments.output.write_text(json.dumps(found, indent=1) + "\n")
 
 
 def trained(seen: Recordings, beside: Recordings, bins: int, epochs: int, seed: int, chance: float) -> Machine:

@@ -93,6 +93,9 @@ def main() -> None:
                 row |= {"event": event(machine, events)}
                 arguments.output.write_text(json.dumps(found))
     found["methods"] = {name: summary(rows, sample) for name, rows in found["each"].items()}
+    for rows in found["each"].values():
+        for index in set(rows) - {str(index) for index in sample}:
+            rows[index].pop("event", None)  # of another sample
     found["fall"] = {kind: side_by_side(found["each"], kind) for kind in ("dead", "event")}
     arguments.output.write_text(json.dumps(found) + "\n")
     if arguments.picture:

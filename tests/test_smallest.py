@@ -101,8 +101,8 @@ def test_budgets(words, chosen, fits):
 
 def test_decisions_that_no_event_alters_are_a_budget():
     pool = [replace(each, certified=share) for each, share in zip(POOL, (0.96, 0.8, 0.9, 0.5, None), strict=True)]
-    for words, chosen, fits in (("certified=85", 3, True), ("certified=95", 1, True), ("certified=97", 1, False)):
-        found = study.choose(pool, budgets(words))
+    for share, chosen, fits in ((85, 3, True), (95, 1, True), (97, 1, False)):
+        found = study.choose(pool, budgets(f"certified={share}"))
         assert (found.cheapest["one"], found.fits) == (chosen, fits)
     assert study.going_on(pool, 1, budgets("certified=99")) == study.going_on(pool, 1)  # it is known on the last rung
 
@@ -189,8 +189,8 @@ def test_the_command(few, monkeypatch, target, table):
 
     if target == "loihi1":
         certified = as_json(*words, "--budget", "certified=1")["tried"]
-        last = [each.pop("certified") for each in certified if each["rung"] == 3]
-        assert (len(set(last)) > 1, min(last) >= 0, certified) == (True, True, found["tried"])
+        assert len({each.pop("certified") for each in certified if each["rung"] == 3}) > 1
+        assert certified == found["tried"]
 
     # once more from the store alone, and the same by hand
     files = {name: (few / name).read_bytes() for name in ("a.pt", "a.loom")}
