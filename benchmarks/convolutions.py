@@ -1,8 +1,9 @@
 """What shared synapse lists save: ``convolutions.py FOLDER NAME=NETWORK … OUT.json``, networks with convolutions.
 
 FOLDER holds clones of public repositories as ``public_networks.py`` wants them; each NETWORK is a checkpoint of ours. A
-convolutional network is added that torch exports as ONNX. All are compiled as they stand, without recordings, once with
-the lists of each core shared and once unrolled, and priced on recordings that are made.
+convolutional network is added that torch exports as ONNX. All are compiled as they stand, once with the lists of each
+core shared and once unrolled, and priced on recordings that are made; floats also with scales that these recordings
+choose at 8 bits, without ``--share-lists`` and with it.
 """
 
 import json
@@ -54,7 +55,8 @@ def figures(file: str, data: Path, options: dict[str, Any]) -> dict[str, Any]:
     if not data.exists():
         public_networks.recordings(data, facts.taxels, polarities, facts.classes, public_networks.RATES[0])
     price = net.estimate(str(data)).value
-    return {
+    agrees = {} if "calibrate" not in options else {"equal": net.verify(str(data)).value.decision_agreement}
+    return agrees | {
         "synapse_words": facts.synapse_words,
         "synapse_words_unrolled": facts.synapse_words_unrolled,
         "cores": facts.cores,
@@ -89,6 +91,10 @@ def main(folder: str, *words: str) -> None:
                 mock.patch.object(legalize, "stored_once", unrolled),
             ):
                 row["unrolled"] = figures(file, Path(place, name), options)
+            if kind != "netx":
+                chosen = options | {"calibrate": str(Path(place, name)), "weight_bits": "8"}
+                row["calibrated"] = figures(file, Path(place, name), chosen)
+                row["share_lists"] = figures(file, Path(place, name), chosen | {"share_lists": True})
             rows.append(row)
             print(json.dumps(row))
     Path(words[-1]).write_text(json.dumps(made() | {"networks": rows}, indent=1) + "\n")

@@ -345,3 +345,20 @@ def test_a_bias_is_off_by_half_a_unit_of_its_exponent_at_most(bias):
     assert np.all(np.abs(mantissa * 2.0**exponent - bias) <= 2.0**exponent / 2)
     smaller = np.abs(np.rint(np.array(bias) / 2.0 ** (exponent - 1))) <= 4095
     assert not np.any(smaller & (exponent > 0))
+
+
+def test_what_a_convolution_repeats_is_rounded_alike_if_lists_are_to_be_shared():
+    kernel = np.random.default_rng(5).normal(size=7)
+    network = nets.chain(
+        sum(np.eye(60, 66, k) * weight for k, weight in enumerate(kernel)),
+        np.random.default_rng(6).normal(size=(3, 60)),
+    )
+    calibration, packings = calibrate(network, recordings(network, 5)), (Packing(bits=4),)
+    for share in (False, True):
+        integer, (_, last) = choose_storage(
+            network, nets.LOIHI, packings=packings, calibration=calibration, share_lists=share
+        )
+        weights = integer.projections[0].weight.toarray()
+        assert all(len(set(np.diag(weights, k))) == 1 for k in range(7)) is share
+        # the dense layer after it repeats nothing: its errors cancel as ever
+        assert last.compensated

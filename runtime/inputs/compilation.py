@@ -28,6 +28,7 @@ def provenance(
         "spike_exact": arguments.spike_exact,
         "keep_all": arguments.keep_all,
         "prune_unused": arguments.prune_unused,
+        **({"share_lists": True} if arguments.share_lists else {}),
         "calibrated": calibrated is not None,
         **({"cores_for": cores_for} if cores_for else {}),
         **({"chips": arguments.chips} if arguments.chips != 1 else {}),

@@ -13,7 +13,7 @@ from spikeloom.models.recordings.events import BIN_S
 NETWORK = ("graph", "taxels", "edges", "directed", "run", "weights", "beta", "theta")
 """Options that say how a checkpoint is read."""
 
-ROUNDING = ("weight_bits", "planes", "scale_groups", "spike_exact", "prune_unused", "keep")
+ROUNDING = ("weight_bits", "planes", "scale_groups", "spike_exact", "prune_unused", "keep", "share_lists")
 """Options of ``compile`` that say how a float network is stored."""
 
 PLACING = ("keep_all", "cores_for", "chips", "optimize", "free_running")
@@ -26,7 +26,7 @@ USUAL: Mapping[str, object] = {
     "chips": 1,
     "optimize": "cores",
     "engine": "spikeloom",
-    **dict.fromkeys(("directed", "spike_exact", "prune_unused", "keep_all", "free_running"), False),
+    **dict.fromkeys(("directed", "spike_exact", "prune_unused", "share_lists", "keep_all", "free_running"), False),
 }
 """What options are where they are not given; others are None."""
 

@@ -41,6 +41,7 @@ class Options:
     # Least share of equal decisions on held-out training recordings for which the cheapest storage is chosen, see
     # :mod:`storage.held_out`, where nothing else says how layers are stored; None: 8 bits
     keep: float | None = None
+    share_lists: bool = False  # Round weights that repeat alike, so that cores store their lists once
     keep_all: bool = False  # Keep neurons that provably do nothing, too
     prune_unused: bool = False  # Remove neurons that did not fire on any training recording, too
     # (samples, taxels, polarities, steps); recordings for calibration: 32, evenly spaced, are used, of planes 256

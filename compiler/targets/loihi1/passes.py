@@ -131,7 +131,9 @@ def _quantize(done: Compilation) -> Compilation:
         check_packings(packings, len(network.populations), target)
         integer, choices, exactness = make_exact(network, target, done.calibration, bits=packings[0].bits)
         return replace(done, integer=integer, choices=choices, exactness=exactness, connected=LATER)
-    integer, choices = choose_storage(network, target, packings=packings, calibration=done.calibration)
+    integer, choices = choose_storage(
+        network, target, packings=packings, calibration=done.calibration, share_lists=options.share_lists
+    )
     return replace(done, integer=integer, choices=choices, connected=LATER)  # large, and no pass needs it again
 
 

@@ -61,6 +61,11 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     storage.add_argument(
         "--prune-unused", action="store_true", help="leave out neurons that never fired on the training split, too"
     )
+    storage.add_argument(
+        "--share-lists",
+        action="store_true",
+        help="with --calibrate: round what a convolution repeats alike, for less memory",
+    )
     storage.add_argument("--calibrate", metavar="PATH", help="recordings whose train split chooses storage and scales")
     what = f"share of equal decisions on held-out training recordings that storage has to keep (default: {KEEP:g})"
     storage.add_argument("--keep", type=float, metavar="X", help=what)
@@ -99,6 +104,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         keep=parse_keep(arguments),
         keep_all=arguments.keep_all,
         prune_unused=arguments.prune_unused,
+        share_lists=arguments.share_lists,
         cores_for=parse_cores(arguments.cores_for),
         chips=arguments.chips,
         optimize=arguments.optimize,

@@ -27,6 +27,7 @@ from spikeloom.compiler.interpret import integer_layer
 from spikeloom.compiler.ir import Form, IntegerNetwork, IntegerPopulation, Network, Population, row_parts
 from spikeloom.compiler.passes.calibrate import MANY, NUDGES, Calibration, fewer
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.legalize import stored_once
 from spikeloom.compiler.targets.loihi1.options import Packing, check_packings
 from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
 from spikeloom.compiler.targets.loihi1.storage.scales import (
@@ -75,10 +76,29 @@ def _register(population: Population) -> str:
     return "current" if current_load(decay_registers(population.beta, population.alpha)[0]) > 1 else "accumulator"
 
 
-def best_scale(layer: FloatLayer, packing: Packing, exponents: tuple[int, ...], *, clip: bool = True) -> Rounded:
+def _repeats(stored: Rounded, target: Target) -> bool:
+    """Whether a core that held a whole population would store half of its synapse lists at most."""
+    held = lists = 0
+    for projection in stored.projections:
+        weight = projection.weight.tocsc()
+        weight.eliminate_zeros()
+        lengths = np.diff(weight.indptr)
+        held += len(stored_once(0 * lengths, lengths, weight.indices, weight.data, target))
+        lists += len(lengths)
+    return 2 * held <= lists
+
+
+def best_scale(
+    layer: FloatLayer,
+    packing: Packing,
+    exponents: tuple[int, ...],
+    *,
+    clip: bool = True,
+    shared: Target | None = None,
+) -> Rounded:
     """Scale of one population that keeps most calibration spikes; ModelError if there is none.
 
-    Without `clip` every weight must fit its planes.
+    Without `clip` every weight must fit its planes. Lists that a core of `shared` stores once stay alike.
     """
     population = layer.population
     calibration, post = layer.calibration, layer.post
@@ -108,7 +128,7 @@ def best_scale(layer: FloatLayer, packing: Packing, exponents: tuple[int, ...], 
         several = grouped(layer, best, packing.groups)
         if several is not None:
             best = min(judged(several, post, calibration), best, key=attrgetter("cost"))
-    if calibration is not None:
+    if calibration is not None and not (shared and _repeats(best, shared)):
         best = compensated(layer, best, calibration) or best
     return replace(best, tried=tried)
 
@@ -196,9 +216,11 @@ def choose_storage(
     *,
     packings: Sequence[Packing] = (Packing(),),
     calibration: Calibration | None = None,
+    share_lists: bool = False,
 ) -> tuple[IntegerNetwork, tuple[Choice, ...]]:
     """Choose the scales of each population and round weights, thresholds, biases and decays.
 
+    To `share_lists`, errors cancel only in layers whose weights do not repeat, see :func:`legalize.stored_once`.
     ``calibrate.FEW`` recordings of the calibration choose, several planes use ``MANY``; without it scales come from the
     weights and the proven bounds alone. OptionError if there are no such packings; ModelError, with a line for each, if
     populations have no usable scale.
@@ -209,13 +231,14 @@ def choose_storage(
     for post, packing in enumerate(packings):
         layer = layer_of(network, post, known)
         try:
-            best = best_scale(layer, packing, target.choices["synapse.exponent"])
+            shared = target if share_lists else None
+            best = best_scale(layer, packing, target.choices["synapse.exponent"], shared=shared)
         except ModelError as error:
             faults.append(str(error))
             calibration = known = None  # later layers can only be found faulty, too
             continue
         if calibration is not None and known is not None:
-            if packing.planes > 1:
+            if packing.planes > 1 and (best.compensated or not share_lists):
                 best = round_with_more(layer, best, calibration)
             best = nudged(layer, best, known)
             known = known.after(integer_layer(best.population, best.projections))
