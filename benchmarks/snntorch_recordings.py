@@ -7,7 +7,7 @@
 The recordings are ``events`` (samples, channels, steps) uint8 and ``labels``, as benchmarks/recordings_npz.py writes
 them, so that this script needs snnTorch and its dependencies and nothing of this package. FOLDER gets
 ``snntorch.nir`` and ``snntorch_spikes.npz``: the spikes of both layers on the test split. With --recurrent the first
-layer hears itself (RLeaky). Everything is seeded.
+layer hears itself (RLeaky), else ``snntorch.onnx`` has one step of the same network. Everything is seeded.
 """
 
 import argparse
@@ -62,6 +62,23 @@ def run(net: nn.Sequential, events: torch.Tensor) -> tuple[torch.Tensor, torch.T
     return torch.stack(hidden, 1), torch.stack(out, 1)
 
 
+class Step(nn.Module):
+    """One step of the feed-forward network, its membranes as inputs and outputs."""
+
+    def __init__(self, net: nn.Sequential) -> None:
+        super().__init__()
+        self.stages, self.neurons = nn.ModuleList([net[0], net[2]]), [net[1], net[3]]
+
+    def forward(self, spikes: torch.Tensor, *membranes: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Spikes of the classes, and the membranes."""
+        kept = []
+        for stage, one, before in zip(self.stages, self.neurons, membranes, strict=True):
+            beta, theta = float(one.beta[0]), float(one.threshold[0])
+            kept.append(beta * before * (before <= theta).float() + stage(spikes))
+            spikes = (kept[-1] > theta).float()
+        return spikes, *kept
+
+
 def main() -> None:
     """Train, export, run."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -95,6 +112,9 @@ def main() -> None:
     for layer in (net[1], net[3]):
         layer.reset_mem()
     nir.write(arguments.folder / "snntorch.nir", export_to_nir(net, given[:1, :, 0], ignore_dims=[0]))
+    if not arguments.recurrent:
+        rest = (given[:1, :, 0], *(torch.zeros(1, len(layer.beta)) for layer in (net[1], net[3])))
+        torch.onnx.export(Step(net).eval(), rest, arguments.folder / "snntorch.onnx", dynamo=False)
     spikes = {"1": np.packbits(hidden.numpy() > 0), "3": np.packbits(out.numpy() > 0)}
     np.savez_compressed(arguments.folder / "snntorch_spikes.npz", shape=np.array(hidden.shape), **spikes)
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from spikeloom.compiler.targets.loihi1.passes import Compilation, lay_out_again, to_integers, without
     from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
     from spikeloom.compiler.targets.loihi1.storage.scales import layer_of, rounded
+    from spikeloom.compiler.targets.loihi1.storage.weight_storage import fullest, round_population
 
 __version__ = "0.1.0"
 
@@ -26,6 +27,7 @@ _NAMES = {
     "passes": "Compilation lay_out_again to_integers without",
     "storage.choose_storage": "round_to_forms",
     "storage.scales": "layer_of rounded",
+    "storage.weight_storage": "fullest round_population",
 }
 _PLACES = {name: module for module, names in _NAMES.items() for name in names.split()}
 """Module of the target that each public name is imported from when it is first used."""

@@ -87,6 +87,15 @@ class Projection:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Form:
+    """How one population is stored."""
+
+    bits: int  # Storage width of a mantissa
+    exponents: tuple[int, ...]  # Exponent of each plane, finest first
+    threshold: IntArray  # (neurons,) int64; threshold mantissas, at least 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Network:
     """A spiking network in real numbers."""
 
@@ -95,15 +104,7 @@ class Network:
     projections: tuple[Projection, ...]
     readout: Readout
     classes: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Form:
-    """How one population is stored."""
-
-    bits: int  # Storage width of a mantissa
-    exponents: tuple[int, ...]  # Exponent of each plane, finest first
-    threshold: IntArray  # (neurons,) int64; threshold mantissas, at least 1
+    forms: tuple[Form, ...] | None = None  # How the chip stores each population, where it was fine-tuned for it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -173,6 +174,16 @@ class IntegerNetwork:
     projections: tuple[IntegerProjection, ...]
     readout: Readout
     classes: int
+
+    @property
+    def forms(self) -> tuple[Form, ...]:
+        """How each population is stored."""
+        found = []
+        for post, population in enumerate(self.populations):
+            planes = [p for p in self.projections if p.post == post]
+            exponents = tuple(sorted({p.exponent for p in planes}))
+            found.append(Form(bits=planes[0].bits, exponents=exponents, threshold=population.threshold))
+        return tuple(found)
 
 
 def depths(network: Network | IntegerNetwork) -> tuple[int, ...]:

@@ -164,15 +164,7 @@ def compile(
     SpikeloomError
         If something cannot be used, or the network does not fit; the message says what to do.
     """
-    source: str | Network
-    if isinstance(network, str):
-        source = network
-    else:
-        from spikeloom.models.networks.module import module_network
-
-        if example is None:
-            raise OptionError("compile: a module needs the input of one step; give example=torch.zeros(1, CHANNELS)")
-        source = module_network(network, example)
+    source = _source("compile", network, example)
     folder = tempfile.mkdtemp(prefix="spikeloom-")
     path = Path(folder) / "netlist.loom"
     words = {"checkpoint": source, "calibrate": calibrate, "output": str(path), **options}
@@ -181,6 +173,47 @@ def compile(
     made = Compiled(path, source, kept, result)
     weakref.finalize(made, shutil.rmtree, folder, ignore_errors=True)
     return made
+
+
+def finetune(
+    network: str | nn.Module, data: Data | str, output: str, *, example: Tensor | None = None, **options: Any
+) -> Compiled:
+    """Train a network further on the integers of its chip, and give the netlist of what came of it.
+
+    Parameters
+    ----------
+    network, example
+        As of :func:`compile`, in floats.
+    data : Data or str
+        Recordings, of which the training split trains and the test split reports.
+    output : str
+        File to write: of a checkpoint another one, ``.pt``; of any other network NIR, ``.nir``, its netlist beside it.
+    options
+        As of ``spikeloom finetune``: ``weight_bits="4"``, ``epochs=10``.
+
+    Raises
+    ------
+    SpikeloomError
+        As of :func:`compile`, and if the recordings are not the network's.
+    """
+    words: JsonObject = {"data": data} if isinstance(data, str) else {"data": data.source, "bin": data.bin_s}
+    words |= {"checkpoint": _source("finetune", network, example), "output": output}
+    result = _command("training.finetune", **words, **options)
+    kept = {name: value for name, value in options.items() if name in ("graph", "taxels", "edges", "polarities")}
+    if result.value.netlist is None:
+        return compile(output, **kept)
+    return Compiled(Path(output).with_name(result.value.netlist), output, kept, result)
+
+
+def _source(what: str, network: str | nn.Module, example: Tensor | None) -> str | Network:
+    """File of a network, or what a module means."""
+    if isinstance(network, str):
+        return network
+    from spikeloom.models.networks.module import module_network
+
+    if example is None:
+        raise OptionError(f"{what}: a module needs the input of one step; give example=torch.zeros(1, CHANNELS)")
+    return module_network(network, example)
 
 
 def load(path: str, *, network: str | None = None, **options: Any) -> Compiled:

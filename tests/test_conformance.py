@@ -81,7 +81,7 @@ export onnx:
 export sanafe:
     bytes cores format groups input_cores neurons path sha256 synapses
 finetune:
-    before command data data_sha256 epochs file fine_tuned_from fine_tuned_weights history last seed sha256
+    before command data data_sha256 epochs file fine_tuned_from fine_tuned_weights history last netlist? seed sha256
     test_samples weight_bits
 inspect checkpoint:
     assumed beta classes given graph layers layout sha256 system taxels theta training bins? dynamics? hops? towers?
@@ -329,7 +329,7 @@ COMMANDS = {
     "chart": ("binned", "chart {file} --data {data} --grid bits=8 --jobs 1 -o {out}/chart"),
     "yardsticks": ("joined", "yardsticks {file} --data {data}"),
     "train": ("mlp", "train --data {data} --system mlp --features 2 --epochs 1 -o {out}/x.pt"),
-    "finetune": ("tactilesgnet", "finetune {file} --data {data} --weight-bits 4 --epochs 1 -o {out}/x.pt"),
+    "finetune": ("recurrent", "finetune {file} --dt 0.02 --data {data} --weight-bits 4 --epochs 1 -o {out}/x.nir"),
     "join": ("joined", "join {folder}/1.pt {folder}/2.pt -o {out}/x.pt"),
     "data": ("mlp", "data describe {data}"),
     **{

@@ -275,7 +275,7 @@ def test_groups_of_neurons_vote_for_a_class():
 def test_the_nir_file_alone_has_the_integers_and_the_decays(tmp_path_factory, network):
     path = tmp_path_factory.mktemp("nir") / "net.nir"
     netlist = compile_network(network).netlist
-    path.write_bytes(nir_export.export(netlist, 0.02))
+    path.write_bytes(nir_export.export(lift(netlist), 0.02))
     integer = lift(netlist)
     found = read_nir(path, dt=0.02, polarities=network.input.polarities).network
     assert [one.name for one in found.populations] == [one.name.replace(".", "_") for one in integer.populations]
@@ -293,7 +293,7 @@ def test_the_nir_file_alone_has_the_integers_and_the_decays(tmp_path_factory, ne
 
 def test_another_program_that_follows_nir_makes_nearly_the_same_spikes(tmp_path):
     netlist, path = specimen("timed").machine.netlist, tmp_path / "net.nir"
-    path.write_bytes(nir_export.export(netlist, 0.02))
+    path.write_bytes(nir_export.export(lift(netlist), 0.02))
     graph = nir.read(path)
     events = with_clocks(events_of(5, samples=1, steps=60), netlist.clocks)
     chip = engine.simulate(netlist, events, spikes=True)
@@ -309,7 +309,7 @@ def test_another_program_that_follows_nir_makes_nearly_the_same_spikes(tmp_path)
 def test_a_membrane_that_keeps_all_is_an_if(tmp_path):
     netlist = compile_network(network_chain(np.full((2, 2), 0.3), beta=1.0)).netlist
     path = tmp_path / "net.nir"
-    path.write_bytes(nir_export.export(netlist, 0.02))
+    path.write_bytes(nir_export.export(lift(netlist), 0.02))
     graph = nir.read(path)
     assert [type(node).__name__ for node in graph.nodes.values()].count("IF") == 1
     assert read_nir(path, dt=0.02).network.populations[0].beta == 1

@@ -11,13 +11,12 @@ from oracles import comparable, load_weights, refused
 from test_checkpoint import rebuilt
 
 import spikeloom.models.training.train
-from spikeloom.compiler import Options, compile_network
+from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_integer
-from spikeloom.compiler.passes.calibrate import calibrate
-from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
 from spikeloom.models.graphs import build_graph, normalised_adjacency
@@ -29,7 +28,7 @@ from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.training.evaluate import evaluate
-from spikeloom.models.training.finetune import finetune, initial_forms
+from spikeloom.models.training.finetune import finetune
 from spikeloom.models.training.recipes import DECAY_EPOCHS, RELEASED, Recipe
 from spikeloom.models.training.record import training_record
 from spikeloom.models.training.robust import worn
@@ -230,7 +229,6 @@ def test_the_validation_part_is_a_fifth_of_every_class_and_disjoint():
 
 
 LOIHI = load_target("loihi1")
-EXPONENTS = LOIHI.choices["synapse.exponent"]
 
 
 def drawn(checkpoint, seed, *, samples=12, steps=20, split="train"):
@@ -243,9 +241,8 @@ def drawn(checkpoint, seed, *, samples=12, steps=20, split="train"):
 
 
 def tuned_forms(checkpoint, adjacency, events, bits):
-    network = expand(checkpoint, adjacency)
-    layers = len(network.populations)
-    return initial_forms(network, calibrate(network, channels_last(events)), [bits] * layers, 8, EXPONENTS)
+    asked = Options(packings=[Packing(bits=bits, groups=8)], keep_all=True, training_events=events)
+    return LOIHI.compile(Factored(checkpoint, adjacency), asked).integer.forms
 
 
 @pytest.mark.parametrize(("bits", "seed"), [(2, 0), (3, 1), (4, 2), (8, 0)])
@@ -253,7 +250,7 @@ def test_the_model_computes_what_the_compiled_network_computes(tmp_path, bits, s
     checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
     data = drawn(checkpoint, seed)
     forms = tuned_forms(checkpoint, adjacency, data.events, bits)
-    model = QuantisedNet(checkpoint, adjacency, forms)
+    model = QuantisedNet(Factored(checkpoint, adjacency), forms)
     integer, _ = round_to_forms(expand(checkpoint, adjacency), forms)
     found = model.spikes_of(time_first(data.events))
     expected = run_integer(integer, channels_last(data.events)).spikes
@@ -265,7 +262,7 @@ def test_the_model_computes_what_the_compiled_network_computes(tmp_path, bits, s
 def test_batches_do_not_mix(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     data = drawn(checkpoint, 0, samples=5)
-    model = QuantisedNet(checkpoint, adjacency, tuned_forms(checkpoint, adjacency, data.events, 4))
+    model = QuantisedNet(Factored(checkpoint, adjacency), tuned_forms(checkpoint, adjacency, data.events, 4))
     together = model(time_first(data.events))
     alone = torch.cat([model(time_first(data.events[i : i + 1])) for i in range(5)])
     assert torch.equal(together, alone)
@@ -275,7 +272,7 @@ def test_gradients_are_those_of_the_rounded_float_model(tmp_path):
     """At 8 bits and with scales this fine the straight-through gradient is the float model's, to a few parts in 100."""
     checkpoint, adjacency = small_checkpoint(tmp_path)
     data = drawn(checkpoint, 1, samples=3)
-    model = QuantisedNet(checkpoint, adjacency, tuned_forms(checkpoint, adjacency, data.events, 8))
+    model = QuantisedNet(Factored(checkpoint, adjacency), tuned_forms(checkpoint, adjacency, data.events, 8))
     model(time_first(data.events)).square().sum().backward()
     sizes = [len(dense.bias) for dense in checkpoint.dense]
     architecture = Architecture(
@@ -287,10 +284,7 @@ def test_gradients_are_those_of_the_rounded_float_model(tmp_path):
         beta=819 / 4096,
     )
     plain = SpikingNet(architecture, adjacency)
-    exact = {"conv1.hops": model.hops, "conv1.bias": model.conv_bias}
-    for dense, weight, bias in zip(plain.dense, model.weights, model.biases, strict=True):
-        exact |= {f"{dense}.weight": weight, f"{dense}.bias": bias}
-    load_weights(plain, {name: parameter.detach().numpy() for name, parameter in exact.items()})
+    load_weights(plain, model.tensors())
     events = torch.tensor(data.events.transpose(3, 0, 1, 2), dtype=torch.float32)
     plain(events).square().sum().backward()
     ours, theirs = model.hops.grad, plain.conv1.hops.grad
@@ -304,13 +298,14 @@ def test_weights_that_would_overflow_are_shrunk(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     data = drawn(checkpoint, 0)
     forms = tuned_forms(checkpoint, adjacency, data.events, 8)
-    model = QuantisedNet(checkpoint, adjacency, forms)
+    model = QuantisedNet(Factored(checkpoint, adjacency), forms)
     with torch.no_grad():
         model.hops *= 40
         model.weights[0] *= 40
         model.biases[0] += 1e9
     model.make_legal()
     for integers in model.integers:
+        assert integers.full.max() <= ONE_STEP_SUM_MAX
         assert np.maximum(integers.units, 0).sum(axis=0).max() <= ONE_STEP_SUM_MAX
         assert np.maximum(-integers.units, 0).sum(axis=0).max() <= ONE_STEP_SUM_MAX
 
@@ -330,24 +325,24 @@ def test_what_is_lost_and_comes_has_its_chance():
 
 def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
-    train, test = drawn(checkpoint, 0), drawn(checkpoint, 1)
-    whole = finetune(checkpoint, adjacency, train, test, LOIHI, bits=[2], epochs=4, seed=3)
+    network, train, test = Factored(checkpoint, adjacency), drawn(checkpoint, 0), drawn(checkpoint, 1)
+    whole = finetune(network, train, test, LOIHI, bits=[2], epochs=4, seed=3)
 
     state = tmp_path / "x.state"
     for robust, same in ((0.0, True), (0.2, False)):
-        other = finetune(checkpoint, adjacency, train, test, LOIHI, bits=[2], epochs=4, seed=3, robust=robust)
+        other = finetune(network, train, test, LOIHI, bits=[2], epochs=4, seed=3, robust=robust)
         assert (other.history == whole.history) is same
     options = {"bits": [2], "epochs": 4, "seed": 3, "state": state}
-    refused(OptionError, "--robust -0.1: ", finetune, checkpoint, adjacency, train, test, LOIHI, robust=-0.1, **options)
-    refused(KilledError, "", finetune, checkpoint, adjacency, train, test, LOIHI, after_epoch=killed, **options)
-    rest = finetune(checkpoint, adjacency, train, test, LOIHI, resume=True, **options)
+    refused(OptionError, "--robust -0.1: ", finetune, network, train, test, LOIHI, robust=-0.1, **options)
+    refused(KilledError, "", finetune, network, train, test, LOIHI, after_epoch=killed, **options)
+    rest = finetune(network, train, test, LOIHI, resume=True, **options)
     assert rest.history == whole.history
-    for name, array in whole.weights.items():
-        np.testing.assert_array_equal(rest.weights[name], array)
+    for name, array in whole.net.tensors().items():
+        np.testing.assert_array_equal(rest.net.tensors()[name], array)
     moved = replace(checkpoint, conv_bias=checkpoint.conv_bias + 1)  # as other epochs of the same file are
     for other, what in ((moved, "network"), (replace(checkpoint, beta=0.6), "beta")):
         words = f"belongs to a training with other {what}"
-        refused(OptionError, words, finetune, other, adjacency, train, test, LOIHI, resume=True, **options)
+        refused(OptionError, words, finetune, Factored(other, adjacency), train, test, LOIHI, resume=True, **options)
 
 
 @pytest.mark.parametrize(
@@ -364,7 +359,7 @@ def test_a_loss_that_is_no_number(tmp_path, monkeypatch, loss, name, found):
     data = drawn(checkpoint, 0)
     monkeypatch.setattr("spikeloom.models.training.finetune.rate_loss", loss)
     words = f"epoch 1, step 1: the {name} is {found}|state of the epoch before is kept"
-    refused(DataError, words, finetune, checkpoint, adjacency, data, data, LOIHI, bits=[4], epochs=2)
+    refused(DataError, words, finetune, Factored(checkpoint, adjacency), data, data, LOIHI, bits=[4], epochs=2)
 
 
 @pytest.mark.parametrize(
@@ -404,7 +399,7 @@ def test_the_model_is_the_chip_on_every_recording(tmp_path, objects_zip, contain
         netlist = compile_network(expand(checkpoint, adjacency), Options(forms=checkpoint.forms)).netlist
         for split in ("train", "test"):
             data = load_data(place, split)
-            model = quantised_spikes(checkpoint, adjacency, data.events)
+            model = quantised_spikes(Factored(checkpoint, adjacency), data.events)
             trace = engine.simulate(netlist, data.events.reshape(len(data), -1, data.steps), spikes=True)
             for index, layer in enumerate(netlist.layers):
                 kept = comparable(netlist, index)  # the chip leaves out what nobody hears

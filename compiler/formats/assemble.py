@@ -26,6 +26,7 @@ class ReadNetwork(Generic[N]):
     facts: tuple[str, ...]  # what was read and what was assumed, for people
     sha256: str  # of the file, and of data beside it
     read_as: Mapping[str, Any] = field(default_factory=dict)  # beyond what the file says: the time step of a NIR file
+    training: Mapping[str, Any] | None = None  # how it was fine-tuned, where the file says so
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

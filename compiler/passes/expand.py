@@ -134,6 +134,7 @@ def expand(checkpoint: Checkpoint, propagation: FloatArray) -> Network:
         ),
         readout=checkpoint.readout,
         classes=checkpoint.classes,
+        forms=checkpoint.forms,
     )
 
 

@@ -249,9 +249,10 @@ def _integrate(current: Any, beta: Any, theta: Any, spikes: Any, membrane: Any) 
 
 
 @numba.njit(cache=True)
-def _differentiate_step(
+def differentiate_step(
     from_above: Any, membrane: Any, later: Any, beta: Any, theta: Any, width: Any, reset: Any, smooth: Any, out: Any
 ) -> None:
+    """Gradient of the current of a step from that of its spikes, and `later`, that of the step after."""
     zero, one = membrane.dtype.type(0), membrane.dtype.type(1)
     for i in range(len(membrane)):
         u = membrane[i]
@@ -281,7 +282,7 @@ def _differentiate(
     steps, size = membrane.shape
     later = np.zeros(size, membrane.dtype)
     for t in range(steps - 1, -1, -1):
-        _differentiate_step(spikes_gradient[t], membrane[t], later, beta, theta, width, reset, smooth, out[t])
+        differentiate_step(spikes_gradient[t], membrane[t], later, beta, theta, width, reset, smooth, out[t])
         later = out[t]
 
 

@@ -1,218 +1,366 @@
 """The network on the chip's own integers, as a torch model with gradients: what it computes is what the chip computes.
 
-Weights, biases and thresholds are rounded by :func:`fixedpoint.round_steps`, the compiler's own rounding. Synaptic
-sums are sums of integers in float32, exact below 2**24, which the 21-bit accumulator guarantees; the recurrence runs in
-integers. Gradients pass the rounding straight through, and a spike by the same surrogate as in training.
+Weights, biases and thresholds are rounded by :mod:`fixedpoint`, the compiler's own rounding. Synaptic sums are sums of
+integers in float32, exact below 2**24, which the 21-bit accumulator guarantees; the recurrence runs in integers.
+Gradients pass the rounding straight through, and a spike by the same surrogate as in training; those of a recurrent
+layer run through its own spikes, too.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import sparse
 from torch import Tensor, nn
 
-from spikeloom.compiler import fixedpoint
-from spikeloom.compiler.checkpoint import Checkpoint
+from spikeloom.compiler import fixedpoint, fullest, ir, round_population
+from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.tensors import members, side_by_side
-from spikeloom.compiler.ir import Form
-from spikeloom.compiler.passes.expand import effective_weight, stack_of
+from spikeloom.compiler.passes.expand import Factored, expand, stack_of
 from spikeloom.compiler.systems import in_order
-from spikeloom.models.networks.layers import differentiate, events_of, gather, rates_of, scatter, time_first
-from spikeloom.models.networks.surrogate import RECTANGLE
+from spikeloom.models.networks.layers import differentiate_step, events_of, gather, rates_of, scatter, time_first
+from spikeloom.models.networks.networks import Weights
+from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 
 SHRINK = 0.98
 """A neuron whose weights would overflow the accumulator has them scaled by this, until they do not."""
 
+THETA = 0.5
+"""Threshold that a network is brought to if it has another: what the surrogate and the learning rate are made for."""
+
+WITHIN = 0.49
+"""Share of a step that a weight may be away from the integer that it starts at."""
+
+RELAY = 100
+"""Threshold of a layer of relays alone, in weight units: NIR holds what makes them fire as a bias, which must fit."""
+
+MATRIX_LIMIT = 2**26
+"""Weights of a layer, zeros among them, which is one matrix here."""
+
 Array = NDArray[Any]
+
+
+class Stage:
+    """A population and the synapses into it: its sources lie side by side, its own spikes last."""
+
+    def __init__(self, network: ir.Network, post: int, form: ir.Form) -> None:
+        into = sorted((p for p in network.projections if p.post == post), key=lambda p: p.pre == post)
+        self.population, self.form, self.sources = network.populations[post], form, [p.pre for p in into]
+        self.inputs = sum(p.weight.shape[1] for p in into if p.pre != post)
+        weight = sparse.hstack([p.weight for p in into], format="csr")
+        weight.sort_indices()
+        self.shape = weight.shape
+        if np.prod(weight.shape) > MATRIX_LIMIT:
+            size = f"{weight.shape[0]:,} x {weight.shape[1]:,} weights, zeros among them"
+            raise ModelError(f"{self.population.name}: has {size}, fine-tuning holds {MATRIX_LIMIT:,}; use it as it is")
+        self.row, self.column = np.repeat(np.arange(weight.shape[0]), np.diff(weight.indptr)), weight.indices
+        # neurons that relay a clock come last; they learn nothing
+        self.learning = self.population.size - self.population.relays
+        held = int(weight.indptr[self.learning])
+        self.weight, self.relays = torch.tensor(weight.data[:held]).float(), torch.tensor(weight.data[held:])
+        self.step = fixedpoint.step_units(form.bits, form.exponents)
+        self.scale = form.threshold / self.population.theta
+
+    def one_sided(self, steps: Array) -> tuple[Array, Array]:
+        """Largest positive and negative sum of each neuron, each plane by itself, as :func:`ir.one_sided`."""
+        sides, exponents = np.zeros((2, self.shape[0])), self.form.exponents
+        for mantissa, exponent in zip(
+            fixedpoint.split_planes(steps, self.form.bits, exponents), exponents, strict=True
+        ):
+            units = fixedpoint.in_units(mantissa, exponent)
+            sides += [np.bincount(self.row, np.maximum(sign * units, 0), self.shape[0]) for sign in (1, -1)]
+        return sides[0], sides[1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Integers:
     """One layer in chip integers, rounded once per step of the optimizer."""
 
+    stage: Stage
     units: Array  # (inputs, neurons) float32; weights in weight units, whole numbers (halves of a step never occur)
     real: Array  # (neurons, inputs) float32; the same in the float model's units
-    # bias, threshold: (neurons,) int64; in membrane units
-    bias: Array
-    threshold: Array
-    unit: Array  # (neurons,) float64; membrane of the float model in one membrane unit
-    keep: int  # What a membrane keeps in a step, in 1/4096
+    registers: ir.IntegerPopulation
+    full: Array  # (neurons,) float64; the fullest that any input makes the accumulator, see :func:`fullest`
 
 
 class QuantisedNet(nn.Module):
-    """A network on chip integers: a checkpoint on what its first layer sees, see :func:`expand.stack_of`.
+    """A network on chip integers; `forms` say how the chip stores each layer.
 
-    `forms` say how the chip stores each layer, conv1 first.
+    Of a checkpoint on its graph the filters of the first layer are learned, of everything else each synapse by itself.
+    ModelError if a layer is too large for one matrix.
     """
 
-    def __init__(self, checkpoint: Checkpoint, adjacency: Array, forms: Sequence[Form]) -> None:
+    def __init__(
+        self, model: Factored | ir.Network, forms: Sequence[ir.Form], surrogate: Surrogate = RECTANGLE
+    ) -> None:
         super().__init__()
-        self.forms = tuple(forms)
-        self.names = ("conv1", *(dense.name for dense in checkpoint.dense))
-        self.theta = checkpoint.theta
-        self.keep = (1 << fixedpoint.DECAY_BITS) - fixedpoint.decay_registers(checkpoint.beta)[1]
-        self.system = checkpoint.system
-        self.stack = stack_of(checkpoint, adjacency)
-        self.hops = nn.Parameter(torch.tensor(checkpoint.hops))
-        self.conv_bias = nn.Parameter(torch.tensor(checkpoint.conv_bias))
-        self.weights = nn.ParameterList(nn.Parameter(torch.tensor(dense.weight)) for dense in checkpoint.dense)
-        self.biases = nn.ParameterList(nn.Parameter(torch.tensor(dense.bias)) for dense in checkpoint.dense)
+        self.surrogate = surrogate
+        self.stack: Array | None = None
+        if isinstance(model, ir.Network):
+            self.network = in_thresholds(model)
+        else:
+            checkpoint = model.checkpoint
+            self.network, self.system = expand(checkpoint, model.propagation), checkpoint.system
+            self.stack = stack_of(checkpoint, model.propagation)
+            self.hops = nn.Parameter(torch.tensor(checkpoint.hops))
+            self.conv_bias = nn.Parameter(torch.tensor(checkpoint.conv_bias))
+        self.names = tuple(population.name for population in self.network.populations)
+        self.forms = tuple(
+            replace(form, exponents=(0,), threshold=np.full(each.size, RELAY)) if each.relays == each.size else form
+            for each, form in zip(self.network.populations, forms, strict=True)
+        )
+        self.stages = [Stage(self.network, post, form) for post, form in enumerate(self.forms)]
+        self.first = 0 if self.stack is None else 1  # of the layers whose synapses are learned by themselves
+        own = self.stages[self.first :]
+        biases = (torch.tensor(stage.population.bias[: stage.learning]).float() for stage in own)
+        self.weights = nn.ParameterList(nn.Parameter(stage.weight) for stage in own)
+        self.biases = nn.ParameterList(map(nn.Parameter, biases))
         self.integers: tuple[Integers, ...] = ()
         self.round()
 
-    def real_weights(self) -> list[tuple[Array, Array]]:
-        """Weights (neurons, inputs) and biases (neurons,) of each layer, float64, the convolution expanded."""
-        hops = self.hops.detach().numpy().astype(np.float64)
-        conv = in_order(self.system, effective_weight(self.stack, hops))
-        bias = np.tile(self.conv_bias.detach().numpy().astype(np.float64), (self.stack.shape[1], 1))
-        layers = [(conv.reshape(len(conv), -1), in_order(self.system, bias))]
-        for weight, bias in zip(self.weights, self.biases, strict=True):
-            layers.append((weight.detach().numpy().astype(np.float64), bias.detach().numpy().astype(np.float64)))
-        return layers
+    def start_at(self, integer: ir.IntegerNetwork) -> None:
+        """Move weights and biases to where they round to an integer network of these forms, no farther."""
+        for post, stage in list(enumerate(self.stages))[self.first :]:
+            planes = ir.added_up((p.pre, p.effective()) for p in integer.projections if p.post == post)
+            units = sparse.hstack([planes[pre] for pre in stage.sources]).toarray()
+            weight, bias = self.weights[post - self.first], self.biases[post - self.first]
+            learned = slice(len(weight))
+            steps = units[stage.row[learned], stage.column[learned]] / stage.step
+            step = (stage.step / stage.scale)[stage.row[learned]]
+            near = np.clip(weight.detach().numpy() / step, steps - WITHIN, steps + WITHIN) * step
+            held = integer.populations[post].bias / (stage.scale * (1 << fixedpoint.MEMBRANE_SHIFT))
+            with torch.no_grad():
+                weight.copy_(torch.tensor(near))
+                bias.copy_(torch.tensor(held[: stage.learning]))
+        self.round()
+
+    def given(self, post: int) -> tuple[Tensor, Tensor]:
+        """Weights of a layer's synapses and biases of its neurons in float64, a convolution expanded, with relays."""
+        stage = self.stages[post]
+        if post >= self.first or self.stack is None:
+            weight, bias = self.weights[post - self.first].double(), self.biases[post - self.first].double()
+        else:
+            held, (places, features) = len(stage.weight), (self.stack.shape[1], self.hops.shape[1])
+            conv = torch.einsum("kij,kfc->ifjc", torch.tensor(self.stack), self.hops.double())
+            conv = in_order(self.system, conv).reshape(stage.learning, -1)
+            weight = conv[stage.row[:held], stage.column[:held]]
+            bias = in_order(self.system, self.conv_bias.double().repeat(places).view(places, features))
+        if not stage.population.relays:
+            return weight, bias
+        return torch.cat([weight, stage.relays]), torch.cat([bias, bias.new_zeros(stage.population.relays)])
+
+    def learned(self) -> ir.Network:
+        """The network with its present weights and biases, thresholds as of :func:`in_thresholds`."""
+        populations, projections = [], []
+        for post, stage in enumerate(self.stages):
+            weight, bias = (each.detach().numpy() for each in self.given(post))
+            populations.append(replace(stage.population, bias=bias))
+            whole, first = sparse.csr_array((weight, (stage.row, stage.column)), shape=stage.shape), 0
+            for pre in stage.sources:
+                size = self.network.input.size if pre == ir.INPUT else self.network.populations[pre].size
+                projections.append(ir.Projection(pre=pre, post=post, weight=whole[:, first : first + size]))
+                first += size
+        return replace(self.network, populations=tuple(populations), projections=tuple(projections))
+
+    def tensors(self) -> Weights:
+        """Weights and biases as a checkpoint holds them."""
+        found = {"conv1.hops": self.hops, "conv1.bias": self.conv_bias}
+        for name, weight, bias in zip(self.names[1:], self.weights, self.biases, strict=True):
+            found |= {f"{name}.weight": weight.view(len(bias), -1), f"{name}.bias": bias}
+        return {name: parameter.detach().numpy().copy() for name, parameter in found.items()}
 
     def round(self) -> None:
         """Round all weights, after every change of them; `make_legal` sees that every bias has a register value."""
         found = []
-        for (weight, bias), form in zip(self.real_weights(), self.forms, strict=True):
-            scale = form.threshold / self.theta
-            steps = fixedpoint.round_steps(weight, scale[:, None], form.bits, form.exponents)
-            units = steps * fixedpoint.step_units(form.bits, form.exponents)
-            mantissa, exponent = fixedpoint.encode_bias(bias * scale * (1 << fixedpoint.MEMBRANE_SHIFT))
-            found.append(
-                Integers(
-                    units=np.ascontiguousarray(units.T, np.float32),
-                    real=(units / scale[:, None]).astype(np.float32),
-                    bias=mantissa << exponent,
-                    threshold=form.threshold << fixedpoint.MEMBRANE_SHIFT,
-                    unit=1 / (scale * (1 << fixedpoint.MEMBRANE_SHIFT)),
-                    keep=self.keep,
-                )
-            )
+        for post, stage in enumerate(self.stages):
+            weight, bias = (each.detach().numpy() for each in self.given(post))
+            registers, _ = round_population(stage.population, (), stage.form, bias=bias)
+            steps = fixedpoint.round_steps(weight, stage.scale[stage.row], stage.form.bits, stage.form.exponents)
+            units = np.zeros(stage.shape[::-1], np.float32)
+            units[stage.column, stage.row] = steps * stage.step
+            real = np.ascontiguousarray((units / stage.scale.astype(np.float32)).T)
+            full = fullest(registers, *stage.one_sided(steps))
+            found.append(Integers(stage=stage, units=units, real=real, registers=registers, full=full))
         self.integers = tuple(found)
 
     def clip_weights(self) -> None:
-        """Keep the weights of dense layers within half a step of what their storage holds, so that none gets lost."""
+        """Keep single weights within half a step of what their storage holds, so that none gets lost."""
         with torch.no_grad():
-            for weight, form in zip(self.weights, self.forms[1:], strict=True):
-                step = fixedpoint.step_units(form.bits, form.exponents) * self.theta / form.threshold
-                limit = torch.tensor((fixedpoint.reach(form.bits, form.exponents) + 0.5) * step, dtype=torch.float32)[
-                    :, None
-                ]
+            for weight, stage in zip(self.weights, self.stages[self.first :], strict=True):
+                most = (fixedpoint.reach(stage.form.bits, stage.form.exponents) + 0.5) * stage.step / stage.scale
+                limit = torch.tensor(most[stage.row[: len(weight)]], dtype=torch.float32)
                 weight.copy_(torch.clamp(weight, -limit, limit))
 
     def make_legal(self) -> None:
         """Shrink weights and biases until no accumulator can overflow and every bias has a register value; round."""
         with torch.no_grad():
-            for layer, form in enumerate(self.forms):
-                bias = self.conv_bias if layer == 0 else self.biases[layer - 1]
-                most = (
-                    (fixedpoint.BIAS_MANTISSA_MAX << fixedpoint.BIAS_EXPONENT_MAX)
-                    * self.theta
-                    / (form.threshold << fixedpoint.MEMBRANE_SHIFT)
+            for post, stage in enumerate(self.stages):
+                shared = post < self.first
+                bias = self.conv_bias if shared else self.biases[post - self.first]
+                most = (fixedpoint.BIAS_MANTISSA_MAX << fixedpoint.BIAS_EXPONENT_MAX) / (
+                    stage.scale * (1 << fixedpoint.MEMBRANE_SHIFT)
                 )
-                bound = torch.tensor(most.min() if layer == 0 else most, dtype=torch.float32) * SHRINK
+                bound = torch.tensor(most.min() if shared else most[: stage.learning], dtype=torch.float32) * SHRINK
                 bias.copy_(torch.clamp(bias, -bound, bound))
-            over = True
-            while over:
-                self.round()
-                over = False
-                for layer, integers in enumerate(self.integers):
-                    up = np.maximum(integers.units, 0).sum(axis=0, dtype=np.float64)
-                    down = np.maximum(-integers.units, 0).sum(axis=0, dtype=np.float64)
-                    wrong = np.maximum(up, down) > fixedpoint.ONE_STEP_SUM_MAX
-                    if not wrong.any():
-                        continue
-                    over = True
-                    if layer:
-                        self.weights[layer - 1][torch.tensor(wrong)] *= SHRINK
-                    else:
+            self.round()
+            while any((integers.full > fixedpoint.ONE_STEP_SUM_MAX).any() for integers in self.integers):
+                for post, integers in enumerate(self.integers):
+                    wrong, stage = integers.full > fixedpoint.ONE_STEP_SUM_MAX, integers.stage
+                    if post >= self.first:
+                        weight, bias = self.weights[post - self.first], self.biases[post - self.first]
+                        weight[torch.tensor(wrong[stage.row[: len(weight)]])] *= SHRINK
+                        if stage.population.alpha:  # what lasts fills the membrane together with the bias
+                            bias[torch.tensor(wrong[: stage.learning])] *= SHRINK
+                    elif self.stack is not None:
                         places, features = self.stack.shape[1], self.hops.shape[1]
                         feature = in_order(self.system, np.tile(np.arange(features), (places, 1)))
-                        self.hops[:, torch.tensor(np.unique(feature[wrong]))] *= SHRINK
+                        self.hops[:, torch.tensor(np.unique(feature[wrong[: stage.learning]]))] *= SHRINK
+                        if stage.population.alpha and wrong.any():
+                            self.conv_bias.mul_(SHRINK)
+                self.round()
 
     def spikes_of(self, events: Tensor) -> list[Tensor]:
         """Spikes of every layer, (steps, samples, neurons), for events (steps, samples, taxels, channels)."""
-        stack = torch.tensor(self.stack, dtype=torch.float32)
-        places, features = stack.shape[1], self.hops.shape[1]
-        # for the gradient only; the integers come from float64
-        conv = in_order(self.system, torch.einsum("kij,kfc->ifjc", stack, self.hops))
-        bias = in_order(self.system, self.conv_bias.repeat(places).view(places, features))
-        found, spikes = [], events.flatten(2)
-        pairs = [(conv.reshape(len(conv), -1), bias), *zip(self.weights, self.biases, strict=True)]
-        for (weight, bias), integers in zip(pairs, self.integers, strict=True):
-            spikes = _ChipLayer.apply(spikes, weight, bias, integers, self.theta)  # type: ignore[no-untyped-call]
-            found.append(spikes)
+        clocks, inputs = self.network.input.clocks, events.flatten(2)
+        if clocks.channels:
+            ticks = torch.tensor(clocks.events(len(inputs)), dtype=torch.float32).t()[:, None]
+            inputs = torch.cat([inputs, ticks.expand(-1, inputs.shape[1], -1)], dim=2)
+        found: list[Tensor] = []
+        for post, integers in enumerate(self.integers):
+            sources = [inputs if pre == ir.INPUT else found[pre] for pre in integers.stage.sources if pre != post]
+            received = sources[0] if len(sources) == 1 else torch.cat(sources, dim=2)
+            given = self.given(post)
+            found.append(_ChipLayer.apply(received, *given, integers, self.surrogate))  # type: ignore[no-untyped-call]
         return found
 
     def forward(self, events: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Spikes per step of each output neuron, (samples, classes), for events (steps, samples, taxels, channels).
+        """Spikes per step of each class, (samples, classes), for events (steps, samples, taxels, channels).
 
         `lengths` (samples,) has the steps of each recording, where some were filled up with silence.
         """
-        return rates_of(self.spikes_of(events)[-1], lengths)
+        readout = self.network.readout
+        rates = rates_of(self.spikes_of(events)[readout.population], lengths)
+        votes = rates.new_zeros(len(rates), self.network.classes)
+        return votes.index_add(1, torch.tensor(readout.label), rates)
+
+
+def in_thresholds(network: ir.Network) -> ir.Network:
+    """The network with weights and biases in units in which every threshold is ``THETA``."""
+    factors = [THETA / population.theta for population in network.populations]
+    pairs = zip(network.populations, factors, strict=True)
+    populations = tuple(replace(each, theta=THETA, bias=each.bias * factor) for each, factor in pairs)
+    weights = [ir.with_data(p.weight, p.weight.data * factors[p.post]) for p in network.projections]
+    projections = (replace(p, weight=weight) for p, weight in zip(network.projections, weights, strict=True))
+    return replace(network, populations=populations, projections=tuple(projections))
 
 
 class _ChipLayer(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, spikes: Tensor, _weight: Tensor, _bias: Tensor, integers: Integers, theta: float) -> Tensor:
+    def forward(
+        ctx: Any, spikes: Tensor, _weight: Tensor, _bias: Tensor, integers: Integers, surrogate: Surrogate
+    ) -> Tensor:
         steps, samples, inputs = spikes.shape
+        registers, stage = integers.registers, integers.stage
         source, bounds = events_of(spikes.detach().reshape(-1, inputs).contiguous().numpy())
-        sums = np.zeros((steps * samples, integers.units.shape[1]), np.float32)
-        gather(source, bounds, integers.units, sums)
-        shape = steps, sums.size // steps
+        sums = np.zeros((steps * samples, registers.size), np.float32)
+        gather(source, bounds, integers.units[:inputs], sums)
+        shape = steps, samples * registers.size
         fired, membrane = np.empty(shape, np.float32), np.empty(shape, np.float32)
-        tiled = [np.tile(a, samples) for a in (integers.bias, integers.threshold, integers.unit)]
-        _integrate_chip(sums.reshape(shape), tiled[0], tiled[1], tiled[2], integers.keep, fired, membrane)
-        ctx.kept = source, bounds, membrane, integers, theta, samples
+        unit = 1 / (stage.scale * (1 << fixedpoint.MEMBRANE_SHIFT))  # membrane of the float model in one membrane unit
+        threshold = registers.threshold << fixedpoint.MEMBRANE_SHIFT
+        bias, threshold, unit = (np.tile(each, samples) for each in (registers.bias, threshold, unit))
+        alpha, beta = (
+            round(kept * fixedpoint.DECAY_ONE) for kept in (registers.realised_alpha, registers.realised_beta)
+        )
+        own = integers.units[inputs:]
+        _integrate_chip(sums.reshape(shape), own, bias, threshold, unit, alpha, beta, fired, membrane)
+        ctx.kept = source, bounds, fired, membrane, integers, samples, surrogate
         return torch.from_numpy(fired).view(steps, samples, -1)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor, None, None]:
-        source, bounds, membrane, integers, theta, samples = ctx.kept
+        source, bounds, fired, membrane, integers, samples, surrogate = ctx.kept
+        stage, inputs, neurons = integers.stage, integers.stage.inputs, integers.registers.size
         above = gradients[0].contiguous().view(membrane.shape).numpy()
-        current = np.empty_like(membrane)
-        differentiate(above, membrane, integers.keep / (1 << fixedpoint.DECAY_BITS), theta, RECTANGLE, current)
+        current, through_bias = _backwards(above, membrane, integers, samples, surrogate)
         rows = current.reshape(len(membrane) * samples, -1)
         weight = np.zeros_like(integers.units)
-        scatter(source, bounds, rows, weight)
+        scatter(source, bounds, rows, weight[:inputs])
+        if stage.inputs < len(weight):
+            weight[inputs:] = fired[:-1].reshape(-1, neurons).T @ rows[samples:]
         below = None
         if ctx.needs_input_grad[0]:
-            below = torch.from_numpy(rows @ integers.real).view(len(membrane), samples, -1)
-        return below, torch.from_numpy(weight.T), torch.from_numpy(rows.sum(0)), None, None
+            below = torch.from_numpy(rows @ integers.real[:, :inputs]).view(len(membrane), samples, -1)
+        bias = through_bias.reshape(-1, neurons).sum(0)
+        return below, torch.from_numpy(weight[stage.column, stage.row]), torch.from_numpy(bias), None, None
+
+
+def _backwards(
+    above: Array, membrane: Array, integers: Integers, samples: int, surrogate: Surrogate
+) -> tuple[Array, Array]:
+    """Gradients of what flows into the currents and of the bias, both (steps, samples * neurons), from the spikes'."""
+    own, registers = integers.real[:, integers.stage.inputs :], integers.registers
+    alpha, theta = np.float32(registers.realised_alpha), np.float32(integers.stage.population.theta)
+    beta, width, reset = map(np.float32, (registers.realised_beta, surrogate.width, surrogate.reset))
+    smooth = surrogate.shape == FAST_SIGMOID
+    current, direct = np.empty_like(membrane), np.empty_like(membrane)
+    later, drained = np.zeros((2, membrane.shape[1]), np.float32)
+    for t in range(len(membrane) - 1, -1, -1):
+        given = above[t] + (drained.reshape(samples, -1) @ own).ravel() if own.size else above[t]
+        differentiate_step(given, membrane[t], later, beta, theta, width, reset, smooth, direct[t])
+        later = direct[t]
+        np.add(later, alpha * drained, out=current[t])
+        drained = current[t]
+    return current, direct
 
 
 @numba.njit(cache=True)
-def _chip_step(sums: Any, v: Any, bias: Any, threshold: Any, unit: Any, keep: Any, fired: Any, membrane: Any) -> None:
-    for i in range(len(v)):
-        magnitude = abs(v[i]) * keep >> fixedpoint.DECAY_BITS
-        u = (magnitude if v[i] >= 0 else -magnitude) + (np.int64(sums[i]) << fixedpoint.MEMBRANE_SHIFT) + bias[i]
+def _chip_step(
+    sums: Any, i: Any, v: Any, bias: Any, threshold: Any, unit: Any, keep_u: Any, keep_v: Any, fired: Any, membrane: Any
+) -> None:
+    for n in range(len(v)):
+        left, magnitude = abs(i[n]) * keep_u >> fixedpoint.DECAY_BITS, abs(v[n]) * keep_v >> fixedpoint.DECAY_BITS
+        i[n] = (left if i[n] >= 0 else -left) + (np.int64(sums[n]) << fixedpoint.MEMBRANE_SHIFT)
+        u = (magnitude if v[n] >= 0 else -magnitude) + i[n] + bias[n]
         u = min(max(u, -fixedpoint.MEMBRANE_MAX), fixedpoint.MEMBRANE_MAX)
-        spike = u > threshold[i]
-        fired[i] = spike
-        membrane[i] = u * unit[i]
-        v[i] = 0 if spike else u
+        spike = u > threshold[n]
+        fired[n] = spike
+        membrane[n] = u * unit[n]
+        v[n] = 0 if spike else u
 
 
 @numba.njit(cache=True)
-def _integrate_chip(sums: Any, bias: Any, threshold: Any, unit: Any, keep: Any, fired: Any, membrane: Any) -> None:
-    """The chip's compartment without a current of its own, along the first axis; its ``spec`` module defines it."""
-    v = np.zeros(sums.shape[1], np.int64)
+def _integrate_chip(
+    sums: Any, own: Any, bias: Any, threshold: Any, unit: Any, keep_u: Any, keep_v: Any, fired: Any, membrane: Any
+) -> None:
+    """The chip's compartment along the first axis; its ``spec`` module defines it.
+
+    `own` (neurons, neurons), or (0, neurons), are weights from what the layer fired in the step before.
+    """
+    neurons = own.shape[1]
+    i, v = np.zeros(sums.shape[1], np.int64), np.zeros(sums.shape[1], np.int64)
     for t in range(len(sums)):
-        _chip_step(sums[t], v, bias, threshold, unit, keep, fired[t], membrane[t])
+        if t > 0 and len(own) > 0:
+            for n in range(len(v)):
+                if fired[t - 1, n] > 0:
+                    first = n // neurons * neurons
+                    for m in range(neurons):
+                        sums[t, first + m] += own[n - first, m]
+        _chip_step(sums[t], i, v, bias, threshold, unit, keep_u, keep_v, fired[t], membrane[t])
 
 
-def quantised_spikes(
-    checkpoint: Checkpoint, adjacency: NDArray[np.float64], events: NDArray[np.uint8]
-) -> dict[str, NDArray[np.bool_]]:
-    """Spikes of every layer of a fine-tuned checkpoint as its torch model computes them, (samples, steps, neurons)."""
-    if checkpoint.towers > 1:
-        return side_by_side(checkpoint, [quantised_spikes(m, adjacency, events) for m in members(checkpoint)])
-    assert checkpoint.forms is not None, "only a fine-tuned checkpoint has a quantised model"
-    network = QuantisedNet(checkpoint, adjacency, checkpoint.forms)
+def quantised_spikes(model: Factored | ir.Network, events: NDArray[np.uint8]) -> dict[str, NDArray[np.bool_]]:
+    """Spikes of every layer of a fine-tuned network as its torch model computes them, (samples, steps, neurons)."""
+    if not isinstance(model, ir.Network) and model.checkpoint.towers > 1:
+        parts = [replace(model, checkpoint=member) for member in members(model.checkpoint)]
+        return side_by_side(model.checkpoint, [quantised_spikes(part, events) for part in parts])
+    forms = model.forms if isinstance(model, ir.Network) else model.checkpoint.forms
+    assert forms is not None, "only a fine-tuned network has a quantised model"
+    network = QuantisedNet(model, forms)
     found: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in network.names}
     with torch.no_grad():
         for recording in events:

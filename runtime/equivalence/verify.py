@@ -84,8 +84,8 @@ def verify(
     network, integer, names = float_network(model), machine.integer, machine.layers
     machine.require_sensor(events)
     beside = machine.beside(engine_name)
-    tuned = isinstance(source, Factored) and source.checkpoint.forms is not None
     origin = network if original is None else float_network(source)
+    tuned = origin.forms is not None
     kept, checked = machine.compared(), min(spec_samples, len(events))
     begin("specification", 0)
     equal = machine.check(events[:checked], lengths=lengths) == 0
@@ -173,11 +173,10 @@ def verify(
 
 
 def _fine_tuned(source: Factored | Network) -> Callable[[npt.NDArray[np.uint8]], list[BoolArray]]:
-    """What gives the spikes of each layer of a fine-tuned checkpoint's torch model."""
+    """What gives the spikes of each layer of a fine-tuned network's torch model."""
     from spikeloom.models.networks.quantised import quantised_spikes  # torch, so only here
 
-    assert isinstance(source, Factored), "networks are not fine-tuned"
-    return lambda events: list(quantised_spikes(source.checkpoint, source.propagation, events).values())
+    return lambda events: list(quantised_spikes(source, events).values())
 
 
 def _others(votes: IntArray, theirs: IntArray) -> int:

@@ -1,12 +1,12 @@
 """What the options of ``compile`` ask for: storage of each layer, cores, and what a netlist remembers of it."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from spikeloom.compiler import KEEP, Packing, __version__
-from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.ir import Form
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.inputs.recordings import origin_of
@@ -24,7 +24,7 @@ def provenance(
         **asked.origin(arguments.run),
         **(origin_of(asked.training) or origin_of(seen)),
         **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
-        **storage(parse_packings(arguments), checkpoint),
+        **storage(parse_packings(arguments), asked.network.forms),
         "spike_exact": arguments.spike_exact,
         "keep_all": arguments.keep_all,
         "prune_unused": arguments.prune_unused,
@@ -79,10 +79,10 @@ def parse_keep(arguments: argparse.Namespace) -> float | None:
     return float(keep)
 
 
-def storage(packings: tuple[Packing, ...] | None, checkpoint: Checkpoint | None) -> Mapping[str, Any]:
-    """The same for the provenance of a netlist."""
-    if checkpoint is not None and checkpoint.forms is not None:
-        return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}
+def storage(packings: tuple[Packing, ...] | None, forms: Sequence[Form] | None) -> Mapping[str, Any]:
+    """The same for the provenance of a netlist; `forms` are what a network was fine-tuned for."""
+    if forms is not None:
+        return {"weight_bits": _one_or_list([form.bits for form in forms]), "fine_tuned": True}
     known, names = packings or (Packing(),), {"weight_bits": "bits", "planes": "planes", "scale_groups": "groups"}
     return {name: _one_or_list([getattr(packing, field) for packing in known]) for name, field in names.items()}
 

@@ -124,6 +124,7 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
 
         steps = {name: getattr(arguments, name) or made.get(name) for name in ("dt", "convention")}
         found = read_nir(path, **steps, **layout)
+        training = found.training
     return LoadedNetwork(
         network=found.network if netlist is None else _named_alike(found.network, netlist),
         sha256=found.sha256,

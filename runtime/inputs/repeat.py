@@ -13,6 +13,9 @@ from spikeloom.models.recordings.events import BIN_S
 NETWORK = ("graph", "taxels", "edges", "directed", "run", "weights", "beta", "theta")
 """Options that say how a checkpoint is read."""
 
+LAYOUT = ("polarities", "dt", "convention")
+"""Options that say how a NIR or ONNX file is read."""
+
 ROUNDING = ("weight_bits", "planes", "scale_groups", "spike_exact", "prune_unused", "keep", "share_lists")
 """Options of ``compile`` that say how a float network is stored."""
 

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from spikeloom.compiler.errors import SpikeloomError
     from spikeloom.models.networks.lif import LIF
-    from spikeloom.runtime.api import Compiled, compile, load, recordings
+    from spikeloom.runtime.api import Compiled, compile, finetune, load, recordings
 
 from spikeloom.compiler import __version__
 
-__all__ = ["LIF", "Compiled", "SpikeloomError", "__version__", "compile", "load", "recordings"]
+__all__ = ["LIF", "Compiled", "SpikeloomError", "__version__", "compile", "finetune", "load", "recordings"]
 
 _PLACES = {"SpikeloomError": "compiler.errors", "LIF": "models.networks.lif"}
 

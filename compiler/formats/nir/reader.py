@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +16,21 @@ from scipy import sparse
 from spikeloom.compiler.dynamics import MOST_STEPS, RELAY_WEIGHT, Clocks
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import reading
-from spikeloom.compiler.fixedpoint import decay_registers, kept_shares
+from spikeloom.compiler.fixedpoint import (
+    THRESHOLD_MANTISSA_MAX,
+    decay_registers,
+    kept_shares,
+    plane_distance,
+    read_only,
+)
 from spikeloom.compiler.formats.affine import scaled, shifted
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble, by_depth, class_of_each
-from spikeloom.compiler.formats.hdf5 import AGAIN, read_hdf5
+from spikeloom.compiler.formats.hdf5 import AGAIN, entry_of, read_hdf5
 from spikeloom.compiler.formats.names import named, printable, unique_names
 from spikeloom.compiler.formats.nir import CONVENTIONS, stages
 from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, graph_of, loops, only
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
-from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
+from spikeloom.compiler.ir import INPUT, Form, Input, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.types import FloatArray, IntArray
 
@@ -80,7 +88,31 @@ def network_of(
     network = assemble(layers, sensor, voters, label)
     facts = _facts(graph, steps, spiking, f"input {printable(entry.name)}: {words}", sensor)
     facts.append(f"classes: the spikes of {printable(spiking[voters].node.name)} in output {printable(end.name)}")
-    return ReadNetwork(network=network, facts=tuple(facts), sha256=graph.sha256, read_as=asdict(steps))
+    training = json.loads(entry_of(graph.metadata, "training", str) or "null")
+    return ReadNetwork(
+        network=replace(network, forms=_forms(spiking, network)),
+        facts=tuple(facts),
+        sha256=graph.sha256,
+        read_as=asdict(steps),
+        training=training if isinstance(training, dict) else None,
+    )
+
+
+def _forms(spiking: Sequence[Neurons], network: Network) -> tuple[Form, ...] | None:
+    """Storage that a network was fine-tuned for, where all nodes say so; ModelError if no chip has it."""
+    found = {}
+    for name, one in zip(unique_names([one.node.name for one in spiking]), spiking, strict=True):
+        stored = replace(one.node, values=one.node.metadata)
+        if not stored.has("bits"):
+            return None
+        bits, exponents = stored.few("bits")[0], stored.integers("exponents").ravel().tolist()
+        gaps = (0 < after - before <= plane_distance(bits) for before, after in pairwise(exponents))
+        within = 2 <= bits <= 8 and exponents and -8 <= exponents[0] and exponents[-1] < 8 and all(gaps)
+        whole = np.all(one.theta == np.rint(one.theta)) and one.theta.max() <= THRESHOLD_MANTISSA_MAX
+        if not within or not whole:
+            raise stored.fail("has no usable storage, or thresholds that are not whole; fine-tune it again")
+        found[name] = Form(bits=bits, exponents=tuple(exponents), threshold=read_only(one.theta))
+    return tuple(found[each.name] for each in network.populations) if len(found) == len(network.populations) else None
 
 
 def _walk(graph: Graph, steps: stages.Steps, shape: tuple[int, ...]) -> tuple[list[Neurons], stages.Value]:

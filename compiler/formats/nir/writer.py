@@ -9,6 +9,7 @@ float is not.
 * Time constants are those of the forward Euler method for the step given: ``1 - dt / tau`` is what a step keeps, and
   ``r = tau / dt`` makes a step add its input as it is.
 * Inputs are one flat axis, ``taxel * polarities + polarity``, then the clocks. A vote of several neurons is a Linear.
+* A channel that always has an event is a bias, as in the file that it was read from.
 
 Neurons that the chip leaves out are there and receive nothing.
 """
@@ -16,14 +17,13 @@ Neurons that the chip leaves out are there and receive nothing.
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler import lift
+from spikeloom.compiler.dynamics import MOST_STEPS, Clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.formats.nir.stages import require_step
-from spikeloom.compiler.ir import INPUT, IntegerPopulation, Sparse, added_up
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Sparse, added_up
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import FORGETS
 
 VERSION = "1.0.8"
@@ -35,16 +35,19 @@ DENSE_LIMIT = 2**28
 Float32 = npt.NDArray[np.float32]
 
 
-def export(netlist: Netlist, dt: float) -> bytes:
-    """Content of the file, for steps of `dt` seconds; equal netlists give equal bytes.
+def export(network: IntegerNetwork, dt: float, *, training: str | None = None) -> bytes:
+    """Content of the file, for steps of `dt` seconds; equal networks give equal bytes.
 
-    Raises ModelError if NIR cannot say what the netlist does, OptionError if there is no such time step.
+    With `training`, how the network was fine-tuned, the file says how each layer is stored, too: it compiles to these
+    very integers.
+
+    Raises ModelError if NIR cannot say what the network does, OptionError if there is no such time step.
     """
     require_step(dt)
-    network = lift(netlist)
     # what separates names in a file becomes an underscore
     names = plain_names([population.name for population in network.populations], taken=["input", "output", "votes"])
-    nodes: dict[str, Tree] = {"input": {"type": "Input", "shape": np.array([network.input.size])}}
+    always = int(network.input.clocks == Clocks(channels=1, steps=MOST_STEPS))
+    nodes: dict[str, Tree] = {"input": {"type": "Input", "shape": np.array([network.input.size - always])}}
     edges: list[tuple[str, str]] = []
     for post, (population, name) in enumerate(zip(network.populations, names, strict=True)):
         bias = population.bias / (1 << MEMBRANE_SHIFT)
@@ -52,11 +55,19 @@ def export(netlist: Netlist, dt: float) -> bytes:
         for number, (pre, weight) in enumerate(sorted(sources.items())):
             source = "input" if pre == INPUT else names[pre]
             synapses = f"{source}_to_{name}"
-            nodes[synapses] = {"type": "Linear", "weight": _dense(population, weight)}
+            dense, added = _dense(population, weight), np.zeros(population.size)
+            if always and pre == INPUT:
+                dense, added = dense[:, :-1], dense[:, -1].astype(np.float64)
             if population.decay_u == FORGETS and not number:
-                nodes[synapses] |= {"type": "Affine", "bias": bias.astype(np.float32)}
+                added = added + bias
+            nodes[synapses] = {"type": "Linear", "weight": dense}
+            if (population.decay_u == FORGETS and not number) or added.any():
+                nodes[synapses] |= {"type": "Affine", "bias": added.astype(np.float32)}
             edges += [(source, synapses), (synapses, name)]
         nodes[name] = _neurons(population, bias, dt)
+        if training is not None:
+            form = network.forms[post]
+            nodes[name]["metadata"] = {"bits": np.array(form.bits), "exponents": np.array(form.exponents)}
     voters, label = names[network.readout.population], network.readout.label
     if np.array_equal(label, np.arange(network.classes)):
         edges.append((voters, "output"))
@@ -66,7 +77,9 @@ def export(netlist: Netlist, dt: float) -> bytes:
         nodes["votes"] = {"type": "Linear", "weight": votes}
         edges += [(voters, "votes"), ("votes", "output")]
     nodes["output"] = {"type": "Output", "shape": np.array([network.classes])}
-    said = {"dt": np.array(dt), "writer": "spikeloom"}
+    said: Tree = {"dt": np.array(dt), "writer": "spikeloom"}
+    if training is not None:
+        said["training"] = training
     graph = {"type": "NIRGraph", "edges": edges, "metadata": said, "nodes": nodes}
     return hdf5_bytes({"version": VERSION, "node": graph})
 

@@ -57,9 +57,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     machine.require_sensor(data.events)
     chosen = range(len(data)) if arguments.sample is None else [find_recording(data, arguments.sample, "--sample")]
 
-    tuned = loaded.checkpoint is not None and loaded.checkpoint.forms is not None
     machine.require_windows()
-    rounding = check_rounding(machine, loaded.network, fine_tuned=tuned)
+    rounding = check_rounding(machine, loaded.network, fine_tuned=loaded.network.forms is not None)
     for index in chosen:
         events = data.events[index : index + 1, ..., : data.steps_of(index)]
         explanation = explain(

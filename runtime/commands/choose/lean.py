@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if arguments.output is not None:
         lean = {"differ": result.differ} | encode(result.rows[result.taken].removed)
         made = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256, **loaded.origin(arguments.run)}
-        made |= storage(None, loaded.checkpoint)
+        made |= storage(None, loaded.network.forms)
         made |= {"keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True, "lean": lean}
         write_netlist(replace(netlist, provenance={**netlist.provenance, **made}), arguments.output)
     if arguments.network is not None and loaded.checkpoint is not None:

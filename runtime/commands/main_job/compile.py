@@ -28,7 +28,7 @@ from spikeloom.runtime.inputs.compilation import parse_cores, parse_keep, parse_
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings
-from spikeloom.runtime.inputs.repeat import NETWORK, ROUNDING, command, given, refuse, words
+from spikeloom.runtime.inputs.repeat import LAYOUT, NETWORK, ROUNDING, command, given, refuse, words
 from spikeloom.runtime.machines.base import chip_module, describe, trained_for
 from spikeloom.runtime.report.console import Progress, progress
 from spikeloom.runtime.report.encode import INLINE
@@ -112,8 +112,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     )
     options.require_consistent(calibrated=arguments.calibrate is not None)
     asked = load_network(arguments.checkpoint, arguments)
-    checkpoint, training, found = asked.checkpoint, None, None
-    if checkpoint is not None and checkpoint.forms is not None:
+    forms, training, found = asked.network.forms, None, None
+    if forms is not None:
         refuse(arguments, ("keep",), f"{arguments.checkpoint} was fine-tuned for its own storage")
     if arguments.calibrate is not None:
         progress("reading the recordings")
@@ -139,7 +139,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         asked.model,
         replace(
             options,
-            forms=None if checkpoint is None else checkpoint.forms,
+            forms=forms,
             training_events=training,
             provenance=provenance(arguments, asked, calibrated=found),
         ),
@@ -147,15 +147,16 @@ def run(arguments: argparse.Namespace) -> Outcome:
         after=dump,
     )
     sha256 = write_netlist(compilation.netlist, arguments.output)
-    shown = chip_module(arguments.target, "compiled").outcome(compilation, sha256, asked.facts, _finetune(arguments))
+    helps = _finetune(arguments, checkpoint=asked.checkpoint is not None)
+    shown = chip_module(arguments.target, "compiled").outcome(compilation, sha256, asked.facts, helps)
     return shown  # type: ignore[no-any-return]
 
 
-def _finetune(arguments: argparse.Namespace) -> str:
+def _finetune(arguments: argparse.Namespace, *, checkpoint: bool) -> str:
     """What to type for training on the chip's integers."""
-    given_network = words(given(arguments, NETWORK))
+    read = words(given(arguments, (*NETWORK, *LAYOUT)))
     data = ("--data", str(arguments.calibrate), "--weight-bits", "8")
-    return command("finetune", str(arguments.checkpoint), *given_network, *data, "-o", "TUNED.pt")
+    return command("finetune", str(arguments.checkpoint), *read, *data, "-o", "TUNED.pt" if checkpoint else "TUNED.nir")
 
 
 def _compile_integers(arguments: argparse.Namespace) -> Outcome:

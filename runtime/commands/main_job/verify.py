@@ -66,8 +66,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_match(netlist, loaded.model)
     if (difference := loaded.differs_from(netlist.provenance, arguments.run)) is not None:
         tell(f"warning: {arguments.netlist}: {difference}")
-    tuned = loaded.checkpoint is not None and loaded.checkpoint.forms is not None
-    held = check_rounding(integer_machine(machine), loaded.network, fine_tuned=tuned)
+    held = check_rounding(integer_machine(machine), loaded.network, fine_tuned=loaded.network.forms is not None)
     if arguments.data is None or not held.layers:
         return Outcome(held, rounding_sections, 0 if held.holds else 1)
     original = None if arguments.original is None else load_network(arguments.original, arguments)

@@ -3,32 +3,39 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from spikeloom.compiler import DEFAULT_TARGET, round_to_forms
-from spikeloom.compiler.checkpoint import layers_of
+from spikeloom.compiler.checkpoint import WEIGHTS, layers_of
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.files import remove_leftovers, sha256_of
+from spikeloom.compiler.files import remove_leftovers, sha256_of, write_atomically
+from spikeloom.compiler.formats import NIR
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
-from spikeloom.models.recordings.events import joined_bins
+from spikeloom.models.recordings.events import BIN_S, joined_bins, of_length
 from spikeloom.models.recordings.evtouch import data_digest
 from spikeloom.models.recordings.grasps import SYNTHETIC
-from spikeloom.runtime.commands.options import add_checkpoint, add_data
+from spikeloom.runtime.commands.main_job import compile
+from spikeloom.runtime.commands.options import NETWORK_FILES, add_data, add_network
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_graph, load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
-from spikeloom.runtime.report.encode import INLINE
+from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 from spikeloom.runtime.studies.jobs import only_one
 
-REPEATED = ("weight_bits", "scale_groups", "robust", "epochs", "seed")
+if TYPE_CHECKING:
+    from spikeloom.models.networks.quantised import QuantisedNet
+
+REPEATED = (*repeat.LAYOUT, "weight_bits", "scale_groups", "robust", "epochs", "seed")
 """Options of its own that decide the result."""
 
 
@@ -70,27 +77,37 @@ class FinetuneRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finetuned:
-    """A fine-tuning and the checkpoint that holds it."""
+    """A fine-tuning and the file that holds it; `netlist` beside it if that is NIR."""
 
     record: FinetuneRecord = field(metadata=INLINE)
     file: str
     sha256: str
+    netlist: str | None = field(default=None, metadata=OPTIONAL)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    add_checkpoint(parser)
+    parser.add_argument("checkpoint", metavar=NETWORK_FILES, help="trained network, or pretrained:NAME")
+    add_network(parser)
     add_data(parser)
     parser.add_argument("--target", default=DEFAULT_TARGET, help=f"chip (default: {DEFAULT_TARGET})")
     parser.add_argument(
-        "--weight-bits", required=True, metavar="N[,N]", help="storage width, one or one a layer: 2 to 6 or 8"
+        "--weight-bits",
+        metavar="N[,N]",
+        help="storage width, one or one a layer: 2 to 6 or 8 (default: the storage that compile --calibrate chooses)",
     )
-    parser.add_argument("--scale-groups", type=int, default=8, metavar="N", help="scales in a layer (default: 8)")
+    parser.add_argument("--scale-groups", type=int, metavar="N", help="scales in a layer, of that width (default: 8)")
+    parser.add_argument("--robust", type=float, metavar="X", help="chance of an event, and of a taxel, to be lost: 0.1")
     parser.add_argument("--epochs", type=int, default=40, metavar="N", help="default: 40")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the order of recordings (default: 0)")
-    parser.add_argument("--robust", type=float, metavar="X", help="chance of an event, and of a taxel, to be lost: 0.1")
     parser.add_argument("--resume", action="store_true", help="go on with an interrupted one of the same options")
-    parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
+    parser.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        metavar="OUT.pt|OUT.nir",
+        help="a checkpoint is written back as one; any other network as NIR, with its netlist OUT.loom beside it",
+    )
 
 
 def _state(output: Path, *, resume: bool) -> Path:
@@ -115,52 +132,40 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
 
 def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
-    """Fine-tune and write the checkpoint; return the report."""
+    """Fine-tune and write the network; return the report."""
     state = _state(output, resume=arguments.resume)
     target = load_target(arguments.target, COMPARTMENTS)
-    widths = whole_numbers(arguments.weight_bits, "--weight-bits")
-    path = arguments.checkpoint
-    checkpoint = load_checkpoint(path, arguments)
-    if checkpoint.forms is not None:
-        raise ModelError(f"{path}: was fine-tuned already; give the network that it was made from")
-    if not checkpoint.dynamics.is_plain:
-        raise ModelError(
-            f"{path}: has clocks, or decays of single layers, which fine-tuning does not know; compile it as it is"
-        )
-    if checkpoint.towers > 1:
-        raise ModelError(
-            f"{path}: has {checkpoint.towers} towers, which fine-tuning takes one by one; fine-tune what it was joined "
-            "from, then join that"
-        )
-    asked = load_graph(arguments, checkpoint.system)
-    name, adjacency = propagation(checkpoint, asked, arguments.checkpoint)
+    widths = None if arguments.weight_bits is None else whole_numbers(arguments.weight_bits, "--weight-bits")
+    if widths is None:
+        repeat.refuse(arguments, ("scale_groups",), "is for --weight-bits; held-out recordings choose the storage")
+    loaded = load_network(arguments.checkpoint, arguments)
+    _require_trainable(arguments, loaded, output)
     require_splits(arguments.data)
+    taken = loaded.network.input
     found = [
         recordings(
             arguments.data,
             split,
-            classes=checkpoint.classes,
-            taxels=checkpoint.taxels,
+            classes=loaded.network.classes,
+            taxels=taken.taxels,
             bin_s=arguments.bin,
             labels_for="fine-tuning",
-            trained=origin_of(checkpoint.training),
+            trained=origin_of(loaded.training),
         )
         for split in ("train", "test")
     ]
-    training, test = (joined_bins(each, checkpoint.bins) for each in found)
-    from spikeloom.models.networks.checkpoint import save_again
+    training, test = (of_length(joined_bins(each, taken.bins), taken.clocks.length) for each in found)
     from spikeloom.models.training.finetune import finetune as tune
     from spikeloom.models.training.record import CHOSEN_ON
 
     try:
         tuned = tune(
-            checkpoint,
-            adjacency,
+            loaded.model,
             training,
             test,
             target,
             bits=widths,
-            groups=arguments.scale_groups,
+            groups=8 if arguments.scale_groups is None else arguments.scale_groups,
             epochs=arguments.epochs,
             seed=arguments.seed,
             robust=arguments.robust or 0.0,
@@ -170,26 +175,76 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
     except KeyboardInterrupt:
         kept = f"the epochs so far are kept in {state}; go on with the same command and --resume"
         raise KeyboardInterrupt(kept if state.exists() else "") from None
+    epoch = WEIGHTS[0] if loaded.checkpoint is None else loaded.checkpoint.weights
     record = FinetuneRecord(
         command=" ".join(_words(arguments, SYNTHETIC if arguments.data == SYNTHETIC else training.source)),
-        fine_tuned_from=checkpoint.sha256,
-        fine_tuned_weights=checkpoint.weights,
-        weight_bits=widths,
+        fine_tuned_from=loaded.sha256,
+        fine_tuned_weights=epoch,
+        weight_bits=widths or [form.bits for form in tuned.net.forms],
         seed=arguments.seed,
         epochs=arguments.epochs,
         data=training.source,
         data_sha256=data_digest(*found),
         test_samples=len(test),
         before=Before(correct=tuned.before, accuracy=tuned.before / len(test)),
-        last=Tuned(correct=tuned.after, accuracy=tuned.after / len(test), chosen_on=CHOSEN_ON[checkpoint.weights]),
+        last=Tuned(correct=tuned.after, accuracy=tuned.after / len(test), chosen_on=CHOSEN_ON[epoch]),
         history=[[epoch.loss, epoch.correct] for epoch in tuned.history],
     )
-    edges = asked.edges if checkpoint.edges is None and asked is not None else checkpoint.edges
-    changed = replace(checkpoint, graph=name, edges=edges, forms=tuned.forms, **layers_of(tuned.weights))
-    save_again(output, changed, training=asdict(record))
-    round_to_forms(expand(read_checkpoint(output), adjacency), tuned.forms)  # it compiles, or says why not
+    write = _write_nir if loaded.checkpoint is None else _write_checkpoint
+    netlist = write(arguments, loaded, tuned.net, record)
     state.unlink(missing_ok=True)
-    return Finetuned(record=record, file=output.name, sha256=sha256_of(output))
+    return Finetuned(record=record, file=output.name, sha256=sha256_of(output), netlist=netlist)
+
+
+def _require_trainable(arguments: argparse.Namespace, loaded: LoadedNetwork, output: Path) -> None:
+    """Refuse networks that cannot be trained on, and a place whose name says another format."""
+    path, checkpoint = arguments.checkpoint, loaded.checkpoint
+    if loaded.network.forms is not None:
+        raise ModelError(f"{path}: was fine-tuned already; give the network that it was made from")
+    if loaded.format == "counting":
+        raise ModelError(f"{path}: counts by a linear rule, which no gradient runs through; train it anew")
+    if checkpoint is not None and checkpoint.towers > 1:
+        raise ModelError(
+            f"{path}: has {checkpoint.towers} towers, which fine-tuning takes one by one; fine-tune what it was joined "
+            "from, then join that"
+        )
+    if (output.suffix == NIR) != (checkpoint is None):
+        what, ending = ("no checkpoint", NIR) if checkpoint is None else ("a checkpoint", ".pt")
+        raise OptionError(f"-o {output}: {path} is {what}, it is written back as {ending}; give OUT{ending}")
+    if checkpoint is None:
+        require_place(str(output.with_suffix(".loom")), "-o", arguments)
+
+
+def _write_checkpoint(
+    arguments: argparse.Namespace, loaded: LoadedNetwork, net: QuantisedNet, record: FinetuneRecord
+) -> None:
+    from spikeloom.models.networks.checkpoint import save_again
+
+    output, checkpoint, adjacency = arguments.output, loaded.checkpoint, loaded.adjacency
+    assert checkpoint is not None
+    assert adjacency is not None
+    asked = load_graph(arguments, checkpoint.system)
+    edges = asked.edges if checkpoint.edges is None and asked is not None else checkpoint.edges
+    changed = replace(checkpoint, graph=loaded.graph, edges=edges, forms=net.forms, **layers_of(net.tensors()))
+    save_again(output, changed, training=asdict(record))
+    round_to_forms(expand(read_checkpoint(output), adjacency), net.forms)  # it compiles, or says why not
+
+
+def _write_nir(arguments: argparse.Namespace, loaded: LoadedNetwork, net: QuantisedNet, record: FinetuneRecord) -> str:
+    """Write the network, and the netlist that it compiles to; the name of that."""
+    from spikeloom.compiler.formats.nir import writer
+
+    integer, _ = round_to_forms(net.learned(), net.forms)
+    dt = loaded.read_as.get("dt", BIN_S * integer.input.bins)
+    content = writer.export(integer, dt, training=json.dumps(asdict(record)))
+    with write_atomically(arguments.output) as file:
+        file.write(content)
+    netlist = Path(arguments.output).with_suffix(".loom")
+    words = [arguments.output, "--polarities", str(integer.input.polarities), "--target", arguments.target]
+    parser = argparse.ArgumentParser()
+    compile.add_arguments(parser)
+    compile.run(parser.parse_args([*words, "-o", str(netlist)]))
+    return netlist.name
 
 
 def _words(arguments: argparse.Namespace, source: str) -> list[str]:
@@ -197,7 +252,8 @@ def _words(arguments: argparse.Namespace, source: str) -> list[str]:
     files = {name: getattr(arguments, name) for name in ("taxels", "edges")}
     options = repeat.given(arguments, (*repeat.NETWORK, "target", "bin", *REPEATED)) | {"data": source}
     options |= {name: Path(file).name for name, file in files.items() if file}
-    return ["spikeloom", "finetune", Path(arguments.checkpoint).name, *repeat.words(options)]
+    name = Path(arguments.checkpoint).name if isinstance(arguments.checkpoint, str) else "MODULE"
+    return ["spikeloom", "finetune", name, *repeat.words(options)]
 
 
 def finetune_sections(result: Finetuned) -> Iterable[Section]:
@@ -210,4 +266,5 @@ def finetune_sections(result: Finetuned) -> Iterable[Section]:
         [f"epoch {record.epochs}", f"{last[0]:.5f}", f"{last[1]:,}", percent(record.last.correct, total)],
     ]
     head = ["on chip integers", "loss", "training right", "test"]
-    yield Section("Fine-tuning", [Text(record.command), Table(head, rows), Text(f"  written: {result.file}")])
+    written = result.file if result.netlist is None else f"{result.file}, {result.netlist}"
+    yield Section("Fine-tuning", [Text(record.command), Table(head, rows), Text(f"  written: {written}")])

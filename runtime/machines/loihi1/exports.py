@@ -107,7 +107,7 @@ def _nir(request: Request) -> Export:
     )
     lines = (f"in steps of {dt:g} s ({facts.convention})",)
     with reading(request.source, FormatError, "compile it again"):
-        content = nir.export(netlist, dt)
+        content = nir.export(lift(netlist), dt)
     return Export(content=[content], facts=facts, lines=lines)
 
 

@@ -24,8 +24,8 @@ def study(
     that may go, by layer.
     """
     progress("compiling")
-    forms = None if loaded.checkpoint is None else loaded.checkpoint.forms
-    compilation = compile_network(loaded.network, Options(forms=forms, training_events=training.events))
+    options = Options(forms=loaded.network.forms, training_events=training.events)
+    compilation = compile_network(loaded.network, options)
     whole, allowed = compilation.netlist, int(differ * len(training) + 1e-9)
     spikes: IntArray = machine_of(whole).run(training.events, lengths=training.lengths).counts.sum(axis=0)
     wanted, wanted_test = trials.decisions(whole, training), trials.decisions(whole, test)

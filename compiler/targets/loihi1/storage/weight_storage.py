@@ -10,8 +10,10 @@ bits are one weight of up to 16 bits. Only a weight that the finest plane cannot
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from spikeloom.compiler import ir
 from spikeloom.compiler.fixedpoint import (
@@ -113,15 +115,19 @@ def loads(population: ir.IntegerPopulation, projections: tuple[ir.IntegerProject
     What is within ``ONE_STEP_SUM_MAX`` overflows neither accumulator nor current, whatever the input. Nor does it
     saturate a membrane, unless that keeps more than half of itself: the scale would then be too coarse.
     """
-    up, down = ir.one_sided(projections, population.size)
-    worst = np.maximum(up, down).astype(np.float64)
+    return fullest(population, *ir.one_sided(projections, population.size))
+
+
+def fullest(population: ir.IntegerPopulation, up: npt.NDArray[Any], down: npt.NDArray[Any]) -> FloatArray:
+    """The same from the largest positive and negative sum of a step, (neurons,) in weight units."""
+    filled: FloatArray = np.maximum(up, down).astype(np.float64)
     if population.decay_u == FORGETS:
-        return worst
-    fullest = worst * current_load(population.decay_u)
+        return filled
+    filled *= current_load(population.decay_u)
     if 2 * population.decay_v >= DECAY_ONE:
         gather, lost = (1 << MEMBRANE_SHIFT) * DECAY_ONE / (population.decay_u + 1), population.decay_v / DECAY_ONE
         held = (1 - lost) * (population.threshold << MEMBRANE_SHIFT)
         rise = held + gather * up + np.maximum(population.bias, 0)
         fall = (gather * down + np.maximum(-population.bias, 0)) / lost
-        fullest = np.maximum(fullest, np.maximum(rise, fall) * (ONE_STEP_SUM_MAX / MEMBRANE_MAX))
-    return fullest
+        filled = np.maximum(filled, np.maximum(rise, fall) * (ONE_STEP_SUM_MAX / MEMBRANE_MAX))
+    return filled
