@@ -137,7 +137,6 @@ def require_keys(what, found):
     assert always <= set(found) <= always | sometimes
 
 
-# --- the chip ------------------------------------------------------------------------------------------------------
 @over(LAYERED)
 def test_every_kernel_is_the_specification(name):
     made = specimen(name)
@@ -208,7 +207,6 @@ def test_streams_give_the_votes_of_whole_recordings(name):
         stream.reset()
 
 
-# --- files ---------------------------------------------------------------------------------------------------------
 @over(MAKERS)
 def test_a_file_holds_the_netlist_to_the_byte(name):
     made = specimen(name)
@@ -229,7 +227,6 @@ def test_compiled_again_the_bytes_are_the_same(name, tmp_path):
     assert (tmp_path / "again.loom").read_bytes() == made.netlist.read_bytes()
 
 
-# --- costs ---------------------------------------------------------------------------------------------------------
 @over(LAYERED)
 def test_costs_are_those_counted_spike_by_spike(name):
     made = specimen(name)
@@ -254,7 +251,6 @@ def test_costs_of_crossbars_are_those_counted_tick_by_tick(name):
         assert price.energy_j[marginal.name][sample] == pytest.approx(joules)
 
 
-# --- the float side ------------------------------------------------------------------------------------------------
 @over(CHECKPOINTS)
 def test_the_expanded_network_is_the_float_model(name):
     made = specimen(name)
@@ -268,7 +264,6 @@ def test_the_expanded_network_is_the_float_model(name):
             assert theirs.any(), layer
 
 
-# --- commands ------------------------------------------------------------------------------------------------------
 @over((*FLOAT, *CROSSBARS))
 def test_verify_holds_every_network_to_its_file(name):
     made = specimen(name)
@@ -370,7 +365,6 @@ def test_watch_decides_as_run(name, tmp_path):
     assert counts == made.machine.run(made.events).votes.tolist()
 
 
-# --- shipped networks, held against what was recorded -----------------------------------------------------------------
 NETWORKS = {
     "grasps": {},
     "objects": {"planes": "2", "scale_groups": "4"},

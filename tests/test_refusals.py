@@ -336,7 +336,6 @@ def test_a_violated_limit_is_named(place, tmp_path):
     assert not (tmp_path / "out.loom").exists()
 
 
-# -- unreadable files, interrupts and full disks -----------------------------------------------------------------------
 def test_unreadable_files(refusal, monkeypatch):
     as_ever = Path.open
 

@@ -193,7 +193,7 @@ def test_an_array_of_objects_is_never_unpickled(path):
     assert not (path.parent / "unpickled").exists()
 
 
-@pytest.mark.parametrize("value", [None, 1.5, "three", [1], {"name": "fc1"}, True, -1])
+@pytest.mark.parametrize("value", [None, 1.5, "three", [1], {"name": "fc1"}, True, -1, 2**32])
 def test_manifest_entries_of_another_kind(path, value):
     fine = {str: "target", dict: "provenance"}.get(type(value))
     keys = {"target", "taxels", "polarities", "classes", "layers", "provenance", "clocks", "bins"} - {fine}
