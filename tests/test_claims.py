@@ -27,7 +27,7 @@ UNITS = r"%|×|[µmnp]?[JWs]\b|[MGk]i?B?\b|(?:points?|times|cores?|operations|sp
 NUMBER = re.compile(rf"(?<!\w)\d[\d,.]*(?: ?(?:{UNITS})| *(?=\|))")
 """With a unit, of so many, or alone in a cell of a table."""
 
-DRAWN = {"growth", "skins", "fuzz", "public"}  # results of made recordings or damages
+DRAWN = {"growth", "skins", "fuzz", "public", "convolutions"}  # results of made recordings or damages
 
 
 @cache
