@@ -16,8 +16,7 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.ir import INPUT, Form, Input, Network, Population, Projection, Readout
 from spikeloom.models.networks.layers import Spike, time_first
 from spikeloom.models.networks.quantised import QuantisedNet
-from spikeloom.models.networks.surrogate import RECTANGLE
-from spikeloom.models.training.recipes import TIMED
+from spikeloom.models.training.recipes import RELEASED, TIMED
 
 
 def biased_currents(folder):
@@ -35,10 +34,8 @@ def biased_currents(folder):
 @pytest.mark.parametrize("name", ["recurrent", "onnx", "timed", "biased currents"])
 def test_what_is_written_compiles_to_the_chip_that_was_trained(tmp_path, name, storage):
     made = biased_currents(tmp_path) if name == "biased currents" else specimen(name)
-    data = made.data
-    file = tmp_path / ("x.pt" if name == "timed" else "x.nir")
-    words = ("finetune", made.network, *made.reading, "--data", data, *storage, "--epochs", "2", "-o", file)
-    found = as_json(*words)
+    file, data = tmp_path / ("x.pt" if name == "timed" else "x.nir"), made.data
+    found = as_json("finetune", made.network, *made.reading, "--data", data, *storage, "--epochs", "2", "-o", file)
     assert found["history"][1][0] != found["history"][0][0]
     as_json("compile", file, "-o", tmp_path / "again.loom")
     if name != "timed":
@@ -51,7 +48,7 @@ def test_what_is_written_compiles_to_the_chip_that_was_trained(tmp_path, name, s
     assert "fine-tuned already" in refusal("finetune", file, "--data", data, "-o", tmp_path / f"y{file.suffix}")
 
 
-@pytest.mark.parametrize("surrogate", [RECTANGLE, TIMED.surrogate])
+@pytest.mark.parametrize("surrogate", [RELEASED.surrogate, TIMED.surrogate])
 def test_gradients_run_through_own_spikes_and_currents(surrogate):
     """With scales this fine, and equal spikes, they are those of the same equations in torch."""
     rng, alpha, beta, size = np.random.default_rng(0), 0.5, 3277 / 4096, 6
@@ -64,8 +61,7 @@ def test_gradients_run_through_own_spikes_and_currents(surrogate):
     events = time_first((rng.random((3, 2, 2, 25)) < 0.4).astype(np.uint8))
     wanted = torch.tensor(rng.normal(size=(3, size)), dtype=torch.float32)
     (model(events) * wanted).sum().backward()
-    given, own = (torch.tensor(w, dtype=torch.float32, requires_grad=True) for w in weights)
-    bias = torch.tensor(neurons.bias, dtype=torch.float32, requires_grad=True)
+    given, own, bias = (torch.tensor(each).float().requires_grad_() for each in (*weights, neurons.bias))
     current = membrane = spikes = torch.zeros(3, size)
     fired = []
     for step in events.flatten(2):
@@ -91,12 +87,11 @@ def test_storage_that_no_chip_has_is_refused(change):
 
 
 def test_what_cannot_be_fine_tuned(tmp_path):
-    made, counters = specimen("recurrent"), specimen("counters")
+    made, counters, timed = map(specimen, ("recurrent", "counters", "timed"))
     words = ("finetune", made.network, *made.reading, "--data", made.data)
     assert "no checkpoint, it is written back as .nir" in refusal(*words, "-o", tmp_path / "x.pt")
     assert "--scale-groups 4: is for --weight-bits" in refusal(*words, "--scale-groups", "4", "-o", tmp_path / "x.nir")
     assert "has 39 taxels" in refusal(*words[:-1], "synthetic", "-o", tmp_path / "x.nir")
     assert "no gradient" in refusal("finetune", counters.network, "--data", counters.data, "-o", tmp_path / "x.nir")
-    made = specimen("timed")
-    assert "written back as .pt" in refusal("finetune", made.network, "--data", made.data, "-o", tmp_path / "x.nir")
+    assert "written back as .pt" in refusal("finetune", timed.network, "--data", timed.data, "-o", tmp_path / "x.nir")
     assert not list(tmp_path.glob("x.*"))
