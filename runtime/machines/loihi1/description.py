@@ -161,8 +161,8 @@ def sections(facts: NetlistFacts) -> Iterator[Section]:
     if facts.clocks is not None and facts.clocks.length is not None:
         lines.append(f"  a recording is run for {facts.clocks.length} steps, whatever its own length")
     if facts.synapse_words < SHARED * facts.synapse_words_unrolled:
-        words = f"{facts.synapse_words:,} words of synaptic memory, {facts.synapse_words_unrolled:,} if it did not"
-        lines.append(f"  what a convolution repeats is stored once a core: {words}")
+        words = f"{facts.synapse_words:,} words, {facts.synapse_words_unrolled:,} unrolled"
+        lines.append(f"  synapse lists that repeat are stored once a core: {words}")
     if facts.bins is not None:
         lines.append(f"  a step joins {facts.bins} bins of the recordings")
     if facts.free_running is not None:
