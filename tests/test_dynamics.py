@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from oracles import load_weights, refused
 from timed_networks import GRAPH, SMALL, TIMING, louder, written
 
-from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, clocks_over, with_clocks
+from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, clocks_over
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.graphs import normalised_adjacency
@@ -68,16 +68,6 @@ def test_a_clock_ticks_in_every_step_of_its_part_and_none_after_the_last():
     ticks = Clocks(channels=2, steps=3).events(8)
     assert ticks.tolist() == [[1, 1, 1, 0, 0, 0, 0, 0], [0, 0, 0, 1, 1, 1, 0, 0]]
     assert Clocks(channels=2, steps=3).events(2, first=2).tolist() == [[1, 0], [0, 1]]
-
-
-def test_recordings_get_the_clocks_after_their_own_channels():
-    events = np.arange(2 * 3 * 2 * 5).reshape(2, 3, 2, 5).astype(np.uint8)
-    fed = with_clocks(events, Clocks(channels=2, steps=2))
-    assert fed.shape == (2, 8, 5)
-    assert fed.dtype == np.uint8
-    assert_array_equal(fed[:, :6], events.reshape(2, 6, 5))
-    assert fed[1, 6:].tolist() == [[1, 1, 0, 0, 0], [0, 0, 1, 1, 0]]
-    assert with_clocks(events, NO_CLOCKS).shape == (2, 6, 5)
 
 
 def network_step_by_step(network, events, surrogate):

@@ -96,23 +96,6 @@ def test_layers_integrate_in_their_window_only(simulate):
         assert aligned(netlist, trace.spikes[None], layer).shape == (1, 3, 1)
 
 
-def test_what_arrives_outside_the_window_is_dropped(simulate):
-    # a skip from the input arrives too early, a recurrent spike too late; both are dropped, overflow or not
-    first = Neuron(layer=0, threshold=0, bias=1)
-    second = Neuron(layer=1, decay_v=0, threshold=NEVER)
-    huge = ((1, 254), (1, 254))
-    netlist = build(
-        [first, second],
-        [Axon(source=0, exponent=7, targets=huge), Axon(source=1, targets=((1, 2), (0, 2)))],
-        n_inputs=1,
-        depths=[0, 2],
-    )
-    trace = simulate(netlist, events("1100"))
-    # first spikes in steps 0 to 3, which arrive in 1 to 4; the window of second is 2 to 5
-    assert trace.membranes[:, 1].tolist() == [0, 0, 128, 256, 384, 384]
-    assert trace.membranes[:, 0].tolist() == [1, 129, 129, 129, 0, 0]
-
-
 def two_layers() -> Netlist:
     """254 * 128 + 254 is 32766, the largest even sum that holds; the other 2 of channel 1 are too many."""
     axons = [

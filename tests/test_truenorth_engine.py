@@ -83,17 +83,6 @@ def test_votes_count_in_their_window_only(first, votes):
     assert both(netlist, np.array([[1, 0, 1, 1]], np.uint8)).counts.votes.tolist() == [0, votes]
 
 
-def test_spikes_that_meet_on_an_axon_are_one():
-    draft = alone(Neuron(threshold=2), channels=2)
-    draft.clock(0, 0, period=2, phase=1)
-    netlist = draft.netlist(taxels=2, polarities=1, classes=1)
-    trace = both(netlist, np.array([[1, 1, 0, 0], [1, 0, 0, 0]], np.uint8))
-    assert trace.counts.axons.tolist() == [3]
-    assert int(trace.counts.merged) == 2
-    assert np.flatnonzero(trace.spikes[:, 0]).tolist() == [1]
-    assert trace.membranes[:, 0].tolist() == [1, 0, 0, 1]
-
-
 @settings(max_examples=80)
 @given(crossbars(), st.integers(0, 2**31))
 def test_engine_equals_specification(netlist, seed):
