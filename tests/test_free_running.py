@@ -75,8 +75,8 @@ def test_commands(spikeloom, as_json, refusal):
     verdict = as_json("verify", "free.loom", *data)
     assert (verdict["row_different"], verdict["spec_equals_engine"]) == (0, True)
     assert verdict["ladder"][-1]["stage"] == "free_running"
-    for words in (("explain", "free.loom", *data), ("anytime", "free.loom", *data[2:])):
-        assert refusal(*words).startswith("netlist: is free-running, which this cannot take")
+    for command, options in (("explain", data), ("anytime", data[2:]), ("certify", data[2:])):
+        assert refusal(command, "free.loom", *options).startswith("netlist: is free-running, which this cannot take")
     assert refusal("export", "free.loom", "--to", "onnx", "-o", "x.onnx").startswith("onnx: a free-running netlist")
     write_netlist(replace(read_netlist("free.loom"), blank=facts["steps"] - 1), "short.loom")
     code, out, _ = spikeloom("verify", "short.loom", "--checkpoint", "net.pt")

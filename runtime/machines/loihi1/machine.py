@@ -165,11 +165,11 @@ class Loihi(IntegerMachine):
 
     @cached_property
     def _chip(self) -> Chip | None:
-        """For changed runs; None where a register may overflow, or no layer has a window."""
+        """For changed runs; None where a register may overflow."""
         from spikeloom.runtime.machines.loihi1.changes import kernel
 
-        unknown = self.free_running or kernel.overflows(self.netlist)
-        return None if unknown else kernel.chip_of(self.netlist)
+        self.require_windows()
+        return None if kernel.overflows(self.netlist) else kernel.chip_of(self.netlist)
 
     def effects(self, channels: EventArray, changes: Changes) -> Effects:
         """Only what a change reaches is simulated again."""
