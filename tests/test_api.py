@@ -57,6 +57,9 @@ def test_modules_come_in_as_they_are(data):
     net = api.compile(module, example=torch.zeros(1, 2 * TAXELS))
     assert "E0  specification = engine" in str(net.verify(data.test, min_agreement=0.0))
     refused(OptionError, "example=", api.compile, module)
+    tuned = api.finetune(module, data, "tuned.nir", example=torch.zeros(1, 2 * TAXELS), epochs=1)
+    assert tuned.verify(data.test, min_agreement=0.0).value.quantised_different == 0
+    assert "written: tuned.nir, tuned.loom" in str(tuned)
 
 
 def test_what_does_not_suit_is_refused(data, net):
