@@ -122,9 +122,3 @@ def towers_of(checkpoint: Checkpoint) -> tuple[IntArray, ...]:
     relays = np.full(checkpoint.dynamics.clocks.channels, SHARED)
     dense = (np.repeat(towers, len(stage.bias) // checkpoint.towers) for stage in checkpoint.dense)
     return (np.concatenate([first, relays]), *dense)
-
-
-def inputs_of(checkpoint: Checkpoint, layer: int) -> IntArray:
-    """Neurons of the layer before that each tower of a fully connected layer receives, (towers, inputs), in order."""
-    before = towers_of(checkpoint)[layer - 1]
-    return np.stack([np.flatnonzero((before == t) | (before == SHARED)) for t in range(checkpoint.towers)])

@@ -124,7 +124,7 @@ def build_graph(name: str, coordinates: ArrayLike = NEUTOUCH) -> Graph:
     else:
         raise OptionError(f"graph {name!r}: unknown; choose {CHOICES}")
     if plain == name:
-        edges = _collapse(edges)
+        edges = edges[np.sort(np.unique(edges, axis=0, return_index=True)[1])]  # every row once
     else:
         canonical = f"released:{canonical}"
     return Graph(name=canonical, coordinates=layout, edges=edges)
@@ -185,17 +185,6 @@ def _distances(coordinates: FloatArray) -> FloatArray:
     return np.sqrt(squares).round(9)
 
 
-def _both_ways(pairs: IntArray) -> IntArray:
-    """Each pair (i, j) followed by (j, i)."""
-    return np.stack([pairs, pairs[:, ::-1]], axis=1).reshape(-1, 2)
-
-
-def _collapse(edges: IntArray) -> IntArray:
-    """Drop every row that occurred before."""
-    first = np.unique(edges, axis=0, return_index=True)[1]
-    return edges[np.sort(first)]
-
-
 def _manual_edges() -> IntArray:
     """Hand-drawn edges: for each taxel those to its higher neighbours, then those back."""
     rows: list[tuple[int, int]] = []
@@ -224,7 +213,8 @@ def _mst_edges(distance: FloatArray, sigma: float, *, neutouch: bool) -> IntArra
     low, high = np.triu_indices(len(distance), 1)
     near = distance[low, high] < sigma
     tree = _tree(distance, ties["start"], ties["first"])
-    return _both_ways(np.concatenate([tree, np.stack([low[near], high[near]], axis=1)]))
+    pairs = np.concatenate([tree, np.stack([low[near], high[near]], axis=1)])
+    return np.stack([pairs, pairs[:, ::-1]], axis=1).reshape(-1, 2)
 
 
 def _tree(distance: FloatArray, start: int, first: list[list[int]]) -> IntArray:

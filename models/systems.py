@@ -70,12 +70,6 @@ def taxels_alone(coordinates: FloatArray) -> Graph:
     return Graph(name=NO_GRAPH, coordinates=coordinates, edges=np.zeros((0, 2), np.int64))
 
 
-def with_self_loops(edges: IntArray, n: int) -> FloatArray:
-    """Propagation of a GCN: the adjacency with a self loop for every taxel, normalised; (taxels, taxels)."""
-    loops = np.repeat(np.arange(n)[:, None], 2, axis=1)
-    return normalised_adjacency(np.concatenate([edges, loops]), n)
-
-
 def propagation_of(system: str, edges: IntArray, taxels: int, grid: Grid | None, filters: int) -> FloatArray:
     """What the first layer of a system sees, in the form that :func:`expand.stack_of` takes.
 
@@ -86,7 +80,8 @@ def propagation_of(system: str, edges: IntArray, taxels: int, grid: Grid | None,
         case "tactilesgnet":
             return normalised_adjacency(edges, taxels)
         case "gcn":
-            return with_self_loops(edges, taxels)[None]
+            loops = np.repeat(np.arange(taxels)[:, None], 2, axis=1)
+            return normalised_adjacency(np.concatenate([edges, loops]), taxels)[None]
         case "mlp":
             return np.eye(taxels)[:, None, :]
     assert system == GRID_CNN, "systems are checked where they are named"

@@ -66,7 +66,9 @@ def expressed(netlist: CrossbarNetlist, ticks: int | None = None) -> Terms:
     shift[netlist.reset_mode == RESET_NONE] = -netlist.threshold[netlist.reset_mode == RESET_NONE]
 
     endless = (netlist.reset_mode == RESET_NONE) | ((netlist.reset_mode == RESET_LINEAR) & held)
-    fall = np.minimum(_least_sums(netlist) + netlist.leak, 0)
+    neuron, least = netlist.neuron_of_synapse(), np.zeros(netlist.n_neurons, np.int64)
+    np.add.at(least, neuron, np.minimum(netlist.weight[neuron, netlist.axon_type[netlist.axon_of_synapse()]], 0))
+    fall = np.minimum(least + netlist.leak, 0)
     room = floor + np.minimum(netlist.initial, 0)
     falling = endless & ((fall < 0) | (room < 0))
     longest = int((np.maximum(room, 0) // np.maximum(-fall, 1))[falling].min()) if falling.any() else None
@@ -92,15 +94,6 @@ def expressed(netlist: CrossbarNetlist, ticks: int | None = None) -> Terms:
         shift=shift,
         ticks=longest,
     )
-
-
-def _least_sums(netlist: CrossbarNetlist) -> IntArray:
-    """Sum of the negative weights of each neuron over its crossing points; (neurons,)."""
-    neuron = netlist.neuron_of_synapse()
-    weight = netlist.weight[neuron, netlist.axon_type[netlist.axon_of_synapse()]]
-    least = np.zeros(netlist.n_neurons, np.int64)
-    np.add.at(least, neuron, np.minimum(weight, 0))
-    return least
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from spikeloom.compiler.checkpoint import Checkpoint, inputs_of
+from spikeloom.compiler.checkpoint import SHARED, Checkpoint, towers_of
 from spikeloom.compiler.dynamics import RELAY_WEIGHT
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Sparse
@@ -96,11 +96,13 @@ def expand_dense(checkpoint: Checkpoint, layer: int) -> Sparse:
 
     The stored entries are all pairs within a tower, and those from the relays of clocks, whatever their weight.
     """
-    weight, inputs = checkpoint.dense[layer - 1].weight, inputs_of(checkpoint, layer)
-    before = list(checkpoint.neurons.values())[layer - 1]
+    weight, before = checkpoint.dense[layer - 1].weight, towers_of(checkpoint)[layer - 1]
+    inputs = np.stack([np.flatnonzero((before == t) | (before == SHARED)) for t in range(checkpoint.towers)])
     column = np.repeat(inputs, len(weight) // len(inputs), axis=0)
     first = np.arange(0, weight.size + 1, weight.shape[1])
-    return sparse.csr_array((weight.astype(np.float64).ravel(), column.ravel(), first), shape=(len(weight), before))
+    return sparse.csr_array(
+        (weight.astype(np.float64).ravel(), column.ravel(), first), shape=(len(weight), len(before))
+    )
 
 
 def expand(checkpoint: Checkpoint, propagation: FloatArray) -> Network:

@@ -204,7 +204,7 @@ class SpikingNet(TrainedModule):
                 n: self._scaled(index, p) for n, p in state.items() if n.startswith(f"{layer}.") and "bias" not in n
             }
         arrays = {name: p.numpy() for name, p in state.items()}
-        found = {name: (array.T if _turned(name) else array) for name, array in arrays.items()}
+        found = {name: (array.T if name.endswith(".weight") else array) for name, array in arrays.items()}
         if self.architecture.system == MLP:
             weight = found.pop("conv1.weight")
             found = {"conv1.hops": weight.reshape(len(weight), self.architecture.taxels, -1).swapaxes(0, 1)} | found
@@ -244,8 +244,3 @@ def _first_layer(architecture: Architecture, generator: torch.Generator) -> Affi
 
 def _over_all_taxels(x: Tensor, _propagation: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return spike_linear(x.flatten(2), weight, bias)
-
-
-def _turned(name: str) -> bool:
-    """Whether a weight lies transposed in this network."""
-    return name.endswith(".weight")

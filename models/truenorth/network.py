@@ -161,7 +161,8 @@ class NativeNet(TrainedModule):
         dense = dense.reshape(1, architecture.taxels * architecture.channels, -1)
         most = highest_level(architecture.copies)
         # the weights of a filter over the graph differ by orders of magnitude: the largest decides
-        found = [self._round(dense, self.bias.repeat(architecture.taxels), 0, _peaks(dense) / (most + 0.5))]
+        step = dense.detach().abs().amax(1, keepdim=True) / (most + 0.5)
+        found = [self._round(dense, self.bias.repeat(architecture.taxels), 0, step)]
         for depth, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True), 1):
             step = SPREADS[architecture.copies] * weight.detach().abs().mean(1, keepdim=True)
             found.append(self._round(weight, bias.reshape(-1), depth, step))
@@ -290,10 +291,6 @@ def run_network(network: NativeNetwork, events: NDArray[np.uint8]) -> dict[str, 
 def _past(real: Tensor, whole: Tensor) -> Tensor:
     """The whole numbers, to the bit, with the gradient of the real ones."""
     return whole.detach() + (real - real.detach())
-
-
-def _peaks(weight: Tensor) -> Tensor:
-    return weight.detach().abs().amax(1, keepdim=True)
 
 
 def _uniform(shape: tuple[int, ...], bound: float, generator: torch.Generator) -> Tensor:

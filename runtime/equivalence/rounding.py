@@ -131,21 +131,16 @@ def check_rounding(machine: IntegerMachine, network: Network, *, fine_tuned: boo
             faults=list(_other_registers(machine, network, post)),
             other=[what for what, digest in held[name].items() if known.get(what) != digest],
         )
-    whole = [*_broken_limits(machine)]
+    whole: list[str] = []
+    try:
+        machine.legal()
+    except CapacityError as error:
+        whole += map(str, error.violations)
     if (found_blank := machine.netlist.blank) != (due := machine.blank_due):
         whole.append(f"it has {found_blank} blank steps instead of {due}")
     if recorded is None and provenance.get("calibrated") and any(layer.faults for layer in found.values()):
         whole.append("it does not record how it was rounded on recordings: compile it again")
     return Rounding(layers=found, whole=tuple(whole))
-
-
-def _broken_limits(machine: IntegerMachine) -> tuple[str, ...]:
-    """Limits of the chip that a netlist breaks."""
-    try:
-        machine.legal()
-    except CapacityError as error:
-        return tuple(map(str, error.violations))
-    return ()
 
 
 def _other_registers(machine: IntegerMachine, network: Network, post: int) -> Iterator[str]:

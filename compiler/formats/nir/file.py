@@ -147,8 +147,11 @@ def loops(graph: Graph) -> Late:
         pairs = [(source, target) for source, target in graph.edges if {source, target} <= members]
         rest = [pair for pair in pairs if pair[1] not in neurons]
         if len(neurons) > 1 or not nx.is_directed_acyclic_graph(nx.DiGraph(rest)):
+            around = rest if len(neurons) == 1 else pairs
+            circle = [printable(source) for source, _ in nx.find_cycle(nx.DiGraph(around))]
+            shown = circle if len(circle) <= SHOWN else [*circle[: SHOWN - 1], "…"]
             raise ModelError(
-                f"nodes feed each other in a circle ({_circle(rest if len(neurons) == 1 else pairs)}) with "
+                f"nodes feed each other in a circle ({' -> '.join([*shown, circle[0]])}) with "
                 f"{len(neurons)} spiking ones in the loop; a spike takes the chip a step from one to the next: only a "
                 "layer may feed itself, through stages in a row; train without the rest"
             )
@@ -175,10 +178,3 @@ def in_order(graph: Graph, late: Late) -> tuple[str, ...]:
             )
     place = {name: number for number, name in enumerate(graph.nodes)}
     return tuple(name for ready in nx.topological_generations(now) for name in sorted(ready, key=place.__getitem__))
-
-
-def _circle(pairs: list[tuple[str, str]]) -> str:
-    """One circle among edges, in the direction in which it runs."""
-    circle = [printable(source) for source, _ in nx.find_cycle(nx.DiGraph(pairs))]
-    shown = circle if len(circle) <= SHOWN else [*circle[: SHOWN - 1], "…"]
-    return " -> ".join([*shown, circle[0]])

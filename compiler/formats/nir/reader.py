@@ -276,7 +276,10 @@ def _facts(graph: Graph, steps: stages.Steps, spiking: Sequence[Neurons], sensor
     version = printable(graph.version) or "of no version"
     facts = [f"NIR {version}, read in steps of {steps.dt:g} s ({steps.convention})", sensor]
     for one in spiking:
-        fact = f"layer {printable(one.node.name)} ({one.node.type}): {one.value.size} neurons, {_decay_words(one.beta)}"
+        _, realised = kept_shares(*decay_registers(one.beta))
+        fact = f"layer {printable(one.node.name)} ({one.node.type}): {one.value.size} neurons, decay {one.beta:.6g}"
+        if not math.isclose(one.beta, realised, abs_tol=stages.TOLERANCE):
+            fact += f" ({realised:.6g} on the chip)"
         fact += f", current {one.value.alpha:.6g}" if one.value.alpha else ""
         fact += f", fires at v > {_span(one.theta + one.reset)}, then v = {_span(one.reset)}"
         if np.any(np.abs(one.gain - 1) > 1e-4):
@@ -303,13 +306,6 @@ def _facts(graph: Graph, steps: stages.Steps, spiking: Sequence[Neurons], sensor
     if clocked.clocks.channels:
         facts.append("biases that go through a synaptic current come from a channel that always has an event")
     return facts
-
-
-def _decay_words(beta: float) -> str:
-    """A membrane decay, and what the chip makes of it where that differs."""
-    _, realised = kept_shares(*decay_registers(beta))
-    same = math.isclose(beta, realised, abs_tol=stages.TOLERANCE)
-    return f"decay {beta:.6g}" + ("" if same else f" ({realised:.6g} on the chip)")
 
 
 def _span(values: FloatArray) -> str:

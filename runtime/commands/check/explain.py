@@ -7,9 +7,9 @@ float32, as the model was trained.
 import argparse
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.interpret import channels_last
+from spikeloom.compiler.interpret import Activity, channels_last
 from spikeloom.runtime.commands.options import add_netlist_and_model, add_recordings
-from spikeloom.runtime.equivalence.explanation.causes import explain, observe
+from spikeloom.runtime.equivalence.explanation.causes import explain
 from spikeloom.runtime.equivalence.explanation.results import Explained, sections
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.rounding import check_rounding
@@ -61,11 +61,12 @@ def run(arguments: argparse.Namespace) -> Outcome:
     rounding = check_rounding(machine, loaded.network, fine_tuned=loaded.network.forms is not None)
     for index in chosen:
         events = data.events[index : index + 1, ..., : data.steps_of(index)]
+        ran = machine.run(events, spikes=True, membranes=True)
         explanation = explain(
             loaded.network,
             machine.integer,
             channels_last(events, netlist.clocks)[0],
-            observe(machine, events),
+            Activity(spikes=tuple(ran.spikes.values()), membranes=tuple(ran.membranes.values())),
             model=loaded.model,
             rounding=rounding,
             absent=machine.absent,

@@ -28,20 +28,12 @@ from spikeloom.runtime.equivalence.explanation import results
 from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots, sources_of
 from spikeloom.runtime.equivalence.reference import taxel_and_feature
 from spikeloom.runtime.equivalence.rounding import SLACK, Rounding, summed
-from spikeloom.runtime.machines.base import EventArray
-from spikeloom.runtime.machines.integer import IntegerMachine
 
 UNDECIDED = 256 * float(np.finfo(np.float64).eps)
 """Distance to threshold, as a share of all that the neuron adds up, that the order of a sum decides."""
 
 STORED, UNROUNDED, UNCLIPPED = range(3)
 """Weights of a replay: as stored, as the checkpoint has them, as stored but for those that the range cuts off."""
-
-
-def observe(machine: IntegerMachine, events: EventArray) -> Activity:
-    """Spikes and membrane registers of each layer on recordings (samples, taxels, polarities, steps)."""
-    ran = machine.run(events, spikes=True, membranes=True)
-    return Activity(spikes=tuple(ran.spikes.values()), membranes=tuple(ran.membranes.values()))
 
 
 def explain(

@@ -83,6 +83,8 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
     threshold[seats.position] = netlist.threshold << MEMBRANE_SHIFT
     compartment = np.full(size, -1)
     compartment[seats.position] = np.arange(netlist.n_compartments)
+    seated = compartment.reshape(-1, LANES)
+    consecutive = np.all((seated == seated[:, :1] + np.arange(LANES)) | (seated < 0), axis=1)
     return Blocks(
         stage=seats.stage,
         dense=dense,
@@ -102,7 +104,7 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
         depth=seats.depth[seats.layer],
         layer=seats.layer,
         compartment=compartment,
-        whole=_whole(compartment.reshape(-1, LANES)),
+        whole=np.where(consecutive, seated[:, 0], -1),
     )
 
 
@@ -159,12 +161,6 @@ def _narrowed(
     shifted = weight.reshape(-1, LANES) >> shift[row_block][:, None].astype(np.int16)
     narrow = shifted.astype(np.int8)
     return shift, (narrow if np.array_equal(narrow, shifted) else shifted).reshape(-1)
-
-
-def _whole(compartment: IntArray) -> IntArray:
-    """First compartment of each block (blocks, 64) whose own are consecutive, -1 of the others."""
-    following = compartment[:, :1] + np.arange(LANES)
-    return np.where(np.all((compartment == following) | (compartment < 0), axis=1), compartment[:, 0], -1)
 
 
 def _bit(lane: IntArray) -> npt.NDArray[np.uint64]:

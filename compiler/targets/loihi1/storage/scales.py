@@ -97,17 +97,12 @@ def rounded(
         integer, planes = round_population(layer.population, layer.projections, form, steps, bias)
     except ValueError:
         return None
-    if layer.population.relays and not _relays_follow(layer.population, integer, planes):
-        return None
+    if relays := layer.population.relays:  # the one synapse of each has to cross its threshold
+        weight = sum(np.asarray(plane.effective()[-relays:].sum(axis=1)) for plane in planes)
+        if np.any(weight <= integer.threshold[-relays:]):
+            return None
     reached = float(np.max(loads(integer, planes), initial=0))
     return Rounded(form=form, population=integer, projections=planes, reached=reached)
-
-
-def _relays_follow(population: Population, integer: IntegerPopulation, planes: tuple[IntegerProjection, ...]) -> bool:
-    """Whether the one synapse of every relay crosses its threshold."""
-    first = population.size - population.relays
-    weight = sum(np.asarray(plane.effective()[first:].sum(axis=1)) for plane in planes)
-    return bool(np.all(weight > integer.threshold[first:]))
 
 
 def judged(layer: Rounded, post: int, calibration: Calibration | None, parts: int | None = None) -> Rounded:

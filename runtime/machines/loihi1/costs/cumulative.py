@@ -47,14 +47,6 @@ def steady(netlist: Netlist) -> BoolArray:
     return np.asarray(lifted[voters])
 
 
-def vote_charges(netlist: Netlist) -> Charges:
-    """What a spike adds to the votes of each class."""
-    sources = np.zeros((netlist.n_inputs + netlist.n_compartments, netlist.classes), np.int64)
-    voters = np.flatnonzero(netlist.readout_class >= 0)
-    sources[netlist.n_inputs + voters, netlist.readout_class[voters]] = 1
-    return Charges(sources=sources, updates=np.zeros((netlist.n_compartments, netlist.classes), np.int64))
-
-
 def run(prepared: engine.Engine, target: Target, events: EventArray, lengths: IntArray, *, lag: int) -> Cumulative:
     """Run recordings (samples, n_inputs, T), each for its own length in data steps (samples,), once.
 
@@ -68,7 +60,11 @@ def run(prepared: engine.Engine, target: Target, events: EventArray, lengths: In
     updates = np.zeros((netlist.n_compartments, sources.shape[1]), np.int64)
     updates[:, -1] = 1
     amounts = Charges(sources=sources, updates=updates)
-    parts = [vote_charges(netlist), amounts, *map(timing.charges, latencies.values())]
+    polls = np.zeros((netlist.n_inputs + netlist.n_compartments, netlist.classes), np.int64)
+    voters = np.flatnonzero(netlist.readout_class >= 0)
+    polls[netlist.n_inputs + voters, netlist.readout_class[voters]] = 1
+    polled = Charges(sources=polls, updates=np.zeros((netlist.n_compartments, netlist.classes), np.int64))
+    parts = [polled, amounts, *map(timing.charges, latencies.values())]
     trace = engine.simulate(prepared, events, lengths=lengths, charges=side_by_side(parts))
     assert trace.charged is not None, "sums were wanted"
     ends = np.cumsum([part.sources.shape[1] for part in parts])[:-1]
