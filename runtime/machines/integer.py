@@ -1,12 +1,9 @@
 """Chips whose netlist reads back as the integer network that the float model became, neuron by neuron."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,10 +11,8 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.base import EventArray, Machine, Price
+from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.report.sections import Block
-
-if TYPE_CHECKING:
-    from spikeloom.runtime.machines.core_map import CoreMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,15 +1,10 @@
 """Sections as a page: one HTML file that needs nothing else, the same bytes for the same sections."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from importlib import resources
-from typing import TYPE_CHECKING
+from typing import Any
 
 from spikeloom.runtime.report.sections import Section
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
 
 def page(title: str, about: str, sections: Iterable[Section]) -> str:
@@ -18,7 +13,7 @@ def page(title: str, about: str, sections: Iterable[Section]) -> str:
 
     files = resources.files("spikeloom.runtime.report")
     template = _environment().get_template("page.html")
-    return template.render(
+    rendered: str = template.render(
         title=title,
         about=about,
         sections=list(sections),
@@ -26,9 +21,10 @@ def page(title: str, about: str, sections: Iterable[Section]) -> str:
         script=files.joinpath("page.js").read_text("utf-8"),
         version=__version__,
     )
+    return rendered
 
 
-def _environment() -> Environment:
+def _environment() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined  # a tenth of a second that other commands save
 
     environment = Environment(
@@ -46,7 +42,7 @@ def _environment() -> Environment:
 def fragment(section: Section) -> str:
     """A section alone."""
     blocks = _environment().get_template("blocks.html").module
-    return str(blocks.show(section, 3))  # type: ignore[attr-defined]
+    return str(blocks.show(section, 3))
 
 
 def anchor(title: str) -> str:

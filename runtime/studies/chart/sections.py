@@ -1,12 +1,10 @@
 """A chart for people: which point to deploy, accuracy over costs, fronts, every point, and where all is from."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +17,6 @@ from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Block, Code, Details, Figure, Section, Table, Text
 from spikeloom.runtime.studies.chart.results import Chart, ChosenBy, Point
 from spikeloom.runtime.studies.chart.study import above_on_test
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 LISTED = 20
 """Rows of a table that a terminal shows."""
@@ -170,7 +165,7 @@ def series_of(points: Sequence[Point]) -> str:
     return next((name for name in names if len({getattr(point, name) for point in points}) > 1), "network")
 
 
-def _scatter(drawing: Drawing, panel: Axes, chart: Chart, name: str) -> None:
+def _scatter(drawing: Drawing, panel: Any, chart: Chart, name: str) -> None:
     """Points over a cost, small but for those on the front; a ring and an interval around the choice."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
