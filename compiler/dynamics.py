@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.types import JsonObject
+from spikeloom.compiler.types import EventArray, JsonObject
 
 RELAY_WEIGHT = 2.0
 """Weight of a clock channel to its relay, in thresholds."""
@@ -37,7 +37,7 @@ class Clocks:
     # Steps that every recording is run: shorter ones end in silence, longer ones are cut; their own by default
     length: int | None = field(default=None, metadata={"optional": True})
 
-    def events(self, steps: int, *, first: int = 0) -> npt.NDArray[np.uint8]:
+    def events(self, steps: int, *, first: int = 0) -> EventArray:
         """Events of the steps ``first … first + steps - 1``, (channels, steps).
 
         Examples

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from spikeloom.compiler import ir
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks, with_clocks
 from spikeloom.compiler.fixedpoint import DECAY_ONE, MEMBRANE_MAX, MEMBRANE_SHIFT
-from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 
 if TYPE_CHECKING:
     from spikeloom.compiler.layer_kernel import Raster, Synapses
@@ -54,7 +54,7 @@ class Layer:
         self._run(raster(sources), spikes.view(np.uint8), kept, np.empty(_NONE, np.uint8), moved)
         return spikes, kept
 
-    def moved(self, sources: Raster, wanted: npt.NDArray[np.uint8]) -> npt.NDArray[np.int32]:
+    def moved(self, sources: Raster, wanted: EventArray) -> npt.NDArray[np.int32]:
         """Entries in which neurons differ from those `wanted`, and spikes more than there; (2, neurons).
 
         `wanted` (samples, steps, bytes) has a bit for each neuron, the first lowest.

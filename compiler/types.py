@@ -7,6 +7,8 @@ import numpy.typing as npt
 
 BoolArray = npt.NDArray[np.bool_]
 
+EventArray = npt.NDArray[np.uint8 | np.bool_]
+
 FloatArray = npt.NDArray[np.float64]
 
 IntArray = npt.NDArray[np.int64]

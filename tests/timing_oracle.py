@@ -15,8 +15,7 @@ from spikeloom.compiler.formats.sanafe import dense_neurons
 from spikeloom.compiler.targets.base import Target, TimeTable
 from spikeloom.compiler.targets.loihi1.layout.place import hops
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.types import BoolArray
-from spikeloom.runtime.machines.base import EventArray
+from spikeloom.compiler.types import BoolArray, EventArray
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.timing import SimpleTimes, charges, simple_times
 from spikeloom.runtime.machines.loihi1.timing_kernel import Tables

@@ -18,14 +18,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE, RESET_TO, CrossbarNetlist
-from spikeloom.compiler.types import IntArray
-
-EventArray = npt.NDArray[np.uint8] | npt.NDArray[np.bool_]
+from spikeloom.compiler.types import EventArray, IntArray
 
 Place = tuple[int, int]
 

@@ -10,8 +10,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.ranc import EventArray, Terms, aims_of, crossbar, mesh_of, packets_of
+from spikeloom.compiler.formats.ranc import Terms, aims_of, crossbar, mesh_of, packets_of
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.types import EventArray
 
 WIDTHS = {"OFFSET_BITS": 9, "MEMBRANE_BITS": 22, "WEIGHT_BITS": 11, "LEAK_BITS": 11, "THRESHOLD_BITS": 22}
 """Widths of registers: those of the chip, twice as much for neurons that are doubled, and counted from elsewhere."""

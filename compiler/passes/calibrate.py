@@ -15,7 +15,7 @@ import numpy.typing as npt
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.interpret import BATCH, Layer, float_simulation, raster, step_late, threads
 from spikeloom.compiler.ir import INPUT, Network
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from spikeloom.compiler.layer_kernel import Raster
@@ -37,7 +37,7 @@ Array = TypeVar("Array", bound=npt.NDArray[Any])
 class Spikes:
     """Spikes of a population, kept at a bit each; an index into samples and steps gives them as booleans."""
 
-    bits: npt.NDArray[np.uint8]  # (samples, steps, bytes), the first neuron lowest
+    bits: EventArray  # (samples, steps, bytes), the first neuron lowest
     size: int  # Neurons
 
     def __getitem__(self, rows: Any) -> BoolArray:

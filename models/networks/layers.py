@@ -18,10 +18,10 @@ from typing import Any
 
 import numba
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from spikeloom.compiler.types import EventArray
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 
 LARGE = 1 << 16
@@ -203,7 +203,7 @@ def times(rows: Tensor, weight: Tensor) -> Tensor:
     return out
 
 
-def time_first(events: npt.NDArray[np.uint8]) -> Tensor:
+def time_first(events: EventArray) -> Tensor:
     """(samples, taxels, channels, steps) uint8 to (steps, samples, taxels, channels) float32."""
     return torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32, order="C"))
 

@@ -18,6 +18,7 @@ from spikeloom.compiler.formats.tensors import members, side_by_side
 from spikeloom.compiler.interpret import threads
 from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached, copy, integrate_float, keep
 from spikeloom.compiler.systems import GCN, TACTILESGNET, feature_major, in_order
+from spikeloom.compiler.types import EventArray
 
 Array = npt.NDArray[Any]
 
@@ -29,7 +30,7 @@ STEPS = 32
 
 
 def float_spikes(
-    checkpoint: Checkpoint, adjacency: npt.NDArray[np.float64], events: npt.NDArray[np.uint8], *, dtype: str = "float32"
+    checkpoint: Checkpoint, adjacency: npt.NDArray[np.float64], events: EventArray, *, dtype: str = "float32"
 ) -> dict[str, npt.NDArray[np.bool_]]:
     """Spikes of every layer, (samples, steps, neurons) by name, on recordings (samples, taxels, channels, steps).
 
@@ -39,7 +40,7 @@ def float_spikes(
 
 
 def float_membranes(
-    checkpoint: Checkpoint, adjacency: npt.NDArray[np.float64], events: npt.NDArray[np.uint8], *, dtype: str = "float32"
+    checkpoint: Checkpoint, adjacency: npt.NDArray[np.float64], events: EventArray, *, dtype: str = "float32"
 ) -> dict[str, npt.NDArray[np.floating]]:
     """Membranes of every layer before the comparison; as :func:`float_spikes`, (samples, steps, neurons) of `dtype`."""
     return _run(checkpoint, adjacency, events, np.dtype(dtype), membranes=True)

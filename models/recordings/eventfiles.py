@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.types import FloatArray
+from spikeloom.compiler.types import EventArray, FloatArray
 from spikeloom.models.graphs import MAX_TAXELS
 from spikeloom.models.recordings.csvtable import read_table
 from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name, opened, parse_npy
@@ -31,7 +31,7 @@ class EventStream:
     name: str  # Of the file
     time_s: FloatArray  # (events,) float64; seconds from the start of the recording, 0 or more, in any order
     taxel: NDArray[np.int64]  # (events,) int64; below `MAX_TAXELS`
-    polarity: NDArray[np.uint8]  # (events,) uint8; 1 for rising, 0 for falling
+    polarity: EventArray  # (events,) uint8; 1 for rising, 0 for falling
     label: int  # Class of the recording, `UNLABELLED` where nothing says it
     at: Callable[[int], str]  # Place of an event by its index, for messages
 
@@ -75,7 +75,7 @@ def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, wher
     )
 
 
-def _polarity(where: str, values: FloatArray, at: Callable[[int], str]) -> NDArray[np.uint8]:
+def _polarity(where: str, values: FloatArray, at: Callable[[int], str]) -> EventArray:
     """1 for rising, 0 for falling, from either code."""
     low, zero, high = values == -1, values == 0, values == 1
     wrong = ~(low | zero | high)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.types import EventArray
 from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.counts import GAP_S, EventCounts
 from spikeloom.models.recordings.csvtable import LABELS, is_table, labels_beside
@@ -44,7 +45,7 @@ class _Recording:
     """One recording in bins, (taxels, 2, steps), and what messages call it."""
 
     where: str
-    grid: NDArray[np.uint8]
+    grid: EventArray
     label: int
     counts: EventCounts
 
@@ -159,7 +160,7 @@ def need_labels(recordings: evtouch.Recordings, what: str) -> evtouch.Recordings
 
 def bin_events(
     stream: EventStream, bin_s: float = BIN_S, *, taxels: int | None = None
-) -> tuple[NDArray[np.uint8], EventCounts]:
+) -> tuple[EventArray, EventCounts]:
     """Put the events of one recording into bins.
 
     Bin ``k`` holds the times from ``k * bin_s`` to before the next; a time less than a billionth of a bin before an
@@ -281,7 +282,7 @@ def other_sensor(recordings: evtouch.Recordings) -> str | None:
     return f"{recordings.source}: has events of taxels 0..{last} only, the network has {recordings.taxels}"
 
 
-def _taxel_notes(source: str, events: NDArray[np.uint8]) -> list[str]:
+def _taxel_notes(source: str, events: EventArray) -> list[str]:
     """Taxels that count from 1 leave the first silent, and no other."""
     alive = np.asarray(events.any(axis=(0, 2, 3)), np.bool_)
     if len(alive) < 4 or alive[0] or not alive[1:].all():

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from spikeloom.compiler.archive import arrays_digest, opened_zip, read_npy
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.files import reading
+from spikeloom.compiler.types import EventArray
 from spikeloom.models.recordings.counts import EventCounts
 
 MAX_POLARITIES = 8
@@ -44,7 +45,7 @@ class Recordings:
 
     # (samples, taxels, polarities, steps) uint8; 1 where a taxel sent an event of that polarity in that step;
     # C-contiguous, read-only
-    events: NDArray[np.uint8]
+    events: EventArray
     labels: NDArray[np.int64]  # (samples,) int64; class of each recording, or `UNLABELLED`; read-only
     files: tuple[str, ...]  # File name of each recording
     split: str  # For example ``test``
@@ -165,7 +166,7 @@ def parse_npy(where: str, opener: Callable[[], IO[Any]]) -> NDArray[Any]:
     return values
 
 
-def parse_bins(where: str, opener: Callable[[], IO[Any]], taxels: int | None) -> NDArray[np.uint8]:
+def parse_bins(where: str, opener: Callable[[], IO[Any]], taxels: int | None) -> EventArray:
     """Events (taxels, polarities, steps) of an npy file; DataError if it holds anything else, or not the `taxels`."""
     values = parse_npy(where, opener)
     shape = values.shape

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spikeloom.compiler.errors import DataError
+from spikeloom.compiler.types import EventArray
 from spikeloom.models.networks.layers import time_first
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.recipes import CROSS_ENTROPY, RELEASED, Recipe
@@ -29,7 +30,7 @@ def evaluate(network: torch.nn.Module, recordings: Recordings, recipe: Recipe = 
     return loss / len(recordings), correct
 
 
-def _batches(recordings: Recordings) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+def _batches(recordings: Recordings) -> Iterator[tuple[slice, EventArray]]:
     """All recordings in order, a few of one length at a time: where they stand, and their events without filling."""
     start = 0
     while start < len(recordings):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.types import EventArray
 
 
 def require_chance(chance: float) -> None:
@@ -14,7 +14,7 @@ def require_chance(chance: float) -> None:
         raise OptionError(f"--robust {chance:g}: allowed are numbers from 0 to below 1; choose another")
 
 
-def worn(events: npt.NDArray[np.uint8], chance: float, draw: np.random.Generator) -> npt.NDArray[np.uint8]:
+def worn(events: EventArray, chance: float, draw: np.random.Generator) -> EventArray:
     """Recordings (samples, taxels, polarities, steps) of which each event is lost, and each taxel, with a `chance`.
 
     As many events as are lost in the mean come anywhere else. Without a chance nothing is drawn.
@@ -24,5 +24,5 @@ def worn(events: npt.NDArray[np.uint8], chance: float, draw: np.random.Generator
     lost = draw.random(events.shape) < chance
     come = draw.random(events.shape) < chance * events.mean(axis=(1, 2, 3), keepdims=True)
     alive = draw.random(events.shape[:2]) >= chance
-    found: npt.NDArray[np.uint8] = ((events & ~lost) | come) & alive[:, :, None, None]
+    found: EventArray = ((events & ~lost) | come) & alive[:, :, None, None]
     return found

@@ -31,6 +31,7 @@ from spikeloom.compiler.targets.truenorth.native import (
     Stage,
     highest_level,
 )
+from spikeloom.compiler.types import EventArray
 from spikeloom.models.networks.networks import Sizes, TrainedModule
 from spikeloom.models.networks.surrogate import RECTANGLE, Surrogate
 from spikeloom.models.truenorth.neurons import block_sums, integrate
@@ -263,13 +264,13 @@ def native_network(architecture: NativeArchitecture, arrays: Mapping[str, NDArra
     )
 
 
-def votes_by_step(network: NativeNetwork, events: NDArray[np.uint8]) -> NDArray[np.int64]:
+def votes_by_step(network: NativeNetwork, events: EventArray) -> NDArray[np.int64]:
     """Votes (steps, classes) in one recording (1, taxels, polarities, steps)."""
     spikes = run_network(network, events)[network.stages[-1].name][0]
     return np.asarray(spikes.reshape(len(spikes), -1, network.classes).sum(axis=1))
 
 
-def run_network(network: NativeNetwork, events: NDArray[np.uint8]) -> dict[str, NDArray[np.bool_]]:
+def run_network(network: NativeNetwork, events: EventArray) -> dict[str, NDArray[np.bool_]]:
     """Spikes of every layer (samples, steps, neurons), as the model computes them in training.
 
     `events` are (samples, taxels, polarities, steps) uint8.

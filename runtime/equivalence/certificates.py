@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler.interpret import BATCH, channels_last, cut, raster, synapses_of, threads
@@ -36,7 +35,7 @@ from spikeloom.compiler.layer_kernel import (
 from spikeloom.compiler.passes.expand import Factored, effective_weight, expand, stack_of
 from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.systems import TACTILESGNET, in_order
-from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.machines.votes import readout_counts, wins
 
 UNIT = 2.0**-24
@@ -220,7 +219,7 @@ class Certainty:
         self._layers = _layers(model)
         self._clocks = model.input.clocks if isinstance(model, Network) else model.checkpoint.dynamics.clocks
 
-    def spikes(self, events: npt.NDArray[np.uint8]) -> list[tuple[BoolArray, BoolArray]]:
+    def spikes(self, events: EventArray) -> list[tuple[BoolArray, BoolArray]]:
         """Of each layer two arrays (samples, steps, neurons) bool: what surely spikes, and what may or may not.
 
         All others surely do not. `events` is (samples, taxels, polarities, steps) uint8.
@@ -298,7 +297,7 @@ class Certifier:
 
     def add(
         self,
-        events: npt.NDArray[np.uint8],
+        events: EventArray,
         chip: Sequence[BoolArray],
         decisions: IntArray,
         lengths: IntArray | None = None,

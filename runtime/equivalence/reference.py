@@ -25,7 +25,7 @@ from spikeloom.compiler.ir import IntegerNetwork, Network, Projection, Sparse
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import parts_of
 from spikeloom.runtime.machines.votes import votes_by_step
@@ -57,7 +57,7 @@ def _timing(clocks: Clocks, bins: int) -> dict[str, int]:
     return found | ({"bins of a step": bins} if bins > 1 else {})
 
 
-def reference_of(model: Factored | Network) -> Callable[[npt.NDArray[np.uint8]], list[BoolArray]]:
+def reference_of(model: Factored | Network) -> Callable[[EventArray], list[BoolArray]]:
     """What gives the spikes of each layer in float32: of a checkpoint in its own operator order, else synapse sums."""
     if isinstance(model, Network):
         clocks, ready = model.input.clocks, float_simulation(model, np.float32)
@@ -81,7 +81,7 @@ def votes_so_far(network: Network, model: Factored | Network, data: Recordings) 
     return np.concatenate(votes)
 
 
-def membranes_of(model: Factored | Network, events: npt.NDArray[np.uint8]) -> list[npt.NDArray[np.floating]]:
+def membranes_of(model: Factored | Network, events: EventArray) -> list[npt.NDArray[np.floating]]:
     """Membranes of each layer in float32, likewise."""
     from spikeloom.models.networks.reference import float_membranes
 

@@ -7,7 +7,6 @@ in which the two differ are ill-posed, decided by the rounding of a sum and not 
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler import Netlist
 from spikeloom.compiler.errors import DataError
@@ -15,7 +14,7 @@ from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.interpret import channels_last, cut, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored
-from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
 from spikeloom.runtime.equivalence.certificates import Certifier
 from spikeloom.runtime.equivalence.reference import (
@@ -40,7 +39,7 @@ Layers = Sequence[BoolArray]
 def verify(
     netlist: Netlist,
     source: Factored | Network,
-    events: npt.NDArray[np.uint8],
+    events: EventArray,
     labels: IntArray,
     files: tuple[str, ...],
     *,
@@ -172,7 +171,7 @@ def verify(
     )
 
 
-def _fine_tuned(source: Factored | Network) -> Callable[[npt.NDArray[np.uint8]], list[BoolArray]]:
+def _fine_tuned(source: Factored | Network) -> Callable[[EventArray], list[BoolArray]]:
     """What gives the spikes of each layer of a fine-tuned network's torch model."""
     from spikeloom.models.networks.quantised import quantised_spikes  # torch, so only here
 
@@ -195,7 +194,7 @@ def _first_divergence(
     reference: list[BoolArray],
     chip: list[BoolArray],
     wide: list[BoolArray],
-    events: npt.NDArray[np.uint8],
+    events: EventArray,
     files: tuple[str, ...],
 ) -> Divergence | None:
     """First entry in which spikes of the float32 model and the chip differ."""

@@ -25,15 +25,13 @@ from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target, with_tables
 from spikeloom.compiler.targets.netlist_file import Netlist
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime import machines
 from spikeloom.runtime.inputs.files import require_netlist, shipped
 from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting, by_running
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
-
-EventArray = npt.NDArray[np.uint8 | np.bool_]
 
 Done = Callable[[int], object] | None
 """Called with the number of recordings done."""

@@ -9,8 +9,8 @@ import numpy as np
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import IntegerNetwork
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.machines.base import EventArray, Machine, Price
+from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
+from spikeloom.runtime.machines.base import Machine, Price
 from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.report.sections import Block
 

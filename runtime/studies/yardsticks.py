@@ -25,7 +25,7 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GCN, TACTILESGNET
-from spikeloom.compiler.types import FloatArray
+from spikeloom.compiler.types import EventArray, FloatArray
 from spikeloom.runtime.report.encode import key
 from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Section, Table, Text
@@ -107,7 +107,7 @@ class Yardsticks:
 def measure(
     checkpoint: Checkpoint,
     adjacency: FloatArray,
-    events: npt.NDArray[np.uint8],
+    events: EventArray,
     spikes: Mapping[str, SpikeTrain],
     *,
     lengths: npt.NDArray[np.int64] | None = None,
@@ -147,7 +147,7 @@ def measure(
 
 
 def _neurobench(
-    network: Network, inputs: npt.NDArray[np.uint8], trains: Sequence[SpikeTrain], last: npt.NDArray[np.int64]
+    network: Network, inputs: EventArray, trains: Sequence[SpikeTrain], last: npt.NDArray[np.int64]
 ) -> NeuroBench:
     macs = acs = 0.0
     zeros = weights = parameters = 0

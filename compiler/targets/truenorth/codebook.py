@@ -11,13 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.ir import INPUT, Network, Population
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 
 BIN_TICKS = 20
 """Ticks of a data step whose sums travel in time: a millisecond each of the sensor's 20."""
@@ -164,7 +163,7 @@ class PartialSums:
 
 
 def run_levels(
-    network: LevelNetwork, events: npt.NDArray[np.uint8], *, most: int = MOST
+    network: LevelNetwork, events: EventArray, *, most: int = MOST
 ) -> tuple[dict[str, BoolArray], tuple[PartialSums, ...]]:
     """Spikes (steps, neurons) of each layer for one recording (channels, steps), and the partial sums of split layers.
 

@@ -25,7 +25,6 @@ from math import floor
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import with_clocks
@@ -33,7 +32,7 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, Place, history_free
 from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_LINEAR, RESET_NONE, CrossbarNetlist
-from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 
 MAGNITUDES = tuple(1 << kind for kind in range(AXON_TYPES))
 """Weights of the axon types of a core of sums."""
@@ -183,7 +182,7 @@ def _filled(draft: Draft, chip: Target, layer: str, wanted: Iterable[Wanted]) ->
     ]
 
 
-def run_counters(plan: Plan, events: npt.NDArray[np.uint8]) -> dict[str, BoolArray]:
+def run_counters(plan: Plan, events: EventArray) -> dict[str, BoolArray]:
     """Spikes (steps, neurons) of each layer for one recording (taxels, polarities, steps), in whole numbers.
 
     Step s of a layer is the tick ``s`` after its first, see :attr:`Plan.first`.

@@ -21,10 +21,9 @@ from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
-from spikeloom.compiler.types import IntArray, JsonObject
+from spikeloom.compiler.types import EventArray, IntArray, JsonObject
 from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.eventlines import Event, EventLines, Mark
 from spikeloom.runtime.commands.options import add_netlist
@@ -76,7 +75,7 @@ class Watch:
     real: bool  # Whether to keep to the wall clock
     # Says from a chip step and the votes after it whether the grasp is decided, see :func:`exits.live`
     may_end: Callable[[int, IntArray], bool] | None
-    column: NDArray[np.uint8]  # Inputs of the open bin, (channels,)
+    column: EventArray  # Inputs of the open bin, (channels,)
     origin: Decimal | None = None  # Of the grasp; None between two grasps
     epoch: float = 0.0  # Wall clock at the origin
     decided: bool = False

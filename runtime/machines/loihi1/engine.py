@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.types import BoolArray, IntArray
-from spikeloom.runtime.machines.base import Done, EventArray, require_channels
+from spikeloom.compiler.types import BoolArray, EventArray, IntArray
+from spikeloom.runtime.machines.base import Done, require_channels
 from spikeloom.runtime.machines.loihi1.block_kernel import CHARGES, Blocks, add_charges, run_recordings, scratch_of
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.kernel import State, Tables, chip_steps, state_of, tables_of

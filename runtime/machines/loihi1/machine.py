@@ -18,8 +18,8 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.idle import forgotten
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
-from spikeloom.compiler.types import BoolArray, IntArray
-from spikeloom.runtime.machines.base import Done, EventArray, Price, T, differences, one_by_one
+from spikeloom.compiler.types import BoolArray, EventArray, IntArray
+from spikeloom.runtime.machines.base import Done, Price, T, differences, one_by_one
 from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import engine

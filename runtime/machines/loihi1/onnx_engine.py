@@ -11,8 +11,8 @@ import numpy as np
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.formats.onnx.writer import Layer, plan
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.types import BoolArray, IntArray
-from spikeloom.runtime.machines.base import EventArray, require_channels
+from spikeloom.compiler.types import BoolArray, EventArray, IntArray
+from spikeloom.runtime.machines.base import require_channels
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.engine import Engine
 from spikeloom.runtime.machines.votes import class_counts

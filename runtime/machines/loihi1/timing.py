@@ -28,8 +28,7 @@ import numpy.typing as npt
 from spikeloom.compiler.targets.base import PICOSECONDS, Target, TimeTable
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count, require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.machines.base import EventArray
+from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1.timing_kernel import Tables, schedule
 from spikeloom.runtime.machines.loihi1.trace import Charges
 

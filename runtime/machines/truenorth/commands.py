@@ -8,7 +8,6 @@ from operator import add
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.archive import COUNTERS
@@ -25,7 +24,7 @@ from spikeloom.compiler.targets.truenorth.in_time import first_spikes
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, unlike, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Compilation, Options, Source
-from spikeloom.compiler.types import BoolArray, IntArray, JsonObject
+from spikeloom.compiler.types import BoolArray, EventArray, IntArray, JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import NETWORKS, LoadedNetwork, load_network
@@ -111,7 +110,7 @@ def provenance(trained: Trained) -> JsonObject:
 
 
 Modelled = tuple[Mapping[str, BoolArray], tuple[PartialSums, ...]]
-Model = Callable[[npt.NDArray[np.uint8]], Modelled]
+Model = Callable[[EventArray], Modelled]
 """Spikes (steps, neurons) of each layer for events (taxels, polarities, steps); partial sums that travel in time."""
 
 
@@ -259,7 +258,7 @@ def compare(
     )
 
 
-def _votes(network: Network, events: npt.NDArray[np.uint8]) -> IntArray:
+def _votes(network: Network, events: EventArray) -> IntArray:
     """Votes (1, classes) of a float network in a recording (1, taxels, polarities, steps)."""
     done = float_simulation(network).run(channels_last(events, network.input.clocks))
     return readout_counts(network.readout, network.classes, done.spikes[network.readout.population])
@@ -327,7 +326,7 @@ def verify(arguments: argparse.Namespace) -> Outcome:
         source = trained = network.network
         first = {stage.name: n for n, stage in enumerate(trained.stages)}
 
-        def model(events: npt.NDArray[np.uint8]) -> Modelled:
+        def model(events: EventArray) -> Modelled:
             return {name: held[0] for name, held in run_network(trained, events[None]).items()}, ()
 
     again = machine.target.compile(source, Options(in_time=copies or None)).netlist

@@ -23,9 +23,10 @@ import numpy as np
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.formats.ranc import EventArray, Mesh, Terms, expressed, mesh_of
+from spikeloom.compiler.formats.ranc import Mesh, Terms, expressed, mesh_of
 from spikeloom.compiler.formats.ranc_memory import memories, packet_lines, sizes
 from spikeloom.compiler.targets.truenorth.netlist import crossbar_bytes
+from spikeloom.compiler.types import EventArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.truenorth.machine import TrueNorth
 from spikeloom.runtime.report.console import Progress, progress

@@ -10,8 +10,8 @@ from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.legalize import signed_range
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO, CrossbarNetlist
-from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.machines.base import EventArray, require_channels
+from spikeloom.compiler.types import EventArray, IntArray
+from spikeloom.runtime.machines.base import require_channels
 from spikeloom.runtime.machines.truenorth import kernel
 from spikeloom.runtime.machines.truenorth.spec import Counts, Trace
 from spikeloom.runtime.machines.truenorth.twins import Twins, find_twins

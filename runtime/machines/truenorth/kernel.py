@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import EventArray, IntArray
 
 Int32 = npt.NDArray[np.int32]
 
@@ -59,7 +59,7 @@ class State(NamedTuple):
 
     membrane: Int32
     steady_sum: Int32
-    steady_spike: npt.NDArray[np.uint8]
+    steady_spike: EventArray
     arrived: IntArray
     due: Int32
     dues: IntArray

@@ -14,8 +14,8 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.counting import LARGEST
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars
-from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.machines.base import Done, EventArray, Machine, Price, T
+from spikeloom.compiler.types import EventArray, IntArray
+from spikeloom.runtime.machines.base import Done, Machine, Price, T
 from spikeloom.runtime.machines.truenorth import cost, engine, spec
 from spikeloom.runtime.machines.truenorth.spec import Trace
 

@@ -33,8 +33,8 @@ import numpy.typing as npt
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.legalize import signed_range
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO, CrossbarNetlist
-from spikeloom.compiler.types import BoolArray, IntArray
-from spikeloom.runtime.machines.base import EventArray, require_channels
+from spikeloom.compiler.types import BoolArray, EventArray, IntArray
+from spikeloom.runtime.machines.base import require_channels
 
 MembraneArray = npt.NDArray[np.int32]
 

@@ -12,18 +12,17 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler import Netlist
 from spikeloom.compiler.errors import NumericRangeError, OptionError
 from spikeloom.compiler.interpret import Simulation, cut, float_simulation, vote
 from spikeloom.compiler.ir import INPUT, Network
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
 from spikeloom.runtime.machines.votes import readout_counts
 
-Events = npt.NDArray[np.uint8]
+Events = EventArray
 
 SIDES = ("float", "chip")
 

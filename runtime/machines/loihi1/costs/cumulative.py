@@ -9,8 +9,7 @@ import numpy as np
 from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, largest_current
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.machines.base import EventArray
+from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.runtime.machines.integer import LONGEST, Cumulative
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost

@@ -12,8 +12,8 @@ import numpy as np
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.place import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.types import FloatArray, IntArray
-from spikeloom.runtime.machines.base import Done, EventArray
+from spikeloom.compiler.types import EventArray, FloatArray, IntArray
+from spikeloom.runtime.machines.base import Done
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.cost import Costs
