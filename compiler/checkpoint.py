@@ -15,7 +15,7 @@ from spikeloom.compiler.dynamics import PLAIN, Dynamics
 from spikeloom.compiler.fixedpoint import frozen
 from spikeloom.compiler.ir import Form, Readout
 from spikeloom.compiler.systems import MLP, TACTILESGNET, Grid, in_order
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import AnyArray, IntArray
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -89,7 +89,7 @@ class Checkpoint:
         return Readout(population=len(self.dense), label=label)
 
 
-def layers_of(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
+def layers_of(arrays: Mapping[str, AnyArray]) -> dict[str, Any]:
     """Fields of a :class:`Checkpoint` that hold its weights, from tensors by name; read-only copies."""
     held = {name: frozen(np.array(array, np.float32, order="C")) for name, array in arrays.items()}
     stages = sorted(

@@ -11,12 +11,10 @@ first dense layer they are a bias that changes with time.
 """
 
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from spikeloom.compiler.types import EventArray, JsonObject
+from spikeloom.compiler.types import AnyArray, EventArray, JsonObject
 
 RELAY_WEIGHT = 2.0
 """Weight of a clock channel to its relay, in thresholds."""
@@ -67,7 +65,7 @@ def clocks_over(channels: int, steps: int) -> Clocks:
     return Clocks(channels=channels, steps=-(-steps // channels)) if channels else NO_CLOCKS
 
 
-def with_clocks(events: npt.NDArray[Any], clocks: Clocks) -> npt.NDArray[Any]:
+def with_clocks(events: AnyArray, clocks: Clocks) -> AnyArray:
     """Recordings (samples, taxels, polarities, steps) as the input channels of a network, its clocks last.
 
     Gives (samples, taxels * polarities + clocks, steps) of the same type.

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import AnyArray, FloatArray, IntArray
 
 DECAY_BITS = 12
 """Decay registers count in 1/4096."""
@@ -182,7 +182,7 @@ def encode_bias(bias: FloatArray) -> tuple[IntArray, IntArray]:
     return mantissa, exponent
 
 
-def frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def frozen(array: AnyArray) -> AnyArray:
     """The same array, read-only from now on."""
     array.flags.writeable = False
     return array

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from spikeloom.compiler import ir
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks, with_clocks
 from spikeloom.compiler.fixedpoint import DECAY_ONE, MEMBRANE_MAX, MEMBRANE_SHIFT
-from spikeloom.compiler.types import BoolArray, EventArray, IntArray
+from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, IntArray
 
 if TYPE_CHECKING:
     from spikeloom.compiler.layer_kernel import Raster, Synapses
@@ -34,7 +34,7 @@ class Activity:
 
     spikes: tuple[BoolArray, ...]  # One array per population, all aligned with the data
     # Membrane before the reset, where it is kept; floats in model units, or int64 register values
-    membranes: tuple[npt.NDArray[Any], ...]
+    membranes: tuple[AnyArray, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,7 +46,7 @@ class Layer:
     # What :func:`layer_kernel.run_layer` takes between the raster of `pres` and what it fills
     fixed: tuple[Any, ...]
 
-    def run(self, sources: Sequence[BoolArray], *, membranes: bool = False) -> tuple[BoolArray, npt.NDArray[Any]]:
+    def run(self, sources: Sequence[BoolArray], *, membranes: bool = False) -> tuple[BoolArray, AnyArray]:
         """Spikes, and membranes if wanted, of recordings from the spikes of `pres`, all (samples, steps, neurons)."""
         shape = *sources[0].shape[:2], self.size
         spikes, kept = np.empty(shape, np.bool_), np.empty(shape if membranes else _NONE, self._kind)
@@ -71,7 +71,7 @@ class Layer:
 
     @property
     def _kind(self) -> np.dtype[Any]:
-        bias: npt.NDArray[Any] = self.fixed[2]
+        bias: AnyArray = self.fixed[2]
         return bias.dtype
 
 
@@ -147,8 +147,8 @@ class Simulation:
     def run(self, events: BoolArray, *, membranes: bool = False) -> Activity:
         """Run recordings (samples, steps, channels), each from rest, some at a time on all cores."""
 
-        def batch(start: int) -> list[tuple[BoolArray, npt.NDArray[Any]]]:
-            done: list[tuple[BoolArray, npt.NDArray[Any]]] = []
+        def batch(start: int) -> list[tuple[BoolArray, AnyArray]]:
+            done: list[tuple[BoolArray, AnyArray]] = []
             for layer in self.layers:
                 sources = [events[start : start + BATCH] if pre == ir.INPUT else done[pre][0] for pre in layer.pres]
                 done.append(layer.run(sources, membranes=membranes))
@@ -206,7 +206,7 @@ def step_late(spikes: BoolArray) -> BoolArray:
     return late
 
 
-def channels_last(events: npt.NDArray[Any], clocks: Clocks = NO_CLOCKS) -> BoolArray:
+def channels_last(events: AnyArray, clocks: Clocks = NO_CLOCKS) -> BoolArray:
     """Recordings (samples, taxels, polarities, steps) as the (samples, steps, channels) used here, clocks last."""
     return np.ascontiguousarray(with_clocks(events, clocks).transpose(0, 2, 1)).astype(np.bool_)
 

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
 from spikeloom.compiler.fixedpoint import in_units, kept_shares
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import AnyArray, FloatArray, IntArray
 
 INPUT = -1
 """Source id of a projection that starts at the input."""
@@ -217,7 +216,7 @@ def added_up(weights: Iterable[tuple[int, Sparse]]) -> dict[int, Sparse]:
     return found
 
 
-def with_data(weight: Sparse, data: npt.NDArray[Any]) -> Sparse:
+def with_data(weight: Sparse, data: AnyArray) -> Sparse:
     """A csr_array of other numbers that shares its structure with `weight`: change neither in place."""
     return sparse.csr_array((data, weight.indices, weight.indptr), shape=weight.shape)
 

@@ -17,9 +17,8 @@ from scipy import sparse
 
 from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT
 from spikeloom.compiler.ir import Sparse
-from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.compiler.types import AnyArray, BoolArray, IntArray
 
-AnyArray = npt.NDArray[Any]
 Function = Callable[..., Any]
 
 DENORMAL = 1e-30

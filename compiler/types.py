@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+AnyArray = npt.NDArray[Any]
+
 BoolArray = npt.NDArray[np.bool_]
 
 EventArray = npt.NDArray[np.uint8 | np.bool_]

@@ -43,7 +43,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.archive import AGAIN, CLOCKS, GRAPH, Kind, arrays_digest, entry_faults, read_npy, stored_members
 from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, constant_faults, layers_of
@@ -55,6 +54,7 @@ from spikeloom.compiler.formats.tensors import Arrays, apart, faults_of, taxel_f
 from spikeloom.compiler.formats.torch_checkpoint import NOT_A_CHECKPOINT, read_torch
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SMALL_GRID, SYSTEMS, TITLES, Grid, shape_faults
+from spikeloom.compiler.types import AnyArray
 
 FORMAT = "spikeloom-checkpoint"
 VERSION = 6
@@ -126,7 +126,7 @@ def _require_fit(where: str, found: Checkpoint, beta: float | None, theta: float
         raise OptionError(f"--beta {beta:g}: {where} has a decay for each layer, {decays}; omit --beta")
 
 
-def content_digest(manifest: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> str:
+def content_digest(manifest: Mapping[str, Any], arrays: Mapping[str, AnyArray]) -> str:
     """Hash that a manifest states: over its other entries and all arrays."""
     stated = {key: value for key, value in manifest.items() if key != "sha256"}
     return hashlib.sha256(f"{json.dumps(stated, sort_keys=True)}\n{arrays_digest(arrays)}".encode()).hexdigest()

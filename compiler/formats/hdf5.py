@@ -10,17 +10,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler import files
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import FileFault, read_whole
 from spikeloom.compiler.types import FloatArray, IntArray
 
-Array = npt.NDArray[Any]
-
 Tree = dict[str, Any]
-"""By name a further Tree, an Array of numbers or truth values, a string, lists of strings, or None for other things."""
+"""By name a further Tree, an array of numbers or truth values, a string, lists of strings, or None for other things."""
 
 E = TypeVar("E")
 

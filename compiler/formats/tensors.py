@@ -10,25 +10,22 @@ Neurons of the first layer count as in any network of the system, with the featu
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.checkpoint import SHARED, Checkpoint, layers_of, towers_of
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.ir import Form
+from spikeloom.compiler.types import AnyArray
 
-Arrays = dict[str, npt.NDArray[Any]]
+Arrays = dict[str, AnyArray]
 
 Shape = tuple[str, ...]
 """A wanted shape; a word stands for any size from 1, the same wherever it occurs."""
 
 
-def faults_of(
-    arrays: Mapping[str, npt.NDArray[Any]], wanted: Mapping[str, Shape], title: str = "a TactileSGNet"
-) -> list[str]:
+def faults_of(arrays: Mapping[str, AnyArray], wanted: Mapping[str, Shape], title: str = "a TactileSGNet") -> list[str]:
     """Missing, mis-shaped and unknown tensors, and values that are not finite, in that order per tensor.
 
     Examples
@@ -67,7 +64,7 @@ def wanted_dense(stages: int) -> dict[str, Shape]:
     return wanted
 
 
-def taxel_faults(arrays: Mapping[str, npt.NDArray[Any]], features: int, clocks: int = 0) -> list[str]:
+def taxel_faults(arrays: Mapping[str, AnyArray], features: int, clocks: int = 0) -> list[str]:
     """Whether the first dense stage was made for a whole number of taxels, and the clocks beside them."""
     inputs = arrays["fc1.weight"].shape[1]
     if inputs <= clocks or (inputs - clocks) % features:
@@ -76,7 +73,7 @@ def taxel_faults(arrays: Mapping[str, npt.NDArray[Any]], features: int, clocks: 
     return []
 
 
-def apart(arrays: Mapping[str, npt.NDArray[Any]], towers: int) -> tuple[Arrays, ...]:
+def apart(arrays: Mapping[str, AnyArray], towers: int) -> tuple[Arrays, ...]:
     """Arrays of each tower of a joined network, whose filters, rows and biases lie one tower after the other.
 
     Examples
@@ -89,12 +86,12 @@ def apart(arrays: Mapping[str, npt.NDArray[Any]], towers: int) -> tuple[Arrays, 
     return tuple({name: part[tower] for name, part in parts.items()} for tower in range(towers))
 
 
-def together(towers: Sequence[Mapping[str, npt.NDArray[Any]]]) -> Arrays:
+def together(towers: Sequence[Mapping[str, AnyArray]]) -> Arrays:
     """Inverse of :func:`apart`."""
     return {name: np.concatenate([one[name] for one in towers], axis=_tower_axis(name)) for name in towers[0]}
 
 
-def tower_faults(arrays: Mapping[str, npt.NDArray[Any]], towers: int) -> list[str]:
+def tower_faults(arrays: Mapping[str, AnyArray], towers: int) -> list[str]:
     """Arrays that do not hold as much for every tower."""
     return [
         f"{printable(name)} is {array.shape}, not as much for each of {towers} towers"
@@ -125,7 +122,7 @@ def members(checkpoint: Checkpoint) -> tuple[Checkpoint, ...]:
     return tuple(found)
 
 
-def side_by_side(checkpoint: Checkpoint, every: Sequence[Mapping[str, npt.NDArray[Any]]]) -> Arrays:
+def side_by_side(checkpoint: Checkpoint, every: Sequence[Mapping[str, AnyArray]]) -> Arrays:
     """Values of all neurons from those of each tower; by layer, (..., neurons)."""
     found = {}
     for (name, neurons), owner in zip(checkpoint.neurons.items(), towers_of(checkpoint), strict=True):

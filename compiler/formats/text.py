@@ -6,8 +6,9 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
+
+from spikeloom.compiler.types import AnyArray
 
 
 def text(made: Any) -> str:
@@ -36,7 +37,7 @@ def _shown(value: Any) -> str:
     return repr(value)
 
 
-def _span(values: npt.NDArray[Any]) -> str:
+def _span(values: AnyArray) -> str:
     """Least and largest value."""
     if not values.size:
         return "none"
@@ -44,7 +45,7 @@ def _span(values: npt.NDArray[Any]) -> str:
     return f"{low:.6g}" if low == high else f"{low:.6g}…{high:.6g}"
 
 
-def _digest(*arrays: npt.NDArray[Any]) -> str:
+def _digest(*arrays: AnyArray) -> str:
     """A short hash of the values, whatever integer type holds them: stored numbers and indices come in several."""
     found = hashlib.sha256()
     for array in arrays:

@@ -10,12 +10,11 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.interpret import BATCH, Layer, float_simulation, raster, step_late, threads
 from spikeloom.compiler.ir import INPUT, Network
-from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
+from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from spikeloom.compiler.layer_kernel import Raster
@@ -30,7 +29,7 @@ NUDGES = (0.08, 0.04, 0.02, 0.01, 0.005, 0.0025)
 """Shares of its threshold by which a neuron's bias is moved up or down, one after another, where that keeps spikes."""
 
 
-Array = TypeVar("Array", bound=npt.NDArray[Any])
+Array = TypeVar("Array", bound=AnyArray)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +106,7 @@ class Calibration:
         Of each neuron the entries in which its spikes differ, and how many more there are; (2, neurons).
         """
 
-        def part(rows: slice) -> npt.NDArray[Any]:
+        def part(rows: slice) -> AnyArray:
             return layer.moved(self.raster(layer.pres, post, rows), self.spikes[post].bits[rows])
 
         counts = list(threads().map(part, self.parts()[:parts]))

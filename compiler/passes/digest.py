@@ -10,13 +10,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from spikeloom.compiler.ir import IntegerNetwork, added_up
-from spikeloom.compiler.passes.prune import Mask, of_source, zeroed
+from spikeloom.compiler.passes.prune import of_source, zeroed
+from spikeloom.compiler.types import BoolArray
 
 DIGITS = 16
 """Hexadecimal digits of a digest."""
 
 
-def digests(network: IntegerNetwork, gone: Sequence[Mask]) -> dict[str, dict[str, str]]:
+def digests(network: IntegerNetwork, gone: Sequence[BoolArray]) -> dict[str, dict[str, str]]:
     """Digests of the neurons of each layer, their thresholds, weights and biases, without those that are `gone`.
 
     Weights are sums of planes in weight units, so that neither the order of synapses nor zeros count.

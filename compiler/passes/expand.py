@@ -15,7 +15,6 @@ filter. Outputs equal those of the factored form up to floating-point rounding (
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler.checkpoint import SHARED, Checkpoint, towers_of
@@ -23,7 +22,7 @@ from spikeloom.compiler.dynamics import RELAY_WEIGHT
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Sparse
 from spikeloom.compiler.systems import TACTILESGNET, TITLES, in_order
-from spikeloom.compiler.types import FloatArray
+from spikeloom.compiler.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +64,7 @@ def synapses(stack: FloatArray, filters: FloatArray, system: str = TACTILESGNET)
     weight; rows are in the order of the system's neurons, columns taxel-major.
     """
     weight = effective_weight(stack, filters)
-    connected: npt.NDArray[np.bool_] = (stack != 0).any(axis=0)
+    connected: BoolArray = (stack != 0).any(axis=0)
     connected = np.broadcast_to(connected[:, None, :, None], weight.shape)
     columns = weight.shape[2] * weight.shape[3]
     weight, connected = (in_order(system, array).reshape(-1, columns) for array in (weight, connected))

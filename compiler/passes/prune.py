@@ -10,21 +10,17 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection, Network, Sparse, row_parts, with_data
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.passes.range_proof import settled
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
-Mask = npt.NDArray[np.bool_]
-"""Some neurons of a population, (neurons,) bool."""
-
-Masks = tuple[Mask, ...]
+Masks = tuple[BoolArray, ...]
 """Some neurons of each population."""
 
-Known = dict[int, Mask]
+Known = dict[int, BoolArray]
 """Neurons that are known to do nothing, by population; the channels of the input under ``INPUT``."""
 
 Net = TypeVar("Net", Network, IntegerNetwork)
@@ -56,7 +52,7 @@ def never_fires(network: Network) -> Masks:
     return _without_voters(network, tuple(silent[post] for post in range(len(network.populations))))
 
 
-def _spread(network: Net, judge: Callable[[Net, int, Known], Mask]) -> Known:
+def _spread(network: Net, judge: Callable[[Net, int, Known], BoolArray]) -> Known:
     """Neurons of all populations that `judge` finds silent, first population first: silence spreads."""
     silent: Known = {INPUT: np.zeros(network.input.size, np.bool_)}
     for post in range(len(network.populations)):
@@ -64,7 +60,7 @@ def _spread(network: Net, judge: Callable[[Net, int, Known], Mask]) -> Known:
     return silent
 
 
-def _grow(network: Net, post: int, known: Known, judge: Callable[[Net, int, Known], Mask]) -> None:
+def _grow(network: Net, post: int, known: Known, judge: Callable[[Net, int, Known], BoolArray]) -> None:
     """Let `judge` say which neurons of a population do nothing, given what is known to do nothing."""
     known[post] = np.zeros(network.populations[post].size, np.bool_)
     known[post] = judge(network, post, known)
@@ -87,7 +83,7 @@ def _sums(network: Net, post: int, silent: Known) -> tuple[FloatArray, FloatArra
     return up, total
 
 
-def _never_fires(network: Network, post: int, silent: Known) -> Mask:
+def _never_fires(network: Network, post: int, silent: Known) -> BoolArray:
     """Neurons of one population that cannot fire as long as those that are known to be silent do not."""
     population = network.populations[post]
     up, total = _sums(network, post, silent)
@@ -153,7 +149,7 @@ def removable(network: IntegerNetwork) -> tuple[Masks, Masks]:
     return tuple(silent[i] for i in indices), tuple(unread[i] for i in indices)
 
 
-def _silent(network: IntegerNetwork, post: int, silent: Known) -> Mask:
+def _silent(network: IntegerNetwork, post: int, silent: Known) -> BoolArray:
     """The same on the chip: the membrane stays at or below its threshold, register rounding included."""
     population = network.populations[post]
     inflow = _sums(network, post, silent)[0] * (1 << MEMBRANE_SHIFT)
@@ -161,7 +157,7 @@ def _silent(network: IntegerNetwork, post: int, silent: Known) -> Mask:
     return settled(step, population.realised_beta) <= population.threshold << MEMBRANE_SHIFT
 
 
-def _unread(network: IntegerNetwork, pre: int, unread: Known, silent: Known) -> Mask:
+def _unread(network: IntegerNetwork, pre: int, unread: Known, silent: Known) -> BoolArray:
     """Neurons of one population, not silent, without a vote or a synapse to one that is neither."""
     received = np.full(network.populations[pre].size, pre == network.readout.population)
     for p in network.projections:
@@ -171,7 +167,7 @@ def _unread(network: IntegerNetwork, pre: int, unread: Known, silent: Known) -> 
     return ~received & ~silent[pre]
 
 
-def without_channels(network: IntegerNetwork, channels: Mask) -> IntegerNetwork:
+def without_channels(network: IntegerNetwork, channels: BoolArray) -> IntegerNetwork:
     """Set the weights from some input channels, (channels,) bool, to zero; the structure stays."""
     none = none_of(network)
     projections = (
@@ -241,16 +237,16 @@ def _without_voters(network: Network, masks: Masks) -> Masks:
     return tuple(np.zeros_like(mask) if i == voting else mask for i, mask in enumerate(masks))
 
 
-def of_source(masks: Sequence[Mask], pre: int, size: int) -> Mask:
+def of_source(masks: Sequence[BoolArray], pre: int, size: int) -> BoolArray:
     """Of `masks` that of a source; none of the `size` channels if it is the input."""
     return np.zeros(size, np.bool_) if pre == INPUT else masks[pre]
 
 
-def _touched(weight: Sparse, rows: Mask, columns: Mask) -> Mask:
+def _touched(weight: Sparse, rows: BoolArray, columns: BoolArray) -> BoolArray:
     """Whether each stored synapse is in one of these rows or columns."""
     return np.asarray(np.repeat(rows, np.diff(weight.indptr)) | columns[weight.indices])
 
 
-def zeroed(weight: Sparse, rows: Mask, columns: Mask) -> Sparse:
+def zeroed(weight: Sparse, rows: BoolArray, columns: BoolArray) -> Sparse:
     """Set some rows and columns to zero; the structure stays."""
     return with_data(weight, np.where(_touched(weight, rows, columns), 0, weight.data))

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from spikeloom.compiler.dynamics import PLAIN, RELAY_WEIGHT, Clocks, Dynamics
 from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, feature_major, in_order
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.networks.layers import (
     filter_places,
     lasting_current,
@@ -84,7 +85,7 @@ class Sizes:
     channels: int = 2  # Inputs per taxel (polarities)
     hops: int = HOPS  # K of the graph convolution of a TactileSGNet, which has K + 1 filters
 
-    def network(self, propagation: NDArray[np.float64], *, seed: int, surrogate: Surrogate) -> TrainedModule:
+    def network(self, propagation: FloatArray, *, seed: int, surrogate: Surrogate) -> TrainedModule:
         """An untrained network."""
         raise NotImplementedError
 
@@ -100,7 +101,7 @@ class Architecture(Sizes):
     system: str = TACTILESGNET  # One of :data:`spikeloom.compiler.systems.SYSTEMS`
     dynamics: Dynamics = PLAIN  # Decays of single layers, and clocks
 
-    def network(self, propagation: NDArray[np.float64], *, seed: int = 0, surrogate: Surrogate) -> SpikingNet:
+    def network(self, propagation: FloatArray, *, seed: int = 0, surrogate: Surrogate) -> SpikingNet:
         """An untrained network."""
         return SpikingNet(self, propagation, seed=seed, surrogate=surrogate)
 
@@ -122,7 +123,7 @@ class SpikingNet(TrainedModule):
     def __init__(
         self,
         architecture: Architecture,
-        propagation: NDArray[np.float64],
+        propagation: FloatArray,
         *,
         seed: int = 0,
         surrogate: Surrogate = RECTANGLE,
@@ -212,7 +213,7 @@ class SpikingNet(TrainedModule):
             found["fc1.weight"] = found["fc1.weight"][:, self._order()]
         return {name: array.copy(order="C") for name, array in found.items()}
 
-    def _order(self) -> NDArray[np.int64]:
+    def _order(self) -> IntArray:
         """Neuron of ours that is the first, second … one in the order of the system."""
         features, clocks = self.architecture.features, self.architecture.dynamics.clocks.channels
         own = np.arange(self.places * features).reshape(self.places, features)

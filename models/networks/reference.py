@@ -18,9 +18,7 @@ from spikeloom.compiler.formats.tensors import members, side_by_side
 from spikeloom.compiler.interpret import threads
 from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached, copy, integrate_float, keep
 from spikeloom.compiler.systems import GCN, TACTILESGNET, feature_major, in_order
-from spikeloom.compiler.types import EventArray
-
-Array = npt.NDArray[Any]
+from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, FloatArray
 
 BATCH = 8
 """Recordings that run together."""
@@ -30,8 +28,8 @@ STEPS = 32
 
 
 def float_spikes(
-    checkpoint: Checkpoint, adjacency: npt.NDArray[np.float64], events: EventArray, *, dtype: str = "float32"
-) -> dict[str, npt.NDArray[np.bool_]]:
+    checkpoint: Checkpoint, adjacency: FloatArray, events: EventArray, *, dtype: str = "float32"
+) -> dict[str, BoolArray]:
     """Spikes of every layer, (samples, steps, neurons) by name, on recordings (samples, taxels, channels, steps).
 
     What the first layer sees, see :func:`expand.stack_of`, is rounded to `dtype`; networks are trained in float32.
@@ -40,15 +38,15 @@ def float_spikes(
 
 
 def float_membranes(
-    checkpoint: Checkpoint, adjacency: npt.NDArray[np.float64], events: EventArray, *, dtype: str = "float32"
+    checkpoint: Checkpoint, adjacency: FloatArray, events: EventArray, *, dtype: str = "float32"
 ) -> dict[str, npt.NDArray[np.floating]]:
     """Membranes of every layer before the comparison; as :func:`float_spikes`, (samples, steps, neurons) of `dtype`."""
     return _run(checkpoint, adjacency, events, np.dtype(dtype), membranes=True)
 
 
 def _run(
-    checkpoint: Checkpoint, adjacency: Array, events: Array, dtype: np.dtype[Any], *, membranes: bool
-) -> dict[str, Array]:
+    checkpoint: Checkpoint, adjacency: AnyArray, events: AnyArray, dtype: np.dtype[Any], *, membranes: bool
+) -> dict[str, AnyArray]:
     if checkpoint.towers > 1:
         every = [_run(each, adjacency, events, dtype, membranes=membranes) for each in members(checkpoint)]
         return side_by_side(checkpoint, every)
@@ -72,8 +70,8 @@ def _run(
 
 
 def _layers(
-    checkpoint: Checkpoint, adjacency: Array, dtype: np.dtype[Any]
-) -> list[Callable[[Array], tuple[Array, Array]]]:
+    checkpoint: Checkpoint, adjacency: AnyArray, dtype: np.dtype[Any]
+) -> list[Callable[[AnyArray], tuple[AnyArray, AnyArray]]]:
     """What turns spikes of some steps into spikes and membranes of each layer, from rest at first."""
     dynamics, hops = checkpoint.dynamics, checkpoint.hops.astype(dtype)
     propagation, bias = adjacency.astype(dtype), checkpoint.conv_bias.astype(dtype)
@@ -91,19 +89,21 @@ def _layers(
     ]
 
 
-def _linear(weight: Array, bias: Array) -> Callable[[Array], Array]:
+def _linear(weight: AnyArray, bias: AnyArray) -> Callable[[AnyArray], AnyArray]:
     return lambda spikes: spikes @ weight + bias
 
 
 class _Neurons:
     """Neurons of a layer and their state; what arrives is what `drive` makes of spikes (steps, samples, neurons)."""
 
-    def __init__(self, drive: Callable[[Array], Array], bias: Array, alpha: float, beta: float, theta: float) -> None:
+    def __init__(
+        self, drive: Callable[[AnyArray], AnyArray], bias: AnyArray, alpha: float, beta: float, theta: float
+    ) -> None:
         self._drive, self._bias = drive, bias if alpha else np.zeros_like(bias)
         self._constants = [bias.dtype.type(value) for value in (alpha, beta, theta)]
-        self._state: Array = np.zeros(0, bias.dtype)
+        self._state: AnyArray = np.zeros(0, bias.dtype)
 
-    def __call__(self, spikes: Array) -> tuple[Array, Array]:
+    def __call__(self, spikes: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Spikes, zeros and ones of the float type, and membranes of some steps."""
         drive = np.ascontiguousarray(self._drive(spikes))
         if not len(self._state):
@@ -132,7 +132,9 @@ def _integrate(
         copy(membrane, drive[t])
 
 
-def _with_relays(checkpoint: Checkpoint, spikes: Array, membranes: Array, first: int) -> tuple[Array, Array]:
+def _with_relays(
+    checkpoint: Checkpoint, spikes: AnyArray, membranes: AnyArray, first: int
+) -> tuple[AnyArray, AnyArray]:
     """Add those of the relays, which spike as their clocks tick."""
     clocks = checkpoint.dynamics.clocks
     ticks = clocks.events(len(spikes), first=first).T.astype(spikes.dtype)
@@ -143,11 +145,11 @@ def _with_relays(checkpoint: Checkpoint, spikes: Array, membranes: Array, first:
     )
 
 
-def _first(system: str, x: Array, propagation: Array, hops: Array, bias: Array) -> Array:
+def _first(system: str, x: AnyArray, propagation: AnyArray, hops: AnyArray, bias: AnyArray) -> AnyArray:
     """Currents of the first layer, (steps, samples, neurons), in the order of the system's neurons."""
     steps, samples, taxels, channels = x.shape
     if system == GCN:
-        current: Array = propagation[0] @ (x @ hops[0].T) + bias
+        current: AnyArray = propagation[0] @ (x @ hops[0].T) + bias
         return current.reshape(steps, samples, -1)
     # taxels first: a hop is then one product of (taxels, taxels) with a wide matrix
     reached = x.transpose(2, 0, 1, 3).reshape(taxels, -1)

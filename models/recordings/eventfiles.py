@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.types import EventArray, FloatArray
+from spikeloom.compiler.types import EventArray, FloatArray, IntArray
 from spikeloom.models.graphs import MAX_TAXELS
 from spikeloom.models.recordings.csvtable import read_table
 from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name, opened, parse_npy
@@ -30,7 +29,7 @@ class EventStream:
 
     name: str  # Of the file
     time_s: FloatArray  # (events,) float64; seconds from the start of the recording, 0 or more, in any order
-    taxel: NDArray[np.int64]  # (events,) int64; below `MAX_TAXELS`
+    taxel: IntArray  # (events,) int64; below `MAX_TAXELS`
     polarity: EventArray  # (events,) uint8; 1 for rising, 0 for falling
     label: int  # Class of the recording, `UNLABELLED` where nothing says it
     at: Callable[[int], str]  # Place of an event by its index, for messages

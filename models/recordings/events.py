@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.types import EventArray
+from spikeloom.compiler.types import AnyArray, EventArray
 from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.counts import GAP_S, EventCounts
 from spikeloom.models.recordings.csvtable import LABELS, is_table, labels_beside
@@ -212,7 +211,7 @@ def joined_bins(recordings: evtouch.Recordings, bins: int) -> evtouch.Recordings
     return replace(recordings, events=join_bins(recordings.events, bins), lengths=lengths)
 
 
-def join_bins(events: NDArray[Any], bins: int) -> NDArray[Any]:
+def join_bins(events: AnyArray, bins: int) -> AnyArray:
     """Events (..., steps) in bins as many times as long, (..., ceil(steps / bins)).
 
     Examples
@@ -230,7 +229,7 @@ def of_length(recordings: evtouch.Recordings, steps: int | None) -> evtouch.Reco
     return replace(recordings, events=fitted(recordings.events, steps), lengths=None)
 
 
-def fitted(events: NDArray[Any], steps: int) -> NDArray[Any]:
+def fitted(events: AnyArray, steps: int) -> AnyArray:
     """Events (..., steps) cut to so many steps, or filled up with silence.
 
     Examples

@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import IO, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spikeloom.compiler.archive import arrays_digest, opened_zip, read_npy
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.files import reading
-from spikeloom.compiler.types import EventArray
+from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, IntArray
 from spikeloom.models.recordings.counts import EventCounts
 
 MAX_POLARITIES = 8
@@ -46,13 +45,13 @@ class Recordings:
     # (samples, taxels, polarities, steps) uint8; 1 where a taxel sent an event of that polarity in that step;
     # C-contiguous, read-only
     events: EventArray
-    labels: NDArray[np.int64]  # (samples,) int64; class of each recording, or `UNLABELLED`; read-only
+    labels: IntArray  # (samples,) int64; class of each recording, or `UNLABELLED`; read-only
     files: tuple[str, ...]  # File name of each recording
     split: str  # For example ``test``
     source: str  # Name of the folder, zip or generator
     # (samples,) int64, or None; steps of each recording; read-only. None where all have as many as the array, as in the
     # released layout.
-    lengths: NDArray[np.int64] | None = None
+    lengths: IntArray | None = None
     counts: EventCounts | None = None  # What was odd about their events; None where they had bins already
     bin_s: float | None = None  # Seconds of a bin, where they were events; of those before any were joined
 
@@ -79,7 +78,7 @@ class Recordings:
         return int(self.events.shape[3])
 
     @property
-    def step_counts(self) -> NDArray[np.int64]:
+    def step_counts(self) -> IntArray:
         """Time steps of each recording; (samples,) int64."""
         return np.full(len(self), self.steps) if self.lengths is None else self.lengths
 
@@ -87,7 +86,7 @@ class Recordings:
         """Time steps of one recording."""
         return self.steps if self.lengths is None else int(self.lengths[index])
 
-    def part(self, chosen: slice | NDArray[Any], split: str | None = None) -> Self:
+    def part(self, chosen: slice | AnyArray, split: str | None = None) -> Self:
         """Some of the recordings, by indices, truth values or a slice; of another `split` if it has a name."""
         indices = np.arange(len(self))[chosen]
         return replace(
@@ -99,9 +98,9 @@ class Recordings:
             lengths=None if self.lengths is None else self.lengths[chosen],
         )
 
-    def identity(self) -> dict[str, NDArray[Any]]:
+    def identity(self) -> dict[str, AnyArray]:
         """Arrays that tell these recordings from others, whatever their names."""
-        arrays: dict[str, NDArray[Any]] = {"events": self.events, "labels": self.labels}
+        arrays: dict[str, AnyArray] = {"events": self.events, "labels": self.labels}
         return arrays if self.lengths is None else arrays | {"lengths": self.lengths}
 
 
@@ -153,14 +152,14 @@ def label_in_name(name: str) -> int:
     return UNLABELLED if match is None else int(match[1])
 
 
-def parse_npy(where: str, opener: Callable[[], IO[Any]]) -> NDArray[Any]:
+def parse_npy(where: str, opener: Callable[[], IO[Any]]) -> AnyArray:
     """Numbers or truth values of an npy file of at most `MAX_FILE_BYTES`; DataError if it is none."""
     with reading(where, DataError, "copy or download it again"):
         with opener() as file:
             data = file.read(MAX_FILE_BYTES + 1)
         if len(data) > MAX_FILE_BYTES:
             raise DataError(f"more than {MAX_FILE_BYTES} bytes, the limit of a recording; split it")
-        values: NDArray[Any] = read_npy(data)
+        values: AnyArray = read_npy(data)
     if values.dtype.kind not in "biuf":
         raise DataError(f"{where}: dtype {values.dtype.str!r}, allowed are numbers; convert it")
     return values
@@ -175,7 +174,7 @@ def parse_bins(where: str, opener: Callable[[], IO[Any]], taxels: int | None) ->
     if taxels is not None and shape[0] != taxels:
         raise DataError(f"{where}: has {shape[0]} taxels, the network has {taxels}; use recordings of its sensor")
     values = values.view(np.uint8) if values.dtype == np.bool_ else values  # a byte of 2 is no truth value
-    events: NDArray[np.bool_] = values != 0  # NaN becomes an event here and differs from 1 below
+    events: BoolArray = values != 0  # NaN becomes an event here and differs from 1 below
     wrong = values != events
     if wrong.any():
         taxel, polarity, step = (int(index) for index in np.argwhere(wrong)[0])
@@ -235,7 +234,7 @@ def parse_window(words: str) -> int:
     return int(found[1])
 
 
-def steps_of(lengths: NDArray[np.int64], percent: int) -> NDArray[np.int64]:
+def steps_of(lengths: IntArray, percent: int) -> IntArray:
     """Whole steps of a part of each recording, one at least.
 
     Examples

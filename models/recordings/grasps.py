@@ -9,10 +9,10 @@ exponential), so that a seed gives the same bytes wherever numpy draws the same 
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.types import FloatArray
+from spikeloom.compiler.types import BoolArray, FloatArray
 from spikeloom.models.graphs import NEUTOUCH, check_coordinates
 from spikeloom.models.recordings.evtouch import Recordings
 
@@ -109,7 +109,7 @@ def _unit_layout(coordinates: FloatArray) -> FloatArray:
     return (place - (low + high) / 2) / (half or 1.0)
 
 
-def _grasp(rng: np.random.Generator, shape: str, place: FloatArray, steps: int) -> NDArray[np.bool_]:
+def _grasp(rng: np.random.Generator, shape: str, place: FloatArray, steps: int) -> BoolArray:
     """One recording, (taxels, 2, steps)."""
     size = _draw(rng, _SIZES)
     x, y = ((place - _SHIFT * (2 * rng.random(2) - 1)) / size).T

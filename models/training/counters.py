@@ -25,7 +25,7 @@ from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import MOST_CLOCKS
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.fixedpoint import read_only
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import WHOLE, Recordings
 
@@ -135,7 +135,7 @@ class Rule:
     used: IntArray  # Counters that it looks at
     weight: FloatArray  # (classes, used)
 
-    def right(self, data: Counted) -> NDArray[np.bool_]:
+    def right(self, data: Counted) -> BoolArray:
         """Which recordings it decides rightly; (samples,)."""
         return np.asarray(self.sums(data).argmax(axis=1) == data.labels)
 
@@ -192,7 +192,7 @@ def _least_squares(alike: FloatArray, sign: FloatArray, strength: float) -> Floa
     return np.asarray(cho_solve(cho_factor(ridge, overwrite_a=True, check_finite=False), sign, check_finite=False))
 
 
-def _short(sign: FloatArray, sums: FloatArray) -> NDArray[np.bool_]:
+def _short(sign: FloatArray, sums: FloatArray) -> BoolArray:
     """Which recordings are short of the margin; those without a sign are not looked at."""
     return np.asarray((sign * sums < 1) & (sign != 0))
 

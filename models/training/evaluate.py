@@ -6,11 +6,10 @@ from contextlib import contextmanager
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.types import EventArray
+from spikeloom.compiler.types import EventArray, IntArray
 from spikeloom.models.networks.layers import time_first
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.recipes import CROSS_ENTROPY, RELEASED, Recipe
@@ -41,7 +40,7 @@ def _batches(recordings: Recordings) -> Iterator[tuple[slice, EventArray]]:
         start = stop
 
 
-def loss_of(recipe: Recipe, rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
+def loss_of(recipe: Recipe, rates: Tensor, labels: IntArray) -> Tensor:
     """Loss of spike rates (samples, classes) by a recipe, without its penalty on spikes."""
     if recipe.loss == CROSS_ENTROPY:
         wanted = torch.tensor(labels)
@@ -49,7 +48,7 @@ def loss_of(recipe: Recipe, rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
     return rate_loss(rates, labels)
 
 
-def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
+def rate_loss(rates: Tensor, labels: IntArray) -> Tensor:
     """Mean squared error of spike rates (samples, classes) against zeros and a one."""
     target = torch.zeros_like(rates)
     target[torch.arange(len(labels)), torch.tensor(labels)] = 1.0

@@ -27,11 +27,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.types import FloatArray
 from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.networks import Sizes, SpikingNet, TrainedModule, Weights
 from spikeloom.models.recordings.evtouch import Recordings
@@ -79,7 +79,7 @@ class Trained:
 def train(
     training: Recordings,
     test: Recordings,
-    propagation: NDArray[np.float64],
+    propagation: FloatArray,
     architecture: Sizes,
     *,
     epochs: int = RELEASED.epochs,
@@ -278,7 +278,7 @@ def validation_split(training: Recordings) -> tuple[Recordings, Recordings]:
 def train_both(
     training: Recordings,
     test: Recordings,
-    propagation: NDArray[np.float64],
+    propagation: FloatArray,
     architecture: Sizes,
     *,
     epochs: int,

@@ -31,7 +31,7 @@ from spikeloom.compiler.targets.truenorth.native import (
     Stage,
     highest_level,
 )
-from spikeloom.compiler.types import EventArray
+from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.models.networks.networks import Sizes, TrainedModule
 from spikeloom.models.networks.surrogate import RECTANGLE, Surrogate
 from spikeloom.models.truenorth.neurons import block_sums, integrate
@@ -74,7 +74,7 @@ class NativeArchitecture(Sizes):
         """Names of the layers."""
         return ("conv1", *(f"fc{i}" for i in range(1, len(self.hidden) + 2)))
 
-    def inputs(self) -> list[NDArray[np.int64]]:
+    def inputs(self) -> list[IntArray]:
         """Neurons from which each group of the dense layers receives, (groups, inputs of a group) for each layer."""
         widths = (self.taxels * self.features, *(self.groups * size for size in self.hidden))
         rows = (self.taxels, *[self.groups] * len(self.hidden))
@@ -83,7 +83,7 @@ class NativeArchitecture(Sizes):
             for width, row in zip(widths, rows, strict=True)
         ]
 
-    def network(self, propagation: NDArray[np.float64], *, seed: int = 0, surrogate: Surrogate) -> NativeNet:
+    def network(self, propagation: FloatArray, *, seed: int = 0, surrogate: Surrogate) -> NativeNet:
         """An untrained network."""
         return NativeNet(self, propagation, seed=seed, surrogate=surrogate)
 
@@ -131,7 +131,7 @@ class NativeNet(TrainedModule):
     def __init__(
         self,
         architecture: NativeArchitecture,
-        propagation: NDArray[np.float64],
+        propagation: FloatArray,
         *,
         seed: int = 0,
         surrogate: Surrogate = RECTANGLE,
@@ -219,7 +219,7 @@ class Rounded:
 
 def run_layers(
     layers: Sequence[Rounded],
-    inputs: Sequence[NDArray[np.int64]],
+    inputs: Sequence[IntArray],
     clocks: Clocks,
     events: Tensor,
     surrogate: Surrogate = RECTANGLE,
@@ -264,13 +264,13 @@ def native_network(architecture: NativeArchitecture, arrays: Mapping[str, NDArra
     )
 
 
-def votes_by_step(network: NativeNetwork, events: EventArray) -> NDArray[np.int64]:
+def votes_by_step(network: NativeNetwork, events: EventArray) -> IntArray:
     """Votes (steps, classes) in one recording (1, taxels, polarities, steps)."""
     spikes = run_network(network, events)[network.stages[-1].name][0]
     return np.asarray(spikes.reshape(len(spikes), -1, network.classes).sum(axis=1))
 
 
-def run_network(network: NativeNetwork, events: EventArray) -> dict[str, NDArray[np.bool_]]:
+def run_network(network: NativeNetwork, events: EventArray) -> dict[str, BoolArray]:
     """Spikes of every layer (samples, steps, neurons), as the model computes them in training.
 
     `events` are (samples, taxels, polarities, steps) uint8.

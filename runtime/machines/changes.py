@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import AnyArray, IntArray
 
 PART = 64
 """Changed recordings that run together."""
@@ -61,7 +61,7 @@ def joined(changes: list[IntArray]) -> Changes:
     return Changes(np.concatenate([none, *ordered]), np.cumsum([0, *map(len, changes)]))
 
 
-def by_running(run: Callable[[Any], IntArray], channels: npt.NDArray[Any], changes: Changes) -> Effects:
+def by_running(run: Callable[[Any], IntArray], channels: AnyArray, changes: Changes) -> Effects:
     """The definition: each changed recording (channels, steps) is run from its first step to its last.
 
     `run` gives votes (samples, classes) of recordings (samples, channels, steps).

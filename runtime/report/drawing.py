@@ -15,9 +15,8 @@ from functools import wraps
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec
 
 import numpy as np
-import numpy.typing as npt
 
-from spikeloom.compiler.types import JsonObject
+from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.runtime.report.numbers import counted, si
 
 if TYPE_CHECKING:
@@ -168,7 +167,7 @@ def bars(title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str],
 
 
 @styled
-def matrices(title: str, panels: Mapping[str, npt.NDArray[np.int64]]) -> Drawing:
+def matrices(title: str, panels: Mapping[str, IntArray]) -> Drawing:
     """Confusion matrices side by side: rows are labels, columns decisions; right ones are of another colour."""
     from matplotlib.patches import Rectangle
 
@@ -193,7 +192,7 @@ def matrices(title: str, panels: Mapping[str, npt.NDArray[np.int64]]) -> Drawing
 
 @styled
 def raster(
-    title: str, neurons: Sequence[int], steps: int, spikes: Mapping[str, npt.NDArray[np.int64]], kind: str = "neuron"
+    title: str, neurons: Sequence[int], steps: int, spikes: Mapping[str, IntArray], kind: str = "neuron"
 ) -> Drawing:
     """Spikes of both sides: rows are `neurons`, columns steps; differences are marked.
 
@@ -203,7 +202,7 @@ def raster(
     axes = drawing.figure.subplots()
     row = {neuron: index for index, neuron in enumerate(neurons)}
 
-    def places(side: str) -> npt.NDArray[np.int64]:
+    def places(side: str) -> IntArray:
         found = [(step, row[neuron]) for step, neuron in spikes[side].tolist() if neuron in row]
         return np.array(sorted(found), np.int64).reshape(-1, 2)
 

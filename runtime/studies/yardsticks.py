@@ -18,19 +18,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GCN, TACTILESGNET
-from spikeloom.compiler.types import EventArray, FloatArray
+from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.runtime.report.encode import key
 from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Section, Table, Text
-
-SpikeTrain = npt.NDArray[np.bool_]
 
 FLOAT_BYTES = 4
 """Bytes of a float32 parameter."""
@@ -108,9 +105,9 @@ def measure(
     checkpoint: Checkpoint,
     adjacency: FloatArray,
     events: EventArray,
-    spikes: Mapping[str, SpikeTrain],
+    spikes: Mapping[str, BoolArray],
     *,
-    lengths: npt.NDArray[np.int64] | None = None,
+    lengths: IntArray | None = None,
 ) -> Yardsticks:
     """Count a checkpoint's operations on recordings (samples, taxels, channels, steps).
 
@@ -146,9 +143,7 @@ def measure(
     )
 
 
-def _neurobench(
-    network: Network, inputs: EventArray, trains: Sequence[SpikeTrain], last: npt.NDArray[np.int64]
-) -> NeuroBench:
+def _neurobench(network: Network, inputs: EventArray, trains: Sequence[BoolArray], last: IntArray) -> NeuroBench:
     macs = acs = 0.0
     zeros = weights = parameters = 0
     for projection in network.projections:

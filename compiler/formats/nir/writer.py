@@ -25,6 +25,7 @@ from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.formats.nir.stages import require_step
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Sparse, added_up
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import FORGETS
+from spikeloom.compiler.types import FloatArray
 
 VERSION = "1.0.8"
 """Of the layout."""
@@ -94,7 +95,7 @@ def _dense(population: IntegerPopulation, weight: Sparse) -> Float32:
     return np.asarray(weight.toarray().astype(np.float32))
 
 
-def _neurons(population: IntegerPopulation, bias: npt.NDArray[np.float64], dt: float) -> Tree:
+def _neurons(population: IntegerPopulation, bias: FloatArray, dt: float) -> Tree:
     def each(value: float) -> Float32:
         return np.full(population.size, value, np.float32)
 

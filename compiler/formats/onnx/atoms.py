@@ -15,9 +15,8 @@ from scipy import sparse
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.affine import Affine, added, scaled
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.formats.onnx.file import Array
 from spikeloom.compiler.ir import Sparse
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import AnyArray, FloatArray, IntArray
 
 VALUE_LIMIT, COEFFICIENT_LIMIT = 2**22, 2**24
 """Elements of a value, and coefficients of an operator: more than the synapses of a chip."""
@@ -31,7 +30,7 @@ INPUT_ATOM, MEMBRANE, SPIKE, PRODUCT = "input", "membrane", "spike", "product"
 
 NOT_AFFINE = "is not affine in its input; only affine operators between two spiking layers can become synapses"
 
-Value = Array | Affine
+Value = AnyArray | Affine
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

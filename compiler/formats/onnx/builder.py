@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler import __version__
+from spikeloom.compiler.types import AnyArray
 
 OPSET = 17
 IR_VERSION = 8
@@ -22,7 +23,7 @@ INNER = "step/"
 END = 2**63 - 1
 """A slice with this end reaches to the end of its axis."""
 
-Constant = npt.NDArray[Any] | np.generic
+Constant = AnyArray | np.generic
 
 Proto = Any
 """A message of the onnx package, which ships no types."""
@@ -40,7 +41,7 @@ class Port:
         return f"{self.name} {np.dtype(self.kind).name} ({', '.join(map(str, self.shape))})"
 
 
-def one_each(values: npt.NDArray[Any], kind: npt.DTypeLike) -> Constant:
+def one_each(values: AnyArray, kind: npt.DTypeLike) -> Constant:
     """One number for each neuron, or a single number where all are the same."""
     return (values[0] if np.all(values == values[0]) else values).astype(kind)
 
@@ -50,7 +51,7 @@ class Nodes:
     """Nodes in order, and the constants that they read."""
 
     nodes: list[Proto] = field(default_factory=list)
-    constants: dict[str, npt.NDArray[Any]] = field(default_factory=dict)
+    constants: dict[str, AnyArray] = field(default_factory=dict)
 
     def constant(self, name: str, value: Constant) -> str:
         """Hold an array for several nodes; returns its name."""

@@ -16,10 +16,11 @@ from scipy import sparse
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.affine import block_diagonal, convolution
 from spikeloom.compiler.formats.onnx.atoms import COEFFICIENT_LIMIT, Table
-from spikeloom.compiler.formats.onnx.file import BOOL, Array, Node, decimal
+from spikeloom.compiler.formats.onnx.file import BOOL, Node, decimal
 from spikeloom.compiler.ir import Sparse
+from spikeloom.compiler.types import AnyArray
 
-Operands = Sequence[Array | None]
+Operands = Sequence[AnyArray | None]
 
 FLOATING = (1, 10, 11, 16)
 """Element types that Cast widens to float64."""
@@ -58,7 +59,7 @@ SMALL = 64
 """Elements of an operand that may decide the shape of a result."""
 
 
-def evaluate(node: Node, table: Table, operands: Operands) -> list[Array]:
+def evaluate(node: Node, table: Table, operands: Operands) -> list[AnyArray]:
     """Results of an operator in ``NUMERIC`` on numbers, in float64, int64 or bool.
 
     Raises ModelError if a result is too large; the package onnx raises nearly anything on operands or attributes that
@@ -136,7 +137,7 @@ Matrix = Callable[[Node, Table, Sequence[Any], int], Sparse]
 """Of an operator, from the operand of that place, flat in C order; who asks for it adds the biases of Conv and Gemm."""
 
 
-def _contract(table: Table, labels: Sequence[str], out: str, sides: Sequence[Array], which: int) -> Sparse:
+def _contract(table: Table, labels: Sequence[str], out: str, sides: Sequence[AnyArray], which: int) -> Sparse:
     """Matrix of the einsum of two sides by their labels; the side `which` holds positions of an operand."""
     every = out + "".join(sorted({*labels[0], *labels[1]} - {*out}))
     if any(len(set(each)) != len(each) for each in (*labels, out)) or not set(out) <= {*labels[0], *labels[1]}:
@@ -148,7 +149,7 @@ def _contract(table: Table, labels: Sequence[str], out: str, sides: Sequence[Arr
                 raise ValueError("sizes that do not fit each other")
     table.room([sizes[label] for label in every], COEFFICIENT_LIMIT)
 
-    def spread(array: Array, labels: str) -> Array:
+    def spread(array: AnyArray, labels: str) -> AnyArray:
         order = sorted(range(len(labels)), key=lambda axis: every.index(labels[axis]))
         return array.transpose(order).reshape([sizes[label] if label in labels else 1 for label in every])
 
@@ -160,7 +161,7 @@ def _contract(table: Table, labels: Sequence[str], out: str, sides: Sequence[Arr
     return sparse.coo_array(entries, shape=(target.size, int(sides[which].max(initial=-1)) + 1)).tocsr()
 
 
-def _sides(operands: Sequence[Any], which: int) -> list[Array]:
+def _sides(operands: Sequence[Any], which: int) -> list[AnyArray]:
     """Operands, with positions in place of one."""
     place = operands[which]
     return [np.arange(place.size).reshape(place.shape) if each is place else each for each in operands]

@@ -13,14 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import FileFault, read_whole, require_size
 from spikeloom.compiler.formats.names import named, printable
-
-Array = npt.NDArray[Any]
-"""float64, int64 or bool."""
+from spikeloom.compiler.types import AnyArray
 
 OPSETS = range(9, 27)
 """Versions of the operator set whose operators are known here."""
@@ -64,7 +61,7 @@ class Graph:
     nodes: tuple[Node, ...]
     inputs: tuple[Declared, ...]
     outputs: tuple[str, ...]
-    constants: Mapping[str, Array]
+    constants: Mapping[str, AnyArray]  # float64, int64 or bool
     opset: int  # version of its operators
     producer: str
     sha256: str  # of all its bytes
@@ -198,7 +195,7 @@ def _attribute(entry: Any) -> Any:
     raise ModelError(f"attribute {printable(_text(entry.name))} is of a kind that is not known; {DAMAGED}")
 
 
-def _array(proto: Any) -> Array:
+def _array(proto: Any) -> AnyArray:
     """A tensor, its numbers widened to float64, int64 or bool."""
     from onnx import numpy_helper
 

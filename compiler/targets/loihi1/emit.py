@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
 from spikeloom.compiler.ir import INPUT, MANTISSA, IntegerNetwork, depths, fan_in
@@ -16,10 +15,10 @@ from spikeloom.compiler.passes.prune import Masks, none_of
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout import core_needs
 from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import AnyArray, IntArray
 
 
-def _entries(lists: core_needs.Lists, dense: IntArray, base: int) -> tuple[npt.NDArray[Any], ...]:
+def _entries(lists: core_needs.Lists, dense: IntArray, base: int) -> tuple[AnyArray, ...]:
     """Synapses of lists: entries of each list, targets on a core where the chunk starts at `base`, mantissas."""
     length = np.where(dense, lists.last - lists.first + 1, lists.nonzero)
     start = np.cumsum(length) - length
@@ -75,13 +74,13 @@ def emit(
     sizes = np.cumsum([population.size for population in network.populations])
     compartment_id = np.split(compartment, sizes[:-1])
 
-    def column(name: str) -> npt.NDArray[Any]:
+    def column(name: str) -> AnyArray:
         """A field of the populations, of each compartment."""
         return np.concatenate([getattr(network.populations[c.population], name)[c.first : c.last] for c in order])
 
     formats: dict[core_needs.SynapseFormat, int] = {}
     axons_per_core = np.zeros(len(cores), np.int64)
-    parts: dict[str, list[npt.NDArray[Any]]] = {key: [] for key in ("source", "format", "length", "target", "weight")}
+    parts: dict[str, list[AnyArray]] = {key: [] for key in ("source", "format", "length", "target", "weight")}
     needs = core_needs.Needs(network, target)
     for core, chunks in enumerate(cores):
         base, lean = 0, needs.lean(chunks)

@@ -8,14 +8,13 @@ hold come back without synapses or bias, so that they never fire.
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX
 from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Readout
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import AnyArray, IntArray
 
 
 def _one(netlist: Netlist, layer: int, field: str) -> int:
@@ -37,7 +36,7 @@ def lift(netlist: Netlist) -> IntegerNetwork:
         ids = netlist.compartments_of(index)
         held = netlist.neuron[ids]
 
-        def whole(values: npt.NDArray[Any], missing: float, held: IntArray = held, size: int = layer.neurons) -> Any:
+        def whole(values: AnyArray, missing: float, held: IntArray = held, size: int = layer.neurons) -> Any:
             array = np.full(size, missing, values.dtype)
             array[held] = values
             return array

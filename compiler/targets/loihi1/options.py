@@ -4,11 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy.typing as npt
-
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.types import AnyArray
 
 GOALS = ("cores", "latency")
 """What a layout may be chosen for."""
@@ -45,7 +44,7 @@ class Options:
     keep_all: bool = False  # Keep neurons that provably do nothing, too
     prune_unused: bool = False  # Remove neurons that did not fire on any training recording, too
     # (samples, taxels, polarities, steps); recordings for calibration: 32, evenly spaced, are used, of planes 256
-    training_events: npt.NDArray[Any] | None = None
+    training_events: AnyArray | None = None
     # Least number of cores of a layer, by name; they hold no other. Its neurons are cut as evenly as possible.
     cores_for: Mapping[str, int] = field(default_factory=dict)
     chips: int = 1  # Number of chips at most; as few are used as hold the cores

@@ -28,16 +28,14 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-import numpy.typing as npt
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
 from spikeloom.compiler.fixedpoint import DECAY_BITS
 from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import AnyArray, IntArray
 
-AnyArray = npt.NDArray[Any]
 Function = Callable[..., Any]
 
 LANES = 64

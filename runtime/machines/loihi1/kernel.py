@@ -10,14 +10,11 @@ to one of them, so that the low bits say whether anything arrived at all, which 
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached, copy
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.types import IntArray
-
-AnyArray = npt.NDArray[Any]
+from spikeloom.compiler.types import AnyArray, IntArray
 
 ARRIVAL_BITS = 24
 """Bits of a sum that count synapses."""

@@ -20,15 +20,13 @@ References
 from dataclasses import dataclass
 from itertools import pairwise
 from math import lcm
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.targets.base import PICOSECONDS, Target, TimeTable
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count, require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
+from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1.timing_kernel import Tables, schedule
 from spikeloom.runtime.machines.loihi1.trace import Charges
 
@@ -168,7 +166,7 @@ def charges(tables: Tables) -> Charges:
     return Charges(sources=sources, updates=updates)
 
 
-def _ends(spent: npt.NDArray[Any], steps: IntArray, barrier: int) -> dict[str, npt.NDArray[Any]]:
+def _ends(spent: AnyArray, steps: IntArray, barrier: int) -> dict[str, AnyArray]:
     """Fields of :class:`StepTimes`, of what cores take to send, then to receive, (samples, chip steps, 2 * cores)."""
     runs, longest = np.arange(spent.shape[1]) < steps[:, None], spent.argmax(axis=2)
     receives, core = np.divmod(longest, spent.shape[2] // 2)

@@ -10,12 +10,9 @@ sent, so each core needs only a queue.
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached
-from spikeloom.compiler.types import FloatArray, IntArray
-
-AnyArray = npt.NDArray[Any]
+from spikeloom.compiler.types import AnyArray, FloatArray, IntArray
 
 
 class Tables(NamedTuple):

@@ -6,7 +6,6 @@ order of the netlist's ids. A batch of recordings adds one leading axis to every
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +13,7 @@ import numpy.typing as npt
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.compiler.types import AnyArray, BoolArray, IntArray
 
 MembraneArray = npt.NDArray[np.int32]
 
@@ -84,7 +83,7 @@ def unpack(packed: npt.NDArray[np.uint64], compartments: int) -> BoolArray:
     return np.unpackbits(flags, axis=-1, count=compartments, bitorder="little").view(np.bool_)
 
 
-def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArray[Any]:
+def aligned(netlist: Netlist, array: AnyArray, layer: int) -> AnyArray:
     """Cut one layer out of a trace and shift it back by its depth, as the float model counts time.
 
     `array` (…, chip steps, compartments) becomes (…, T, neurons), ordered by neuron; zero for those that the chip does

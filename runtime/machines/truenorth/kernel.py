@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO
-from spikeloom.compiler.types import EventArray, IntArray
+from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 
 Int32 = npt.NDArray[np.int32]
 
@@ -63,7 +63,7 @@ class State(NamedTuple):
     arrived: IntArray
     due: Int32
     dues: IntArray
-    flagged: npt.NDArray[np.bool_]
+    flagged: BoolArray
 
 
 class Tallies(NamedTuple):
@@ -73,7 +73,7 @@ class Tallies(NamedTuple):
     spikes: IntArray
     votes: IntArray
     overflows: IntArray
-    raster: npt.NDArray[np.bool_]
+    raster: BoolArray
     membranes: Int32
 
 

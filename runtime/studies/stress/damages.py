@@ -6,23 +6,19 @@ neuron that the chip does not hold stays as it is in the float network.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler import Netlist, fixedpoint
 from spikeloom.compiler.ir import INPUT, Network
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import AnyArray, BoolArray, FloatArray, IntArray
 from spikeloom.runtime.studies.stress.pair import Pair, perturbation
-
-Mask = npt.NDArray[np.bool_]
 
 HIDDEN = "share of hidden neurons"
 
 
-def with_weights(pair: Pair, weight: npt.NDArray[Any]) -> Pair:
+def with_weights(pair: Pair, weight: AnyArray) -> Pair:
     """Store other mantissas (synapses,); float weights move by as many weight units.
 
     Entries in which nothing changes keep their float weight, bit for bit.
@@ -76,7 +72,7 @@ def weight_bit_flips(pair: Pair, share: float, rng: np.random.Generator) -> Pair
     return with_weights(pair, ((flipped & (2 * half - 1)) - half) * weight_steps(bits))
 
 
-def relays(pair: Pair) -> Mask:
+def relays(pair: Pair) -> BoolArray:
     """Compartments that relay a clock; (compartments,)."""
     first = np.array([population.size - population.relays for population in pair.network.populations])
     return np.asarray(first[pair.netlist.layer] <= pair.netlist.neuron)

@@ -7,17 +7,15 @@ few spikes that move tell there, and one run of each model gives four decisions.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.interpret import channels_last, integer_simulation, vote
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.calibrate import FEW, Spikes, calibrate, evenly_spaced
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.options import Packing
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import AnyArray, IntArray
 
 HELD = 96
 """Recordings that are held out at most, evenly spaced over those that choose no scale."""
@@ -63,7 +61,7 @@ def split(count: int) -> tuple[IntArray, IntArray, IntArray]:
     return few, np.setdiff1d(every, held), held
 
 
-def thinned(events: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def thinned(events: AnyArray) -> AnyArray:
     """Recordings (samples, taxels, polarities, steps) that have lost events at random, always the same ones."""
     draw = np.random.default_rng(0)
     return np.stack([each * (draw.random(each.shape, np.float32) < KEPT) for each in events])
@@ -75,7 +73,7 @@ class HeldOut:
     Recordings are (samples, taxels, polarities, steps); parts in which the float model casts no vote do not count.
     """
 
-    def __init__(self, network: Network, events: npt.NDArray[Any]) -> None:
+    def __init__(self, network: Network, events: AnyArray) -> None:
         self._readout, self._classes = network.readout, network.classes
         self._known = calibrate(network, channels_last(thinned(events), network.input.clocks))
         votes = self._votes(self._known.spikes)

@@ -8,7 +8,6 @@ from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, decay_registers, kept_shares, reach, step_units
 from spikeloom.compiler.interpret import float_layer
@@ -25,6 +24,7 @@ from spikeloom.compiler.targets.loihi1.storage.choose_storage import (
 )
 from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, finest_thresholds, judged, layer_of
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
+from spikeloom.compiler.types import BoolArray
 
 SHARED = 0.8
 """A neuron whose threshold is below this share of its own finest is held back by those it shares the threshold with."""
@@ -89,7 +89,7 @@ def make_exact(
     return assemble(network, chosen), tuple(map(explain_choice, layers, chosen)), tuple(found)
 
 
-def _full_range(layer: FloatLayer, candidate: Rounded) -> npt.NDArray[np.bool_]:
+def _full_range(layer: FloatLayer, candidate: Rounded) -> BoolArray:
     """Whether the largest weight of each neuron fills the planes; shape (neurons,)."""
     form, scale = candidate.form, candidate.population.scale
     steps = layer.peaks() * scale / step_units(form.bits, form.exponents)

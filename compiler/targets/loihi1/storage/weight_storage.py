@@ -10,10 +10,8 @@ bits are one weight of up to 16 bits. Only a weight that the finest plane cannot
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler import ir
 from spikeloom.compiler.fixedpoint import (
@@ -27,7 +25,7 @@ from spikeloom.compiler.fixedpoint import (
     round_steps,
     split_planes,
 )
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import AnyArray, FloatArray, IntArray
 
 FORGETS = DECAY_ONE - 1
 """`decay_u` of a current that forgets everything in one step."""
@@ -118,7 +116,7 @@ def loads(population: ir.IntegerPopulation, projections: tuple[ir.IntegerProject
     return fullest(population, *ir.one_sided(projections, population.size))
 
 
-def fullest(population: ir.IntegerPopulation, up: npt.NDArray[Any], down: npt.NDArray[Any]) -> FloatArray:
+def fullest(population: ir.IntegerPopulation, up: AnyArray, down: AnyArray) -> FloatArray:
     """The same from the largest positive and negative sum of a step, (neurons,) in weight units."""
     filled: FloatArray = np.maximum(up, down).astype(np.float64)
     if population.decay_u == FORGETS:
