@@ -110,6 +110,12 @@ def parts_of(recordings: int, entries: int) -> Iterator[slice]:
     return (slice(first, min(first + size, recordings)) for first in range(0, recordings, size))
 
 
+def one_by_one(channels: EventArray, lengths: IntArray | None) -> Iterator[EventArray]:
+    """Recordings (samples, channels, steps) in turn, each as long as it is."""
+    for index, each in enumerate(channels):
+        yield each if lengths is None else each[:, : lengths[index]]
+
+
 def differences(slow: Any, fast: Any) -> int:
     """Entries of a trace and its counts that differ where `slow` has any; `fast` is a batch of the one recording."""
     found = 0
@@ -260,8 +266,7 @@ class Machine(ABC):
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Spikes, membranes and counts in which simulator and specification differ; events and lengths as for `run`."""
         channels = with_clocks(events, self.netlist.clocks)
-        ends = [channels.shape[2]] * len(channels) if lengths is None else lengths
-        return sum(differences(*self.twice(each[:, :end])) for each, end in zip(channels, ends, strict=True))
+        return sum(differences(*self.twice(sample)) for sample in one_by_one(channels, lengths))
 
     def beside(self, engine: str) -> Callable[[EventArray, IntArray | None], int] | None:
         """Make one of ``ENGINES`` ready to run recordings of some lengths; None for our own.
