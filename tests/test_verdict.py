@@ -44,6 +44,7 @@ def verdict(**changes):
         "quantised_different": None,
         "engine": "spikeloom",
         "engine_different": None,
+        "row_different": None,
         "weights": Rounding(layers={}),
     }
     return SimpleNamespace(**(base | changes))

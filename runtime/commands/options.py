@@ -63,9 +63,8 @@ def add_graph_options(parser: argparse.ArgumentParser, purpose: str) -> None:
     """Add the options that name a taxel graph: the built-in sensor's, or one of the user's own."""
     options = group(parser, "network")
     options.add_argument("--graph", help=f"taxel graph {purpose}: {CHOICES}")
-    options.add_argument(
-        "--taxels", metavar="N|COORDS.csv", help="your own sensor: number of taxels, or their positions x,y[,z] in mm"
-    )
+    what = "your own sensor: number of taxels, or their positions x,y[,z] in mm"
+    options.add_argument("--taxels", metavar="N|COORDS.csv", help=what)
     options.add_argument("--edges", metavar="EDGES.csv", help="your own graph: source,target")
     options.add_argument("--directed", action="store_true", help="take --edges as they are, one way")
 
@@ -103,17 +102,15 @@ def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], defaul
 
 def add_check(parser: argparse.ArgumentParser) -> None:
     """Add the options of a comparison of chip and float model."""
-    parser.add_argument(
-        "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
-    )
+    what = "recordings for spec = engine (default: 3)"
+    parser.add_argument("--spec-samples", type=int, default=3, metavar="N", help=what)
     add_explain_cost(parser)
 
 
 def add_explain_cost(parser: argparse.ArgumentParser) -> None:
     """Add the option that tells what was simulated."""
-    parser.add_argument(
-        "--explain-cost", action="store_true", help="say on stderr (and in --json) what was simulated, and why"
-    )
+    what = "say on stderr (and in --json) what was simulated, and why"
+    parser.add_argument("--explain-cost", action="store_true", help=what)
 
 
 def add_model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
@@ -137,8 +134,7 @@ def add_network(parser: argparse.ArgumentParser) -> None:
     for name, first in (("first", True), ("last", False)):
         what = f"they are the {name} axis, where the shape of an ONNX or NIR input does not say"
         axis.add_argument(f"--polarities-{name}", dest="polarities_first", action="store_const", const=first, help=what)
-    options.add_argument(
-        "--dt", type=float, metavar="SECONDS", help="time step that a NIR file is read in (default: its own)"
-    )
+    what = "time step that a NIR file is read in (default: its own)"
+    options.add_argument("--dt", type=float, metavar="SECONDS", help=what)
     what = f"a step keeps 1 - dt/tau (euler) or exp(-dt/tau) (exponential) of a state (default: {CONVENTIONS[0]})"
     options.add_argument("--convention", choices=CONVENTIONS, help=what)

@@ -96,9 +96,7 @@ def require_splits(path: str | Recordings) -> None:
 def require_suited(data: Recordings, *, classes: int | None, taxels: int | None) -> None:
     """Refuse recordings of another sensor, or of more classes than a network has; DataError naming both."""
     if taxels is not None and data.taxels != taxels:
-        raise DataError(
-            f"{data.source}: has {data.taxels} taxels, the network has {taxels}; use recordings of its sensor"
-        )
+        raise DataError(f"{data.source}: has {data.taxels} taxels, the network has {taxels}; use those of its sensor")
     if classes is not None and data.labels.max(initial=0) >= classes:
         raise DataError(
             f"{data.source}: label {data.labels.max()}, the network has {classes} classes (0..{classes - 1}); "

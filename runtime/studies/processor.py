@@ -30,9 +30,8 @@ from spikeloom.runtime.machines.base import Price
 from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Section, Table, Text
-from spikeloom.runtime.studies.yardsticks import HOROWITZ
+from spikeloom.runtime.studies.yardsticks import ARITHMETIC, HOROWITZ
 
-ARITHMETIC = "Horowitz, ISSCC 2014, figure 1.1.9 (45 nm, 0.9 V)"
 SOLD = "STM32L4R5 (Cortex-M4), data sheet DS12023, typical at 3 V: "
 
 PRICES = {

@@ -32,7 +32,7 @@ from spikeloom.runtime.report.sections import Section, Table, Text
 FLOAT_BYTES = 4
 """Bytes of a float32 parameter."""
 
-_SOURCE = "Horowitz, ISSCC 2014, figure 1.1.9 (45 nm, 0.9 V)"
+ARITHMETIC = "Horowitz, ISSCC 2014, figure 1.1.9 (45 nm, 0.9 V)"
 HOROWITZ = {"float32_add": 0.9, "float32_multiply": 3.7, "int8_multiply": 0.2, "int32_add": 0.1}
 """Energy of one operation, pJ."""
 
@@ -97,7 +97,7 @@ class Yardsticks:
     arithmetic: tuple[Arithmetic, ...]
     graph: str | None = None
     prices_pj: Mapping[str, float] = field(default_factory=HOROWITZ.copy)
-    source: str = _SOURCE
+    source: str = ARITHMETIC
     not_counted: str = NOT_COUNTED
 
 

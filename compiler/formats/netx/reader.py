@@ -227,9 +227,7 @@ def _population(block: Block, size: int, shape: tuple[int, ...]) -> ir.IntegerPo
         raise block.fail("has no neuron, so its membranes are the result, and a chip counts spikes; remove it")
     neuron, kind = replace(block, values=entries), entries.get("type")
     if kind not in NEURONS:
-        raise block.fail(
-            f"has neurons of type {str(kind)[:20]!r}, allowed are {' and '.join(NEURONS)}; train with them"
-        )
+        raise block.fail(f"has neurons of type {str(kind)[:20]!r}, allowed are {' and '.join(NEURONS)}; use them")
     graded = entries.get("gradedSpike"), entries.get("messageBits")
     if any(isinstance(value, np.ndarray) and np.any(value) for value in graded):
         raise block.fail("sends graded spikes, which Loihi 1 does not have; train without")

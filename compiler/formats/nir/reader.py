@@ -285,13 +285,9 @@ def _facts(graph: Graph, steps: stages.Steps, spiking: Sequence[Neurons], sensor
         if np.any(np.abs(one.gain - 1) > 1e-4):
             fact += f"; a step adds {_span(one.gain)} of its input"
         facts.append(fact)
-    facts.append(
-        "v goes to its reset as NIR says; a framework that subtracts the threshold instead means another network"
-    )
+    facts += ["v goes to its reset as NIR says; a framework that subtracts the threshold instead means another network"]
     if any(one.node.type == "CubaLIF" for one in spiking):
-        facts.append(
-            "a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them"
-        )
+        facts += ["a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them"]
     if looped := [printable(one.node.name) for place, one in enumerate(spiking) if place in one.value.terms]:
         facts.append(
             f"{', '.join(looped)}: is recurrent, fed by its own spikes of the step before; snnTorch's RLeaky with "

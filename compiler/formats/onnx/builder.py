@@ -181,9 +181,7 @@ def model_bytes(model: Model, *, name: str, about: str, facts: Mapping[str, Any]
         doc_string=about.replace("``", ""),
     )
     facts = {"version": __version__, **facts}
-    words = {
-        key: facts[key] if isinstance(facts[key], str) else json.dumps(facts[key], sort_keys=True) for key in facts
-    }
+    words = {k: value if isinstance(value, str) else json.dumps(value, sort_keys=True) for k, value in facts.items()}
     onnx.helper.set_model_props(message, dict(sorted(words.items())))
     onnx.checker.check_model(message, full_check=True)
     content: bytes = message.SerializeToString(deterministic=True)

@@ -124,9 +124,7 @@ def _already_reset(
 ) -> tuple[int | None, None, float | None]:
     """A state input that holds the membrane after its reset, so that nothing is reset at its use."""
     pair = table.known.get((PRODUCT, min(membrane, spike), max(membrane, spike)))
-    states = [
-        atom for atom in terms if table.atoms[atom].kind == INPUT_ATOM and diagonal(terms[atom], EQUAL) is not None
-    ]
+    states = [a for a in terms if table.atoms[a].kind == INPUT_ATOM and diagonal(terms[a], EQUAL) is not None]
     reset = {} if pair is None else {membrane: 1.0, pair: -1.0}
     ratios = [_multiple(output, reset) for output in outputs.values() if reset]
     factors = [ratio for ratio in ratios if ratio is not None]

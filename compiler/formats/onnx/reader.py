@@ -151,7 +151,5 @@ def _facts(
         if not n.strict:
             line += "; >= is read as > the next number below"
         facts.append(line)
-    ignored = [
-        printable(atom.label) for index, atom in enumerate(table.atoms) if atom.kind == INPUT_ATOM and index not in used
-    ]
+    ignored = [printable(atom.label) for n, atom in enumerate(table.atoms) if atom.kind == INPUT_ATOM and n not in used]
     return facts + ([f"inputs without effect on a spike: {', '.join(ignored)}"] if ignored else [])

@@ -149,9 +149,7 @@ class _Placing:
                     negative_threshold=reach,
                 )
                 self._add(core, made, layer, n, None if ends is None else ends[n], depth, RELAYED)
-                found.append(
-                    [(core, self.draft.axon(core, sign, [n - first])) for _ in range(groups) for sign in (0, 1)]
-                )
+                found += [[(core, self.draft.axon(core, sign, [n - first])) for _ in range(groups) for sign in (0, 1)]]
             for _ in range(lifts):
                 self._clock(core, 2, range(len(numbers)), start + MOST)
             for _ in range(pulls):

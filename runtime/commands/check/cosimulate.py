@@ -18,9 +18,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options = group(parser, "hardware")
     options.add_argument("--rtl", required=True, metavar="FOLDER", help="a clone of github.com/UA-RCL/RANC (TrueNorth)")
     options.add_argument("--simulator", choices=("verilator", "iverilog"), help="default: verilator, if it is there")
-    options.add_argument(
-        "--work", metavar="FOLDER", help="keep what is built and finished, and go on from it (a minute a recording)"
-    )
+    what = "keep what is built and finished, and go on from it (a minute a recording)"
+    options.add_argument("--work", metavar="FOLDER", help=what)
 
 
 def run(arguments: argparse.Namespace) -> Outcome:

@@ -34,9 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
     add_netlist_and_model(parser)
     add_recordings(parser)
-    parser.add_argument(
-        "--sample", metavar="NAME|N", help="recording to explain, by name or from 0 (default: the first that differs)"
-    )
+    what = "recording to explain, by name or from 0 (default: the first that differs)"
+    parser.add_argument("--sample", metavar="NAME|N", help=what)
     parser.add_argument("--top", type=int, default=10, metavar="N", help="roots to show (default: 10)")
     parser.epilog = NOTES
 

@@ -248,9 +248,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_netlist(parser)
     parser.add_argument("--input", default="-", metavar="FILE", help="event lines (default: -, standard input)")
     parser.add_argument("--bin", default="0.02", metavar="SECONDS", help="bin of the recordings (default: 0.02)")
-    parser.add_argument(
-        "--bins", type=int, metavar="N", help="steps of every grasp: shorter ones are filled up, longer ones cut"
-    )
+    what = "steps of every grasp: shorter ones are filled up, longer ones cut"
+    parser.add_argument("--bins", type=int, metavar="N", help=what)
     what = "where the first bin of a grasp begins: at time 0 or at the first event (default: zero)"
     parser.add_argument("--origin", choices=("zero", "first"), default="zero", help=what)
     what = "keep to the wall clock, or go on as soon as events allow it (default: full)"

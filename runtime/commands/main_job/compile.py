@@ -50,17 +50,15 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add_network(sub)
     storage, layout, output = (group(sub, title) for title in ("storage", "layout", "output"))
     sub.add_argument("--target", default=DEFAULT_TARGET, help=f"chip: {DEFAULT_TARGET} (default), or truenorth")
-    storage.add_argument(
-        "--weight-bits", metavar="N[,N]", help="storage width, one or one a layer: 2 to 6 or 8 (default: 8)"
-    )
+    what = "storage width, one or one a layer: 2 to 6 or 8 (default: 8)"
+    storage.add_argument("--weight-bits", metavar="N[,N]", help=what)
     storage.add_argument("--planes", metavar="N[,N]", help="times a synapse is stored, 1 to 3 (default: 1)")
     storage.add_argument("--scale-groups", metavar="N[,N]", help="scales in a layer, 1 to 8 (default: 1)")
     what = "add planes and scales until the training spikes are the float model's"
     storage.add_argument("--spike-exact", action="store_true", help=what)
     storage.add_argument("--keep-all", action="store_true", help="keep neurons that never fire or reach no neuron")
-    storage.add_argument(
-        "--prune-unused", action="store_true", help="leave out neurons that never fired on the training split, too"
-    )
+    what = "leave out neurons that never fired on the training split, too"
+    storage.add_argument("--prune-unused", action="store_true", help=what)
     storage.add_argument(
         "--share-lists",
         action="store_true",
@@ -79,9 +77,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     layout.add_argument("--optimize", default="cores", metavar="GOAL", help=what)
     what = "no host resets the chip: layers always integrate, blank steps after each recording clear them"
     layout.add_argument("--free-running", action="store_true", help=what)
-    output.add_argument(
-        "--dump-after", action="append", default=[], metavar="PASS", help="print the network after a pass, on stderr"
-    )
+    what = "print the network after a pass, on stderr"
+    output.add_argument("--dump-after", action="append", default=[], metavar="PASS", help=what)
     output.add_argument("-o", "--output", required=True, metavar="NET.loom", help="netlist to write")
 
 

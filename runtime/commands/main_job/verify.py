@@ -32,9 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     add_netlist_and_model(parser)
     add_recordings(parser, window=True, required=False)
-    parser.add_argument(
-        "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"
-    )
+    what = "float model for E2 and E3 (default: the weights of --checkpoint)"
+    parser.add_argument("--original", metavar="CKPT", help=what)
     what = f"onnx: onnxruntime runs the integer graph beside our engine (default: {ENGINES[0]})"
     parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0], help=what)
     what = f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})"

@@ -39,9 +39,8 @@ class Joined:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     parser.add_argument("checkpoints", nargs="+", metavar="CKPT", help="networks of one system, graph and timing")
-    parser.add_argument(
-        "--weights", choices=WEIGHTS, help="epoch to take from each (default: the first of these that it holds)"
-    )
+    what = "epoch to take from each (default: the first of these that it holds)"
+    parser.add_argument("--weights", choices=WEIGHTS, help=what)
     parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
 
 

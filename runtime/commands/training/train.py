@@ -39,9 +39,8 @@ from spikeloom.runtime.studies.training import (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     add_data(parser)
-    parser.add_argument(
-        "--join", type=int, default=1, metavar="N", help="a step joins N bins, an event where one has any (default: 1)"
-    )
+    what = "a step joins N bins, an event where one has any (default: 1)"
+    parser.add_argument("--join", type=int, default=1, metavar="N", help=what)
     needing = ", ".join((*GRAPH_SYSTEMS, NATIVE))
     what = f"{', '.join((*SYSTEMS, NATIVE, COUNTING))} (default: {TACTILESGNET}; {needing} need a graph)"
     group(parser, "network").add_argument("--system", choices=(*SYSTEMS, NATIVE, COUNTING), help=what)
@@ -51,37 +50,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     defaults = ", ".join(f"{recipe.epochs} ({name})" for name, recipe in RECIPES.items())
     what = "how: as the released code does, or with lasting currents and clocks (default: released)"
     parser.add_argument("--recipe", choices=tuple(RECIPES), default=RELEASED.name, help=what)
-    parser.add_argument(
-        "--current-decay", metavar="LAYER=X[,…]", help="share of the synaptic current that a step keeps: fc1=0.95"
-    )
-    parser.add_argument(
-        "--membrane-decay", metavar="LAYER=X[,…]", help="share of the membrane, where it is not 0.2: fc1=0.5"
-    )
+    what = "share of the synaptic current that a step keeps: fc1=0.95"
+    parser.add_argument("--current-decay", metavar="LAYER=X[,…]", help=what)
+    what = "share of the membrane, where it is not 0.2: fc1=0.5"
+    parser.add_argument("--membrane-decay", metavar="LAYER=X[,…]", help=what)
     parser.add_argument("--clocks", type=int, metavar="K", help="inputs that tell which K-th of the recording it is")
     parser.add_argument("--features", type=int, metavar="N", help="of the first layer, per place")
     parser.add_argument("--hops", type=int, metavar="K", help="of a tactilesgnet's graph convolution (default: 3)")
     parser.add_argument("--hidden", metavar="N[,N]", help="neurons of each dense layer but the last (default: 128,256)")
-    parser.add_argument(
-        "--copies", type=int, choices=tuple(BASES), help=f"axons of an input of {NATIVE} (default: {USUAL_COPIES})"
-    )
+    what = f"axons of an input of {NATIVE} (default: {USUAL_COPIES})"
+    parser.add_argument("--copies", type=int, choices=tuple(BASES), help=what)
     counting = group(parser, "counters")
     counting.add_argument("--thresholds", metavar="K[,K]", help="events at which counters spike (default: 1,4,16,64)")
     counting.add_argument("--parts", type=int, metavar="N", help="parts of a recording, counted apart (default: 1)")
     counting.add_argument("--ramp", type=int, metavar="N", help="silent steps of the read-out (default: 32)")
-    counting.add_argument(
-        "--levels", type=int, metavar="N", help="so many classes in a row are levels of one thing (default: 1)"
-    )
-    counting.add_argument(
-        "--weight-bits", type=int, metavar="N", help="of a weight, 2 to 8 (default: 8; truenorth holds up to 5)"
-    )
+    what = "so many classes in a row are levels of one thing (default: 1)"
+    counting.add_argument("--levels", type=int, metavar="N", help=what)
+    what = "of a weight, 2 to 8 (default: 8; truenorth holds up to 5)"
+    counting.add_argument("--weight-bits", type=int, metavar="N", help=what)
     parser.add_argument("--window", metavar="P%%", help="train on the first so many per cent of each recording")
     parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
-    parser.add_argument(
-        "--spike-penalty", type=float, metavar="X", help="loss of a spike on every synapse in every step: fewer spikes"
-    )
-    parser.add_argument(
-        "--robust", type=float, metavar="X", help="chance of an event, and of a taxel, to be lost while training: 0.1"
-    )
+    what = "loss of a spike on every synapse in every step: fewer spikes"
+    parser.add_argument("--spike-penalty", type=float, metavar="X", help=what)
+    what = "chance of an event, and of a taxel, to be lost while training: 0.1"
+    parser.add_argument("--robust", type=float, metavar="X", help=what)
     parser.add_argument("--epochs", type=int, metavar="N", help=f"default: {defaults}")
     what = f"the learning rate falls to a tenth every N epochs, after epoch N + 1 first (default: {DECAY_EPOCHS})"
     parser.add_argument("--decay-epochs", type=int, metavar="N", help=what)

@@ -185,9 +185,7 @@ def sections(found: Estimate) -> list[Section]:
     *counted, _, _ = Amounts.__dataclass_fields__
     rows = [[name.replace("_", " "), *(f"{getattr(column, name):,.0f}" for column in columns)] for name in counted]
     rows.append(["time, 1 tick a millisecond", *(si(column.time_s, "s") for column in columns)])
-    rows += [
-        [f"energy, {name}", *(si(c.energy_j[name], "J") for c in columns)] for name in found.per_inference.energy_j
-    ]
+    rows += [[f"energy, {name}", *(si(c.energy_j[name], "J") for c in columns)] for name in columns[0].energy_j]
     layers = [[layer.name, f"{layer.synaptic_events:,.0f}", f"{layer.spikes:,.0f}"] for layer in found.layers]
     head = f"per inference on {found.cores:,} of {found.cores_of_chip:,} cores, over {found.samples} recordings:"
     pace = found.pace

@@ -84,10 +84,9 @@ def most_votes(machine: IntegerMachine, steps: int) -> IntArray:
 
 def steady_classes(machine: IntegerMachine) -> BoolArray:
     """Classes that get a vote in every step after their first one; shape (classes,)."""
-    classes, voters = machine.netlist.classes, machine.netlist.readout_class
-    counts = [
-        np.bincount(each, minlength=classes) for each in (voters[voters >= 0], voters[voters >= 0][machine.steady])
-    ]
+    classes, readout = machine.netlist.classes, machine.netlist.readout_class
+    votes = readout[readout >= 0]
+    counts = [np.bincount(each, minlength=classes) for each in (votes, votes[machine.steady])]
     return np.asarray((counts[0] == 1) & (counts[1] == 1))
 
 

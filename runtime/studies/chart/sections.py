@@ -69,9 +69,7 @@ def _choice(chart: Chart) -> list[Block]:
         lines.append(f"{' and '.join(pick.budgets)}: {pick.fitting or 'none'} of {len(chart.points)} points fit")
     lines.append(f"{'take' if pick.fits else 'the nearest is'} #{point.number} {point.label}")
     if better := ", ".join(f"#{each.number}" for each in above_on_test(chart)):
-        lines.append(
-            f"on the test split its interval lies below those of {better}, which the training split did not show"
-        )
+        lines += [f"on the test split its interval lies below those of {better}, which the training split did not show"]
     return [Text("\n".join(lines)), _table([point], chart.chosen_by, "The choice"), *_commands([point])]
 
 

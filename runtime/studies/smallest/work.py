@@ -174,9 +174,8 @@ def _network(work: Trial, training: Recordings) -> Measured:
 def _baseline(work: Trial, training: Recordings) -> Measured:
     """A support vector machine: its constant, its decisions, its costs."""
     system, labels, rung = work.candidate.system, training.labels, work.rung
-    tried = {1: baselines.STRENGTHS[system][:1], 2: sorted(baselines.STRENGTHS[system])}.get(
-        rung, (work.setting or 0.0,)
-    )
+    strengths = baselines.STRENGTHS[system]
+    tried = {1: strengths[:1], 2: sorted(strengths)}.get(rung, (work.setting or 0.0,))
     seen, seeds = baselines.features(training, work.candidate), range(1, ROUNDS + 1) if rung == RUNGS else (0,)
     right = {strength: np.zeros(len(training), np.int64) for strength in tried}
     for strength, seed in product(right, seeds):
