@@ -22,6 +22,7 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.tensors import members, side_by_side
 from spikeloom.compiler.passes.expand import Factored, expand, stack_of
 from spikeloom.compiler.systems import in_order
+from spikeloom.compiler.types import EventArray
 from spikeloom.models.networks.layers import differentiate_step, events_of, gather, rates_of, scatter, time_first
 from spikeloom.models.networks.networks import Weights
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
@@ -353,7 +354,7 @@ def _integrate_chip(
         _chip_step(sums[t], i, v, bias, threshold, unit, keep_u, keep_v, fired[t], membrane[t])
 
 
-def quantised_spikes(model: Factored | ir.Network, events: NDArray[np.uint8]) -> dict[str, NDArray[np.bool_]]:
+def quantised_spikes(model: Factored | ir.Network, events: EventArray) -> dict[str, NDArray[np.bool_]]:
     """Spikes of every layer of a fine-tuned network as its torch model computes them, (samples, steps, neurons)."""
     if not isinstance(model, ir.Network) and model.checkpoint.towers > 1:
         parts = [replace(model, checkpoint=member) for member in members(model.checkpoint)]
