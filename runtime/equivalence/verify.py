@@ -144,7 +144,9 @@ def verify(
         },
         spec_samples=checked,
         spec_equals_engine=equal and not engine_different,
-        row_different=_others(machine.in_a_row(events, lengths), chip_votes) if machine.free_running else None,
+        row_different=int(np.sum(vote(machine.in_a_row(events, lengths)) != vote(chip_votes)))
+        if machine.free_running
+        else None,
         weights=rounding or check_rounding(machine, origin, fine_tuned=tuned),
         first_divergence=divergence,
         ladder=tuple(
@@ -176,11 +178,6 @@ def _fine_tuned(source: Factored | Network) -> Callable[[EventArray], list[BoolA
     from spikeloom.models.networks.quantised import quantised_spikes  # torch, so only here
 
     return lambda events: list(quantised_spikes(source, events).values())
-
-
-def _others(votes: IntArray, theirs: IntArray) -> int:
-    """Decisions that are not theirs."""
-    return int(np.count_nonzero(vote(votes) != vote(theirs)))
 
 
 def _differences(ours: Layers, theirs: Layers) -> IntArray:
