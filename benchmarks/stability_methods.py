@@ -165,7 +165,7 @@ def picture(each: Json, to: Path) -> None:
         return 1 if row["dead"] else 0
 
     names = ["float", *(name for name in each if name != "float")]
-    levels = np.array([[level(each[name][index]) for index in each[name]] for name in names])
+    levels = np.array([[level(each[name][index]) for index in sorted(each[name], key=int)] for name in names])
     levels = levels[:, np.lexsort([*levels[::-1], levels.sum(axis=0)])]
     figure, axes = plt.subplots(figsize=(9.6, 0.34 * len(names) + 1.2), layout="constrained")
     axes.imshow(levels, cmap=ListedColormap(list(COLOURS.values())), vmin=0, vmax=2, aspect="auto")
