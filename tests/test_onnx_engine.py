@@ -18,6 +18,7 @@ from zoo import specimen
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, read_only
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
+from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.formats.onnx.writer import digits, plan
 from spikeloom.compiler.targets.loihi1.netlist import reach, read_netlist
 from spikeloom.models.recordings.events import load_data
@@ -188,12 +189,14 @@ def test_registers_that_may_overflow_are_refused():
         refused(ModelError, "onnx: some input may overflow a register of layer0", overflowing)
 
 
-def test_the_reference_of_the_format_computes_the_same():
+def test_the_reference_of_the_format_computes_the_same(tmp_path):
     netlist = three_neurons()
     given = np.random.default_rng(2).integers(0, 2, (2, 2, 12), np.uint8)
     expected = engine.simulate(netlist, given, spikes=True).spikes
     content = onnx.load_from_string(onnx_writer.export(netlist, "scan")[0])
     onnx.checker.check_model(content, full_check=True)
+    (tmp_path / "x.onnx").write_bytes(content.SerializeToString())
+    refused(ModelError, "x.onnx: was written by spikeloom export; use the netlist", read_onnx, tmp_path / "x.onnx")
     model = ReferenceEvaluator(content)
     found = dict(zip(model.output_names, model.run(None, {"events": given.transpose(2, 0, 1)}), strict=True))
     np.testing.assert_array_equal(found["layer0.spikes"].transpose(1, 0, 2), expected[:, :12, :2])

@@ -242,6 +242,7 @@ TABLE = [
     ("verify finger.loom --checkpoint finger.pt --graph manual", "compiled for graph knn:1, this is manual"),
     ("verify net.loom --checkpoint net.pt --require E0", "--require E0: is about recordings, give --data too"),
     ("explain net.loom --checkpoint other.pt --data data", "netlist and checkpoint disagree|fc2 8|fc2 7"),
+    (REPORT.replace("x.html", "x.pdf").format(""), "-o x.pdf: allowed are .html; name one of these"),
     ("report net.loom --checkpoint same.pt --data data -o x.html", "compiled from a checkpoint of sha256"),
     ("lean net.pt --data data --differ 1.5", "--differ 1.5: not a share; give a number from 0 to below 1"),
     # one recording

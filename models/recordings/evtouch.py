@@ -165,6 +165,13 @@ def parse_npy(where: str, opener: Callable[[], IO[Any]]) -> AnyArray:
     return values
 
 
+def other_taxels(found: int, wanted: int) -> str:
+    """What is said of recordings of another sensor."""
+    return (
+        f"has {found} taxels, the network has {wanted}; use recordings of its sensor, or train on these with --taxels"
+    )
+
+
 def parse_bins(where: str, opener: Callable[[], IO[Any]], taxels: int | None) -> EventArray:
     """Events (taxels, polarities, steps) of an npy file; DataError if it holds anything else, or not the `taxels`."""
     values = parse_npy(where, opener)
@@ -172,7 +179,7 @@ def parse_bins(where: str, opener: Callable[[], IO[Any]], taxels: int | None) ->
     if len(shape) != 3 or 0 in shape or shape[1] > MAX_POLARITIES:
         raise DataError(f"{where}: shape {shape}, allowed is (taxels, polarities, steps); one recording per file")
     if taxels is not None and shape[0] != taxels:
-        raise DataError(f"{where}: has {shape[0]} taxels, the network has {taxels}; use recordings of its sensor")
+        raise DataError(f"{where}: {other_taxels(shape[0], taxels)}")
     values = values.view(np.uint8) if values.dtype == np.bool_ else values  # a byte of 2 is no truth value
     events: BoolArray = values != 0  # NaN becomes an event here and differs from 1 below
     wrong = values != events

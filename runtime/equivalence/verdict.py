@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from textwrap import shorten
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -287,8 +288,10 @@ def unmet(levels: tuple[Level, ...], required: Mapping[str, float]) -> list[str]
         wanted = required.get(level.name)
         if wanted is None or (level.share is not None and level.share >= wanted):
             continue
-        counted = level.name in SHARES and level.share is not None
-        missed += [f"{level.name}: " + (f"{level.share:.4f} reached, {wanted:g} required" if counted else level.text)]
+        if level.name in SHARES and level.share is not None:
+            missed.append(f"{level.name}: {level.share:.4f} reached, {wanted:g} required")
+        else:
+            missed.append(f"{level.name}: {shorten(level.text, 100, placeholder=' …')}")
     return missed
 
 

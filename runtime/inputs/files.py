@@ -47,17 +47,21 @@ INPUTS = (
 """Arguments that may name a file to read."""
 
 
-def require_place(path: str | None, option: str, arguments: argparse.Namespace | None = None) -> None:
+def require_place(
+    path: str | None, option: str, arguments: argparse.Namespace | None = None, kinds: Iterable[str] = ()
+) -> None:
     """Refuse, before any work is done, a place where a result could not be written; nothing to do without one.
 
-    Raises OptionError if the folder does not exist, the path is a folder or a device, or one of the `INPUTS` of
-    `arguments`, which must not be overwritten.
+    Raises OptionError if there is no such folder, the path is a folder or a device, has another suffix than one of the
+    `kinds`, or is one of the `INPUTS` of `arguments`, which must not be overwritten.
     """
     if path is None:
         return
     place = Path(path)
     if not place.absolute().parent.is_dir():
         raise OptionError(f"{option} {path}: the folder does not exist; make it first")
+    if kinds and place.suffix not in (allowed := [f".{kind}" for kind in kinds]):
+        raise OptionError(f"{option} {path}: allowed are {', '.join(allowed)}; name one of these")
     if place.exists() and not place.is_file():
         raise OptionError(f"{option} {path}: is not a regular file; give the name of a file to write")
     for name in INPUTS if place.exists() else ():
@@ -75,9 +79,7 @@ def require_picture(arguments: argparse.Namespace, outputs: Iterable[str | Path 
     path = arguments.picture
     if path is None:
         return
-    require_place(path, "--picture", arguments)
-    if Path(path).suffix not in (kinds := [f".{kind}" for kind in PICTURES]):
-        raise OptionError(f"--picture {path}: allowed are {', '.join(kinds)}; name one of these")
+    require_place(path, "--picture", arguments, PICTURES)
     if Path(path).absolute() in [Path(output).absolute() for output in outputs if output is not None]:
         raise OptionError(f"--picture {path}: is what -o names, too; give another name")
 

@@ -10,7 +10,7 @@ from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings import events
 from spikeloom.models.recordings.counts import show_counts
-from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings, first_part, parse_window
+from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings, first_part, other_taxels, parse_window
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
 from spikeloom.runtime.report.console import progress, tell
 
@@ -56,8 +56,8 @@ def recordings(
         events.require_events(SYNTHETIC, bin_s)
         data = synthetic_split(split, limit=limit)
         require_suited(data, classes=classes, taxels=taxels)
-    if trained and classes is not None and limit is None:
-        _warn_of_others(data, trained, classes)
+    if classes is not None and limit is None:
+        _warn_of_others(data, trained or {}, classes)
     return events.joined_bins(data, bins)
 
 
@@ -79,9 +79,11 @@ def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int) 
     """Say on stderr where recordings look like other ones than a network was trained on."""
     name, known = trained.get("data", data.source), int(data.labels.max(initial=UNLABELLED))
     fewer = len(data) >= classes and UNLABELLED < known < classes - 1
-    if name != data.source and (data.split == "train" or fewer):
-        why = f"their classes are 0..{known}, the network's 0..{classes - 1}" if fewer else "calibrate on what it knows"
-        tell(f"warning: {data.source}: the network was trained on {name}; {why}")
+    origin = f"the network was trained on {name}; " if name != data.source else ""
+    if fewer:
+        tell(f"warning: {data.source}: {origin}their classes are 0..{known}, the network's 0..{classes - 1}")
+    elif origin and data.split == "train":
+        tell(f"warning: {data.source}: {origin}calibrate on what it knows")
 
 
 def require_splits(path: str | Recordings) -> None:
@@ -96,7 +98,7 @@ def require_splits(path: str | Recordings) -> None:
 def require_suited(data: Recordings, *, classes: int | None, taxels: int | None) -> None:
     """Refuse recordings of another sensor, or of more classes than a network has; DataError naming both."""
     if taxels is not None and data.taxels != taxels:
-        raise DataError(f"{data.source}: has {data.taxels} taxels, the network has {taxels}; use those of its sensor")
+        raise DataError(f"{data.source}: {other_taxels(data.taxels, taxels)}")
     if classes is not None and data.labels.max(initial=0) >= classes:
         raise DataError(
             f"{data.source}: label {data.labels.max()}, the network has {classes} classes (0..{classes - 1}); "

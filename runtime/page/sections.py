@@ -92,8 +92,9 @@ def _cards(report: Report) -> dict[str, tuple[str, str]]:
     static = "static power, not in that energy"
     for name, unit, found in (("dynamic energy an inference", "J", energy), (static, "W", price.static_w)):
         if found:
-            ends = dict.fromkeys(si(value, unit) for value in (min(found.values()), max(found.values())))
-            cards[name] = " … ".join(ends), ", ".join(found)
+            rising = sorted(found, key=found.__getitem__)
+            ends = dict.fromkeys(si(found[table], unit) for table in (rising[0], rising[-1]))
+            cards[name] = " … ".join(ends), ", ".join(rising)
     for table, seconds in list(price.time_s.items())[:1]:
         cards["time an inference"] = si(float(seconds.mean()), "s"), f"at full speed, {table}, simple model"
     held = sum(core.compartments for core in report.cores.cores)

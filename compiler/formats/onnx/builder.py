@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler import __version__
+from spikeloom.compiler.formats.onnx.file import PRODUCER
 from spikeloom.compiler.types import AnyArray
 
 OPSET = 17
@@ -176,7 +177,7 @@ def model_bytes(model: Model, *, name: str, about: str, facts: Mapping[str, Any]
         nodes.graph(name, inputs, outputs),
         opset_imports=[onnx.helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
-        producer_name="spikeloom",
+        producer_name=PRODUCER,
         producer_version=__version__,
         doc_string=about.replace("``", ""),
     )

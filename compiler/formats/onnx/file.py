@@ -19,6 +19,9 @@ from spikeloom.compiler.files import FileFault, read_whole, require_size
 from spikeloom.compiler.formats.names import named, printable
 from spikeloom.compiler.types import AnyArray
 
+PRODUCER = "spikeloom"
+"""Of files that are written here, from netlists."""
+
 OPSETS = range(9, 27)
 """Versions of the operator set whose operators are known here."""
 
@@ -96,6 +99,8 @@ def read_graph(path: Path) -> Graph:
     proto.ParseFromString(content)
     if not proto.HasField("graph"):
         raise ModelError("holds no graph, so it is not an ONNX file; give a file of torch.onnx.export")
+    if proto.producer_name == PRODUCER:
+        raise ModelError("was written by spikeloom export; use the netlist that it was written from")
     versions = [entry.version for entry in proto.opset_import if _text(entry.domain) in ("", "ai.onnx")]
     opset = versions[0] if versions else 1
     if opset not in OPSETS:

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_netlist_and_model(parser)
     add_recordings(parser)
     what = "recording to explain, by name or from 0 (default: the first that differs)"
-    parser.add_argument("--sample", metavar="NAME|N", help=what)
+    parser.add_argument("--sample", "--recording", metavar="NAME|N", help=what)
     parser.add_argument("--top", type=int, default=10, metavar="N", help="roots to show (default: 10)")
     parser.epilog = NOTES
 

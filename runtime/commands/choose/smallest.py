@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     store = output.with_suffix(".sqlite") if arguments.store is None else Path(arguments.store)
     for place, option in ((output, "-o"), (network, "-o"), (store, "--store")):
         require_place(str(place), option, arguments)
-    require_place(arguments.html, "--html", arguments)
+    require_place(arguments.html, "--html", arguments, ["html"])
     budgets = parse_budgets([words for each in arguments.budget for words in each.split(",")], LIMITS)
     taxels = None if arguments.taxels is None else len(sensor_places(arguments.taxels))
     training, test = both_splits(arguments.data, taxels, arguments.bin)

@@ -136,7 +136,7 @@ def _lines(facts: CheckpointFacts) -> Iterator[str]:
     layers = ", ".join(f"{layer.name} {layer.neurons:,}" for layer in facts.layers)
     system = facts.system if facts.hops is None else f"K = {facts.hops}"
     yield f"checkpoint, {facts.layout} layout: {facts.taxels} taxels, {system}, {layers}, {facts.classes} classes"
-    graph = facts.graph or "not in the file; name it with --graph"
+    graph = facts.graph or "not in the file; compile takes --graph"
     yield f"  graph: {graph if facts.system in GRAPH_SYSTEMS else 'none, as the system has none'}"
     for name, value in (("beta", facts.beta), ("theta", facts.theta)):
         source = "given" if name in facts.given else "read from the file"
