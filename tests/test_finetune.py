@@ -95,7 +95,7 @@ def test_what_cannot_be_fine_tuned(tmp_path):
     assert "no gradient" in refusal("finetune", counters.network, "--data", counters.data, "-o", tmp_path / "x.nir")
     assert "written back as .pt" in refusal("finetune", timed.network, "--data", timed.data, "-o", tmp_path / "x.nir")
     assert not list(tmp_path.glob("x.*"))
-    few = np.zeros((2, TAXELS, 2, 15), np.uint8)
+    few = np.zeros((CLASSES, TAXELS, 2, 15), np.uint8)
     recordings_folder(tmp_path / "few", train=few, test=few, classes=2)
     _, _, told = run(*words[:-1], tmp_path / "few", "--weight-bits", "4", "--epochs", "1", "-o", tmp_path / "x.nir")
-    assert f"few: its classes are 0..1, the network's 0..{CLASSES - 1}" in told
+    assert f"few: their classes are 0..1, the network's 0..{CLASSES - 1}" in told

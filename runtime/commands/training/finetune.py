@@ -27,7 +27,7 @@ from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_graph, load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
-from spikeloom.runtime.report.console import progress, tell
+from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
@@ -159,9 +159,6 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
     from spikeloom.models.training.finetune import finetune as tune
     from spikeloom.models.training.record import CHOSEN_ON
 
-    if (known := int(training.labels.max())) < loaded.network.classes - 1:
-        told = f"its classes are 0..{known}, the network's 0..{loaded.network.classes - 1}"
-        tell(f"warning: {training.source}: {told}; fine-tune on what it was trained on")
     progress("compiling")
     try:
         tuned = tune(
