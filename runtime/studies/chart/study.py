@@ -77,7 +77,8 @@ def chart(
                 for number, window in enumerate(grid.window, len(points) + 1)
             ]
     if not points:
-        raise OptionError(f"--grid: {target.name} refuses all {len(refused)} configurations: {refused[0].why[0]}")
+        why = f"refuses all {len(refused)} configurations; the first: {refused[0].why[0]}"
+        raise OptionError(f"--grid: {target.name} {why}")
     times = {table.name: table.title for table in target.time}
     by = ChosenBy(energy=energy, time=next(iter(times), None))
     points = with_fronts(with_expectations(points, networks), by)
