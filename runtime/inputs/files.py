@@ -9,6 +9,7 @@ from pathlib import Path
 from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import write_atomically
+from spikeloom.compiler.formats import NIR, ONNX
 from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name
 from spikeloom.runtime.report.drawing import PICTURES, Drawing
 
@@ -58,8 +59,9 @@ def require_place(
     if path is None:
         return
     place = Path(path)
-    if not place.absolute().parent.is_dir():
-        raise OptionError(f"{option} {path}: the folder does not exist; make it first")
+    if not (folder := place.absolute().parent).is_dir():
+        why = f"{folder.name} is a file; name" if folder.exists() else "the folder does not exist; make it, or name"
+        raise OptionError(f"{option} {path}: {why} another")
     if kinds and place.suffix not in (allowed := [f".{kind}" for kind in kinds]):
         raise OptionError(f"{option} {path}: allowed are {', '.join(allowed)}; name one of these")
     if place.exists() and not place.is_file():
@@ -124,6 +126,8 @@ def require_inspectable(path: str) -> None:
 
     Raises OptionError if it is a folder, or a zip or npz of something else.
     """
+    if path.endswith((ONNX, NIR)):
+        require_netlist(path)
     if Path(path).is_dir():
         raise OptionError(f"{path}: is a folder, not a netlist or a checkpoint; {_RECORDINGS}")
     if (members := _members(path)) is None:

@@ -134,8 +134,5 @@ LONGEST = 4096
 def integer_machine(machine: Machine) -> IntegerMachine:
     """The same machine, if a float model can be compared with it; else an OptionError."""
     if not isinstance(machine, IntegerMachine):
-        raise OptionError(
-            f"{machine.target.title}: is not compared with a float model neuron by neuron; give a netlist for "
-            "another chip"
-        )
+        raise OptionError(f"{machine.target.title}: is not a chip that this command takes; give a netlist of another")
     return machine
