@@ -45,7 +45,8 @@ def value_at(content, path):
     if not path:
         return content
     if path.startswith("*"):
-        return [value_at(each, path[2:]) for each in content]
+        entries = content.values() if isinstance(content, dict) else content
+        return [value_at(each, path[2:]) for each in entries]
     if isinstance(content, list):
         head, _, rest = path.partition("/")
         if head.isdigit():
