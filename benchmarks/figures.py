@@ -90,7 +90,7 @@ ROOT = Path(__file__).parents[1]
 SHOWN = re.compile(r"^\$ (spikeloom .+)\n((?:(?!\$ |```).*\n)*)", re.MULTILINE)
 """A command in the docs, and what they show of its output."""
 
-IN_HARDWARE = {"counters": 20, "native": 3}
+IN_HARDWARE = {"counters": 20, "native": 20}
 """First test recordings that run in RANC's hardware, by kind of network."""
 
 PAGES = ("anytime", "chart", "compile", "cost", "counting", "data", "formats", "stress", "truenorth", "verify")
