@@ -62,5 +62,6 @@ def points(log: Path, count: int, **trouble: dict[int, Any]) -> list[Square]:
 
 if __name__ == "__main__":
     store, log, count, jobs = sys.argv[1:]
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # even where a job in the background ignores it
     made = points(Path(log), int(count), seconds=dict.fromkeys(range(int(count)), 0.1))
     sweep(made, square, Path(store), jobs=int(jobs), label="squares")

@@ -10,6 +10,7 @@ from numpy.testing import assert_array_equal
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.models.recordings.grasps import synthetic_split
+from spikeloom.models.training import record
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit
 from spikeloom.runtime.commands.choose import smallest
 from spikeloom.runtime.inputs import recordings as recordings_input
@@ -208,6 +209,13 @@ def test_a_network_that_is_trained_by_gradients(few, monkeypatch):
     monkeypatch.setattr(space, "NETWORKS", (("mlp", 10, 4, "8,8"),))
     monkeypatch.setattr(space, "EPOCHS", 2)
     words = ["smallest", "--data", "synthetic", "--jobs", "1", "-o", "a.loom", "--html", "a.html"]
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(record, "training_record", interrupt)
+        assert refusal(*words) == "interrupted; what was found is kept; go on with the same command"
     found = as_json(*words, "--budget", "certified=1")
     network, stored = found["tried"]
     assert all(0.01 < each["certified"] <= 1 for each in found["tried"])

@@ -131,7 +131,7 @@ def test_interrupted_it_says_what_is_kept_and_resumes_to_the_same_bytes(data):
     """The moment of a signal is not fixed: wherever it falls, the result must be the same."""
     kept, words = Path("x.pt.state.validation"), ("--epochs", "8", "-o", "x.pt")
     process = started(*words, until=kept.exists)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 2
     assert err == (
@@ -251,15 +251,19 @@ def test_equal_keys_are_measured_once_and_no_points_are_none(tmp_path):
     assert swept_here(tmp_path, []) == {}
 
 
-def test_a_killed_sweep_goes_on_with_what_it_had(tmp_path):
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT])
+def test_a_killed_sweep_goes_on_with_what_it_had(tmp_path, end):
     store, log = tmp_path / "x.store", tmp_path / "log"
     words = [sys.executable, swept.__file__, str(store), str(log), "60", "2"]
-    process = subprocess.Popen(words, env=os.environ | {"PYTHONPATH": str(ROOT / "src")})
+    process = subprocess.Popen(
+        words, env=os.environ | {"PYTHONPATH": str(ROOT / "src")}, stderr=subprocess.PIPE, text=True
+    )
     deadline = time.monotonic() + 120
     while len(keys(store)) < 6 and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    assert process.wait(timeout=60) == -signal.SIGKILL
+    process.send_signal(end)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, "Exception in thread" in err) == (-end, False)
     made = points(tmp_path / "again", 60)  # a worker may still end its measurement: count in another log
     kept = set(keys(store))
     assert 6 <= len(kept) < 60

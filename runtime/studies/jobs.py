@@ -98,22 +98,21 @@ def sweep(
             return f"{sum(key in results for key in keys)} of {len(keys)} points are kept in {store}"
 
         progress = Progress(len(waiting))
-        with ended_by_signal():
-            try:
-                progress(0, label)
-                for done, (index, found) in enumerate(side_by_side(waiting, partial(_named, measure), jobs=jobs), 1):
-                    key, text = waiting[index].key, json.dumps(found, allow_nan=False)
-                    with kept:
-                        kept.execute("INSERT INTO results VALUES (?, ?)", (key, sealed(key, text)))
-                    results[key] = decode(kind, json.loads(text))
-                    progress(done, label)
-            except KeyboardInterrupt as interrupt:
-                raise KeyboardInterrupt(f"{standing()}; go on with the same command") from interrupt
-            except sqlite3.OperationalError as error:  # a full disk, say
-                raise OSError(None, str(error), str(store)) from error
-            except SpikeloomError as error:
-                error.add_note(standing())
-                raise
+        try:
+            progress(0, label)
+            for done, (index, found) in enumerate(side_by_side(waiting, partial(_named, measure), jobs=jobs), 1):
+                key, text = waiting[index].key, json.dumps(found, allow_nan=False)
+                with kept:
+                    kept.execute("INSERT INTO results VALUES (?, ?)", (key, sealed(key, text)))
+                results[key] = decode(kind, json.loads(text))
+                progress(done, label)
+        except KeyboardInterrupt as interrupt:
+            raise KeyboardInterrupt(f"{standing()}; go on with the same command") from interrupt
+        except sqlite3.OperationalError as error:  # a full disk, say
+            raise OSError(None, str(error), str(store)) from error
+        except SpikeloomError as error:
+            error.add_note(standing())
+            raise
         return {key: results[key] for key in keys}
 
 
@@ -168,10 +167,10 @@ def side_by_side(
             ended = threading.Event()
             watch = threading.Thread(target=_killed_when_still, args=[ended], daemon=True)
             watch.start()
-            work = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
+            work = Parallel(return_as="generator_unordered", batch_size=1)
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # of new processes, until they work
             try:
-                found = work(attempt(index, payload) for index, payload in left.items())
+                found = work(attempt(index, payload) for index, payload in list(left.items()))
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
                 for index, result in found:
                     yield index, result
@@ -249,19 +248,6 @@ def _end_with(parent: int) -> None:
         os._exit(1)  # whatever it was that did not let itself be interrupted
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-@contextmanager
-def ended_by_signal() -> Iterator[None]:
-    """A request to end (SIGTERM) interrupts as Ctrl-C does, so that everything is left tidy."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may say what a signal does
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

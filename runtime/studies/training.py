@@ -22,7 +22,7 @@ from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.drawing import COLOURS, Drawing, sheet, styled
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.sections import Section, Table, Text
-from spikeloom.runtime.studies.jobs import ended_by_signal, only_one, side_by_side
+from spikeloom.runtime.studies.jobs import only_one, side_by_side
 
 TITLES = {"last": "last epoch", "best": "best epoch on test", "clean": "clean epoch, chosen on validation"}
 """What the epochs of ``WEIGHTS`` are called where people read of them."""
@@ -178,9 +178,8 @@ def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
                 tell(f"{job.output}: was not begun, trained from the start")
         waiting = [job for job in jobs if job not in results]
         try:
-            with ended_by_signal():
-                for place, found in side_by_side(waiting, run_job):
-                    results[waiting[place]] = found
+            for place, found in side_by_side(waiting, run_job):
+                results[waiting[place]] = found
         except UnfinishedError as error:
             raise OptionError(f"{error}; go on with --resume, and with fewer --seeds") from error
         except KeyboardInterrupt as interrupt:

@@ -2,18 +2,21 @@
 
 import atexit
 import gc
+import signal
 import sys
 
 
 def main() -> int:
-    """Run the command; an interrupt while Python still loads it is reported as any other."""
+    """Run the command; a request to end (SIGTERM) interrupts as Ctrl-C does, even while Python still loads it."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     atexit.register(gc.freeze)  # nobody waits for garbage to be looked for at the end: a fifth of a second with numba
     try:
         from spikeloom.runtime.cli import main as command
+
+        return command()
     except KeyboardInterrupt:
         sys.stderr.write("spikeloom: interrupted; nothing was written\n")
         return 2
-    return command()
 
 
 if __name__ == "__main__":

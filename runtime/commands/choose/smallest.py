@@ -118,8 +118,14 @@ def _made(
     )
     words = {"train": trained, "compile": [network, *made, "-o", netlist]}
     words |= {"verify": [netlist, "--checkpoint", network, *read], "estimate": [netlist, *read]}
-    for name in ("train", "compile"):
-        _typed(name, words[name])
+    from spikeloom.models.training.train import state_files  # with torch
+
+    begun = not counts and any(file.exists() for file in state_files(Path(f"{network}.state")))
+    try:
+        _typed("train", [*trained, *(["--resume"] if begun else [])])
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("what was found is kept; go on with the same command") from None
+    _typed("compile", words["compile"])
     progress("verifying")
     verdicts = {split: _typed("verify", [*words["verify"], "--split", split]) for split in ("train", "test")}
     machine = machine_for(netlist)
