@@ -21,6 +21,9 @@ MOST_SAID = 300
 RANDOM = 8
 """Letters that are drawn for a name."""
 
+WRITTEN: dict[str, None] = {}
+"""Files that this process has written, in that order."""
+
 
 @contextmanager
 def write_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
@@ -41,6 +44,7 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
         part.replace(target)
+        WRITTEN[str(path)] = None
     except BaseException as error:
         part.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename in (None, str(part)):

@@ -11,10 +11,12 @@ import shlex
 import sys
 from collections.abc import Iterable, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError, SpikeloomError, UnfinishedError
+from spikeloom.compiler.files import WRITTEN
 
 if TYPE_CHECKING:
     from spikeloom.runtime.report.sections import Outcome
@@ -144,11 +146,17 @@ def _parse(words: Sequence[str]) -> Arguments | None:
     return build_parser(first).parse_args(words)
 
 
+def _written() -> str:
+    """Which files are left of a command that did not end."""
+    return ", ".join(path for path in WRITTEN if Path(path).exists())
+
+
 def _mistake(error: Exception) -> str:
     """Lines for a user: one, or one per violated limit."""
     if isinstance(error, OSError) and error.strerror:
         where = error.filename or "a file"
-        return f"{where}: {error.strerror}; check space and permissions"
+        left = f"; written before: {_written()}" if _written() else ""
+        return f"{where}: {error.strerror}; check space and permissions{left}"
     if isinstance(error, MemoryError):
         return f"out of memory ({error or 'no size known'}); give fewer recordings with --limit"
     return " ".join([str(error), *(f"({note})" for note in getattr(error, "__notes__", ()))])
@@ -160,6 +168,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     from spikeloom.runtime.report.sections import terminal
 
     words = sys.argv[1:] if argv is None else argv
+    WRITTEN.clear()
     try:
         arguments = _parse(words)
         if arguments is None:
@@ -182,5 +191,5 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt as interrupt:
         progress("")
-        tell(f"interrupted; {str(interrupt) or 'nothing was written'}")
+        tell(f"interrupted; {str(interrupt) or (_written() or 'nothing') + ' was written'}")
         return 2

@@ -391,6 +391,25 @@ def test_an_older_file_stays_intact(refusal, tmp_path, monkeypatch, old, words, 
     assert old is None or path.read_bytes() == old
 
 
+def full(*_words, **_options):
+    raise OSError(errno.ENOSPC, "No space left on device", "lean.pt")
+
+
+@pytest.mark.parametrize(
+    ("trouble", "line"),
+    [
+        (interrupt, "interrupted; {} was written"),
+        (full, "lean.pt: No space left on device; check space and permissions; written before: {}"),
+    ],
+)
+def test_of_two_files_the_first_is_named(refusal, tmp_path, monkeypatch, trouble, line):
+    netlist = tmp_path / "lean.loom"
+    monkeypatch.setattr("spikeloom.models.networks.checkpoint.save_again", trouble)
+    words = ["lean", "net.pt", "--data", "data", "-o", netlist, "--network", tmp_path / "lean.pt"]
+    assert refusal(*words) == line.format(netlist)
+    assert netlist.exists()
+
+
 @pytest.mark.parametrize(
     ("trouble", "line"), [(interrupt, "nothing was written"), (exhausted, "out of memory (Unable to allocate 9.9 TiB)")]
 )

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, UnfinishedError
-from spikeloom.compiler.files import FileFault, reading, remove_leftovers
+from spikeloom.compiler.files import WRITTEN, FileFault, reading, remove_leftovers
 from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.report.console import Progress, progress, tell
 from spikeloom.runtime.report.encode import decode
@@ -87,6 +87,7 @@ def sweep(
             remove_leftovers(folder)
         with reading(store, DataError, "give another output, or delete it"):
             kept.execute("CREATE TABLE IF NOT EXISTS results (key TEXT PRIMARY KEY, result TEXT)")
+            WRITTEN[str(store)] = None
             if (said := kept.execute("PRAGMA quick_check").fetchone()) != ("ok",):
                 raise FileFault(f"is damaged ({said})")
             rows = dict(kept.execute("SELECT key, result FROM results"))
