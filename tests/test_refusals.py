@@ -220,8 +220,11 @@ TABLE = [
             ("nowhere/out", "the folder does not exist"),
             ("data", "is not a regular file"),
             ("", "is not a regular file"),
+            (f"{'x' * 250}.pt", "cannot be written (File name too long)"),
         )
     ),
+    ("chart net.pt --data data -o nowhere/out", "-o nowhere/out: the folder does not exist"),
+    ("data convert data -o nowhere/out", "-o nowhere/out: the folder does not exist"),
     ("compile net.pt -o net.pt", "-o net.pt: is an input of this command"),
     ("run net.loom --data data --spikes net.loom", "--spikes net.loom: is an input"),
     ("train --data words.txt --graph manual -o words.txt", "-o words.txt: is an input"),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.files import write_atomically
+from spikeloom.compiler.files import beside, write_atomically
 from spikeloom.compiler.formats import NIR, ONNX
 from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name
 from spikeloom.runtime.report.drawing import PICTURES, Drawing
@@ -53,8 +53,8 @@ def require_place(
 ) -> None:
     """Refuse, before any work is done, a place where a result could not be written; nothing to do without one.
 
-    Raises OptionError if there is no such folder, the path is a folder or a device, has another suffix than one of the
-    `kinds`, or is one of the `INPUTS` of `arguments`, which must not be overwritten.
+    Raises OptionError if there is no such folder, or none that takes a file, the path is a folder or a device, has
+    another suffix than one of the `kinds`, or is one of the `INPUTS` of `arguments`, which must not be overwritten.
     """
     if path is None:
         return
@@ -66,6 +66,12 @@ def require_place(
         raise OptionError(f"{option} {path}: allowed are {', '.join(allowed)}; name one of these")
     if place.exists() and not place.is_file():
         raise OptionError(f"{option} {path}: is not a regular file; give the name of a file to write")
+    part = beside(place.resolve())
+    try:
+        part.open("xb").close()
+        part.unlink()
+    except OSError as error:
+        raise OptionError(f"{option} {path}: cannot be written ({error.strerror}); name another") from error
     for name in INPUTS if place.exists() else ():
         given = getattr(arguments, name, None)
         for each in given if isinstance(given, list) else [given]:

@@ -8,6 +8,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.runtime.commands.options import add_data, add_model
 from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.machines.base import DEFAULT
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
@@ -43,15 +44,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; exit code 1 if no point fits a budget."""
     from spikeloom.runtime.studies.chart.sections import printed, write_chart
-    from spikeloom.runtime.studies.chart.study import chart
+    from spikeloom.runtime.studies.chart.study import STORE, chart
     from spikeloom.runtime.studies.chart.work import read_splits
 
     target = load_target(DEFAULT)
     grid = Grid() if arguments.grid is None else parse_grid(arguments.grid, target)
     budgets = parse_budgets(arguments.budget)
     folder = Path(arguments.output)
-    if not folder.absolute().parent.is_dir() or (folder.exists() and not folder.is_dir()):
-        raise OptionError(f"-o {folder}: is not a folder, nor can it be made; give another name")
+    if folder.is_file():
+        raise OptionError(f"-o {folder}: is not a folder; name another")
+    require_place(str(folder / STORE if folder.exists() else folder), "-o", arguments)
     networks = read_networks(arguments)
     tables = [table.name for table in target.energy]
     energy = tables[0] if arguments.table is None else arguments.table

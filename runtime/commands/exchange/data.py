@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -199,7 +200,7 @@ def described_sections(result: Described) -> Iterator[Section]:
 
 def _convert(arguments: Arguments) -> Outcome:
     lines = arguments.output.lower().endswith(".csv")
-    if lines or arguments.output.lower().endswith(".zip"):
+    if lines or arguments.output.lower().endswith(".zip") or not Path(arguments.output).exists():
         require_place(arguments.output, "-o", arguments)
     require_bins(bins := arguments.join)
     count, places = _layout(arguments.taxels)
