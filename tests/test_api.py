@@ -52,7 +52,8 @@ def test_results_show_themselves(data, net):
     assert repr(net).startswith("loihi1: ")
 
 
-def test_modules_come_in_as_they_are(data):
+def test_modules_come_in_as_they_are(data, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     module = nn.Sequential(nn.Linear(2 * TAXELS, 5), api.LIF(), nn.Linear(5, 4), api.LIF())
     net = api.compile(module, example=torch.zeros(1, 2 * TAXELS))
     assert "E0  specification = engine" in str(net.verify(data.test, min_agreement=0.0))
