@@ -96,7 +96,7 @@ def sweep(
         waiting = [first[key] for key in keys if key not in results]
 
         def standing() -> str:
-            return f"{sum(key in results for key in keys)} of {len(keys)} points are kept in {store}"
+            return f"{sum(key in results for key in keys)} of {len(keys)} measurements are kept in {store}"
 
         progress = Progress(len(waiting))
         try:
@@ -182,7 +182,7 @@ def side_by_side(
                     raise UnfinishedError(f"{why}; use fewer --jobs") from error
                 stood = True
                 progress("")
-                tell(f"{number(len(left), 'point')} stood still for {STILL_S:g} s: given up, and begun once more")
+                tell(f"{number(len(left), 'measurement')} stood still for {STILL_S:g} s: given up, and begun once more")
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
                 ended.set()

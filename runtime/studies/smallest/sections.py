@@ -51,7 +51,7 @@ def sections(result: Smallest) -> Iterator[Section]:
 def page(result: Smallest) -> str:
     """The same as one HTML file."""
     name = result.data.path.rstrip("/").rsplit("/", 1)[-1]
-    return html.page(f"The smallest network for {name}", "Point at a mark to read its figures.", sections(result))
+    return html.page(f"The smallest network for {name}", "What was tried, what was taken, and why.", sections(result))
 
 
 def _spent(each: Tried) -> str:
@@ -94,18 +94,18 @@ def _why(result: Smallest) -> Iterator[str]:
     if chosen.number == best.number:
         yield "it is the best of them, and nothing cheaper is as good"
     else:
-        ahead = f"recording by recording it is {_behind(chosen)} points ahead"
+        ahead = f"recording by recording it is {_behind(chosen)} % ahead (± standard error)"
         yield f"the best is {_named(best)} for {_spent(best)}; {ahead}"
     for table, index in choice.cheapest.items():
         if index != chosen.number:
             other = result.candidate(index)
             yield f"by the table {table} it would be {_named(other)}, {_spent(other)}"
     if choice.ahead is None:
-        yield "no candidate is a point more accurate"
+        yield "no candidate is 1 % more accurate"
     else:
         more = result.candidate(choice.ahead)
         times = energy(more) / energy(chosen)
-        yield f"a point more costs {times:.1f} times the energy: {_named(more)}, {_spent(more)}"
+        yield f"1 % more accuracy costs {times:.1f} times the energy: {_named(more)}, {_spent(more)}"
 
 
 def _needless(result: Smallest) -> str:
@@ -131,15 +131,15 @@ def _table(result: Smallest, tried: Sequence[Tried], caption: str, most: int | N
         costs, plain, name, spent, time = each.costs, each.processor, f"#{each.number}", "–", "–"
         size = ["–", "–"]
         if plain is not None:
-            name, spent, size = "–", _spent(each), [f"{plain.operations:,.0f}", "processor"]
+            name, spent, size = "processor", _spent(each), [f"{plain.operations:,.0f}", "–"]
         elif costs is not None:
             marks = {"choice": each is result.chosen, "best": each.number == result.choice.best, "front": each.front}
             name, spent = " ".join([name, *(mark for mark, on in marks.items() if on)]), si(energy(each), "J")
             size = [f"{costs.operations:,.0f}", str(costs.cores)]
             time = "–" if by.time is None else si(costs.time_s[by.time], "s")
-        known = [name, each.candidate.name, f"{100 * each.accuracy:.1f}", _interval(each), _behind(each), spent]
+        known = [each.candidate.name, name, f"{100 * each.accuracy:.1f}", _interval(each), _behind(each), spent]
         rows.append([*known, *([] if by.time is None else [time]), *size])
-    head = ["#", "candidate", "accuracy %", "interval", "behind the best", f"energy ({by.energy})"]
+    head = ["candidate", "#", "accuracy %", "95 % interval", "behind the best %", f"energy ({by.energy})"]
     head += [] if by.time is None else [f"time ({by.time})"]
     return Table([*head, "operations", "cores"], rows, caption, most=most)
 
