@@ -118,7 +118,7 @@ def _decisions(found: Decisions) -> list[Block]:
         if decided[1] != decided[2]
     ]
     tables = [
-        Table(["label decided as", "float", "chip"], wrong, "Wrong decisions", most=LISTED),
+        Table(["label decided as", "float", "chip"], wrong, "Recordings decided wrongly", most=LISTED),
         Table(["recording", "label", "float model", "chip"], moved, "Decided differently", most=LISTED),
     ]
     title = "Confusion matrices of the float model and of the chip"
@@ -126,7 +126,7 @@ def _decisions(found: Decisions) -> list[Block]:
         Figure(
             "confusion",
             partial(drawing.matrices, title, {"float model": ours, "chip": chip}),
-            "Rows are labels, columns decisions; right ones lie on the diagonal, the others are of another colour.",
+            "Recordings of a label (row) that were decided as a class (column); right ones, on the diagonal, are blue.",
             [Table(["class", "recordings", "float", "chip"], classes, "Right decisions by class", most=0)],
         ),
         Text(

@@ -181,7 +181,7 @@ def matrices(title: str, panels: Mapping[str, IntArray]) -> Drawing:
             corner = decided - 0.5, label - 0.5
             axes.add_patch(Rectangle(corner, 1, 1, facecolor=colour, alpha=alpha, edgecolor="none"))
             axes.text(decided, label, str(count), ha="center", va="center", fontsize=size)
-            tip = f"{side}: label {label} decided as {decided}, {count} of {counts[label].sum()}"
+            tip = f"{side}: label {label} decided as {decided}, {count} of {counts[label].sum()} recordings"
             drawing.tips.append((axes, decided, label, tip))
         axes.set(xlim=(-0.5, len(counts) - 0.5), ylim=(len(counts) - 0.5, -0.5), aspect="equal", title=side)
         axes.set(xlabel="decided as", ylabel="label")
