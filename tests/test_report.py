@@ -100,7 +100,7 @@ def test_it_begins_with_a_sentence_and_explains_each_level(made):
 
 
 def test_a_recording_that_is_decided_differently_is_drawn(made):
-    apart = [row[0] for row in re.findall(r"<caption>Decided differently.*?</table>", made[0], re.DOTALL)]
+    apart = [row[0] for row in re.findall(r"<caption><span>Decided differently.*?</table>", made[0], re.DOTALL)]
     decided = made[1]["recording"]["decision"]
     assert (decided["float"] != decided["chip"]) == bool(apart)
 
