@@ -308,8 +308,10 @@ def test_the_command(tmp_path, monkeypatch):
     assert len(result.verdicts) == 4
     assert result.unaltered("dead") == sum(not each.taxels["dead"] for each in result.verdicts)
     assert sum(hanging_on(result)["dead"]) == sum(each.kinds["dead"].alter for each in result.verdicts)
-    code, out, _ = run(*words)
+    code, out, err = run(*words)
     assert code == 0
+    singles = events(3, samples=4).size
+    assert err == f"spikeloom: trying {singles:,} single events of 4 recordings, then taxels, pairs, shifts and cuts\n"
     assert f"no single event alters the decision: {25 * result.certified(1):.2f} %" in out
     assert f"a taxel sends nothing  {'':35}{result.unaltered('dead')} of 4".replace(" ", "") in out.replace(" ", "")
     for wrong in ("--shift -1", "--most 0", "--jobs 0"):

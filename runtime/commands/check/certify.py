@@ -10,10 +10,12 @@ from spikeloom.compiler import __version__
 from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import sha256_of
+from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.commands.options import add_netlist, add_picture, add_recordings
 from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.base import machine_for
+from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.stability.neighbours import KINDS
@@ -51,6 +53,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
             raise OptionError(f"--{name} {count}: allowed are {least} or more; choose another")
     machine = machine_for(arguments.netlist)
     data = load_recordings(arguments, machine.netlist, labels_for="certify", joined=False)
+    singles = int(data.step_counts.sum()) * data.taxels * data.events.shape[2]
+    tell(f"trying {singles:,} single events of {number(len(data), 'recording')}, then taxels, pairs, shifts and cuts")
     found = stability(machine, data, shift=arguments.shift, most=arguments.most, jobs=arguments.jobs)
     result = replace(
         found,
