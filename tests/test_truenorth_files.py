@@ -234,7 +234,7 @@ def test_the_command_for_ranc(tmp_path, monkeypatch):
     words = ["export", "net.loom", "--to", "ranc", "-o", "net.json"]
     first, second = run(*words)[1].splitlines()
     assert json.loads(Path("net.json").read_text("utf-8"))["packets"] == [[]]
-    assert "1 neurons and 1 synapses for ranc" in first
+    assert "1 neurons on the chip and 1 synapses for ranc" in first
     assert second.startswith("run: ranc_sim net.json net.out net.json TICKS")
     words += ["--data", "data", "--recording"]
     assert as_json(*words, "1")["ticks"] == 5 + 2 + 1

@@ -355,12 +355,14 @@ class Format:
     name, title: value of ``--to``, and what it is.
     write: raises OptionError and ModelError where the format cannot hold the network.
     options: options that it takes beside the network.
+    whole: whether it also holds the neurons that the compiler left out.
     """
 
     name: str
     title: str
     write: Callable[[Request], Export]
     options: tuple[str, ...] = ()
+    whole: bool = False
 
 
 def _module(name: str) -> Any:

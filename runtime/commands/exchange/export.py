@@ -91,7 +91,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     )
 
     def sections(result: Written) -> Iterator[Section]:
-        held = f"{result.facts.neurons} neurons and {result.facts.synapses} synapses for {result.format}"
+        where = "" if FORMATS[result.format].whole else " on the chip"
+        held = f"{result.facts.neurons} neurons{where} and {result.facts.synapses} synapses for {result.format}"
         form = "" if export.form is None else f", form {export.form}"
         lines = [f"{result.path}: {held}, {result.bytes} bytes{form}", *export.lines]
         yield Section("", [Text(line) for line in lines])

@@ -77,7 +77,8 @@ def _sanafe(request: Request) -> Export:
     )
     lines = [
         f"groups: {', '.join(facts.groups)}",
-        f"cores (tile.core): {', '.join(facts.cores)}; of the inputs: {', '.join(facts.input_cores)}",
+        f"cores (tile.core, tiles counted by columns, not rows): {', '.join(facts.cores)}; "
+        f"of the inputs: {', '.join(facts.input_cores)}",
     ]
     if facts.floating_currents:
         lines.append(f"currents of {', '.join(facts.floating_currents)} are floats there, so spikes may differ")
@@ -148,11 +149,12 @@ FORMATS = (
     Format(
         name="onnx", title="a netlist as an integer ONNX graph, bit for bit the chip", write=_onnx, options=("form",)
     ),
-    Format(name="nir", title="a netlist as a NIR file in weight units", write=_nir, options=("dt",)),
+    Format(name="nir", title="a netlist as a NIR file in weight units", write=_nir, options=("dt",), whole=True),
     Format(
         name="netx",
         title="a netlist as a .net file of lava-dl, biases rounded to whole weight steps",
         write=_netx,
         options=("data", "split", "bin", "limit"),
+        whole=True,
     ),
 )

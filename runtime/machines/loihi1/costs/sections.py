@@ -82,7 +82,7 @@ def _lines(report: CostReport) -> list[str]:
     real_time = ", ".join(f"{si(value, 'W')} ({name})" for name, value in pace.real_time_w.items())
     lines.append(f"dynamic power at the sensor's pace, {1000 * pace.bin_s:g} ms a step: {real_time}")
     lines += [
-        f"at full speed ({each.time_table}, {each.model} model): {si(each.power_w, 'W')}, energy-delay product "
+        f"at full speed ({each.time_table}, {each.model} model): {si(each.power_w, 'W')}, mean energy-delay product "
         f"{si(each.energy_delay_js, 'J s')} ({each.energy_table})"
         for each in pace.full_speed
     ]
