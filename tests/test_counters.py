@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import as_json, run
+from made_files import recordings_folder
 from numpy.testing import assert_array_equal
 from oracles import refused
 
@@ -235,3 +236,37 @@ def test_commands_take_a_counting_network(monkeypatch, tmp_path):
     assert chart["points"][0]["test"]["correct"] == right
     assert chart["points"][1]["test"]["correct"] == record["test_correct"]
     assert json.loads(str(read_members(tmp_path / "c.pt")["manifest"]))["training"]["strength"] == record["strength"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A network of 40 steps that count and 40 to read out, its netlist and its recordings."""
+    folder = tmp_path_factory.mktemp("counters")
+    counters_file(folder / "c.pt")
+    recordings_folder(folder / "data", train=made().events, test=made(seed=1).events, classes=CLASSES)
+    as_json("compile", folder / "c.pt", "--weight-bits", "8", "-o", folder / "c.loom")
+    return folder / "c.pt", folder / "c.loom", folder / "data"
+
+
+def test_what_is_taken_away_and_exported_is_measured_to_the_end_of_the_ramp(trained, tmp_path):
+    network, netlist, data = trained
+    found = as_json("lean", network, "--data", data, "--differ", "0.3", "-o", tmp_path / "l.loom")
+    row = found["rows"][found["taken"]]
+    assert row["name"] != "nothing"
+    costs = as_json("estimate", tmp_path / "l.loom", "--data", data)
+    assert costs["per_inference"]["synaptic_operations"] == pytest.approx(row["operations"])
+    decided = as_json("run", tmp_path / "l.loom", "--data", data)
+    assert sum(map(int.__eq__, decided["predictions"], decided["labels"])) == row["test"]["right"] > 10
+    moved = as_json("export", netlist, "--to", "netx", "--data", data, "-o", tmp_path / "n.net")
+    assert moved["layers"][-1]["spikes"] == np.sum(as_json("run", netlist, "--data", data)["counts"]) > 0
+
+
+def test_events_that_come_too_late_are_said(trained, tmp_path):
+    network, netlist, data = trained
+    late = np.zeros((2, TAXELS, 2, 100), np.uint8)
+    late[:, 0, 0, [3, 79, 80, 99]] = 1
+    recordings_folder(tmp_path / "late", train=late, test=late, classes=CLASSES)
+    for command, *words in (("run",), ("estimate",), ("verify", "--checkpoint", network)):
+        said = run(command, netlist, *words, "--data", tmp_path / "late")[2]
+        assert said == "spikeloom: warning: late: 4 events after the network's 80 steps: not used\n"
+        assert not run(command, netlist, *words, "--data", data)[2]

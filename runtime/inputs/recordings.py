@@ -5,11 +5,13 @@ from collections.abc import Mapping
 from difflib import get_close_matches
 from typing import Any
 
+import numpy as np
+
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings import events
-from spikeloom.models.recordings.counts import show_counts
+from spikeloom.models.recordings.counts import number, show_counts
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings, first_part, other_taxels, parse_window
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
 from spikeloom.runtime.report.console import progress, tell
@@ -134,7 +136,12 @@ def load_recordings(
         trained=origin_of(netlist.provenance),
     )
     arguments.bin = data.bin_s or arguments.bin  # what the command goes on with
-    return events.of_length(first_part(data, window), netlist.clocks.length) if joined else data
+    if not joined:
+        return data
+    data, length = first_part(data, window), netlist.clocks.length
+    if length is not None and (late := int(data.events[..., length:].sum(dtype=np.int64))):
+        tell(f"warning: {data.source}: {number(late, 'event')} after the network's {length} steps: not used")
+    return events.of_length(data, length)
 
 
 def find_recording(data: Recordings, wanted: str, option: str) -> int:

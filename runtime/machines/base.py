@@ -312,8 +312,7 @@ class Request:
     """What a format is written from; options that were not given are None.
 
     source, output: file of the network, and the one to be written.
-    recordings: reads recordings for a network of some classes, taxels and bins of a step, where a format has a use
-        for them.
+    recordings: reads recordings for a netlist, where a format has a use for them.
     recording: which of them.
     form: which form of the format.
     dt: seconds of a step.
@@ -321,7 +320,7 @@ class Request:
 
     source: str
     output: str
-    recordings: Callable[[int, int, int], Recordings] | None = None
+    recordings: Callable[[Any], Recordings] | None = None
     recording: int | None = None
     form: str | None = None
     dt: float | None = None

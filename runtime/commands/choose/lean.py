@@ -7,6 +7,7 @@ from typing import Any
 
 from spikeloom.compiler import __version__, write_netlist
 from spikeloom.compiler.errors import OptionError
+from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_network, add_recordings
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import storage
@@ -59,8 +60,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
     taken = loaded.network.input
     shared: dict[str, Any] = {"bin_s": arguments.bin, "bins": taken.bins, "taxels": taken.taxels, "labels_for": "lean"}
     shared["classes"] = loaded.network.classes
-    training = recordings(arguments.data, "train", **shared)
-    test = recordings(arguments.data, arguments.split, limit=arguments.limit, **shared)
+    found = (("train", None), (arguments.split, arguments.limit))
+    each = (recordings(arguments.data, split, limit=limit, **shared) for split, limit in found)
+    training, test = (of_length(data, taken.clocks.length) for data in each)
     result, netlist, spared = study(loaded, training, test, arguments.differ, arguments.output)
     if arguments.output is not None:
         lean = {"differ": result.differ} | encode(result.rows[result.taken].removed)

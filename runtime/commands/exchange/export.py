@@ -8,11 +8,12 @@ from typing import Any
 
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.formats.onnx.writer import FORMS
+from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option
 from spikeloom.runtime.inputs.files import require_netlist, require_place
-from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.inputs.repeat import refuse
 from spikeloom.runtime.machines.base import Request, export_formats
 from spikeloom.runtime.report.encode import INLINE
@@ -67,9 +68,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_place(arguments.output, "-o", arguments)
     require_netlist(arguments.source)
 
-    def read(classes: int, taxels: int, bins: int) -> Recordings:
-        asked = {"limit": arguments.limit, "bin_s": arguments.bin}
-        return recordings(arguments.data, arguments.split or "test", classes=classes, taxels=taxels, bins=bins, **asked)
+    def read(netlist: Netlist) -> Recordings:
+        split = arguments.split or "test"
+        return load_recordings(argparse.Namespace(**vars(arguments) | {"split": split}), netlist)
 
     request = Request(
         source=arguments.source,

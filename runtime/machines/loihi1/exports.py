@@ -122,7 +122,7 @@ def _netx(request: Request) -> Export:
     lines = rounded or ["biases, thresholds and weights are the netlist's"]
     count = None
     if request.recordings is not None:
-        data = request.recordings(netlist.classes, netlist.taxels, netlist.bins)
+        data = request.recordings(netlist)
         moved = netx.moved_spikes(network, blocks, channels_last(data.events, netlist.clocks))
         layers = [
             NetxLayer(rounding=block.rounding, spikes_moved=differ, spikes=every)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import ranc
-from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.machines.base import Export, Facts, Format, Request
 
 
@@ -22,10 +21,9 @@ def _ranc(request: Request) -> Export:
     netlist = load(request.source).netlist
     events = None
     if request.recordings is not None:
-        data, number = request.recordings(netlist.classes, netlist.taxels, netlist.bins), request.recording or 0
+        data, number = request.recordings(netlist), request.recording or 0
         if not 0 <= number < len(data.files):
             raise OptionError(f"--recording {number}: --data has recordings 0 to {len(data.files) - 1}")
-        data = of_length(data, netlist.clocks.length)
         events = with_clocks(data.events[number : number + 1, ..., : data.steps_of(number)], netlist.clocks)[0]
     ticks = None if events is None else netlist.ticks(events.shape[1]) + 1
     path, out = request.output, request.output.removesuffix(".json") + ".out"
