@@ -5,17 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from commands import as_json, run
+from commands import as_json, refusal, run
 from made_files import recordings_folder
 from numpy.testing import assert_array_equal
 from oracles import refused
 
+import spikeloom
 from spikeloom.compiler import compile_network
 from spikeloom.compiler.archive import read_members
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.formats.counters import BLOCK, counting_network, read_counters, write_counters
 from spikeloom.compiler.interpret import channels_last, float_simulation
-from spikeloom.models.recordings.events import joined_bins, of_length
+from spikeloom.models.recordings.events import joined_bins, load_data, of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds, held_out, linear_rules
 from spikeloom.runtime.machines.base import machine_of
@@ -270,3 +271,28 @@ def test_events_that_come_too_late_are_said(trained, tmp_path):
         said = run(command, netlist, *words, "--data", tmp_path / "late")[2]
         assert said == "spikeloom: warning: late: 4 events after the network's 80 steps: not used\n"
         assert not run(command, netlist, *words, "--data", data)[2]
+
+
+def test_live_it_runs_to_the_end_of_the_ramp(trained, tmp_path):
+    _, netlist, data = trained
+    decided = as_json("run", netlist, "--data", data)
+    events = load_data(data, "test").events
+    stream = spikeloom.load(str(netlist)).stream()
+    for sample in (0, 1):
+        for column in np.moveaxis(events[sample], -1, 0):
+            step = stream.step(column)
+        assert not step.counts.any()
+        *rest, last = stream.finish()
+        assert (last.counts.tolist(), rest[39].index) == (decided["counts"][sample], 79)
+        stream.reset()
+    for _ in range(80):
+        stream.step(events[0, ..., 0])
+    refused(DataError, "a step after the network's 80 found; call finish()", stream.step, events[0, ..., 0])
+    lines = [f"{t * 0.02:.2f},{taxel},{polarity}\n" for t, taxel, polarity in np.argwhere(events[0].transpose(2, 0, 1))]
+    (tmp_path / "lines.csv").write_text("".join(lines))
+    for words in ((), ("--bins", "80")):
+        shown = run("watch", netlist, "--input", tmp_path / "lines.csv", *words, "--json")[1].splitlines()
+        assert json.loads(shown[-2])["counts"] == decided["counts"][0]
+    for bins in ("40", "81"):
+        told = f"--bins {bins}: the network runs every grasp for 80 steps"
+        assert told in refusal("watch", netlist, "--input", tmp_path / "lines.csv", "--bins", bins)

@@ -216,6 +216,12 @@ def run(arguments: argparse.Namespace) -> Outcome:
         bin_s = origin_of(machine.netlist.provenance).get("bin_s", bin_s)
     netlist = machine.netlist
     bin_s *= netlist.bins
+    bins = arguments.bins or netlist.clocks.length
+    if bins != (netlist.clocks.length or bins):
+        raise OptionError(
+            f"--bins {bins}: the network runs every grasp for {netlist.clocks.length} steps, the last of them its "
+            f"read-out; give --bins {netlist.clocks.length} or leave it out"
+        )
     if netlist.polarities != 2:
         raise ModelError(
             f"{arguments.netlist}: {netlist.polarities} polarities per taxel found, event lines have 2; "
@@ -231,7 +237,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             as_json=arguments.json,
             column=np.zeros(netlist.taxels * netlist.polarities, np.uint8),
             bin_s=bin_s,
-            bins=arguments.bins or netlist.clocks.length,
+            bins=bins,
             from_first=arguments.origin == "first",
             real=arguments.speed == "real",
             may_end=None if factor is None else exits.live(integer_machine(machine), arguments.bins, factor),
@@ -248,7 +254,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_netlist(parser)
     parser.add_argument("--input", default="-", metavar="FILE", help="event lines (default: -, standard input)")
     parser.add_argument("--bin", default="0.02", metavar="SECONDS", help="bin of the recordings (default: 0.02)")
-    what = "steps of every grasp: shorter ones are filled up, longer ones cut"
+    what = "steps of every grasp: shorter ones are filled up, longer ones cut; counters bring their own, read-out included"
     parser.add_argument("--bins", type=int, metavar="N", help=what)
     what = "where the first bin of a grasp begins: at time 0 or at the first event (default: zero)"
     parser.add_argument("--origin", choices=("zero", "first"), default="zero", help=what)

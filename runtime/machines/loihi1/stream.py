@@ -64,6 +64,8 @@ class Stream:
                 "call reset() to begin the next grasp"
             )
         netlist = self._engine.netlist
+        if self.index == netlist.clocks.length:
+            raise DataError(f"stream: a step after the network's {self.index} found; call finish() for the decision")
         bin_ = _one_bin(netlist, events)
         self._column[: len(bin_), 0] = bin_
         self._column[len(bin_) :] = netlist.clocks.events(1, first=self.index)
@@ -72,14 +74,18 @@ class Stream:
     def finish(self) -> tuple[Step, ...]:
         """End the grasp: run the chip steps by which the slowest layer lags; the last one has the final counts.
 
-        None for a network without lag, whose last step was final. Raises as :meth:`step` does.
+        None for a network without lag, whose last step was final. Where a network says how long a recording is run, as
+        counters do, the steps that are missing come first, in silence. Raises as :meth:`step` does.
         """
         if self._ended:
             raise DataError("stream: a second end found, a grasp has one; call reset() to begin the next grasp")
+        netlist = self._engine.netlist
+        silence = np.zeros((netlist.taxels, netlist.polarities), np.uint8)
+        rest = [self.step(silence) for _ in range(self.index, netlist.clocks.length or 0)]
         self._ended = True
         self._column[:] = 0
         length = self.index
-        return tuple(self._advance(length) for _ in range(self._engine.netlist.max_depth))
+        return (*rest, *(self._advance(length) for _ in range(netlist.max_depth)))
 
     def reset(self) -> None:
         """Begin the next grasp, from rest; whatever was left of the last one is dropped."""
