@@ -118,8 +118,8 @@ def test_stress_runs_them_to_the_end_of_their_ramp(plan):
     assert set(warm_state(bench, 1, np.random.default_rng(0)).lengths) == {2 * counters.clocks.length}
 
 
-def counters_file(place):
-    data = counted(made(), PLANS[1])
+def counters_file(place, plan=PLANS[1]):
+    data = counted(made(), plan)
     counters = counters_of(data, fit(data, CLASSES), made(), CLASSES).trained({"seen": 3})
     write_counters(place, counters)
     return counters
@@ -296,3 +296,16 @@ def test_live_it_runs_to_the_end_of_the_ramp(trained, tmp_path):
     for bins in ("40", "81"):
         told = f"--bins {bins}: the network runs every grasp for 80 steps"
         assert told in refusal("watch", netlist, "--input", tmp_path / "lines.csv", "--bins", bins)
+
+
+def test_a_nir_file_knows_how_long_a_recording_is_run(trained, tmp_path):
+    counters_file(tmp_path / "c.pt", replace(PLANS[0], bins=2))
+    as_json("compile", tmp_path / "c.pt", "-o", tmp_path / "c.loom")
+    as_json("export", tmp_path / "c.loom", "--to", "nir", "-o", tmp_path / "c.nir")
+    as_json("compile", tmp_path / "c.nir", "-o", tmp_path / "n.loom")
+    decided = [as_json("run", tmp_path / f"{name}.loom", "--data", trained[2])["predictions"] for name in "cn"]
+    assert decided[0] == decided[1]
+    assert len(set(decided[0])) == CLASSES
+    for form, suffix in (("onnx", "onnx"), ("sanafe", "yaml")):
+        as_json("export", tmp_path / "c.loom", "--to", form, "-o", tmp_path / f"c.{suffix}")
+        assert b"every recording is run for 84 steps" in (tmp_path / f"c.{suffix}").read_bytes()

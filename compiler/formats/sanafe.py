@@ -88,6 +88,8 @@ def export(netlist: Netlist, target: Target) -> Iterator[str]:
     if netlist.clocks.channels:
         length, first = netlist.clocks.steps, netlist.n_inputs - netlist.clocks.channels
         yield f"# from neuron {first} on they are clocks: each spikes in {length} steps, one after the other"
+    if netlist.clocks.length is not None:
+        yield f"# every recording is run for {netlist.clocks.length} steps, in silence after its end"
     if netlist.bins > 1:
         yield f"# a step joins {netlist.bins} bins of the recordings"
     if floating := floating_layers(netlist):

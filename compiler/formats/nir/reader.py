@@ -85,6 +85,8 @@ def network_of(
     voters, label = _readout(end, result, spiking)
     layers, held = _layers(spiking, positions)
     layers, sensor = _with_held(layers, held, sensor)
+    bins, length = (stages.stated_steps(graph, name) for name in ("bins", "length"))
+    sensor = replace(sensor, bins=bins or 1, clocks=replace(sensor.clocks, length=length))
     network = assemble(layers, sensor, voters, label)
     facts = _facts(graph, steps, spiking, f"input {printable(entry.name)}: {words}", sensor)
     facts.append(f"classes: the spikes of {printable(spiking[voters].node.name)} in output {printable(end.name)}")

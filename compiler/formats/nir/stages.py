@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
+from spikeloom.compiler.dynamics import MOST_STEPS
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import affine
 from spikeloom.compiler.formats.affine import Affine, Padding, block_diagonal, convolution, scaled, shifted, through
@@ -65,6 +66,13 @@ def stated_step(graph: Graph) -> float | None:
     """Seconds of a step, where the metadata of a file say so."""
     said = graph.metadata.get("dt")
     return float(said.ravel()[0]) if isinstance(said, np.ndarray) and said.size == 1 else None
+
+
+def stated_steps(graph: Graph, name: str) -> int | None:
+    """A number of steps or bins, where the metadata that we write say so."""
+    said = graph.metadata.get(name)
+    value = said.item() if isinstance(said, np.ndarray) and said.size == 1 else None
+    return value if isinstance(value, int) and 1 <= value <= MOST_STEPS else None
 
 
 def written_step(graph: Graph) -> float | None:

@@ -79,6 +79,9 @@ def export(network: IntegerNetwork, dt: float, *, training: str | None = None) -
         edges += [(voters, "votes"), ("votes", "output")]
     nodes["output"] = {"type": "Output", "shape": np.array([network.classes])}
     said: Tree = {"dt": np.array(dt), "writer": "spikeloom"}
+    bins, length = network.input.bins, network.input.clocks.length
+    said |= {"bins": np.array(bins)} if bins > 1 else {}
+    said |= {"length": np.array(length)} if length is not None else {}
     if training is not None:
         said["training"] = training
     graph = {"type": "NIRGraph", "edges": edges, "metadata": said, "nodes": nodes}

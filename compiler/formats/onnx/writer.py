@@ -213,6 +213,8 @@ def _input_words(netlist: Netlist) -> str:
     if clocks.channels:
         words += f"; then {clocks.channels} clocks: the k-th, from 0, is 1 in the {clocks.steps} steps from "
         words += f"k * {clocks.steps}"
+    if clocks.length is not None:
+        words += f"; every recording is run for {clocks.length} steps, in silence after its end"
     return words
 
 

@@ -254,7 +254,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_netlist(parser)
     parser.add_argument("--input", default="-", metavar="FILE", help="event lines (default: -, standard input)")
     parser.add_argument("--bin", default="0.02", metavar="SECONDS", help="bin of the recordings (default: 0.02)")
-    what = "steps of every grasp: shorter ones are filled up, longer ones cut; counters bring their own, read-out included"
+    what = "steps of every grasp: shorter ones are filled up, longer ones cut; counters know theirs, read-out included"
     parser.add_argument("--bins", type=int, metavar="N", help=what)
     what = "where the first bin of a grasp begins: at time 0 or at the first event (default: zero)"
     parser.add_argument("--origin", choices=("zero", "first"), default="zero", help=what)
