@@ -246,7 +246,15 @@ TABLE = [
     ("verify net.loom --checkpoint net.pt --require E0", "--require E0: is about recordings, give --data too"),
     ("explain net.loom --checkpoint other.pt --data data", "netlist and checkpoint disagree|fc2 8|fc2 7"),
     (REPORT.replace("x.html", "x.pdf").format(""), "-o x.pdf: allowed are .html; name one of these"),
-    ("report net.loom --checkpoint same.pt --data data -o x.html", "compiled from a checkpoint of sha256"),
+    *(
+        (f"{command} --data data --checkpoint {other}", why)
+        for command in ("report -o x.html", "explain", "stress")
+        for other, why in (
+            ("same.pt net.loom", "net.loom: compiled from a checkpoint of sha256"),
+            ("finger.pt finger.loom --graph knn:2", "compiled for graph knn:1, this is knn:2"),
+            ("finger.pt finger.loom --theta 0.9", "conv1 was compiled with theta 0.5, this has 0.9; give --theta 0.5"),
+        )
+    ),
     ("lean net.pt --data data --differ 1.5", "--differ 1.5: not a share; give a number from 0 to below 1"),
     # one recording
     (EXPLAIN.format("--top 0"), "--top 0|at least 1"),

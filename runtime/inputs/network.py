@@ -52,11 +52,12 @@ class LoadedNetwork:
             return {"format": self.format, **self.read_as}
         return {"run": run, "weights": self.checkpoint.weights, "graph": self.graph}
 
-    def differs_from(self, made: Mapping[str, Any], run: int) -> str | None:
-        """How it is not what a netlist of this provenance was compiled from; `run` is which of a file's runs it is.
+    def differs_from(self, netlist: Any, run: int) -> str | None:
+        """How it is not what a netlist was compiled from; `run` is which of a file's runs it is.
 
         ModelError if it is the same file on another graph: what differs then is not the chip's doing.
         """
+        made = netlist.provenance
         if (sha256 := made.get("checkpoint_sha256", self.sha256)) != self.sha256:
             return (
                 f"compiled from a checkpoint of sha256 {sha256[:12]}…, this one has {self.sha256[:12]}…; "
@@ -68,7 +69,16 @@ class LoadedNetwork:
                 if name == "graph":
                     raise ModelError(f"the netlist was {why}")
                 return why
+        for name in ("beta", "theta") if self.checkpoint is not None else ():
+            for layer, ours in zip(netlist.layers, self.network.populations, strict=False):
+                if (due := getattr(layer, name)) != (found := getattr(ours, name)):
+                    return f"{layer.name} was compiled with {name} {due:g}, this has {found:g}; give --{name} {due:g}"
         return None
+
+    def require_same(self, path: str, netlist: Netlist, run: int) -> None:
+        """Refuse another network than the netlist at `path` is from, for the chip would be blamed: a ModelError."""
+        if (difference := self.differs_from(netlist, run)) is not None:
+            raise ModelError(f"{path}: {difference}")
 
     @property
     def model(self) -> Factored | Network:

@@ -17,7 +17,6 @@ from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
 from spikeloom.runtime.machines.base import machine_for
 from spikeloom.runtime.machines.integer import integer_machine
-from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.sections import Outcome
 
 NOTES = """\
@@ -48,8 +47,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     netlist = machine.netlist
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, loaded.model)
-    if (difference := loaded.differs_from(netlist.provenance, arguments.run)) is not None:
-        tell(f"warning: {arguments.netlist}: {difference}")
+    loaded.require_same(arguments.netlist, netlist, arguments.run)
     if arguments.limit is None and arguments.sample is None:
         arguments.limit = LIMIT
     data = load_recordings(arguments, netlist)

@@ -4,7 +4,6 @@ import argparse
 
 import numpy as np
 
-from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_check, add_netlist_and_model, add_recordings
@@ -54,8 +53,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         battery = read_stress(arguments.stress, arguments.netlist, sha256)
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, loaded.model)
-    if (difference := loaded.differs_from(netlist.provenance, arguments.run)) is not None:
-        raise ModelError(f"{arguments.netlist}: {difference}")  # the page would blame the chip for it
+    loaded.require_same(arguments.netlist, netlist, arguments.run)
     data = load_recordings(arguments, netlist, labels_for="report")
     machine.require_sensor(data.events)
     report = _report(arguments, machine, loaded, data, battery)

@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         required = parse_requirements(arguments.require)
     netlist, loaded = machine.netlist, load_network(arguments.checkpoint, arguments, machine.netlist)
     require_match(netlist, loaded.model)
-    if (difference := loaded.differs_from(netlist.provenance, arguments.run)) is not None:
+    if (difference := loaded.differs_from(netlist, arguments.run)) is not None:
         tell(f"warning: {arguments.netlist}: {difference}")
     held = check_rounding(integer_machine(machine), loaded.network, fine_tuned=loaded.network.forms is not None)
     if arguments.data is None or not held.layers:

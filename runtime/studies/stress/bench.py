@@ -115,6 +115,7 @@ def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
     netlist = read_netlist(arguments.netlist)
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, loaded.model)
+    loaded.require_same(arguments.netlist, netlist, arguments.run)
     data = load_recordings(arguments, netlist, labels_for="stress", joined=False)
     digest = hashlib.sha256()
     for array in data.identity().values():
