@@ -18,11 +18,11 @@ METHODS = ((TACTILESGNET, "manual"), (GRID_CNN, "none"), (MLP, "none"), (GCN, "m
 GRAPHS = (
     "manual",
     *(f"knn:{k}" for k in range(1, 9)),
-    *(f"mst:{radius}" for radius in ("0", "2", "2.5", "3", "3.5", "4")),
+    "mst:0",
+    "released:mst:1.5",
+    *(f"mst:{radius}" for radius in ("2", "2.5", "3", "3.5", "4")),
 )
-SAME_AS = {"mst:0": "mst:1.5"}
-"""No two taxels nearer than 1.5 mm are left unjoined by the tree: the same trainings stand beside both published rows.
-The released list of the second has four edges twice."""
+"""The tree joins all taxels nearer than 1.5 mm: only the released list, with four edges twice, tells 1.5 from 0."""
 
 SEEDS = {"methods": 5, "graphs": 3}
 GRID_SEEDS = 3
@@ -54,7 +54,7 @@ for graph, of_objects, of_containers in (
     ("knn:7", (89.65, 0.83), (64.67, 4.31)),
     ("knn:8", (89.51, 0.83), (60.33, 1.39)),
     ("mst:0", (89.03, 0.64), (63.67, 2.17)),
-    ("mst:1.5", (88.68, 0.93), (65.33, 3.80)),
+    ("released:mst:1.5", (88.68, 0.93), (65.33, 3.80)),
     ("mst:2", (89.44, 0.55), (63.00, 0.75)),
     ("mst:2.5", (89.31, 0.94), (65.00, 2.36)),
     ("mst:3", (89.51, 0.69), (64.33, 1.49)),

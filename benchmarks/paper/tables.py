@@ -5,12 +5,12 @@ import io
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from cells import DATA, EPOCHS, RESULTS, RUNS, SAME_AS, Cell, planned, read_cells
+from cells import DATA, EPOCHS, RESULTS, RUNS, Cell, planned, read_cells
 from pictures import pictures
 from spreads import EQUAL, MARGIN, PROTOCOLS, READINGS, Line, Spread, lines_of, rank_correlation, variance
 
@@ -49,7 +49,7 @@ def files(cells: Mapping[str, Cell], *, drawn: bool = True) -> dict[str, bytes]:
     }
     for table in EPOCHS:
         lines = lines_of(table, planned(table), cells)
-        found[f"{table}.csv"] = _csv(_twice(lines), planned(table)).encode()
+        found[f"{table}.csv"] = _csv(lines, planned(table)).encode()
         found[f"{table}.md"] = _markdown(table, lines, cells).encode()
         found |= pictures(table, lines) if drawn else {}
         of = {data: [line for line in lines if line.row.data == data] for data in DATA}
@@ -124,26 +124,16 @@ def _markdown(table: str, lines: Sequence[Line], cells: Mapping[str, Cell]) -> s
         samples = of_data[0].samples
         parts.append(f"## {data} ({samples} test recordings, one is {100 / samples:.2f})")
         statistics = _statistics(of_data)
-        parts += [_marked(_accuracies(_twice(of_data))), _marked(_agreement(statistics))]
+        parts += [_marked(_accuracies(of_data)), _marked(_agreement(statistics))]
         parts += [_marked(_noise(table, statistics)), _marked(_chip(of_data)), _marked(_quiet(of_data))]
     if table == "graphs":
         parts.append(
             "`knn:K` and `mst:SIGMA` are without the repeated edges of the released code, with which the paper's "
             "figures were made: in the released lists all but manual and `mst:0` have some edges twice, which the "
-            "normalisation counts twice; `released:NAME` has them. `mst:1.5` here is `mst:0`, the same trainings."
+            "normalisation counts twice; `released:NAME` has them. `mst:1.5`, without them, is `mst:0`."
         )
         parts += [f"## {EPOCHS['graphs']} epochs against {EPOCHS['methods']}", _marked(_schedule(cells))]
     return "\n\n".join(parts) + "\n"
-
-
-def _twice(lines: Sequence[Line]) -> list[Line]:
-    """With a row for each published one: trainings that stand for two are repeated."""
-    found = []
-    for line in lines:
-        found.append(line)
-        if line.table == "graphs" and (twin := SAME_AS.get(line.row.form)):
-            found.append(replace(line, row=replace(line.row, form=twin)))
-    return found
 
 
 def _marked(table: Table) -> str:
@@ -175,7 +165,7 @@ def _against(line: Line, reading: str) -> str:
 def _statistics(lines: Sequence[Line]) -> dict[str, Any]:
     """By epoch: how the rows of a data set go with the paper's, and whether they differ by more than seeds do."""
     found: dict[str, Any] = {}
-    several = [line for line in _twice(lines) if line.paper is not None]
+    several = [line for line in lines if line.paper is not None]
     papers = [line.paper[0] for line in several if line.paper]
     for reading in READINGS:
         spread = variance([line.accuracy(reading).values for line in lines])
@@ -198,7 +188,7 @@ def _spans(lines: Sequence[Line]) -> dict[str, Any]:
     """How far rows lie apart: points of accuracy, factors of costs, shares of silent neurons, and what these save."""
     costs = {key: [line.mean(key) for line in lines] for key in OPERATIONS}
     costs["energy"] = [line.mean("energy_j", ENERGIES[0]) for line in lines]
-    papers = [line.paper[0] for line in _twice(lines) if line.paper]
+    papers = [line.paper[0] for line in lines if line.paper]
     means = {reading: [line.accuracy(reading).mean for line in lines] for reading in PROTOCOLS}
     first = {key: [line.mean("first_layer", key) for line in lines] for key in FIRST_LAYER}
     silent = [sum(each) for each in zip(first["cannot_fire"], first["quiet_in_training"], strict=True)]
