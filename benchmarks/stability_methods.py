@@ -1,11 +1,10 @@
 """Where methods fail: the float model, its chips and other networks side by side, under single events and dead taxels.
 
-    python benchmarks/stability_methods.py DATA OUT.json --float NETWORK --chips NAME=NET.loom … --verdicts FILE …
+    python benchmarks/stability_methods.py DATA OUT.json --float NETWORK --chips NAME=NET.loom …
 
-Every dead taxel of every test recording is run in all of them. Every single event is changed in a sample: recordings
-whose decision one event alters by the `--verdicts` that ``certify -o`` wrote of some of them, and the first few. The
-float model, in float32 (:func:`interpret.float_simulation`), beside the first netlist, runs each changed recording from
-the first step to the last: half a minute a recording of Objects. What OUT.json holds already is not run again.
+Every dead taxel and every single event of every test recording is run in all of them. The float model, in float32
+(:func:`interpret.float_simulation`), beside the first netlist, runs each changed recording from the first step to the
+last: half a minute a recording of Objects. What OUT.json holds already is not run again.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ import numpy as np
 from made import made
 from matplotlib.colors import ListedColormap
 from matplotlib.patches import Patch
+from tqdm import tqdm
 
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import float_simulation
@@ -30,9 +30,8 @@ from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import propagation
 from spikeloom.runtime.machines.base import machine_for
 from spikeloom.runtime.machines.changes import Changes, Effects, by_running, single
-from spikeloom.runtime.report.encode import read_json
 from spikeloom.runtime.studies.stability.neighbours import cells_of, channels_of
-from spikeloom.runtime.studies.stability.results import PHASES, Stability
+from spikeloom.runtime.studies.stability.results import PHASES
 
 Json = dict[str, Any]
 
@@ -68,34 +67,23 @@ def main() -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("--float", required=True, dest="floats", metavar="NETWORK")
     parser.add_argument("--chips", nargs="+", required=True, metavar="NAME=NET.loom")
-    parser.add_argument("--verdicts", nargs="+", required=True, metavar="FILE")
-    parser.add_argument("--first", type=int, default=12, metavar="N")
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
     test = load_data(arguments.recordings, "test")
     known = json.loads(arguments.output.read_text())["each"] if arguments.output.exists() else {}
     found: Json = made(load_data(arguments.recordings, "train"), test) | {"data": Path(arguments.recordings).name}
-    verdicts = [read_json(Stability, Path(file), "--verdicts", "certify -o").verdicts for file in arguments.verdicts]
-    fall = {each.file for of in verdicts for each in of if not each.at_least}
-    sample = [i for i, file in enumerate(test.files) if file in fall]
-    found["sample"] = {"fallen": len(sample), "first": arguments.first}
-    sample += [i for i in range(arguments.first) if i not in sample]
     chips: dict[str, Any] = {n: machine_for(file) for n, _, file in (each.partition("=") for each in arguments.chips)}
     machines = chips | {"float": Floats(arguments.floats, next(iter(chips.values())).netlist)}
     found["each"] = {name: known.get(name, {}) for name in machines}
     for name, machine in machines.items():
-        for index in [*sample, *range(len(test))]:
-            row = found["each"][name].setdefault(str(index), {})
-            events = test.events[index, ..., : test.steps_of(index)]
-            if "dead" not in row:
-                row |= {"label": int(test.labels[index])} | dead(machine, events)
-            if index in sample and "event" not in row:
-                row |= {"event": event(machine, events)}
+        rows = found["each"][name]
+        for index in tqdm(range(len(test)), desc=name, disable=None):
+            if "event" not in rows.get(str(index), {}):
+                events = test.events[index, ..., : test.steps_of(index)]
+                rows[str(index)] = {"label": int(test.labels[index])} | dead(machine, events)
+                rows[str(index)]["event"] = event(machine, events)
                 arguments.output.write_text(json.dumps(found))
-    found["methods"] = {name: summary(rows, sample) for name, rows in found["each"].items()}
-    for rows in found["each"].values():
-        for index in set(rows) - {str(index) for index in sample}:
-            rows[index].pop("event", None)  # of another sample
+    found["methods"] = {name: summary(rows) for name, rows in found["each"].items()}
     found["fall"] = {kind: side_by_side(found["each"], kind) for kind in ("dead", "event")}
     arguments.output.write_text(json.dumps(found) + "\n")
     if arguments.picture:
@@ -127,20 +115,18 @@ def falls(row: Json, kind: str) -> bool:
     return bool(row["dead"]) if kind == "dead" else any(row["event"]["phases"])
 
 
-def summary(rows: Json, sample: list[int]) -> Json:
+def summary(rows: Json) -> Json:
     """Recordings that are right and that stand; taxels, classes and phases in which the others fall, most first."""
-    tried = [rows[str(index)] for index in sample]
     taxels = np.bincount([taxel for row in rows.values() for taxel in row["dead"]], minlength=1)
     classes = np.bincount([row["label"] for row in rows.values() if row["dead"]], minlength=1)
     return {
         "recordings": len(rows),
         "right": sum(row["decided"] == row["label"] for row in rows.values()),
         "dead": sum(not row["dead"] for row in rows.values()),
-        "sample": len(tried),
-        "event": sum(not falls(row, "event") for row in tried),
-        "removed": sum(not row["event"]["removed"] for row in tried),
-        "added": sum(not row["event"]["added"] for row in tried),
-        "phases": np.sum([row["event"]["phases"] for row in tried], axis=0).tolist(),
+        "event": sum(not falls(row, "event") for row in rows.values()),
+        "removed": sum(not row["event"]["removed"] for row in rows.values()),
+        "added": sum(not row["event"]["added"] for row in rows.values()),
+        "phases": np.sum([row["event"]["phases"] for row in rows.values()], axis=0).tolist(),
         "taxels": [[int(t), int(taxels[t])] for t in np.argsort(-taxels, kind="stable")[:5]],
         "classes": [[int(c), int(classes[c])] for c in np.argsort(-classes, kind="stable")[:5]],
     }
@@ -148,7 +134,7 @@ def summary(rows: Json, sample: list[int]) -> Json:
 
 def side_by_side(each: Json, kind: str) -> Json:
     """Recordings that fall in all networks and in some; in each of them though the floats stand, and the other way."""
-    fall = {n: {i for i, row in rows.items() if kind in row and falls(row, kind)} for n, rows in each.items()}
+    fall = {n: {i for i, row in rows.items() if falls(row, kind)} for n, rows in each.items()}
     floats = fall["float"]
     counts = {
         name: {"fall": len(own), "new": len(own - floats), "gone": len(floats - own)} for name, own in fall.items()
@@ -160,7 +146,7 @@ def picture(each: Json, to: Path) -> None:
     """What alters each decision, networks below each other, recordings that little alters first."""
 
     def level(row: Json) -> int:
-        if "event" in row and falls(row, "event"):
+        if falls(row, "event"):
             return 2
         return 1 if row["dead"] else 0
 
