@@ -86,7 +86,8 @@ def trained(seen: Recordings, beside: Recordings, bins: int, epochs: int, seed: 
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "network.pt")
         usual.save(file, {"last": run.last}, plan, {})
-        return machine_for(spikeloom.compile(str(file), calibrate=seen, weight_bits="8").path)
+        compiled = spikeloom.compile(str(file), calibrate=seen, weight_bits="8")  # its file goes when it does
+        return machine_for(compiled.path)
 
 
 def certified(machine: Machine, data: Recordings) -> Json:
