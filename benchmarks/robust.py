@@ -37,6 +37,8 @@ Json = dict[str, Any]
 
 MOST = 8
 
+COUNTED = ("recordings", "right", "both", "one", "two", "dead")
+
 
 def main() -> None:
     """Train, certify, write after each network."""
@@ -91,8 +93,8 @@ def trained(seen: Recordings, beside: Recordings, bins: int, epochs: int, seed: 
 
 
 def certified(machine: Machine, data: Recordings) -> Json:
-    """Recordings that are right, that bear 1 to `MOST` events, and that bear any dead taxel."""
-    bear, right, dead, ahead = np.zeros(MOST + 1, np.int64), 0, 0, []
+    """Recordings that are right, that bear 1 to `MOST` events, that do both, and that bear any dead taxel."""
+    bear, right, both, dead, ahead = np.zeros(MOST + 1, np.int64), 0, 0, 0, []
     for events, label in zip(data.events, data.labels.tolist(), strict=True):
         channels, cells = channels_of(events[None], machine.netlist)[0], cells_of(events, machine.netlist)
         votes = machine.votes(channels[None])[0]
@@ -101,12 +103,13 @@ def certified(machine: Machine, data: Recordings) -> Json:
         altered = ((effects.votes + votes).argmax(axis=1) != decision) & (cells.cost == 1)
         if not altered.any():
             known = machine.forgetting(channels)
+            both += decision == label
             bear[: 1 + (1 if known is None else max(1, lower_bound(votes, cells, effects, known, MOST)))] += 1
         without = events[None] * (1 - np.eye(len(events), dtype=np.uint8))[:, :, None, None]
         dead += int((machine.votes(channels_of(without, machine.netlist)).argmax(axis=1) == decision).all())
         right += decision == label
         ahead.append(int(np.delete(gaps, decision).min()))
-    counts = {"recordings": len(data), "right": right, "bear": bear[1:].tolist(), "dead": dead}
+    counts = {"recordings": len(data), "right": right, "bear": bear[1:].tolist(), "both": both, "dead": dead}
     return counts | {"ahead": float(np.median(ahead))}
 
 
@@ -114,7 +117,7 @@ def together(runs: list[Json]) -> dict[str, Json]:
     """Sums over the seeds of each chance; beside them how much more, and how much less of what is missing."""
     found: dict[str, Json] = {}
     for run in runs:
-        sums = found.setdefault(f"{run['robust']:g}", {"recordings": 0, "right": 0, "one": 0, "two": 0, "dead": 0})
+        sums = found.setdefault(f"{run['robust']:g}", dict.fromkeys(COUNTED, 0))
         counts = {"one": run["bear"][0], "two": run["bear"][1]} | run
         for name in sums:
             sums[name] += counts[name]
