@@ -309,3 +309,10 @@ def test_a_nir_file_knows_how_long_a_recording_is_run(trained, tmp_path):
     for form, suffix in (("onnx", "onnx"), ("sanafe", "yaml")):
         as_json("export", tmp_path / "c.loom", "--to", form, "-o", tmp_path / f"c.{suffix}")
         assert b"every recording is run for 84 steps" in (tmp_path / f"c.{suffix}").read_bytes()
+
+
+def test_anytime_counts_the_steps_of_the_ramp_too(trained):
+    told = run("anytime", trained[1], "--data", trained[2])[1]
+    assert "\n  run    steps  " in told
+    assert "\n  50 %      40  " in told
+    assert "--bins 80 --until-sure" in told

@@ -36,14 +36,14 @@ def _lines(result: Anytime) -> list[str]:
 
 
 def window_table(result: Anytime) -> Table:
-    """Right decisions by the part of each recording that is observed."""
+    """Right decisions by the part of each recording that is run; the steps of counters end with their read-out."""
     rows = []
     for each in result.windows:
         if each.percent in SHOWN:
             low, high = each.chip.interval
             right = f"{100 * each.chip.correct / result.labelled:.2f} ({100 * low:.1f} … {100 * high:.1f})"
             rows.append([f"{each.percent} %", f"{each.bins:.0f}", right])
-    return Table(["observed", "bins", "chip, % right"], rows)
+    return Table(["run", "steps", "chip, % right"], rows)
 
 
 def _allowed(rule: Calibrated) -> str:

@@ -13,7 +13,7 @@ from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.anytime import exits
 
 WINDOWS = tuple(range(5, 101, 5))
-"""Percent of each recording that is observed."""
+"""Percent of the steps of each recording that are run, those of a read-out among them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +71,7 @@ class Right:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Window:
-    """Decisions of which only the first part of each recording is observed; the read-out still runs to its end."""
+    """Decisions after the first part of the steps of each recording, and those by which the layer that votes lags."""
 
     percent: int
     bins: float
