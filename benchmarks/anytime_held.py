@@ -21,8 +21,7 @@ from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.graphs import NEUTOUCH
-from spikeloom.models.recordings.events import BIN_S
-from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.evtouch import BIN_S, Recordings
 from spikeloom.models.training.kinds import kind_of, seen_by
 from spikeloom.models.training.train import train, validation_split
 from spikeloom.runtime.cli import build_parser

@@ -8,7 +8,8 @@ import sys
 
 import numpy as np
 
-from spikeloom.models.recordings.events import BIN_S, load_data
+from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.evtouch import BIN_S
 
 
 def main() -> None:

@@ -55,7 +55,7 @@ class Data:
     """Recordings of a source by split, read when they are first needed; made by :func:`recordings`."""
 
     source: str
-    bin_s: float
+    bin: float | None
 
     @cached_property
     def train(self) -> Recordings:
@@ -74,20 +74,20 @@ class Data:
         """
         from spikeloom.runtime.inputs.recordings import recordings as read
 
-        return read(self.source, name, classes=None, taxels=None, bin_s=self.bin_s)
+        return read(self.source, name, classes=None, taxels=None, bin_s=self.bin)
 
 
-def recordings(source: str, *, bin_s: float = 0.02) -> Data:
+def recordings(source: str, *, bin: float | None = None) -> Data:
     """Name recordings: a zip, folder or file of them, ``synthetic``, ``objects`` or ``containers``.
 
     Parameters
     ----------
     source : str
         As of ``--data``.
-    bin_s : float
-        Seconds of a time bin, for files of single events.
+    bin : float, optional
+        Seconds of a time bin, for files of single events; 0.02 where it is not given.
     """
-    return Data(source, bin_s)
+    return Data(source, bin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +196,7 @@ def finetune(
     SpikeloomError
         As of :func:`compile`, and if the recordings are not the network's.
     """
-    words: JsonObject = {"data": data} if isinstance(data, str) else {"data": data.source, "bin": data.bin_s}
+    words: JsonObject = {"data": data} if isinstance(data, str) else {"data": data.source, "bin": data.bin}
     words |= {"checkpoint": _source("finetune", network, example), "output": output}
     result = _command("training.finetune", **words, **options)
     kept = {name: value for name, value in options.items() if name in ("graph", "taxels", "edges", "polarities")}

@@ -81,8 +81,8 @@ export onnx:
 export sanafe:
     bytes cores format groups input_cores neurons path sha256 synapses
 finetune:
-    before command data data_sha256 epochs file fine_tuned_from fine_tuned_weights history last netlist? seed sha256
-    test_samples weight_bits
+    before bin_s? command data data_sha256 epochs file fine_tuned_from fine_tuned_weights history last netlist? seed
+    sha256 test_samples weight_bits
 inspect checkpoint:
     assumed beta classes given graph layers layout sha256 system taxels theta training bins? dynamics? hops? towers?
 inspect checkpoint, crossbars:

@@ -10,8 +10,8 @@ from oracles import refused
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings.counts import GAP_S
 from spikeloom.models.recordings.eventfiles import EventStream, read_stream
-from spikeloom.models.recordings.events import BIN_S, MAX_STEPS, bin_events, data_splits, load_data, need_labels
-from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
+from spikeloom.models.recordings.events import MAX_STEPS, bin_events, data_splits, load_data, need_labels
+from spikeloom.models.recordings.evtouch import BIN_S, UNLABELLED, Recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_event_lines, write_released
 from spikeloom.runtime.commands.exchange.data import describe
@@ -262,9 +262,9 @@ def test_hot_taxels_exceed_five_times_the_median_and_silence_is_dead():
     grid[0, :3, :, :5] = 1
     grid[0, 3, :, :25] = 1
     grid[0, 4, :, :26] = 1  # taxel 5 is dead and does not lower the median
-    found = describe(made(grid), 0.02)
+    found = describe(made(grid))
     assert (found.dead, found.hot) == ((5,), (4,))
-    found = describe(made(np.zeros((1, 3, 2, 4))), 0.02)
+    found = describe(made(np.zeros((1, 3, 2, 4))))
     assert (found.dead, found.hot, found.events) == ((0, 1, 2), (), 0)
 
 

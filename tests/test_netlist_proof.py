@@ -1,6 +1,7 @@
 """Level EN: a netlist is what its checkpoint is lowered to, and every small damage that a file can hold has a name."""
 
 import dataclasses
+import json
 import re
 
 import numpy as np
@@ -255,6 +256,24 @@ def test_a_netlist_remembers_bins_and_data(tmp_path, monkeypatch):
         assert {name: made["provenance"][name] for name in ("data", "bin_s")} == {"data": "taps", "bin_s": 0.1}
         assert run("run", "x.loom", "--data", "taps") == run("run", "x.loom", "--data", "taps", "--bin", "0.1")
     assert run("estimate", "x.loom", "--data", "taps")[1].startswith("per inference of 13 chip steps")
+    # the same, whichever command reads them and whoever made the bins
+    tap = "taps/test/tap_0_label_0.csv"
+    *_, grasp, _ = map(json.loads, run("watch", "x.loom", "--input", tap, "--json")[1].splitlines())
+    assert [grasp["counts"]] == as_json("run", "x.loom", "--data", tap)["counts"]
+    said = "--bin 0.02: the network was trained on bins of 0.1 s; omit --bin"
+    for words in ("run x.loom --data taps", "lean net.pt --data taps", f"watch x.loom --input {tap}"):
+        assert said in run(*words.split(), "--bin", "0.02")[2]
+    for width, code in (("0.1", 0), ("0.05", 2)):
+        assert run("data", "convert", "taps", "--bin", width, "-o", f"binned{width}")[0] == 0
+        assert run("run", "x.loom", "--data", f"binned{width}")[0] == code
+        assert as_json("data", "describe", f"binned{width}")["bin_s"] == float(width)
+    assert run("join", "net.pt", "net.pt", "-o", "wide.pt")[0] == 0
+    made = {"wide.pt": (), "less.pt": ("lean", "net.pt", "--data", "taps", "--network", "less.pt")}
+    made["tuned.pt"] = "finetune", "net.pt", "--data", "taps", "--epochs", "1", "--weight-bits", "4", "-o", "tuned.pt"
+    for network, words in made.items():
+        assert not words or run(*words)[0] == 0
+        assert read_checkpoint(network).training["bin_s"] == 0.1
+    assert run("export", "x.loom", "--to", "nir", "-o", "x.nir")[1].endswith("in steps of 0.1 s (euler)\n")
 
 
 OTHERS = {

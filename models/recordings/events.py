@@ -21,10 +21,8 @@ from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.counts import GAP_S, EventCounts
 from spikeloom.models.recordings.csvtable import LABELS, is_table, labels_beside
 from spikeloom.models.recordings.eventfiles import EventStream, read_stream
+from spikeloom.models.recordings.evtouch import BIN_S
 from spikeloom.models.recordings.fetch import DATA_SETS, find_data
-
-BIN_S = 0.02
-"""Width of a time bin in the released recordings, seconds."""
 
 MAX_STEPS = 1_000_000
 
@@ -53,7 +51,8 @@ def load_data(
     path: str | os.PathLike[str],
     split: str = "test",
     *,
-    bin_s: float = BIN_S,
+    bin_s: float | None = None,
+    usual: float = BIN_S,
     taxels: int | None = None,
     classes: int | None = None,
     limit: int | None = None,
@@ -62,15 +61,15 @@ def load_data(
 
     The path is a folder or zip in the released layout; a folder of ``.csv``, ``.npz`` and ``.npy`` recordings, flat (it
     stands for any split) or with ``train/`` and ``test/``; one such file; or the name of a data set that was fetched.
-    `bin_s` is the width of a time bin in seconds; the released layout and ``.npy`` files have bins already, see
-    `require_events`. The network expects so many `taxels` and `classes`; without `taxels` the highest taxel with an
-    event decides. Labels are `UNLABELLED` where nothing says them, see `need_labels`. In the released layout all
-    recordings have labels, the same steps and taxels, and no counts.
+    `bin_s` is the width of a time bin in seconds, where it is not given the `usual` one; the released layout and
+    ``.npy`` files have bins already, see `require_events`. The network expects so many `taxels` and `classes`; without
+    `taxels` the highest taxel with an event decides. Labels are `UNLABELLED` where nothing says them, see
+    `need_labels`. In the released layout all recordings have labels, the same steps and taxels, and no counts.
 
     DataError if a recording cannot be used, with file and place; OptionError if `bin_s` is not a duration or given for
     what has bins already, or `limit` is below 1.
     """
-    if not (math.isfinite(bin_s) and bin_s > 0):
+    if bin_s is not None and not (math.isfinite(bin_s) and bin_s > 0):
         raise OptionError(f"--bin {bin_s:g}: not a duration; give seconds above 0, for example {BIN_S:g}")
     if limit is not None and limit < 1:
         raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
@@ -82,20 +81,23 @@ def load_data(
             raise DataError(f"{source}: split {split!r} is missing or empty; splits with recordings: {present}")
         folder = f"{split}/" if split in found else ""
         chosen = sorted(found[split if split in found else ""].items())[:limit]
-        released = bool(folder) and all(name.lower().endswith(".npy") for name in found[split])
-        if released:
-            require_events(source, bin_s)
+        binned = all(name.lower().endswith(".npy") for name, _ in chosen)
+        released = bool(folder) and binned
+        held = evtouch.parse_width(source, members, chosen[0][1]) if binned else None
+        width = (held or BIN_S) if binned else bin_s or usual
+        if binned:
+            require_events(source, bin_s, width)
         files = [(path.parent if path.is_file() else path) / member for _, member in chosen]
         table, notes = labels_beside(path, files, source)
         read: list[_Recording] = []
-        held = 0
+        size = 0
         for file, (name, member) in zip(files, chosen, strict=True):
             where = source if path == file else f"{source}: {folder}{name}"
-            read.append(_read(file, members[member], where, bin_s, taxels, table.get(file)))
+            read.append(_read(file, members[member], where, width, taxels, table.get(file)))
             _require_alike(read[-1], read[0], released)
             evtouch.require_class(where, read[-1].label, classes)
-            held += read[-1].grid.size
-            evtouch.require_memory(source, held)
+            size += read[-1].grid.size
+            evtouch.require_memory(source, size)
     steps = np.array([each.grid.shape[2] for each in read], np.int64)
     shape = max(each.grid.shape[0] for each in read), read[0].grid.shape[1], int(steps.max())
     evtouch.require_memory(source, len(read) * math.prod(shape))
@@ -118,7 +120,7 @@ def load_data(
         source=source,
         lengths=None if steps.min() == steps.max() else steps,
         counts=None if released else counts,
-        bin_s=None if all(file.suffix.lower() == ".npy" for file in files) else bin_s,
+        bin_s=held if binned else width,
     )
 
 
@@ -133,9 +135,9 @@ def _require_alike(read: _Recording, first: _Recording, released: bool) -> None:
         )
 
 
-def require_events(where: str, bin_s: float) -> None:
-    """Refuse a width of bins for what has bins already."""
-    if bin_s != BIN_S:
+def require_events(where: str, bin_s: float | None, held: float = BIN_S) -> None:
+    """Refuse a width of bins for what has bins already, of another width."""
+    if bin_s not in (None, held):
         raise OptionError(f"--bin {bin_s:g}: {where} holds bins, not times; omit --bin")
 
 
@@ -294,7 +296,6 @@ def _read(
 ) -> _Recording:
     """One recording; `listed` is its class in a table of labels."""
     if file.suffix.lower() == ".npy":
-        require_events(where, bin_s)
         grid = evtouch.parse_bins(where, opener, taxels)
         busy = np.flatnonzero(grid.any(axis=(0, 1)))
         gaps = int(np.count_nonzero((np.diff(busy) - 1) * bin_s > GAP_S))

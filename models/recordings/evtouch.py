@@ -5,6 +5,7 @@ recording is (taxels, polarities, steps), values 0 and 1; of two polarities, 1 i
 contact).
 """
 
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -27,10 +28,16 @@ MAX_POLARITIES = 8
 MAX_TOTAL_BYTES = 4 << 30
 MAX_FILE_BYTES = 64 << 20  # the released recordings have 0.1 MB
 
+BIN_S = 0.02
+"""Width of a bin in seconds, as in the released recordings."""
+
 UNLABELLED = -1
 
 SUFFIXES = (".npy", ".npz", ".csv")
 """Of files that hold a recording: bins, events, events."""
+
+WIDTH = "bins.npy"
+"""File beside the splits that holds one number, seconds of a bin; the released recordings have none."""
 
 _LABEL = re.compile(r"_label_([0-9]{1,6})(?![0-9])")
 _GIVE = "give the folder or zip that holds train/ and test/"
@@ -53,7 +60,7 @@ class Recordings:
     # released layout.
     lengths: IntArray | None = None
     counts: EventCounts | None = None  # What was odd about their events; None where they had bins already
-    bin_s: float | None = None  # Seconds of a bin, where they were events; of those before any were joined
+    bin_s: float | None = None  # Seconds of a bin, where somebody said so; of those before any were joined
 
     def __post_init__(self) -> None:
         for name in ("events", "labels", "lengths"):
@@ -66,6 +73,11 @@ class Recordings:
     def __len__(self) -> int:
         """Return the number of recordings."""
         return len(self.files)
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of a bin, where nobody said so the usual ones."""
+        return BIN_S if self.bin_s is None else self.bin_s
 
     @property
     def taxels(self) -> int:
@@ -163,6 +175,17 @@ def parse_npy(where: str, opener: Callable[[], IO[Any]]) -> AnyArray:
     if values.dtype.kind not in "biuf":
         raise DataError(f"{where}: dtype {values.dtype.str!r}, allowed are numbers; convert it")
     return values
+
+
+def parse_width(source: str, members: Members, recording: str) -> float | None:
+    """Seconds of a bin that stand beside the split of a `recording`, if any do; DataError if they are none."""
+    where = (Path(recording).parent.parent / WIDTH).as_posix()
+    if where not in members:
+        return None
+    seconds = parse_npy(f"{source}: {where}", members[where]).ravel()
+    if len(seconds) != 1 or not (math.isfinite(seconds[0]) and seconds[0] > 0):
+        raise DataError(f"{source}: {where}: allowed is one number, seconds of a bin; convert the events again")
+    return float(seconds[0])
 
 
 def other_taxels(found: int, wanted: int) -> str:

@@ -17,14 +17,14 @@ from spikeloom.compiler.archive import ZIP_DATE, npy_bytes
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.files import beside, write_atomically
 from spikeloom.models.recordings.events import need_labels
-from spikeloom.models.recordings.evtouch import Recordings, require_polarities
+from spikeloom.models.recordings.evtouch import WIDTH, Recordings, require_polarities
 
 SOURCES = "sources.csv"
 """Table of split, new name and old name of every recording."""
 
 
-def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings]) -> None:
-    """Write splits into a new folder, or a zip if the name ends so; all of it or nothing.
+def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings], bin_s: float | None = None) -> None:
+    """Write splits, of bins of so many seconds, into a new folder, or a zip if the name ends so; all or nothing.
 
     A zip that exists is replaced, a folder must not exist. Numbers have leading zeros, so that the plain order of the
     files is the order of the recordings.
@@ -38,7 +38,7 @@ def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings]) -
         raise OptionError(f"-o {path}: the folder around it does not exist; make it first")
     if path.suffix.lower() == ".zip":
         with write_atomically(path) as target, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, content in _members(splits):
+            for name, content in _members(splits, bin_s):
                 info = zipfile.ZipInfo(name, ZIP_DATE)
                 info.compress_type = zipfile.ZIP_DEFLATED
                 info.external_attr = 0o644 << 16
@@ -49,7 +49,7 @@ def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings]) -
     part = beside(path)
     try:
         part.mkdir()
-        for name, content in _members(splits):
+        for name, content in _members(splits, bin_s):
             (part / name).parent.mkdir(exist_ok=True)
             (part / name).write_bytes(content)
         part.rename(path)
@@ -58,7 +58,7 @@ def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings]) -
         raise
 
 
-def _members(splits: Sequence[Recordings]) -> Iterator[tuple[str, bytes]]:
+def _members(splits: Sequence[Recordings], bin_s: float | None) -> Iterator[tuple[str, bytes]]:
     """Name and content of every file; in the table nothing begins as a formula."""
     for recordings in splits:
         for index, events in enumerate(recordings.events):
@@ -71,6 +71,8 @@ def _members(splits: Sequence[Recordings]) -> Iterator[tuple[str, bytes]]:
             safe = f"'{file}" if file[:1] in "=+-@\t\r" else file
             writer.writerow([recordings.split, _name(recordings, index), safe])
     yield SOURCES, text.getvalue().encode()
+    if bin_s is not None:
+        yield WIDTH, npy_bytes(np.array([bin_s]))
 
 
 def _name(recordings: Recordings, index: int) -> str:

@@ -5,7 +5,7 @@ import argparse
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.formats.nir import CONVENTIONS
 from spikeloom.models.graphs import CHOICES
-from spikeloom.models.recordings.events import BIN_S
+from spikeloom.models.recordings.evtouch import BIN_S
 
 MIN_AGREEMENT = 0.95
 """Share of equal decisions that ``verify`` wants."""
@@ -37,8 +37,8 @@ def add_checkpoint(parser: argparse.ArgumentParser, what: str = "trained network
 def add_bin_option(parser: argparse.ArgumentParser) -> None:
     """Add ``--bin``."""
     options = group(parser, "recordings")
-    what = f"width of a time bin for event files (default: {BIN_S:g} s)"
-    options.add_argument("--bin", type=float, default=BIN_S, metavar="S", help=what)
+    what = f"width of a time bin for event files (default: the one that the network was trained on, else {BIN_S:g} s)"
+    options.add_argument("--bin", type=float, metavar="S", help=what)
 
 
 def group(parser: argparse.ArgumentParser, title: str) -> argparse._ArgumentGroup:

@@ -12,7 +12,7 @@ from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings import events
 from spikeloom.models.recordings.counts import number, show_counts
-from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings, first_part, other_taxels, parse_window
+from spikeloom.models.recordings.evtouch import BIN_S, UNLABELLED, Recordings, first_part, other_taxels, parse_window
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
 from spikeloom.runtime.report.console import progress, tell
 
@@ -24,7 +24,7 @@ def recordings(
     limit: int | None = None,
     classes: int | None,
     taxels: int | None,
-    bin_s: float = events.BIN_S,
+    bin_s: float | None = None,
     bins: int = 1,
     labels_for: str | None = None,
     trained: Mapping[str, Any] | None = None,
@@ -33,23 +33,25 @@ def recordings(
 
     Counts of disorder in event files go to stderr. `bins` of them make a step of the network. `labels_for` names what
     needs the label of every recording. `trained` is what is known of the recordings that the network was trained on,
-    see :func:`origin_of`: events come in its bins, and what looks like other recordings is warned of.
+    see :func:`origin_of`: events come in its bins, others are refused, and what looks like other recordings is warned
+    of.
 
     Raises DataError or OptionError if they cannot be used, or do not suit the network.
     """
+    own = (trained or {}).get("bin_s")
     if isinstance(path, Recordings):
         require_suited(path, classes=classes, taxels=taxels)
+        _require_width(path, own)
         if limit is not None and limit < 1:
             raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
         data = path.part(slice(limit))
         return events.joined_bins(data if labels_for is None else events.need_labels(data, labels_for), bins)
     if path != SYNTHETIC:
-        shared: dict[str, Any] = {"limit": limit, "classes": classes, "taxels": taxels}
-        data, own = events.load_data(path, split, bin_s=bin_s, **shared), (trained or {}).get("bin_s")
-        if own is not None and data.bin_s not in (None, own):
-            if bin_s != events.BIN_S:
-                raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {own:g} s; omit --bin")
-            data = events.load_data(path, split, bin_s=own, **shared)
+        if own is not None and bin_s not in (None, own):
+            raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {own:g} s; omit --bin")
+        usual = BIN_S if own is None else own
+        data = events.load_data(path, split, bin_s=bin_s, usual=usual, limit=limit, classes=classes, taxels=taxels)
+        _require_width(data, own)
         _require_sensor(data, split, taxels)
         show_counts(data.source, data.counts)
         if labels_for is not None:
@@ -67,6 +69,15 @@ def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
     """What a netlist remembers of the recordings behind a network: their name, and their bins if they were events."""
     kinds = {"data": str, "bin_s": float}
     return {name: training[name] for name, kind in kinds.items() if training and isinstance(training.get(name), kind)}
+
+
+def _require_width(data: Recordings, own: float | None) -> None:
+    """Refuse recordings whose bins are not those of the network."""
+    if own is not None and data.bin_s not in (None, own):
+        raise DataError(
+            f"{data.source}: bins of {data.bin_s:g} s, the network was trained on bins of {own:g} s; give the events "
+            "that they were made of"
+        )
 
 
 def _require_sensor(data: Recordings, split: str, taxels: int | None) -> None:
@@ -135,7 +146,7 @@ def load_recordings(
         labels_for=labels_for,
         trained=origin_of(netlist.provenance),
     )
-    arguments.bin = data.bin_s or arguments.bin  # what the command goes on with
+    arguments.bin = data.seconds  # what the command goes on with
     if not joined:
         return data
     data, length = first_part(data, window), netlist.clocks.length

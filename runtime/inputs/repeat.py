@@ -8,7 +8,7 @@ from typing import Any
 from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.types import JsonObject
-from spikeloom.models.recordings.events import BIN_S
+from spikeloom.models.recordings.evtouch import BIN_S
 
 NETWORK = ("graph", "taxels", "edges", "directed", "run", "weights", "beta", "theta")
 """Options that say how a checkpoint is read."""

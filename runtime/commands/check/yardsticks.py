@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from spikeloom.runtime.commands.options import add_checkpoint, add_recordings
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
-from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.inputs.recordings import origin_of, recordings
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies import yardsticks
 
@@ -30,6 +30,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         taxels=checkpoint.taxels,
         bin_s=arguments.bin,
         bins=checkpoint.bins,
+        trained=origin_of(checkpoint.training),
     )
     spikes = float_spikes(checkpoint, adjacency, data.events)
     found = yardsticks.measure(checkpoint, adjacency, data.events, spikes, lengths=data.lengths)

@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise OptionError(f"--table {energy}: {target.title} has no such energy table; give {' or '.join(tables)}")
     progress("reading the recordings")
     splits = read_splits(arguments.data, arguments.bin, networks[0])
-    data = data_of(arguments.data, arguments.bin, splits["train"], splits["test"])
+    data = data_of(arguments.data, splits["test"].seconds, splits["train"], splits["test"])
     require_suited(networks, splits, data.sha256)
     require_grid(networks, grid, target)
     folder.mkdir(exist_ok=True)

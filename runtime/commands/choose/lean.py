@@ -13,7 +13,7 @@ from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import storage
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_graph, load_network
-from spikeloom.runtime.inputs.recordings import recordings, require_splits
+from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import Outcome
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     progress("reading the recordings")
     taken = loaded.network.input
     shared: dict[str, Any] = {"bin_s": arguments.bin, "bins": taken.bins, "taxels": taken.taxels, "labels_for": "lean"}
-    shared["classes"] = loaded.network.classes
+    shared |= {"classes": loaded.network.classes, "trained": origin_of(loaded.training)}
     found = (("train", None), (arguments.split, arguments.limit))
     each = (recordings(arguments.data, split, limit=limit, **shared) for split, limit in found)
     training, test = (of_length(data, taken.clocks.length) for data in each)
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if arguments.output is not None:
         lean = {"differ": result.differ} | encode(result.rows[result.taken].removed)
         made = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256, **loaded.origin(arguments.run)}
-        made |= storage(None, loaded.network.forms)
+        made |= {**origin_of(loaded.training), **storage(None, loaded.network.forms)}
         made |= {"keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True, "lean": lean}
         write_netlist(replace(netlist, provenance={**netlist.provenance, **made}), arguments.output)
     if arguments.network is not None and loaded.checkpoint is not None:
@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         asked, given = load_graph(arguments, loaded.checkpoint.system), loaded.checkpoint
         edges = asked.edges if given.edges is None and asked is not None else given.edges
         typed = repeat.words({"data": test.source, "differ": result.differ})
-        made = {"command": repeat.command("lean", Path(arguments.checkpoint).name, *typed)}
+        made = origin_of(loaded.training) | {"command": repeat.command("lean", Path(arguments.checkpoint).name, *typed)}
         less = narrowed(replace(given, graph=loaded.graph, edges=edges), spared)
         save_again(arguments.network, less, training=made | {"pruned_from": loaded.sha256})
     return Outcome(result, sections)

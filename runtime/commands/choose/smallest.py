@@ -81,6 +81,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     budgets = parse_budgets([words for each in arguments.budget for words in each.split(",")], LIMITS)
     taxels = None if arguments.taxels is None else len(sensor_places(arguments.taxels))
     training, test = both_splits(arguments.data, taxels, arguments.bin)
+    arguments.bin = training.seconds
     sensor = _sensor(arguments, training.taxels)
     data = data_of(arguments.data, arguments.bin, training, test)
     target = load_target(arguments.target)

@@ -136,12 +136,12 @@ def _describe(arguments: Arguments) -> Outcome:
     recordings = _load(arguments.source, arguments.split, arguments.bin, count)
     require_polarities(recordings)
     show_notes(recordings.counts)
-    return Outcome(describe(recordings, arguments.bin), described_sections)
+    return Outcome(describe(recordings), described_sections)
 
 
-def describe(recordings: Recordings, bin_s: float) -> Described:
-    """Count the events of one split, whose bins are so many seconds wide."""
-    lengths = recordings.step_counts
+def describe(recordings: Recordings) -> Described:
+    """Count the events of one split."""
+    lengths, bin_s = recordings.step_counts, recordings.seconds
     per_taxel = recordings.events.sum(axis=(0, 3), dtype=np.int64)
     total = per_taxel.sum(axis=1)
     alive = total > 0
@@ -212,9 +212,11 @@ def _convert(arguments: Arguments) -> Outcome:
     taxels = max(recordings.taxels for recordings in loaded)
     steps = max(recordings.steps for recordings in loaded)
     if lines:
-        write_event_lines(arguments.output, loaded, bins * arguments.bin)
+        write_event_lines(arguments.output, loaded, bins * loaded[0].seconds)
     else:
-        write_released(arguments.output, [_grown(recordings, taxels, steps) for recordings in loaded])
+        grown = [_grown(recordings, taxels, steps) for recordings in loaded]
+        known = loaded[0].bin_s is not None or bins > 1
+        write_released(arguments.output, grown, round(bins * loaded[0].seconds, 12) if known else None)
     result = Converted(
         source=arguments.source,
         output=arguments.output,
@@ -243,7 +245,9 @@ def _grown(recordings: Recordings, taxels: int, steps: int) -> Recordings:
     return replace(recordings, events=events, lengths=None)
 
 
-def _load(source: str, split: str, bin_s: float, taxels: int | None, places: FloatArray | None = None) -> Recordings:
+def _load(
+    source: str, split: str, bin_s: float | None, taxels: int | None, places: FloatArray | None = None
+) -> Recordings:
     if source == SYNTHETIC:
         require_events(SYNTHETIC, bin_s)
         return synthetic_split(split) if places is None else synthetic_split(split, coordinates=places)

@@ -9,8 +9,7 @@ from typing import Any
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.formats.onnx.writer import FORMS
 from spikeloom.compiler.targets.netlist_file import Netlist
-from spikeloom.models.recordings.events import BIN_S
-from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.evtouch import BIN_S, Recordings
 from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option
 from spikeloom.runtime.inputs.files import require_netlist, require_place
 from spikeloom.runtime.inputs.recordings import load_recordings

@@ -194,13 +194,13 @@ class Watch:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; its result is the summary, everything else was printed before."""
-    from spikeloom.models.recordings.events import BIN_S
+    from spikeloom.models.recordings.evtouch import BIN_S
     from spikeloom.runtime.inputs.recordings import origin_of
     from spikeloom.runtime.machines.base import machine_for
     from spikeloom.runtime.machines.integer import integer_machine
     from spikeloom.runtime.studies.anytime import exits
 
-    bin_s = _duration(arguments.bin)  # of the recordings; a step of the network may join several
+    bin_s = None if arguments.bin is None else _duration(arguments.bin)
     if arguments.bins is not None and arguments.bins < 1:
         raise OptionError(f"--bins {arguments.bins}: not a length; give 1 or more, or leave it out")
     factor = arguments.until_sure
@@ -212,16 +212,17 @@ def run(arguments: argparse.Namespace) -> Outcome:
             "it, or none for the proof alone"
         )
     machine = machine_for(arguments.netlist)
-    if bin_s == BIN_S:
-        bin_s = origin_of(machine.netlist.provenance).get("bin_s", bin_s)
     netlist = machine.netlist
-    bin_s *= netlist.bins
     bins = arguments.bins or netlist.clocks.length
     if bins != (netlist.clocks.length or bins):
         raise OptionError(
             f"--bins {bins}: the network runs every grasp for {netlist.clocks.length} steps, the last of them its "
             f"read-out; give --bins {netlist.clocks.length} or leave it out"
         )
+    own = origin_of(netlist.provenance).get("bin_s")
+    if own is not None and bin_s not in (None, Decimal(str(own))):
+        raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {own:g} s; omit --bin")
+    step_s = netlist.bins * (bin_s or Decimal(str(own or BIN_S)))  # a step of the network may join several
     if netlist.polarities != 2:
         raise ModelError(
             f"{arguments.netlist}: {netlist.polarities} polarities per taxel found, event lines have 2; "
@@ -236,7 +237,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             lines=EventLines(file, name, netlist.taxels),
             as_json=arguments.json,
             column=np.zeros(netlist.taxels * netlist.polarities, np.uint8),
-            bin_s=bin_s,
+            bin_s=step_s,
             bins=bins,
             from_first=arguments.origin == "first",
             real=arguments.speed == "real",
@@ -253,7 +254,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
     add_netlist(parser)
     parser.add_argument("--input", default="-", metavar="FILE", help="event lines (default: -, standard input)")
-    parser.add_argument("--bin", default="0.02", metavar="SECONDS", help="bin of the recordings (default: 0.02)")
+    parser.add_argument("--bin", metavar="SECONDS", help="bin of the recordings (default: the network's, else 0.02)")
     what = "steps of every grasp: shorter ones are filled up, longer ones cut; counters know theirs, read-out included"
     parser.add_argument("--bins", type=int, metavar="N", help=what)
     what = "where the first bin of a grasp begins: at time 0 or at the first event (default: zero)"

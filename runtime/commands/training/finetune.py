@@ -17,8 +17,8 @@ from spikeloom.compiler.formats import NIR
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
-from spikeloom.models.recordings.events import BIN_S, joined_bins, of_length
-from spikeloom.models.recordings.evtouch import data_digest
+from spikeloom.models.recordings.events import joined_bins, of_length
+from spikeloom.models.recordings.evtouch import BIN_S, data_digest
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.runtime.commands.main_job import compile
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_data, add_network
@@ -74,6 +74,7 @@ class FinetuneRecord:
     before: Before
     last: Tuned
     history: Sequence[Sequence[float]]
+    bin_s: float | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,6 +188,7 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
         epochs=arguments.epochs,
         data=training.source,
         data_sha256=data_digest(*found),
+        bin_s=training.bin_s,
         test_samples=len(test),
         before=Before(correct=tuned.before, accuracy=tuned.before / len(test)),
         last=Tuned(correct=tuned.after, accuracy=tuned.after / len(test), chosen_on=CHOSEN_ON[epoch]),
@@ -237,7 +239,7 @@ def _write_nir(arguments: argparse.Namespace, loaded: LoadedNetwork, net: Quanti
     from spikeloom.compiler.formats.nir import writer
 
     integer, _ = round_to_forms(net.learned(), net.forms)
-    dt = loaded.read_as.get("dt", BIN_S * integer.input.bins)
+    dt = loaded.read_as.get("dt", (record.bin_s or BIN_S) * integer.input.bins)
     content = writer.export(integer, dt, training=json.dumps(asdict(record)))
     with write_atomically(arguments.output) as file:
         file.write(content)

@@ -16,9 +16,10 @@ from spikeloom.compiler.formats.tensors import join as join_networks
 from spikeloom.models.networks.checkpoint import save_again
 from spikeloom.runtime.commands.main_job.inspect import LayerSize, tower_line
 from spikeloom.runtime.inputs.files import require_place, shipped
+from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 
-KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "test_samples", "fine_tuned_from")
+KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "bin_s", "test_samples", "fine_tuned_from")
 """Parts of a network's training record that the joined one keeps, beside what the chosen weights reached."""
 
 
@@ -52,10 +53,14 @@ def run(arguments: Namespace) -> Outcome:
               for record in _records(name, checkpoint)]  # fmt: skip
     if len(towers) < 2:
         raise OptionError(f"join: {arguments.checkpoints[0]} is one network already; give two or more")
+    origins = [origin_of(tower) for tower in towers]
+    widths = sorted({origin["bin_s"] for origin in origins if "bin_s" in origin})
+    if len(widths) > 1:
+        raise ModelError(f"join: networks of bins of {widths[0]:g} s and {widths[-1]:g} s; give those of one width")
     joined = join_networks(found, arguments.checkpoints)
     words = [_shown(name) for name in arguments.checkpoints]
     words += [f"--weights {arguments.weights}"] if arguments.weights else []
-    record: dict[str, Any] = {"command": f"spikeloom join {' '.join(words)}", "towers": towers}
+    record: dict[str, Any] = {"command": f"spikeloom join {' '.join(words)}", "towers": towers} | origins[0]
     output = Path(arguments.output)
     remove_leftovers(output)
     save_again(output, joined, training=record)

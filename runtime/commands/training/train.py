@@ -145,7 +145,7 @@ def _count(arguments: argparse.Namespace) -> Outcome:
     return Outcome(report, counters_sections)
 
 
-def both_splits(data: str, taxels: int | None, bin_s: float) -> tuple[Recordings, Recordings]:
+def both_splits(data: str, taxels: int | None, bin_s: float | None) -> tuple[Recordings, Recordings]:
     """Training and test recordings of a sensor, every one with its label."""
     progress("reading the recordings")
     require_splits(data)

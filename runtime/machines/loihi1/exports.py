@@ -13,7 +13,8 @@ from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
-from spikeloom.models.recordings.events import BIN_S
+from spikeloom.models.recordings.evtouch import BIN_S
+from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.machines.base import Export, Facts, Format, Request
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 
@@ -99,7 +100,8 @@ def _onnx(request: Request) -> Export:
 
 def _nir(request: Request) -> Export:
     netlist = read_netlist(request.source)
-    dt = BIN_S * netlist.bins if request.dt is None else request.dt
+    width = origin_of(netlist.provenance).get("bin_s", BIN_S)
+    dt = width * netlist.bins if request.dt is None else request.dt
     facts = NirFacts(
         neurons=sum(layer.neurons for layer in netlist.layers),
         synapses=netlist.n_synapses,

@@ -24,7 +24,7 @@ from spikeloom.runtime.equivalence.reference import votes_so_far
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
-from spikeloom.runtime.inputs.recordings import recordings, require_splits
+from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
 from spikeloom.runtime.machines.base import DEFAULT, Machine, Price, machine_of
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.studies.chart.grid import Grid
@@ -99,9 +99,10 @@ def commands(work: Measurement, layout: str, window: int) -> tuple[str, str]:
     return repeat.command("compile", network.path, *stored, "-o", file), repeat.command("run", file, *read)
 
 
-def read_splits(path: str, bin_s: float, network: NetworkFile) -> dict[str, Recordings]:
+def read_splits(path: str, bin_s: float | None, network: NetworkFile) -> dict[str, Recordings]:
     """Training and test recordings by split, in bins."""
     shared: dict[str, Any] = {"classes": network.classes, "taxels": network.taxels, "labels_for": "chart"}
+    shared["trained"] = origin_of(network.training)
     require_splits(path)
     return {split: recordings(path, split, bin_s=bin_s, **shared) for split in SPLITS}
 
