@@ -137,7 +137,7 @@ def _against(axes: Axes, lines: Sequence[Line], cost_of: Callable[[Line], float]
             axes.plot([cost], [spread.mean], marker, color=colour, markersize=size, label=label)
             seen += spread.values
         axes.plot([cost, cost], [min(seen), max(seen)], color="0.8", linewidth=0.8, zorder=0)
-        points.setdefault((cost, max(seen)), []).append(line.name)
+        points.setdefault((cost, max(seen)), []).append(line.name.removeprefix("released:"))
     axes.margins(0.08, 0.08)
     axes.grid(alpha=0.3)
     axes.set_ylabel("accuracy at the last epoch (%); dots: seeds")

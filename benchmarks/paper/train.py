@@ -1,6 +1,6 @@
 """Train and measure what the paper's tables lack: ``python benchmarks/paper/train.py Ev-Objects.zip -o FOLDER``.
 
-Weeks of one core for all 126 cells. Networks are kept in FOLDER/networks and are gone on with when the script is run
+Weeks of one core for all 132 cells. Networks are kept in FOLDER/networks and are gone on with when the script is run
 again; figures go to FOLDER/cells.json, from which ``tables.py`` makes the tables.
 """
 
