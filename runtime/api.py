@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import tempfile
 import weakref
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.types import JsonObject
+from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.report.sections import Outcome, Section, terminal
 
 if TYPE_CHECKING:
@@ -99,25 +101,26 @@ class Compiled:
     options: JsonObject
     result: Result
 
-    def verify(self, data: Recordings | str | None = None, **options: Any) -> Result:
+    def verify(self, data: Data | Recordings | str | None = None, **options: Any) -> Result:
         """Compare chip and float model, without recordings only what they store; options as of ``spikeloom verify``."""
         return _command("main_job.verify", netlist=str(self.path), data=data, **self._origin("verify"), **options)
 
-    def estimate(self, data: Recordings | str, **options: Any) -> Result:
+    def estimate(self, data: Data | Recordings | str, **options: Any) -> Result:
         """Operations, energy and time of recordings; options as of ``spikeloom estimate``."""
         return _command("main_job.estimate", netlist=str(self.path), data=data, **options)
 
-    def run(self, data: Recordings | str, **options: Any) -> Result:
+    def run(self, data: Data | Recordings | str, **options: Any) -> Result:
         """Decisions of recordings, the chip's; options as of ``spikeloom run``."""
         return _command("main_job.run", netlist=str(self.path), data=data, **options)
 
-    def report(self, output: str, data: Recordings | str, **options: Any) -> Result:
+    def report(self, output: str, data: Data | Recordings | str, **options: Any) -> Result:
         """Write a page with all of it; options as of ``spikeloom report``."""
         given = self._origin("report") | options
         return _command("main_job.report", netlist=str(self.path), output=output, data=data, **given)
 
     def save(self, path: str) -> None:
         """Write the netlist, a ``.loom`` file."""
+        require_place(path, "save", kinds=["loom"])
         shutil.copyfile(self.path, path)
 
     def stream(self) -> Any:
@@ -141,7 +144,7 @@ class Compiled:
 def compile(
     network: str | nn.Module,
     *,
-    calibrate: Recordings | str | None = None,
+    calibrate: Data | Recordings | str | None = None,
     example: Tensor | None = None,
     **options: Any,
 ) -> Compiled:
@@ -152,12 +155,12 @@ def compile(
     network : str or Module
         Checkpoint, ONNX, NIR or netx file, ``pretrained:NAME``, or a torch module of affine stages and
         :class:`spikeloom.LIF` layers.
-    calibrate : Recordings or str, optional
+    calibrate : Data, Recordings or str, optional
         Training recordings that choose the scales.
     example : Tensor, optional
         Input of one step, for a module.
     options
-        As of ``spikeloom compile``: ``graph="manual"``, ``weight_bits="4"``, ``target=…``.
+        As of ``spikeloom compile``: ``graph="manual"``, ``weight_bits=4``, ``target=…``.
 
     Raises
     ------
@@ -169,7 +172,7 @@ def compile(
     path = Path(folder) / "netlist.loom"
     words = {"checkpoint": source, "calibrate": calibrate, "output": str(path), **options}
     result = _command("main_job.compile", **words)
-    kept = {name: value for name, value in options.items() if name in _defaults("main_job.verify")}
+    kept = {name: value for name, value in options.items() if name in _options("main_job.verify")}
     made = Compiled(path, source, kept, result)
     weakref.finalize(made, shutil.rmtree, folder, ignore_errors=True)
     return made
@@ -189,7 +192,7 @@ def finetune(
     output : str
         File to write: of a checkpoint another one, ``.pt``; of any other network NIR, ``.nir``, its netlist beside it.
     options
-        As of ``spikeloom finetune``: ``weight_bits="4"``, ``epochs=10``.
+        As of ``spikeloom finetune``: ``weight_bits=4``, ``epochs=10``.
 
     Raises
     ------
@@ -207,11 +210,13 @@ def finetune(
 
 def _source(what: str, network: str | nn.Module, example: Tensor | None) -> str | Network:
     """File of a network, or what a module means."""
-    if isinstance(network, str):
-        return network
+    if isinstance(network, str | os.PathLike):
+        return os.fspath(network)
+    from torch import Tensor
+
     from spikeloom.models.networks.module import module_network
 
-    if example is None:
+    if not isinstance(example, Tensor):
         raise OptionError(f"{what}: a module needs the input of one step; give example=torch.zeros(1, CHANNELS)")
     return module_network(network, example)
 
@@ -221,20 +226,45 @@ def load(path: str, *, network: str | None = None, **options: Any) -> Compiled:
     return Compiled(Path(path), network, options, _command("main_job.inspect", path=path))
 
 
-def _defaults(command: str) -> JsonObject:
-    """What every option of a command is where it is not given."""
+def _options(command: str) -> dict[str, argparse.Action]:
+    """Every option of a command."""
     parser = argparse.ArgumentParser()
     module = import_module(f"spikeloom.runtime.commands.{command}")
     module.add_arguments(parser)
-    return {action.dest: action.default for action in parser._actions if action.dest != "help"}
+    return {action.dest: action for action in parser._actions if action.dest != "help"}
+
+
+def _value(option: argparse.Action, given: Any) -> Any:
+    """What a command takes for a value of Python: what its word would mean, or recordings and networks as they are."""
+    from spikeloom.compiler.ir import Network
+    from spikeloom.models.recordings.evtouch import Recordings
+
+    if isinstance(given, Data):
+        return given.train if option.dest == "calibrate" else given.test
+    if given is None or option.nargs == 0 or isinstance(given, Network | Recordings):
+        return given
+    if isinstance(option.default, list):
+        return [given] if isinstance(given, str) else given
+    words = given if isinstance(given, list | tuple) else [given]
+    if not all(isinstance(word, str | int | float | os.PathLike) for word in words):
+        found = type(given).__name__
+        raise OptionError(
+            f"{option.dest}: {found} found; give words as on the command line, or what recordings() gives"
+        )
+    kind: Any = option.type or str
+    try:
+        return kind(",".join(map(str, words)))
+    except ValueError:
+        raise OptionError(f"{option.dest} {given}: not a number of type {kind.__name__}; give one") from None
 
 
 def _command(name: str, **options: Any) -> Result:
     """Run a command on values in place of words."""
-    known = _defaults(name)
+    known = _options(name)
     if unknown := sorted(set(options) - set(known)):
         raise OptionError(f"{unknown[0]}: unknown option; allowed: {', '.join(sorted(known))}")
-    arguments = argparse.Namespace(**known | {"json": False, "debug": False} | options)
+    values = {dest: option.default for dest, option in known.items()} | {"json": False, "debug": False}
+    arguments = argparse.Namespace(**values | {dest: _value(known[dest], given) for dest, given in options.items()})
     found: Outcome = import_module(f"spikeloom.runtime.commands.{name}").run(arguments)
     value = getattr(found.result, "result", found.result)  # without how it was simulated
     return Result(value, tuple(found.sections(found.result)))

@@ -13,7 +13,7 @@ from oracles import refused
 from torch import nn
 
 import spikeloom as api
-from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.errors import CapacityError, DataError, ModelError, OptionError
 from spikeloom.runtime.report.encode import encode
 
 
@@ -57,6 +57,7 @@ def test_modules_come_in_as_they_are(data, tmp_path, monkeypatch):
     module = nn.Sequential(nn.Linear(2 * TAXELS, 5), api.LIF(), nn.Linear(5, 4), api.LIF())
     net = api.compile(module, example=torch.zeros(1, 2 * TAXELS))
     assert "E0  specification = engine" in str(net.verify(data.test, min_agreement=0.0))
+    assert net.report("page.html", data).value.provenance.checkpoint.file == "module"
     refused(OptionError, "example=", api.compile, module)
     tuned = api.finetune(module, data, "tuned.nir", example=torch.zeros(1, 2 * TAXELS), epochs=1)
     assert tuned.verify(data.test, min_agreement=0.0).value.quantised_different == 0
@@ -68,6 +69,24 @@ def test_what_does_not_suit_is_refused(data, net):
         api.compile("pretrained:grasps", wieght_bits="4")
     assert len(net.run(data.test, limit=2).value.files) == 2
     refused(DataError, "has 39 taxels, the network has 6", net.run, api.recordings("synthetic").test)
+    refused(OptionError, "data: ndarray found", net.run, data.test.events)
+    refused(OptionError, "limit x: not a number of type int", lambda: net.run(data, limit="x"))
+    refused(OptionError, "save none/x.loom: the folder does not exist", net.save, "none/x.loom")
+    refused(OptionError, "save x.pt: allowed are .loom", net.save, "x.pt")
+    module = nn.Sequential(nn.Linear(2 * TAXELS, 4), api.LIF())
+    refused(OptionError, "give example=", lambda: api.compile(module, example="x"))
+    refused(ModelError, "example of shape (1, 3)", lambda: api.compile(module, example=torch.zeros(1, 3)))
+    example = torch.zeros(1, 2 * TAXELS)
+    refused(CapacityError, "truenorth.neuron.", lambda: api.compile(module, example=example, target="truenorth"))
+
+
+def test_values_of_python_are_those_of_the_words(place, data, net):
+    network = str(place / "net.pt")
+    assert api.compile(Path(network), calibrate=data, weight_bits=4).path.read_bytes() == net.path.read_bytes()
+    assert api.compile(network, weight_bits=[8, 4, 4, 8]).path.read_bytes() == (
+        api.compile(network, weight_bits="8,4,4,8").path.read_bytes()
+    )
+    assert str(net.run(data, limit="2")) == str(net.run(data.test, limit=2))
 
 
 def test_a_folder_of_the_same_name_is_in_nobodys_way(tmp_path):

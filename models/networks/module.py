@@ -44,7 +44,13 @@ class _Stages:
                 module.register_forward_hook(self._record)
         first = example.detach().double()
         self.batched = first.dim() > 1 and self._is_batch(first)
-        responses = self.respond([first[:1] if self.batched else first])
+        try:
+            responses = self.respond([first[:1] if self.batched else first])
+        except (IndexError, RuntimeError) as error:
+            shape = tuple(first.shape)
+            raise ModelError(
+                f"module: fails on the example of shape {shape} ({error}); give one step's input"
+            ) from None
         self.names = tuple(names[id(layer)] or type(layer).__name__ for layer in self.order)
         for layer, name in zip(self.order, self.names, strict=True):
             if (calls := sum(each is layer for each in self.order)) > 1:

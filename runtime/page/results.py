@@ -154,6 +154,7 @@ def provenance(
     File names are those of the files, without their folders; the page is always called ``report.html``.
     """
     checkpoint = loaded.checkpoint
+    file = Path(arguments.checkpoint).name if isinstance(arguments.checkpoint, str) else loaded.format
     digest = hashlib.sha256()
     for name, array in data.identity().items():
         digest.update(f"{name} {array.shape} {array.dtype.str}".encode())
@@ -170,7 +171,7 @@ def provenance(
             sha256=sha256_of(arguments.netlist),
             facts={"compiled": dict(netlist.provenance)},
         ),
-        checkpoint=Origin(file=Path(arguments.checkpoint).name, sha256=loaded.sha256, facts=facts),
+        checkpoint=Origin(file=file, sha256=loaded.sha256, facts=facts),
         data=Origin(file=Path(data.source).name, sha256=digest.hexdigest(), facts=recorded),
         tables={f"energy, {table.name}": table.title for table in target.energy}
         | {f"time, {table.name}": table.title for table in target.time},

@@ -52,7 +52,7 @@ SPEC_STEPS = 5
 
 def takes(path: str) -> bool:
     """Whether what a user names is a network that was trained for the chip."""
-    return Path(shipped(path)).is_file() and is_trained(shipped(path))
+    return isinstance(path, str) and Path(shipped(path)).is_file() and is_trained(shipped(path))
 
 
 def read(path: str, arguments: argparse.Namespace) -> Trained:
@@ -92,7 +92,7 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
     try:
         netlist = chip.compile(source, Options(in_time=arguments.in_time, provenance=origin), after=dump).netlist
     except ModelError as error:
-        raise ModelError(f"{path}: {error}") from error
+        raise ModelError(f"{path if isinstance(path, str) else 'module'}: {error}") from error
     return describe(netlist, write_crossbars(netlist, arguments.output))
 
 
