@@ -72,7 +72,7 @@ def test_what_does_not_suit_is_refused(data, net):
     refused(OptionError, "data: ndarray found", net.run, data.test.events)
     refused(OptionError, "limit x: not a number of type int", lambda: net.run(data, limit="x"))
     refused(OptionError, "save none/x.loom: the folder does not exist", net.save, "none/x.loom")
-    refused(OptionError, "save x.pt: allowed are .loom", net.save, "x.pt")
+    refused(OptionError, "save x.pt: has to end in .loom", net.save, "x.pt")
     module = nn.Sequential(nn.Linear(2 * TAXELS, 4), api.LIF())
     refused(OptionError, "give example=", lambda: api.compile(module, example="x"))
     refused(ModelError, "example of shape (1, 3)", lambda: api.compile(module, example=torch.zeros(1, 3)))

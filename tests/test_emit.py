@@ -152,7 +152,7 @@ def test_different_decays_in_a_layer_are_refused(field, tmp_path):
     refused(FormatError, f"layer0|2 values of {field}", lift, netlist)
     write_netlist(netlist, file)
     for form in ("nir", "netx"):
-        said = refusal("export", file, "--to", form, "-o", tmp_path / "out")
+        said = refusal("export", file, "--to", form, "-o", tmp_path / f"out.{form.removesuffix('x')}")
         assert said.startswith(f"{file}: layer layer0: has 2 values of {field}")
 
 

@@ -125,9 +125,18 @@ def test_all_recordings(fixture, bits, request, tmp_path):
     for split, size in zip(("train", "test"), sizes, strict=True):
         events = load_data(archive, split).events
         assert len(events) == size
-        words = ["compile", f"pretrained:{name}", "--calibrate", archive, "--weight-bits", bits, "-o", tmp_path / "net"]
+        words = [
+            "compile",
+            f"pretrained:{name}",
+            "--calibrate",
+            archive,
+            "--weight-bits",
+            bits,
+            "-o",
+            tmp_path / "n.loom",
+        ]
         assert cli.main([*map(str, words)]) == 0
-        netlist = read_netlist(tmp_path / "net")
+        netlist = read_netlist(tmp_path / "n.loom")
         total = 0
         for start in range(0, size, PART):
             part = events[start : start + PART].reshape(-1, netlist.n_inputs, events.shape[3])

@@ -207,8 +207,6 @@ TABLE = [
     (SEEDS.format("-o x.pt --robust 1"), "--robust 1: allowed are numbers from 0 to below 1"),
     (SEEDS.format(f"-o x.pt --seed {10**22}"), f"--seed {10**22}: allowed are 0 to {2**63 - 1}"),
     (SEEDS.format("-o x.pt --picture none/x.png"), "--picture none/x.png: the folder does not exist"),
-    (SEEDS.format("--picture ./x-seed1.png --seeds 2 -o x.png"), "--picture ./x-seed1.png: is what -o names"),
-    (SEEDS.format("--picture x.png -o x.png"), "--picture x.png: is what -o names"),
     (SEEDS.format("-o x.pt --epochs 1 --resume"), "nothing was interrupted, neither x.pt nor x.pt.state.validation"),
     # prices
     ("estimate net.loom --data data --detail spikes", "argument --detail: invalid choice|counts|cycle"),
@@ -229,7 +227,7 @@ TABLE = [
     ("run net.loom --data data --spikes net.loom", "--spikes net.loom: is an input"),
     ("train --data words.txt --graph manual -o words.txt", "-o words.txt: is an input"),
     *(
-        (f"{command} --picture x.txt", "--picture x.txt: allowed are .png, .svg, .pdf")
+        (f"{command} --picture x.txt", "--picture x.txt: has to end in .png or .svg or .pdf")
         for command in (
             "train --data data -o x.pt",
             NETLISTS[3].replace(" ", " net.loom ", 1),
@@ -237,6 +235,22 @@ TABLE = [
         )
     ),
     ("certify net.loom --data data -o x.svg --picture x.svg", "--picture x.svg: is what -o names, too"),
+    *(
+        (f"{command} x.txt", f"{command.split()[-1]} x.txt: has to end in {kind}; give another name")
+        for command, kind in (
+            ("compile net.pt -o", ".loom"),
+            ("train --data synthetic --graph manual -o", ".pt"),
+            ("finetune net.pt --data data -o", ".pt or .nir"),
+            ("join net.pt same.pt -o", ".pt"),
+            ("smallest --data data -o", ".loom"),
+            ("lean net.pt --data data -o", ".loom"),
+            ("lean net.pt --data data --network", ".pt"),
+            ("run net.loom --data data --spikes", ".npz"),
+            ("export net.loom --to onnx -o", ".onnx"),
+            ("export net.loom --to sanafe -o", ".yaml"),
+            ("export net.loom --to netx -o", ".net"),
+        )
+    ),
     ("data convert grasp_label_1.npz -o grasp_label_1.npz", "-o grasp_label_1.npz: exists already"),
     # what does not belong together
     ("verify net.loom --data data --checkpoint bare.pt", "bare.pt: the graph is not in this file"),
@@ -245,7 +259,7 @@ TABLE = [
     ("verify finger.loom --checkpoint finger.pt --graph manual", "compiled for graph knn:1, this is manual"),
     ("verify net.loom --checkpoint net.pt --require E0", "--require E0: is about recordings, give --data too"),
     ("explain net.loom --checkpoint other.pt --data data", "netlist and checkpoint disagree|fc2 8|fc2 7"),
-    (REPORT.replace("x.html", "x.pdf").format(""), "-o x.pdf: allowed are .html; name one of these"),
+    (REPORT.replace("x.html", "x.pdf").format(""), "-o x.pdf: has to end in .html; give another name"),
     *(
         (f"{command} --data data --checkpoint {other}", why)
         for command in ("report -o x.html", "explain", "stress")
@@ -383,22 +397,25 @@ def almost_full(path, mode="r", *options, whole=Path.open, **more):
 
 
 @pytest.mark.parametrize(
-    ("old", "words"),
-    [(b"an older result", ["compile", "net.pt", "-o"]), (None, ["run", "net.loom", "--data", "data", "--spikes"])],
+    ("old", "name", "words"),
+    [
+        (b"an older result", "out.loom", ["compile", "net.pt", "-o"]),
+        (None, "out.npz", ["run", "net.loom", "--data", "data", "--spikes"]),
+    ],
 )
 @pytest.mark.parametrize(
     ("patched", "replacement", "line"),
     [("pathlib.Path.open", almost_full, "No space left on device"), ("os.fsync", interrupt, "nothing was written")],
     ids=["full disk", "interrupt"],
 )
-def test_an_older_file_stays_intact(refusal, tmp_path, monkeypatch, old, words, patched, replacement, line):
-    path = tmp_path / "result"
+def test_an_older_file_stays_intact(refusal, tmp_path, monkeypatch, old, name, words, patched, replacement, line):
+    path = tmp_path / name
     if old is not None:
         path.write_bytes(old)
     monkeypatch.setattr(patched, replacement)
     assert line in refusal(*words, path)
     monkeypatch.undo()
-    assert [file.name for file in tmp_path.iterdir()] == ([] if old is None else ["result"])
+    assert [file.name for file in tmp_path.iterdir()] == ([] if old is None else [name])
     assert old is None or path.read_bytes() == old
 
 

@@ -62,8 +62,6 @@ def require_place(
     if not (folder := place.absolute().parent).is_dir():
         why = f"{folder.name} is a file; name" if folder.exists() else "the folder does not exist; make it, or name"
         raise OptionError(f"{option} {path}: {why} another")
-    if kinds and place.suffix not in (allowed := [f".{kind}" for kind in kinds]):
-        raise OptionError(f"{option} {path}: allowed are {', '.join(allowed)}; name one of these")
     if place.exists() and not place.is_file():
         raise OptionError(f"{option} {path}: is not a regular file; give the name of a file to write")
     part = beside(place.resolve())
@@ -77,6 +75,8 @@ def require_place(
         for each in given if isinstance(given, list) else [given]:
             if isinstance(each, str) and Path(shipped(each)).exists() and place.samefile(shipped(each)):
                 raise OptionError(f"{option} {path}: is an input of this command ({each}); give another name")
+    if kinds and place.suffix not in (allowed := [f".{kind}" for kind in kinds]):
+        raise OptionError(f"{option} {path}: has to end in {' or '.join(allowed)}; give another name")
 
 
 def require_picture(arguments: argparse.Namespace, outputs: Iterable[str | Path | None]) -> None:

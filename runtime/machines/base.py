@@ -355,6 +355,7 @@ class Format:
     write: raises OptionError and ModelError where the format cannot hold the network.
     options: options that it takes beside the network.
     whole: whether it also holds the neurons that the compiler left out.
+    ending: of its files, where that is not its name.
     """
 
     name: str
@@ -362,6 +363,7 @@ class Format:
     write: Callable[[Request], Export]
     options: tuple[str, ...] = ()
     whole: bool = False
+    ending: str = ""
 
 
 def _module(name: str) -> Any:

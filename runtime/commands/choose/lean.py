@@ -46,8 +46,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     if not 0 <= arguments.differ < 1:
         raise OptionError(f"--differ {arguments.differ:g}: not a share; give a number from 0 to below 1")
-    require_place(arguments.output, "-o", arguments)
-    require_place(arguments.network, "--network", arguments)
+    require_place(arguments.output, "-o", arguments, ["loom"])
+    require_place(arguments.network, "--network", arguments, ["pt"])
     loaded = load_network(arguments.checkpoint, arguments)
     plain = loaded.checkpoint is not None and loaded.checkpoint.forms is None and loaded.checkpoint.towers == 1
     if arguments.network is not None and not plain:

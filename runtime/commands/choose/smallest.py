@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler import DEFAULT_TARGET
-from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.systems import MLP, SYSTEMS
@@ -72,11 +71,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
     output = Path(arguments.output)
     network = output.with_suffix(".pt")
-    if network == output:
-        raise OptionError(f"-o {output}: is the name of the network beside the netlist; give NET.loom")
     store = output.with_suffix(".sqlite") if arguments.store is None else Path(arguments.store)
-    for place, option in ((output, "-o"), (network, "-o"), (store, "--store")):
-        require_place(str(place), option, arguments)
+    for place, option, kinds in ((output, "-o", ["loom"]), (network, "-o", ()), (store, "--store", ())):
+        require_place(str(place), option, arguments, kinds)
     require_place(arguments.html, "--html", arguments, ["html"])
     budgets = parse_budgets([words for each in arguments.budget for words in each.split(",")], LIMITS)
     taxels = None if arguments.taxels is None else len(sensor_places(arguments.taxels))

@@ -64,7 +64,7 @@ def _require_fit(arguments: argparse.Namespace) -> None:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Write the file."""
     _require_fit(arguments)
-    require_place(arguments.output, "-o", arguments)
+    require_place(arguments.output, "-o", arguments, [FORMATS[arguments.to].ending or arguments.to])
     require_netlist(arguments.source)
 
     def read(netlist: Netlist) -> Recordings:

@@ -84,7 +84,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
-    require_place(arguments.output, "-o", arguments)
+    require_place(arguments.output, "-o", arguments, ["loom"])
     chip = load_target(arguments.target)
     if isinstance(arguments.checkpoint, str) and arguments.checkpoint.endswith(NETX):
         return _compile_integers(arguments)

@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
-    require_place(arguments.spikes, "--spikes", arguments)
+    require_place(arguments.spikes, "--spikes", arguments, ["npz"])
     machine = machine_for(arguments.netlist)
     data = load_recordings(arguments, machine.netlist)
     account = Account(machine, data)

@@ -128,7 +128,7 @@ def _state(output: Path, *, resume: bool) -> Path:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Fine-tune, write the checkpoint, report; the text of a KeyboardInterrupt says what is kept."""
-    require_place(arguments.output, "-o", arguments)
+    require_place(arguments.output, "-o", arguments, ["pt", "nir"])
     with only_one(Path(arguments.output)):
         return Outcome(_finetuned(arguments, Path(arguments.output)), finetune_sections)
 

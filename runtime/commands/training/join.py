@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> Outcome:
     """Join, write the checkpoint, report."""
-    require_place(arguments.output, "-o", arguments)
+    require_place(arguments.output, "-o", arguments, ["pt"])
     found = [_network(name, arguments.weights) for name in arguments.checkpoints]
     towers = [record for name, checkpoint in zip(arguments.checkpoints, found, strict=True)
               for record in _records(name, checkpoint)]  # fmt: skip

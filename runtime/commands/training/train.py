@@ -94,9 +94,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if arguments.seeds < 1:
         raise OptionError(f"--seeds {arguments.seeds}: at least 1 is needed; give a positive number")
     require_bins(arguments.join)
-    require_place(arguments.output, "-o", arguments)
-    seeds = range(arguments.seed, arguments.seed + arguments.seeds)
-    require_picture(arguments, [output_of(arguments.output, seed, arguments.seeds) for seed in seeds])
+    require_place(arguments.output, "-o", arguments, ["pt"])
+    require_picture(arguments, ())
     graph, _ = _sensor(arguments)
     percent = WHOLE if arguments.window is None else parse_window(arguments.window)
     training, test = (first_part(each, percent) for each in both_splits(arguments.data, graph.n_taxels, arguments.bin))
@@ -122,7 +121,7 @@ def _count(arguments: argparse.Namespace) -> Outcome:
     if (arguments.recipe, arguments.seed, arguments.seeds) != (RELEASED.name, 0, 1):
         raise OptionError("--system counters: one rule without chance; omit --recipe, --seed and --seeds")
     require_bins(arguments.join)
-    require_place(arguments.output, "-o", arguments)
+    require_place(arguments.output, "-o", arguments, ["pt"])
     asked = {name: value for name, value in repeat.given(arguments, COUNTERS_ONLY).items() if value is not None}
     if arguments.window is not None:
         asked["window"] = parse_window(arguments.window)

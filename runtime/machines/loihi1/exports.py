@@ -147,7 +147,12 @@ def _netx(request: Request) -> Export:
 
 
 FORMATS = (
-    Format(name="sanafe", title=f"network and mapping of a netlist for SANA-FE {sanafe.VERSION}, YAML", write=_sanafe),
+    Format(
+        name="sanafe",
+        title=f"network and mapping of a netlist for SANA-FE {sanafe.VERSION}, YAML",
+        write=_sanafe,
+        ending="yaml",
+    ),
     Format(
         name="onnx", title="a netlist as an integer ONNX graph, bit for bit the chip", write=_onnx, options=("form",)
     ),
@@ -158,5 +163,6 @@ FORMATS = (
         write=_netx,
         options=("data", "split", "bin", "limit"),
         whole=True,
+        ending="net",
     ),
 )

@@ -41,5 +41,6 @@ FORMATS = (
         title="TrueNorth cores, and a recording, for RANC's simulator, JSON",
         write=_ranc,
         options=("data", "split", "bin", "recording"),
+        ending="json",
     ),
 )
