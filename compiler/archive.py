@@ -194,8 +194,6 @@ CLOCKS: Kind = {"channels": (0, MOST_CLOCKS), "steps": (1, MOST_STEPS), "length?
 def entry_faults(manifest: Mapping[str, Any], kinds: Mapping[str, Kind]) -> list[str]:
     """Entries of a manifest that are missing or of another kind.
 
-    Examples
-    --------
     >>> entry_faults({"taxels": 0, "layers": ["fc1"]}, {"taxels": (1, 9), "layers": [str], "target": str})
     ['the manifest has no usable taxels, target']
     """

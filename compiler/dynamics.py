@@ -38,8 +38,6 @@ class Clocks:
     def events(self, steps: int, *, first: int = 0) -> EventArray:
         """Events of the steps ``first … first + steps - 1``, (channels, steps).
 
-        Examples
-        --------
         >>> Clocks(channels=2, steps=2).events(5).tolist()
         [[1, 1, 0, 0, 0], [0, 0, 1, 1, 0]]
         """
@@ -57,8 +55,6 @@ NO_CLOCKS = Clocks()
 def clocks_over(channels: int, steps: int) -> Clocks:
     """Clocks that share recordings of so many steps among them.
 
-    Examples
-    --------
     >>> clocks_over(8, 250).steps
     32
     """
@@ -111,8 +107,6 @@ PLAIN = Dynamics()
 def dynamics_faults(dynamics: Dynamics, layers: int) -> list[str]:
     """What is wrong about the dynamics of a network of so many layers.
 
-    Examples
-    --------
     >>> dynamics_faults(Dynamics(alphas=(0.5, 1.0)), 2)
     ['a current decay of 1, allowed are 0 <= decay < 1']
     """

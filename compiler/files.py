@@ -106,8 +106,6 @@ def _shortened(said: str, room: int) -> str:
 def plain(text: str) -> str:
     r"""Text that a terminal only shows: control characters of a name, say, are escaped, line breaks stay.
 
-    Examples
-    --------
     >>> print(plain("\x1b[2Jgrasp ä.csv"))
     \x1b[2Jgrasp ä.csv
     """

@@ -52,8 +52,6 @@ def weight_step(bits: int) -> int:
     A mixed-sign format spends one bit on the sign and drops the least significant bits of a 9-bit span, so even
     8 bits only hold even mantissas.
 
-    Examples
-    --------
     >>> [weight_step(bits) for bits in (8, 6, 4, 2)]
     [2, 8, 32, 128]
     """
@@ -66,8 +64,6 @@ def decay_registers(beta: float, alpha: float = 0.0) -> tuple[int, int]:
     The chip's current loses one part in 4096 more than its register says. So it can forget all, which a membrane
     cannot, and cannot keep all.
 
-    Examples
-    --------
     >>> decay_registers(0.2)
     (4095, 3277)
     >>> decay_registers(0.2, 0.95)
@@ -79,8 +75,6 @@ def decay_registers(beta: float, alpha: float = 0.0) -> tuple[int, int]:
 def kept_shares(decay_u: IntArray | int, decay_v: IntArray | int) -> tuple[Any, Any]:
     """Shares of current and membrane that a step keeps, from their registers: what :func:`decay_registers` rounds to.
 
-    Examples
-    --------
     >>> kept_shares(4095, 3277) == (0.0, 819 / 4096)
     True
     """
@@ -104,8 +98,6 @@ def largest_current(worst: IntArray, decay_u: IntArray | int) -> IntArray:
 def plane_distance(bits: int) -> int:
     """Largest difference of exponents at which two planes leave no gap between their values.
 
-    Examples
-    --------
     >>> [plane_distance(bits) for bits in (8, 4, 2)]
     [7, 3, 1]
     """
@@ -115,8 +107,6 @@ def plane_distance(bits: int) -> int:
 def reach(bits: int, exponents: tuple[int, ...]) -> int:
     """Largest magnitude that planes hold together, in steps of the finest one.
 
-    Examples
-    --------
     >>> reach(8, (0,)), reach(8, (-1, 6)), reach(2, (0, 1))
     (127, 16383, 3)
     """
@@ -133,8 +123,6 @@ def round_steps(weight: FloatArray, scale: FloatArray | float, bits: int, expone
 
     `scale`, which broadcasts against `weight`, is in weight units per real unit.
 
-    Examples
-    --------
     >>> round_steps(np.array([1.0, -0.3, 100.0]), 254.0, 8, (0,)).tolist()
     [127, -38, 127]
     """
@@ -147,8 +135,6 @@ def split_planes(steps: IntArray, bits: int, exponents: tuple[int, ...]) -> list
 
     A coarser plane is zero wherever the finer ones hold the value.
 
-    Examples
-    --------
     >>> [plane.tolist() for plane in split_planes(np.array([5, 127, 128, -300]), 8, (-1, 6))]
     [[10, 254, 0, -88], [0, 0, 2, -4]]
     """
@@ -167,8 +153,6 @@ def encode_bias(bias: FloatArray) -> tuple[IntArray, IntArray]:
 
     ``mantissa * 2**exponent`` is the nearest value that the chip can hold; ValueError beyond ``4095 * 2**7``.
 
-    Examples
-    --------
     >>> [part.tolist() for part in encode_bias(np.array([-4095.0, 4096.0, 4095.4, 0.4]))]
     [[-4095, 2048, 4095, 0], [0, 1, 0, 0]]
     """

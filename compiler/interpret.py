@@ -196,8 +196,6 @@ def run_integer(
 def step_late(spikes: BoolArray) -> BoolArray:
     """Spikes (samples, steps, neurons) as their own population receives them: each in the step after.
 
-    Examples
-    --------
     >>> step_late(np.array([[[True], [False], [True]]])).ravel().tolist()
     [False, True, False]
     """
@@ -214,8 +212,6 @@ def channels_last(events: AnyArray, clocks: Clocks = NO_CLOCKS) -> BoolArray:
 def cut(spikes: BoolArray, lengths: IntArray | None) -> BoolArray:
     """Take away spikes (samples, steps, neurons) after the end of each recording; None where all are equally long.
 
-    Examples
-    --------
     >>> cut(np.ones((2, 3, 1), bool), np.array([3, 1])).sum(axis=1).ravel().tolist()
     [3, 1]
     """
@@ -225,8 +221,6 @@ def cut(spikes: BoolArray, lengths: IntArray | None) -> BoolArray:
 def vote(counts: IntArray) -> IntArray:
     """Class of each sample from its spike counts (samples, classes): most spikes, lowest index on a tie.
 
-    Examples
-    --------
     >>> vote(np.array([[1, 3, 3], [0, 0, 0]])).tolist()
     [1, 0]
     """

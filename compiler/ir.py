@@ -243,8 +243,6 @@ def one_sided(projections: Iterable[IntegerProjection], neurons: int) -> tuple[I
 def row_parts(weight: Sparse) -> Iterator[slice]:
     """Rows of a matrix in turn, so many that they hold about ``PART`` synapses.
 
-    Examples
-    --------
     >>> list(row_parts(sparse.csr_array((2, 5))))
     [slice(0, 2, None)]
     """

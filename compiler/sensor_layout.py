@@ -26,8 +26,6 @@ def sensor_layout(
     Raises ModelError if the shape does not say, or says another number than `polarities`; OptionError if there are no
     such polarities.
 
-    Examples
-    --------
     >>> sensor_layout([1, 39, 2])[2]
     '39 taxels, 2 polarities, as [taxels, polarities]'
     >>> sensor_layout([2, 2, 2], polarities_first=True)[1].tolist()

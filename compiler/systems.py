@@ -91,8 +91,6 @@ def in_order(system: str, array: Any) -> Any:
 def shape_faults(system: str, filters: int, places: int, taxels: int, grid: Grid | None) -> list[str]:
     """What is wrong about a first layer that was made for so many places.
 
-    Examples
-    --------
     >>> shape_faults(MLP, 39, 1, 39, None), shape_faults(GCN, 2, 39, 39, None)
     ([], ['a GCN has 1 filter, conv1.hops has 2'])
     """

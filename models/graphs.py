@@ -96,8 +96,6 @@ def build_graph(name: str, coordinates: ArrayLike = NEUTOUCH) -> Graph:
     shorter than sigma; the plain names keep the first of equal rows. Distances are compared after rounding to
     1e-9 mm, because positions are typed in decimals and equal distances differ in their last bits.
 
-    Examples
-    --------
     >>> build_graph("manual").edges.shape
     (146, 2)
     >>> build_graph("released:knn:3").edges.shape, build_graph("knn:3").edges.shape
@@ -138,8 +136,6 @@ def normalised_adjacency(edges: ArrayLike, n: int) -> FloatArray:
 
     ModelError if the edges are malformed (see `check_edges`).
 
-    Examples
-    --------
     >>> normalised_adjacency([[0, 1], [1, 0]], 3)
     array([[0., 1., 0.],
            [1., 0., 0.],

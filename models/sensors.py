@@ -127,8 +127,6 @@ def sensor_graph(
 def parts_warning(where: str, edges: IntArray, n: int) -> str | None:
     """Say whether a graph of `n` taxels falls into parts, over edges in either direction; the largest first.
 
-    Examples
-    --------
     >>> print(parts_warning("edges.csv", np.array([[0, 1], [2, 3], [3, 4]]), 6))
     edges.csv: the graph has 3 parts, of 3, 2, 1 taxels (with taxels 2, 0, 5); touch does not spread between them
     """

@@ -30,8 +30,6 @@ def grid_cells(coordinates: FloatArray = NEUTOUCH) -> IntArray:
 
     DataError if the sensor has three dimensions or is too large.
 
-    Examples
-    --------
     >>> grid_cells().max(axis=0).tolist(), grid_cells()[1].tolist()
     ([12, 18], [1, 6])
     """

@@ -82,8 +82,6 @@ class Parser(argparse.ArgumentParser):
 def near(word: str, known: Iterable[str]) -> str:
     """What was probably meant, as part of a sentence.
 
-    Examples
-    --------
     >>> near("verfy", COMMANDS), near("x", COMMANDS)
     (', did you mean verify?', '')
     """

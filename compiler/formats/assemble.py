@@ -44,8 +44,6 @@ def class_of_each(counts: Sparse) -> IntArray | None:
 
     counts: csr_array (classes, neurons); what the output is, in terms of spikes.
 
-    Examples
-    --------
     >>> from scipy import sparse
     >>> class_of_each(sparse.csr_array([[0.5, 0.5, 0.0], [0.0, 0.0, 0.5]])).tolist()
     [0, 0, 1]

@@ -29,8 +29,6 @@ def printable(name: str) -> str:
 def plain_names(names: Sequence[str], taken: Collection[str] = ()) -> tuple[str, ...]:
     """Names of letters, digits and underscores; one that is not unique, or taken, gets its place as a suffix.
 
-    Examples
-    --------
     >>> plain_names(["a.b", "input", "fc", "fc"], taken=["input"])
     ('a_b', 'input_1', 'fc_2', 'fc_3')
     """
@@ -46,8 +44,6 @@ def plain_names(names: Sequence[str], taken: Collection[str] = ()) -> tuple[str,
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
     """The names, or ``layer1`` … for those that are empty, long or not unique.
 
-    Examples
-    --------
     >>> unique_names(["conv", "", "fc", "fc"])
     ('conv', 'layer2', 'layer3', 'layer4')
     """

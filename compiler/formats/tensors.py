@@ -28,8 +28,6 @@ Shape = tuple[str, ...]
 def faults_of(arrays: Mapping[str, AnyArray], wanted: Mapping[str, Shape], title: str = "a TactileSGNet") -> list[str]:
     """Missing, mis-shaped and unknown tensors, and values that are not finite, in that order per tensor.
 
-    Examples
-    --------
     >>> faults_of({"a": np.ones(2), "b": np.ones((2, 3)), "d": np.ones(1)}, {"a": ("n",), "b": ("m", "n"), "c": ("n",)})
     ['b is (2, 3), wanted (2, 2)', 'c is missing', 'd is not part of a TactileSGNet']
     >>> faults_of({"a": np.array([1.0, np.nan])}, {"a": ("features",)})
@@ -76,8 +74,6 @@ def taxel_faults(arrays: Mapping[str, AnyArray], features: int, clocks: int = 0)
 def apart(arrays: Mapping[str, AnyArray], towers: int) -> tuple[Arrays, ...]:
     """Arrays of each tower of a joined network, whose filters, rows and biases lie one tower after the other.
 
-    Examples
-    --------
     >>> both = {"conv1.hops": np.ones((1, 4, 2)), "conv1.bias": np.arange(4), "fc1.weight": np.ones((6, 5))}
     >>> [{name: array.shape for name, array in one.items()} for one in apart(both, 2)][1]
     {'conv1.hops': (1, 2, 2), 'conv1.bias': (2,), 'fc1.weight': (3, 5)}

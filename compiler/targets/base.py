@@ -98,8 +98,6 @@ class TimeTable:
     def barrier(self, tiles: int) -> int:
         """Picoseconds of the barrier among so many used tiles, at least one.
 
-        Examples
-        --------
         >>> [load_target("loihi1").time[0].barrier(tiles) for tiles in (1, 3, 4, 32)]
         [600000, 1000000, 1400000, 1800000]
         """
@@ -199,8 +197,6 @@ def load_target(name: str, cores: str | None = None) -> Target:
 
     OptionError if there is no such target, or its cores are of the other kind.
 
-    Examples
-    --------
     >>> load_target("loihi1").limit("core.synapse_words"), load_target("truenorth").limit("core.axons")
     (16384, 256)
     """

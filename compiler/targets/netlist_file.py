@@ -74,8 +74,6 @@ class Netlist:
 def part_of(bounds: IntArray) -> IntArray:
     """Part of each entry, of range bounds (parts + 1,).
 
-    Examples
-    --------
     >>> part_of(np.array([0, 2, 2, 3])).tolist()
     [0, 0, 2]
     """

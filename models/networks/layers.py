@@ -135,8 +135,6 @@ class Spike(torch.autograd.Function):
 def lasting_current(drive: Tensor, alpha: float) -> Tensor:
     """Synaptic currents along the first axis, from rest: ``i_t = alpha * i_{t-1} + drive_t``.
 
-    Examples
-    --------
     >>> lasting_current(torch.tensor([1.0, 0.0, 2.0]), 0.5).tolist()
     [1.0, 0.5, 2.25]
     """

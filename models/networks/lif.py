@@ -16,8 +16,6 @@ class LIF(nn.Module):
     Keeps membrane and spikes from call to call, one call a step; :meth:`reset` before each recording. `beta` is the
     share of the membrane that a step keeps, `theta` the threshold.
 
-    Examples
-    --------
     >>> import torch
     >>> neuron = LIF(beta=0.5, theta=1.0)
     >>> [float(neuron(torch.tensor([0.75]))) for _ in range(3)]

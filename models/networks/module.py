@@ -137,8 +137,6 @@ def module_network(
 
     ModelError if a stage is not affine, or the chip cannot have the network.
 
-    Examples
-    --------
     >>> net = nn.Sequential(nn.Linear(4, 3), LIF(), nn.Linear(3, 2), LIF(beta=0.9))
     >>> [(population.name, population.size) for population in module_network(net, torch.zeros(1, 4)).populations]
     [('1', 3), ('3', 2)]

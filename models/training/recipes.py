@@ -113,8 +113,6 @@ RECIPES = {recipe.name: recipe for recipe in (RELEASED, TIMED)}
 def held_decays(beta: float, alpha: float) -> tuple[float, float]:
     """Decays of membrane and current that the chip's registers hold instead of these.
 
-    Examples
-    --------
     >>> held_decays(0.5, 0.95) == (0.5, 3891 / 4096)
     True
     """
@@ -125,8 +123,6 @@ def held_decays(beta: float, alpha: float) -> tuple[float, float]:
 def decays_asked(words: str, option: str, layers: tuple[str, ...]) -> Decays:
     """Decays by layer, from the words of an option; layers of decay zero are left out.
 
-    Examples
-    --------
     >>> decays_asked("fc1=0.95,fc3=0.5", "--current-decay", ("conv1", "fc1", "fc2", "fc3"))
     (('fc1', 0.95), ('fc3', 0.5))
     """

@@ -169,8 +169,6 @@ class Verdict:
 def spike_agreement(spikes: LayerSpikes) -> float:
     """Share of the spikes of a layer that float model and chip have in common, 1 for two silent layers.
 
-    Examples
-    --------
     >>> spike_agreement(LayerSpikes(float=60, chip=40, different=20, ill_posed=0))
     0.8
     """
@@ -200,8 +198,6 @@ def mcnemar(labels: IntArray, first: IntArray, second: IntArray) -> tuple[int, i
     .. [1] Q. McNemar, "Note on the sampling error of the difference between correlated proportions or percentages",
        Psychometrika 12, 1947.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> labels = np.zeros(6, int)
     >>> mcnemar(labels, np.array([0, 0, 0, 0, 0, 1]), np.array([1, 1, 1, 1, 1, 1]))
@@ -258,8 +254,6 @@ def levels_of(verdict: Verdict) -> tuple[Level, ...]:
 def parse_requirements(words: str) -> dict[str, float]:
     """Read a gate such as ``E0,E2=0.99,E3=0.98``; OptionError if a part is no level, comes twice, or has a wrong share.
 
-    Examples
-    --------
     >>> parse_requirements("E0,E3=0.98")
     {'E0': 1.0, 'E3': 0.98}
     """

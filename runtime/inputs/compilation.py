@@ -94,8 +94,6 @@ def _one_or_list(values: list[int]) -> int | list[int]:
 def parse_cores(words: str | None) -> dict[str, int]:
     """Least number of cores by layer, from the words of ``--cores-for``.
 
-    Examples
-    --------
     >>> parse_cores("conv1=8,fc1=6")
     {'conv1': 8, 'fc1': 6}
 

@@ -37,8 +37,6 @@ USUAL: Mapping[str, object] = {
 def words(options: Mapping[str, Any]) -> list[str]:
     """Options as they are typed; those that are None or False are omitted, as is what is usual.
 
-    Examples
-    --------
     >>> words({"weight_bits": "4,8", "directed": True, "run": 0, "beta": 0.0, "planes": None, "bin": 0.02})
     ['--weight-bits', '4,8', '--directed', '--beta', '0.0']
     """
@@ -67,8 +65,6 @@ def refuse(arguments: argparse.Namespace, names: Sequence[str], why: str) -> Non
 def command(*typed: str) -> str:
     """A command line.
 
-    Examples
-    --------
     >>> command("run", "a b.loom")
     "spikeloom run 'a b.loom'"
     """

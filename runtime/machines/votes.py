@@ -40,8 +40,6 @@ def wins(decisions: IntArray, least: IntArray, most: IntArray) -> BoolArray:
 
     `decisions` is the class in question, (samples,); `least` and `most` bound the votes, (samples, classes).
 
-    Examples
-    --------
     >>> least, most = np.array([[3, 3], [3, 3], [2, 1]]), np.array([[3, 3], [3, 4], [4, 2]])
     >>> wins(np.array([0, 0, 0]), least, most).tolist()
     [True, False, True]

@@ -36,8 +36,6 @@ def encode(value: Any) -> Any:
 
     Arrays become lists, infinities and NaN become null. Raises TypeError if a value has no form in JSON.
 
-    Examples
-    --------
     >>> encode({"spikes": np.arange(3), "left": (math.inf, None)})
     {'spikes': [0, 1, 2], 'left': [None, None]}
     """

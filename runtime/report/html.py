@@ -48,8 +48,6 @@ def fragment(section: Section) -> str:
 def anchor(title: str) -> str:
     """Id of a chapter.
 
-    Examples
-    --------
     >>> anchor("Energy and time")
     'energy-and-time'
     """

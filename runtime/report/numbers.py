@@ -8,8 +8,6 @@ from collections.abc import Iterable, Sequence
 def percent(right: int, total: int) -> str:
     """Accuracy with its Wilson interval.
 
-    Examples
-    --------
     >>> percent(127, 144)
     '88.19 % (127 of 144; 95 % interval 81.9 … 92.5)'
     """
@@ -20,8 +18,6 @@ def percent(right: int, total: int) -> str:
 def si(value: float, unit: str) -> str:
     """Three digits with an SI prefix.
 
-    Examples
-    --------
     >>> si(0.000321, "J"), si(0.0, "J"), si(2.5e-9, "J"), si(9.999e-4, "J")
     ('321 µJ', '0 J', '2.5 nJ', '1 mJ')
     """
@@ -43,8 +39,6 @@ def dominant(static_j: Iterable[float], dynamic_j: Iterable[float]) -> str:
 def counted(value: float) -> str:
     """A large number in few letters.
 
-    Examples
-    --------
     >>> counted(950.0), counted(2000.0), counted(1.75e6)
     ('950', '2k', '1.75M')
     """
@@ -61,8 +55,6 @@ def wilson(successes: float, trials: int, z: float = 1.959963984540054) -> tuple
     ----------
     .. [1] E. B. Wilson, "Probable inference, the law of succession, and statistical inference", JASA 22, 1927.
 
-    Examples
-    --------
     >>> [round(100 * bound, 1) for bound in wilson(127, 144)]
     [81.9, 92.5]
     >>> wilson(0, 0)
@@ -86,8 +78,6 @@ def of_mean(values: Sequence[float], level: float = 0.95) -> tuple[float, float]
     ----------
     .. [1] Student, "The probable error of a mean", Biometrika 6, 1908.
 
-    Examples
-    --------
     >>> [round(bound, 3) for bound in of_mean([1.0, 2.0, 3.0])]
     [-0.484, 4.484]
     """

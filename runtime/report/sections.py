@@ -99,8 +99,6 @@ class Outcome:
 def terminal(sections: Iterable[Section]) -> str:
     """Plain text: the blocks of a section line by line, an empty line between sections.
 
-    Examples
-    --------
     >>> spikes = Table(["layer", "spikes"], [["conv1", "12"], ["fc1", "3456"], ["fc2", "7"]], most=2)
     >>> print(terminal([Section("Spikes", [Text("of 3 recordings"), spikes], chapter=True)]))
     Spikes

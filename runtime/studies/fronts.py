@@ -10,8 +10,6 @@ from spikeloom.compiler.errors import OptionError
 def front(gains: Sequence[float], costs: Sequence[float]) -> list[bool]:
     """Which points no other one beats: at least as much gain for at most the cost, and better in one of them.
 
-    Examples
-    --------
     >>> front([0.9, 0.8, 0.7, 0.9], [3.0, 1.0, 2.0, 3.0])
     [True, True, False, True]
     """
@@ -59,8 +57,6 @@ def parse_budgets(
 ) -> tuple[Budget, ...]:
     """Read the words of every ``--budget``; an OptionError says which is none of what has `limits`.
 
-    Examples
-    --------
     >>> [(each.what, each.limit) for each in parse_budgets(["latency=5ms", "accuracy=88"])]
     [('latency', 0.005), ('accuracy', 0.88)]
     """

@@ -48,8 +48,6 @@ class Job:
 def content_key(facts: Mapping[str, Any]) -> str:
     """Key of a point: a hash of the JSON values that decide its result (options, hashes of files, versions).
 
-    Examples
-    --------
     >>> content_key({"bits": 8, "data": "c0ffee"})
     'a758198fa7fc427a63415cec'
     >>> content_key({"bits": 8, "data": "c0ffee"}) == content_key({"data": "c0ffee", "bits": 8})

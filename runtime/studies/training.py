@@ -80,8 +80,6 @@ class Job:
 def output_of(output: str, seed: int, seeds: int) -> Path:
     """File of one seed: the one that was asked for, or ``NAME-seedN.pt`` where there are several.
 
-    Examples
-    --------
     >>> output_of("a/x.pt", 3, 1).as_posix(), output_of("a/x.pt", 3, 5).as_posix()
     ('a/x.pt', 'a/x-seed3.pt')
     """

@@ -73,8 +73,6 @@ class Graph:
 def decimal(value: Any) -> float:
     """The shortest decimal that is this float32.
 
-    Examples
-    --------
     >>> decimal(np.float32(0.2)), float(np.float32(0.2))
     (0.2, 0.20000000298023224)
     """

@@ -82,8 +82,6 @@ class Layer:
 def digits(weight: IntArray) -> tuple[Digit, ...]:
     """Write a matrix of integers in int8 digits.
 
-    Examples
-    --------
     >>> [(digit.tolist(), factor.tolist()) for digit, factor in digits(np.array([[508, -254]]))]
     [([[127, -127]], [4, 2])]
     >>> [(digit.tolist(), factor.tolist()) for digit, factor in digits(np.array([[300, 1]]))]

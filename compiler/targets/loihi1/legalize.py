@@ -45,8 +45,6 @@ def list_words(entries: IntArray, weight_bits: IntArray | int, index_bits: IntAr
     A list is cut in blocks of up to 64 synapses; a block costs its entries and a header, rounded up to whole words
     (nengo-loihi, ``block.py``, ``Synapse.bits``).
 
-    Examples
-    --------
     >>> from spikeloom.compiler.targets.base import load_target
     >>> list_words(np.array([0, 43, 128]), 8, 0, load_target("loihi1")).tolist()
     [0, 6, 18]
@@ -70,8 +68,6 @@ def stored_once(form: IntArray, lengths: IntArray, place: IntArray, weight: IntA
     (lists,) are formats and numbers of entries, `place` (compartment on the core) and `weight` (entries,) those of all
     lists in turn.
 
-    Examples
-    --------
     >>> from spikeloom.compiler.targets.base import load_target
     >>> place, weight = np.array([0, 2, 5, 7, 3, 300, 302]), np.array([8, -4, 8, -4, 8, 8, -4])
     >>> stored_once(np.ones(4, int), np.array([2, 2, 1, 2]), place, weight, load_target("loihi1")).tolist()

@@ -53,8 +53,6 @@ def crossing_points(levels: IntArray, weights: Sequence[int]) -> IntArray:
 
     One weight is negative, the others are 1, 2, 4 as far as they go.
 
-    Examples
-    --------
     >>> crossing_points(np.array([-3, -2, -1, 0, 1, 2, 3]), (-3, 1, 2)).tolist()
     [[1, 0, 0], [1, 1, 0], [1, 0, 1], [0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1]]
     >>> crossing_points(np.array([-4, -1, 0, 3]), (1, 2, -4)).tolist()

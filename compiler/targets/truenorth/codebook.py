@@ -46,8 +46,6 @@ def codebook(weight: FloatArray, copies: int) -> tuple[IntArray, FloatArray]:
     The weights of the types are 1 and -1; 1, 2 and -4; 1, 2, 4 and -8 steps, which gives for 2, 3, 4 copies the levels
     -1…1, -4…3, -8…7. Of the steps that are tried a neuron has the one of least squared error.
 
-    Examples
-    --------
     >>> level, step = codebook(np.array([[0.5, -0.4, 0.02]]), 2)
     >>> level.tolist(), [f"{each:.2f}" for each in step]
     ([[1, -1, 0]], ['0.45'])

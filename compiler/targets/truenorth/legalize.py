@@ -57,8 +57,6 @@ def require_legal(netlist: CrossbarNetlist, chip: Target) -> None:
 def signed_range(bits: int) -> tuple[int, int]:
     """Smallest and largest number of so many bits with sign.
 
-    Examples
-    --------
     >>> signed_range(9)
     (-256, 255)
     """

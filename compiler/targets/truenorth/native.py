@@ -55,8 +55,6 @@ THRESHOLD_MOST = 1 << 17
 def highest_level(copies: int) -> int:
     """Levels are the whole numbers of at most this magnitude.
 
-    Examples
-    --------
     >>> [highest_level(copies) for copies in (2, 3, 4)]
     [1, 3, 7]
     """

@@ -44,8 +44,6 @@ UNIT: int = 2**MEMBRANE_SHIFT  # a weight or a threshold of one, in membrane uni
 def decayed(value: IntArray, lost: IntArray | int) -> IntArray:
     """Keep ``(4096 - lost) / 4096`` of registers, rounding toward zero.
 
-    Examples
-    --------
     >>> decayed(np.array([6, -6, -5]), 3277).tolist()
     [1, -1, 0]
     """

@@ -71,8 +71,6 @@ class DetailedTimes(StepTimes):
 def _way(start: int, end: int, port: int, width: int, tile_links: int) -> list[int]:
     """Links from a core to a tile, along x first: the core's port, then the link by which each further tile is entered.
 
-    Examples
-    --------
     >>> _way(0, 9, 2, 8, 8)
     [6, 8, 74]
     """

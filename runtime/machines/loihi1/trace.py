@@ -74,8 +74,6 @@ def pack(spikes: BoolArray) -> npt.NDArray[np.uint64]:
 def unpack(packed: npt.NDArray[np.uint64], compartments: int) -> BoolArray:
     """Spikes (…, compartments) of ``Trace.packed``.
 
-    Examples
-    --------
     >>> unpack(np.array([[5]], np.uint64), 4).tolist()
     [[True, False, True, False]]
     """

@@ -166,8 +166,6 @@ def price(netlist: CrossbarNetlist, chip: Target, counts: Counts, bin_s: float) 
 def joules(table: EnergyTable, events: IntArray, time_s: FloatArray) -> tuple[FloatArray, FloatArray | None]:
     """Joules of so many synaptic events, (samples,), and of the chip's floor in that time where no event holds it.
 
-    Examples
-    --------
     >>> from spikeloom.compiler.targets.base import load_target
     >>> all_in, marginal = load_target("truenorth").energy
     >>> joules(all_in, np.array([1_000_000]), np.array([0.25]))

@@ -82,8 +82,6 @@ class Neuron:
 def saturated(value: int, bits: int) -> int:
     """The nearest number that a register of so many bits with sign holds.
 
-    Examples
-    --------
     >>> saturated(524288, 20), saturated(-524289, 20), saturated(7, 20)
     (524287, -524288, 7)
     """
@@ -98,8 +96,6 @@ def neuron_tick(neuron: Neuron, positive: int, negative: int, bits: int) -> tupl
     register. Returns whether it spiked, and whether the register was left, or would have been in some order of
     arrivals.
 
-    Examples
-    --------
     A threshold of 3 reached exactly is a spike; a linear reset keeps what is above it.
 
     >>> neuron = Neuron(0, False, 3, RESET_LINEAR, 0, 0, False, 2)

@@ -172,8 +172,6 @@ def turning_points(at: Standing) -> FloatArray:
 def calibrate(points: FloatArray, allowed: float) -> Calibrated:
     """Smallest factor with which at most the share `allowed` of races ends otherwise, and so with every larger one.
 
-    Examples
-    --------
     >>> calibrate(np.array([0.0, 3.0, 1.0, 2.0]), 0.25)
     Calibrated(allowed=0.25, factor=2.0, races=4, differ=1, bound=0.7514)
     """

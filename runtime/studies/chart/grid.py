@@ -35,8 +35,6 @@ def parse_grid(text: str, target: Target) -> Grid:
 
     An OptionError names the value that cannot be understood, and what is allowed.
 
-    Examples
-    --------
     >>> from spikeloom.compiler import DEFAULT_TARGET
     >>> from spikeloom.compiler.targets.base import load_target
     >>> found = parse_grid("bits=2-3,8+4+4+8,window=50-100%", load_target(DEFAULT_TARGET))

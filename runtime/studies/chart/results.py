@@ -29,8 +29,6 @@ class Share:
 def share(correct: int, samples: int) -> Share:
     """The share of right decisions.
 
-    Examples
-    --------
     >>> share(3, 4).accuracy
     0.75
     """

@@ -92,8 +92,6 @@ def effects(netlist: Netlist, spikes: IntArray) -> FloatArray:
 def most_spared(parts: int, least: int, fits: Callable[[int], bool]) -> int:
     """Bisect for a largest number of parts that fits; fewer than `least` are not tried.
 
-    Examples
-    --------
     >>> most_spared(4, 1, lambda count: count <= 3)
     3
     """

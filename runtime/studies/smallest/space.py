@@ -76,8 +76,6 @@ def counting(steps: int, levels: int = 1, bits: int = 8) -> Iterator[Candidate]:
 
     A counter sees one event a step at most, so thresholds above the steps of a part are omitted.
 
-    Examples
-    --------
     >>> [each.name for each in counting(2)]
     ['counters 1', 'counters 1,2', 'counters 1 parts=2']
     """

@@ -153,8 +153,6 @@ def accuracy(found: Measured) -> float:
 def gap(best: Measured, other: Measured) -> tuple[float, float]:
     """What one has ahead of another, over recordings that both decided, and the standard error of that.
 
-    Examples
-    --------
     >>> best = Measured(right=(5, 5, 5, 0), tried=(5, 5, 5, 5), setting=0.1)
     >>> gap(best, Measured(right=(5, 5, 0, 5), tried=(5, 5, 5, 5), setting=0.1))
     (0.0, 0.408248290463863)

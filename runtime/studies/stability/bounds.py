@@ -22,8 +22,6 @@ from spikeloom.runtime.studies.stability.neighbours import Cells
 def needed(votes: IntArray) -> tuple[int, IntArray]:
     """Decision of votes (classes,), and by how much each other class must gain on it to win; 0 for itself.
 
-    Examples
-    --------
     >>> needed(np.array([3, 5, 5]))
     (1, array([2, 0, 1]))
     """

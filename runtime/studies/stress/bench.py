@@ -146,8 +146,6 @@ def _distances(arguments: argparse.Namespace, checkpoint: Checkpoint | None, tax
 def distances(taxels: int, places: FloatArray | None, edges: IntArray | None) -> FloatArray:
     """Distances between taxels: of their positions, else on their graph, else of their numbers; (taxels, taxels).
 
-    Examples
-    --------
     >>> distances(3, None, None)[0].tolist(), distances(3, None, np.array([[0, 2], [2, 1]]))[0].tolist()
     ([0.0, 1.0, 2.0], [0.0, 2.0, 1.0])
     """

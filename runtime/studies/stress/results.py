@@ -109,8 +109,6 @@ class Stress:
 def shown(level: Level) -> str:
     """A level as it is typed.
 
-    Examples
-    --------
     >>> shown(3), shown(0.25), shown(1e-4)
     ('3', '0.25', '0.0001')
     """

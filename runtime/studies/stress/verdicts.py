@@ -44,8 +44,6 @@ class Requirement:
 def parse_requirement(words: str) -> Requirement:
     """Read ``taxels_dead:3>=0.85``; an OptionError says why it is none.
 
-    Examples
-    --------
     >>> str(parse_requirement("taxels_dead:3 >= 0.85"))
     'taxels_dead:3>=0.85'
     """

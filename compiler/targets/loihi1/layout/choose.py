@@ -169,8 +169,6 @@ _Cut = tuple[list[Chunk], FloatArray, dict[int, IntArray]]
 def _useful(size: int, most: int) -> list[int]:
     """Numbers of chunks, up to `most`, whose largest is smaller than with fewer chunks.
 
-    Examples
-    --------
     >>> _useful(20, 12)
     [1, 2, 3, 4, 5, 7, 10]
     """

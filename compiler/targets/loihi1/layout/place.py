@@ -62,8 +62,6 @@ def core_traffic(network: IntegerNetwork, cores: Cores, rates: tuple[FloatArray,
 def hops(tile: Tiles, other: Tiles, width: int) -> tuple[Tiles, Tiles]:
     """East-west and north-south hops between two tiles of a chip under XY routing.
 
-    Examples
-    --------
     >>> hops(0, 17, 8)
     (1, 2)
     """
@@ -139,8 +137,6 @@ def chip_tiles(target: Target) -> int:
 def chip_of_core(core_tile: IntArray, target: Target) -> IntArray:
     """Chip of each core, from its tile; shape (cores,).
 
-    Examples
-    --------
     >>> from spikeloom.compiler.targets.base import load_target
     >>> chip_of_core(np.array([0, 31, 32, 70]), load_target("loihi1")).tolist()
     [0, 0, 1, 2]

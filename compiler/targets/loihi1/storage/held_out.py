@@ -50,8 +50,6 @@ def ladder(target: Target) -> Iterator[Packing]:
 def split(count: int) -> tuple[IntArray, IntArray, IntArray]:
     """Which of so many recordings choose the scales, which may choose those of several planes, and are held out.
 
-    Examples
-    --------
     >>> [part.tolist() for part in split(5)]
     [[0, 2, 4], [0, 2, 4], [1, 3]]
     """

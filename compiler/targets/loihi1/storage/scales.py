@@ -116,8 +116,6 @@ def judged(layer: Rounded, post: int, calibration: Calibration | None, parts: in
 def planes_from(exponent: int, bits: int, planes: int, largest: int) -> tuple[int, ...]:
     """Exponents of up to `planes` planes from a finest one, up to `largest`, as far apart as leaves no gap.
 
-    Examples
-    --------
     >>> planes_from(-1, 8, 2, 7), planes_from(3, 8, 3, 7)
     ((-1, 6), (3, 7))
     """
@@ -227,8 +225,6 @@ def group_by_fineness(finest: IntArray, groups: int) -> IntArray:
     Rounding errors grow with ``1 / threshold``. Sorted by what they allow, the neurons of a group are neighbours and
     share the smallest: an optimal cut is found by dynamic programming.
 
-    Examples
-    --------
     >>> group_by_fineness(np.array([10, 100, 11, 90, 12]), 2).tolist()
     [10, 90, 10, 90, 10]
     """

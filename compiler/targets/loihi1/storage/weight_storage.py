@@ -99,8 +99,6 @@ def current_load(decay_u: int) -> float:
     A current that loses ``(decay_u + 1) / 4096`` a step adds up to ``4096 / (decay_u + 1)`` sums, in a register four
     times as wide. At least 1: the accumulator comes first.
 
-    Examples
-    --------
     >>> current_load(4095), round(current_load(204), 3)
     (1.0, 4.995)
     """
