@@ -119,7 +119,8 @@ def price(netlist: CrossbarNetlist, chip: Target, counts: Counts, bin_s: float) 
     for table in chip.energy:
         events_j, floor_j = joules(table, counted["synaptic_events"], time_s)
         energy[table.name] = events_j if floor_j is None else events_j + floor_j
-        dynamic[table.name] = events_j
+        if floor_j is not None:  # else the price of an event holds standing power, too
+            dynamic[table.name] = events_j
         floor = None if floor_j is None else float(floor_j.mean())
         readings.append(
             Reading(
@@ -157,7 +158,7 @@ def price(netlist: CrossbarNetlist, chip: Target, counts: Counts, bin_s: float) 
         energy_j=energy,
         time_s={TICK: time_s},
         step_s={TICK: step_s},
-        dynamic_j=dynamic,
+        dynamic_j=dynamic or energy,
         static_w=result.static_w,
         outcome=Outcome(result, sections),
     )
@@ -188,12 +189,15 @@ def sections(found: Estimate) -> list[Section]:
     head = f"per inference on {found.cores:,} of {found.cores_of_chip:,} cores, over {found.samples} recordings:"
     pace = found.pace
     seconds = found.per_inference.time_s / pace.step_s * pace.bin_s
+    static = [f"{si(watts, 'W')} ({name})" for name, watts in found.static_w.items()]
+    events = [each.events_j for each in found.energy if each.floor_j is not None]
     lines = [
         *map(_reading_line, found.energy),
         "two readings of one measurement: take one, never their sum",
         f"a data step takes {si(pace.step_s, 's')}: {'keeps' if pace.real_time else 'does not keep'} the sensor's pace "
         f"of {1000 * pace.bin_s:g} ms a step",
-        dominant([watts * seconds for watts in found.static_w.values()], [each.events_j for each in found.energy]),
+        f"static power of a chip: {', '.join(static)}",
+        *([dominant([watts * seconds for watts in found.static_w.values()], events)] if events else []),
         *(f"not priced: {line}" for line in found.not_priced),
     ]
     return [
