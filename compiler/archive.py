@@ -29,8 +29,8 @@ COUNTERS = "spikeloom-counters"
 """A counting network."""
 
 FORMATS = {
-    "spikeloom-netlist": "cores of compartments (Loihi)",
-    "spikeloom-crossbars": "crossbar cores (TrueNorth)",
+    "spikeloom-netlist": "cores of compartments (--target loihi1)",
+    "spikeloom-crossbars": "crossbar cores (--target truenorth)",
     TRAINED: "a network trained for TrueNorth, not yet compiled",
     COUNTERS: "a counting network, not yet compiled",
 }

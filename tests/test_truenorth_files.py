@@ -64,7 +64,7 @@ def test_numpy_alone_reads_it_and_a_reader_of_other_files_names_it(path):
         assert (manifest["format"], manifest["provenance"]) == (crossbar.FILE.format, {"made": "by hand"})
         assert members["weight"].tolist() == [[1, 1, 0, 0]] * 2
     assert is_netlist(path)
-    with pytest.raises(FormatError, match=r"holds crossbar cores \(TrueNorth\), this is for .* \(Loihi\)"):
+    with pytest.raises(FormatError, match=r"holds crossbar cores \(--target truenorth\), this is for .* \(--target loihi1\)"):
         read_netlist(path)
 
 
@@ -236,6 +236,13 @@ def test_the_command_for_ranc(tmp_path, monkeypatch):
     assert json.loads(Path("net.json").read_text("utf-8"))["packets"] == [[]]
     assert "1 neurons on the chip and 1 synapses for ranc" in first
     assert second.startswith("run: ranc_sim net.json net.out net.json TICKS")
+    for command in ("anytime", "report --checkpoint x -o x.html", "explain --checkpoint x", "stress --checkpoint x"):
+        name, *more = command.split()
+        said = refusal(name, "net.loom", *more, "--data", "data")
+        assert said == f"net.loom: is for IBM TrueNorth, which {name} does not take; give one for another chip"
+    assert "this is for cores of compartments (--target loihi1)" in refusal(*words[:3], "nir", "-o", "net.nir")
+    costs = run("estimate", "net.loom", "--data", "data")[1]
+    assert "static power of a chip: 42 mW (idle_0v70), 65 mW (typical_0v75)" in costs
     words += ["--data", "data", "--recording"]
     assert as_json(*words, "1")["ticks"] == 5 + 2 + 1
     packets = json.loads(Path("net.json").read_text("utf-8"))["packets"]

@@ -131,8 +131,9 @@ LONGEST = 4096
 """Steps after which :attr:`IntegerMachine.least_intervals` looks no further: a spike may follow then."""
 
 
-def integer_machine(machine: Machine) -> IntegerMachine:
-    """The same machine, if a float model can be compared with it; else an OptionError."""
+def integer_machine(machine: Machine, path: str = "netlist", command: str = "this command") -> IntegerMachine:
+    """The same machine, if a float model can be compared with it; else an OptionError, which names file and command."""
     if not isinstance(machine, IntegerMachine):
-        raise OptionError(f"{machine.target.title}: is not a chip that this command takes; give a netlist of another")
+        title = machine.target.title
+        raise OptionError(f"{path}: is for {title}, which {command} does not take; give one for another chip")
     return machine

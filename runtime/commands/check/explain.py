@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; differences are its subject, not a failure."""
     if arguments.top < 1:
         raise OptionError(f"--top {arguments.top}: at least 1 root can be shown; give a positive number")
-    machine = integer_machine(machine_for(arguments.netlist))
+    machine = integer_machine(machine_for(arguments.netlist), arguments.netlist, "explain")
     netlist = machine.netlist
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, loaded.model)

@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     require_place(arguments.output, "-o", arguments)
     allowed = _allowed(arguments)
-    machine = integer_machine(machine_for(arguments.netlist))
+    machine = integer_machine(machine_for(arguments.netlist), arguments.netlist, "anytime")
     data = load_recordings(arguments, machine.netlist)
     machine.require_sensor(data.events)
     points = _races(arguments, machine)

@@ -241,7 +241,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
             bins=bins,
             from_first=arguments.origin == "first",
             real=arguments.speed == "real",
-            may_end=None if factor is None else exits.live(integer_machine(machine), arguments.bins, factor),
+            may_end=None
+            if factor is None
+            else exits.live(integer_machine(machine, arguments.netlist, "--until-sure"), arguments.bins, factor),
             found=Summary(early=None if factor is None else 0),
         )
         session.run()

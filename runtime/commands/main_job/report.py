@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; nothing is written before everything is known."""
     require_place(arguments.output, "-o", arguments, ["html"])
-    machine = integer_machine(machine_for(arguments.netlist))
+    machine = integer_machine(machine_for(arguments.netlist), arguments.netlist, "report")
     netlist = machine.netlist
     battery = None
     if arguments.stress is not None:

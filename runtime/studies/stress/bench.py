@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler import Netlist, read_netlist
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.types import FloatArray, IntArray
@@ -15,9 +15,10 @@ from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import fitted, join_bins
 from spikeloom.models.sensors import read_layout
 from spikeloom.runtime.equivalence.reference import require_match
-from spikeloom.runtime.inputs.files import require_netlist
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_graph, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
+from spikeloom.runtime.machines.base import machine_for
+from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.studies.stress import damages, disturbances
 from spikeloom.runtime.studies.stress.pair import Events, Inputs, Pair, Perturbation, perturbation
 
@@ -111,8 +112,7 @@ NAMES = {each.name: each for each in _ALL if isinstance(each, Perturbation)}
 
 def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
     """Everything that is stressed, the float network, and a hash of the recordings."""
-    require_netlist(arguments.netlist)
-    netlist = read_netlist(arguments.netlist)
+    netlist = integer_machine(machine_for(arguments.netlist), arguments.netlist, "stress").netlist
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, loaded.model)
     loaded.require_same(arguments.netlist, netlist, arguments.run)
