@@ -121,6 +121,7 @@ def recording_zip() -> list[bytes]:
     names = [f"x/{split}/sample_{i}_label_{i}.npy" for split in ("test", "train") for i in (0, 1)]
     made = made_files.events(samples=4, steps=6).astype(np.float32)
     members = {name: archive.npy_bytes(one) for name, one in zip(names, made, strict=True)}
+    members["x/bins.npy"] = archive.npy_bytes(np.array([0.02]))
     return [archive.zip_bytes(members), made_files.zipped(members, zipfile.ZIP_DEFLATED)]
 
 
