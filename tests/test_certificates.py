@@ -11,6 +11,7 @@ from made_files import CLASSES, FEATURES, TAXELS, events, ring, small_checkpoint
 from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.interpret import channels_last, run_float, vote
 from spikeloom.compiler.passes.expand import Factored, expand
+from spikeloom.compiler.passes.range_proof import open_ranges
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.equivalence.certificates import SPARE, Certainty, Certifier, _layers, _step
 from spikeloom.runtime.equivalence.verify import verify
@@ -279,7 +280,10 @@ def test_registers_without_a_proof_are_named(tmp_path):
     netlist = compile_network(expand(checkpoint, adjacency), Options(keep_all=True)).netlist
     recordings = events(2, steps=8)
     found = certified(Factored(checkpoint, adjacency), lift(netlist), recordings, *on_chip(netlist, recordings))
-    assert found.unproven == ("conv1", "fc1", "fc2", "fc3")
+    assert found.unproven == found.saturating == ("conv1", "fc1", "fc2", "fc3")
+    said = "no register of conv1, fc1, fc2, fc3 overflows for any input, but some may saturate a membrane"
+    assert list(open_ranges(found.unproven, found.saturating)) == [said]
+    assert [*open_ranges(("a",), ())] == ["no proof of range for a: the simulator stops at the first overflow"]
 
 
 @given(st.data())

@@ -64,7 +64,9 @@ def test_numpy_alone_reads_it_and_a_reader_of_other_files_names_it(path):
         assert (manifest["format"], manifest["provenance"]) == (crossbar.FILE.format, {"made": "by hand"})
         assert members["weight"].tolist() == [[1, 1, 0, 0]] * 2
     assert is_netlist(path)
-    with pytest.raises(FormatError, match=r"holds crossbar cores \(--target truenorth\), this is for .* \(--target loihi1\)"):
+    with pytest.raises(
+        FormatError, match=r"holds crossbar cores \(--target truenorth\), this is for .* \(--target loihi1\)"
+    ):
         read_netlist(path)
 
 

@@ -1,5 +1,6 @@
 """Prove that registers stay in range for any input, from the weights alone."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -25,7 +26,20 @@ class RangeProof:
     @property
     def holds(self) -> bool:
         """Whether no register can leave its range, whatever the input."""
-        return self.accumulator <= ACCUMULATOR_MAX and self.current <= CURRENT_MAX and self.membrane <= MEMBRANE_MAX
+        return not self.stops and self.membrane <= MEMBRANE_MAX
+
+    @property
+    def stops(self) -> bool:
+        """Whether some input may overflow a sum or a current, where the simulator stops; a membrane saturates."""
+        return self.accumulator > ACCUMULATOR_MAX or self.current > CURRENT_MAX
+
+
+def open_ranges(unproven: Sequence[str], saturating: Sequence[str]) -> Iterator[str]:
+    """Lines about layers that some input brings out of their range; where they are `saturating`, only a membrane."""
+    if stopping := [layer for layer in unproven if layer not in saturating]:
+        yield f"no proof of range for {', '.join(stopping)}: the simulator stops at the first overflow"
+    if saturating:
+        yield f"no register of {', '.join(saturating)} overflows for any input, but some may saturate a membrane"
 
 
 def settled(inflow: FloatArray | IntArray, kept: float) -> FloatArray:

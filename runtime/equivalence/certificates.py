@@ -277,13 +277,14 @@ class Certificate:
     """What is proven.
 
     Of the recordings' spikes, layer by layer, and decisions, in whatever order the float model adds; and of any input:
-    `unproven` layers may bring a register out of its range.
+    `unproven` layers may bring a register out of its range, those of them that are `saturating` only a membrane.
     """
 
     layers: Mapping[str, LayerCertificate]
     samples: int
     decisions: int
     unproven: tuple[str, ...]
+    saturating: tuple[str, ...]
 
 
 class Certifier:
@@ -328,9 +329,11 @@ class Certifier:
             population.name: LayerCertificate(entries=entries, equal=entries - unknown - different, different=different)
             for population, (entries, unknown, different) in zip(self._integer.populations, figures, strict=True)
         }
+        loose = [proof for proof in prove_ranges(self._integer) if not proof.holds]
         return Certificate(
             layers=layers,
             samples=self._samples,
             decisions=self._decisions,
-            unproven=tuple(proof.layer for proof in prove_ranges(self._integer) if not proof.holds),
+            unproven=tuple(proof.layer for proof in loose),
+            saturating=tuple(proof.layer for proof in loose if not proof.stops),
         )

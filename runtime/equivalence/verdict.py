@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.passes.range_proof import open_ranges
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.equivalence.breakdowns import Breakdown
 from spikeloom.runtime.equivalence.rounding import Rounding
@@ -337,9 +338,9 @@ def certified(certificate: Certificate) -> list[Block]:
         ]
         for name, layer in certificate.layers.items()
     ]
-    proof = "no register overflows for any input"
-    if certificate.unproven:
-        proof = f"some input may overflow a register of {', '.join(certificate.unproven)}: no proof of range"
+    proof = (
+        "; ".join(open_ranges(certificate.unproven, certificate.saturating)) or "no register overflows for any input"
+    )
     return [
         Table(["certified in any order of sums", "entries", "equal", "different", "undecided"], rows),
         Text(f"{certificate.decisions} of {certificate.samples} decisions certified equal; {proof}"),

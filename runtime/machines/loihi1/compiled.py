@@ -3,9 +3,9 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX
 from spikeloom.compiler.passes.prune import Removal
-from spikeloom.compiler.passes.range_proof import RangeProof
+from spikeloom.compiler.passes.range_proof import RangeProof, open_ranges
 from spikeloom.compiler.targets.loihi1.layout.choose import Expectation, Layout
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
@@ -191,12 +191,7 @@ def _proven(facts: CompilationFacts) -> Iterator[str]:
             f"proof: no register overflows for any input (fullest accumulator: {worst.layer}, "
             f"{100 * worst.accumulator / ACCUMULATOR_MAX:.1f} % of 21 bits)"
         )
-    stops = [p.layer for p in loose if p.accumulator > ACCUMULATOR_MAX or p.current > CURRENT_MAX]
-    clips = [proof.layer for proof in loose if proof.layer not in stops]
-    if stops:
-        yield f"no proof of range for {', '.join(stops)}: the simulator stops at the first overflow"
-    if clips:
-        yield f"no register of {', '.join(clips)} overflows for any input, but some may saturate a membrane"
+    yield from open_ranges([each.layer for each in loose], [each.layer for each in loose if not each.stops])
 
 
 def _placed(facts: CompilationFacts) -> Iterator[str]:
