@@ -80,7 +80,7 @@ def lift(netlist: Netlist) -> IntegerNetwork:
             projections += [IntegerProjection(pre=before, post=index, weight=none, exponent=0, bits=layer.weight_bits)]
     voting = np.unique(netlist.layer[netlist.readout_class >= 0])
     if len(voting) != 1:
-        raise FormatError(f"netlist: {len(voting)} layers vote for classes, one is allowed; compile it again")
+        raise FormatError(f"{len(voting)} layers vote for classes, one is allowed; compile it again")
     return IntegerNetwork(
         input=Input(taxels=netlist.taxels, polarities=netlist.polarities, clocks=netlist.clocks, bins=netlist.bins),
         populations=tuple(populations),

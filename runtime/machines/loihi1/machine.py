@@ -6,12 +6,15 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.errors import FormatError
+from spikeloom.compiler.files import reading
 from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import Target
@@ -44,6 +47,7 @@ class Loihi(IntegerMachine):
     """A netlist and its simulator."""
 
     netlist: Netlist
+    file: str = "netlist"  # What messages call it
     details = ("counts", "cycle")
 
     @cached_property
@@ -131,7 +135,8 @@ class Loihi(IntegerMachine):
         """Compartments as populations, axons as projections."""
         from spikeloom.compiler.targets.loihi1.lift import lift
 
-        return lift(self.netlist)
+        with reading(self.file, FormatError, "compile it again"):
+            return lift(self.netlist)
 
     def cumulative(self, events: EventArray, lengths: IntArray) -> Cumulative:
         """Sums that the engine adds up itself: no spike is kept."""
@@ -243,4 +248,4 @@ counting_source = counting_network
 
 def load(path: str | os.PathLike[str]) -> Loihi:
     """Read a netlist file; raises as :func:`netlist.read_netlist` does."""
-    return Loihi(read_netlist(path))
+    return Loihi(read_netlist(path), Path(path).name)
