@@ -279,6 +279,7 @@ def test_a_netlist_remembers_bins_and_data(tmp_path, monkeypatch):
 OTHERS = {
     "compile net.pt -o x.loom --calibrate few": "trained on taps; calibrate on what it knows",
     "run net.loom --data few": "trained on taps; their classes are 0..1, the network's 0..3",
+    "run net.loom --limit 1 --data few": "trained on taps; are their classes the same?",
     "run net.loom --data four": "events of taxels 0..3 only, the network has 6; are they of its sensor?",
 }
 
@@ -288,7 +289,7 @@ def test_recordings_that_look_like_others_are_warned_of(tmp_path, monkeypatch, w
     monkeypatch.chdir(tmp_path)
     csv_folder(tmp_path / "few", classes=2 if words.startswith("run") else 4)
     csv_folder(tmp_path / "four", taxels=4)
-    own_file(tmp_path / "net.pt", training={"data": "taps"})
+    own_file(tmp_path / "net.pt", training={"data": "four" if "four" in words else "taps"})
     assert run("compile", "net.pt", "-o", "net.loom")[0] == 0
     code, _, err = run(*words.split())
     assert (code, err.count("warning: ")) == (0, 1)

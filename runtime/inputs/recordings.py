@@ -60,8 +60,8 @@ def recordings(
         events.require_events(SYNTHETIC, bin_s)
         data = synthetic_split(split, limit=limit)
         require_suited(data, classes=classes, taxels=taxels)
-    if classes is not None and limit is None:
-        _warn_of_others(data, trained or {}, classes)
+    if classes is not None:
+        _warn_of_others(data, trained or {}, classes, whole=limit is None)
     return events.joined_bins(data, bins)
 
 
@@ -88,15 +88,17 @@ def _require_sensor(data: Recordings, split: str, taxels: int | None) -> None:
         tell(f"warning: {why}; are they of its sensor?")
 
 
-def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int) -> None:
+def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int, *, whole: bool) -> None:
     """Say on stderr where recordings look like other ones than a network was trained on."""
     name, known = trained.get("data", data.source), int(data.labels.max(initial=UNLABELLED))
-    fewer = len(data) >= classes and UNLABELLED < known < classes - 1
-    origin = f"the network was trained on {name}; " if name != data.source else ""
+    fewer = whole and len(data) >= classes and UNLABELLED < known < classes - 1
+    same = name.partition(", seed")[0] == data.source.partition(", seed")[0]  # splits of synthetic ones differ in these
+    origin = "" if same else f"the network was trained on {name}; "
     if fewer:
         tell(f"warning: {data.source}: {origin}their classes are 0..{known}, the network's 0..{classes - 1}")
-    elif origin and data.split == "train":
-        tell(f"warning: {data.source}: {origin}calibrate on what it knows")
+    elif origin and not (whole and len(data) == 1):  # a file of one recording has its own name
+        asked = "calibrate on what it knows" if data.split == "train" else "are their classes the same?"
+        tell(f"warning: {data.source}: {origin}{asked}")
 
 
 def require_splits(path: str | Recordings) -> None:
