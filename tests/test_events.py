@@ -322,6 +322,12 @@ def test_a_touch_of_several_events_a_second_is_never_taken_for_another_unit(seed
     assert bin_events(stream)[1].notes == ()
 
 
+def test_times_that_do_not_count_from_the_start_are_noticed(write):
+    write("late/a.csv", f"{HEADER}100,0,1\n100.7,1,1\n")
+    note = "events begin at 100 s; count times from the start of the recording"
+    assert warned(write("late/b.csv", f"{HEADER}4,0,1\n").parent) == (f"late: a.csv: {note}",)
+
+
 def test_taxels_that_count_from_one(write):
     rows = "".join(f"0.{i},{i},1\n" for i in range(1, 6))
     path = write("one/a.csv", HEADER + rows)

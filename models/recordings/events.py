@@ -192,13 +192,17 @@ def bin_events(
     evtouch.require_memory(stream.name, n * 2 * steps)
     grid = np.zeros((n, 2, steps), dtype=np.uint8)
     grid[stream.taxel, stream.polarity, step] = 1
-    sent = len(stream.time_s)
+    sent, first, note = len(stream.time_s), float(stream.time_s.min()), ""
+    if odd:
+        note = f"times up to {last:g} s with less than an event a second; write seconds"
+    elif first > max(last - first, 10 * GAP_S):
+        note = f"events begin at {first:g} s; count times from the start of the recording"
     return grid, EventCounts(
         events=sent,
         out_of_order=int(np.count_nonzero(stream.time_s < np.maximum.accumulate(stream.time_s))),
         duplicates=sent - int(np.count_nonzero(grid)),
         gaps=int(np.count_nonzero(np.diff(np.sort(stream.time_s)) > GAP_S)),
-        notes=(f"times up to {last:g} s with less than an event a second; write seconds",) if odd else (),
+        notes=(note,) if note else (),
     )
 
 
