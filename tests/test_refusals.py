@@ -50,6 +50,7 @@ def place(tmp_path_factory):
     own_file(at / "same.pt", last=made_weights(7))
     (at / "empty.pt").touch()
     (at / "words.txt").write_text("hello")
+    (at / "semicolons.csv").write_text("time_s;taxel;polarity\n0;1;1\n")
     (at / "bomb.pt").write_bytes(zipped({"manifest.json": bytes(1 << 20)}, zipfile.ZIP_DEFLATED))
     (at / "notes.zip").write_bytes(zipped({"a/b/notes.txt": "hello"}))
     for name in ("events", "grasp_label_1"):
@@ -131,6 +132,8 @@ TABLE = [
     ),
     ("run pretrained:grasps --data data", "compile it first: spikeloom compile pretrained:grasps -o NET.loom"),
     (COMPILE.format("grasp_label_1.npz"), "grasp_label_1.npz: holds recordings; give the network here|--calibrate"),
+    ("join net.loom net.pt -o out.pt", "net.loom: is a netlist, its weights are rounded"),
+    ("data describe semicolons.csv", "columns time_s;taxel;polarity, expected are|name them so, separated by commas"),
     # graphs, targets, storage
     (COMPILE.format("bare.pt"), "bare.pt: the graph is not in this file|--graph: manual"),
     (COMPILE.format("bare.pt --graph manual"), f"the graph has 39 taxels, fc1 was trained on {TAXELS}"),

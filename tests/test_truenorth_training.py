@@ -240,7 +240,7 @@ VERIFY = "verify net.loom --data data --checkpoint"
         (f"{VERIFY} net.pt --require E3=1", "--require E3=1: a network for TrueNorth has one model"),
         (f"{VERIFY} two.pt", "--checkpoint two.pt: net.loom was compiled from another file"),
         ("verify two.loom --data data --checkpoint two.pt", "--weights last: two.loom was compiled from best"),
-        ("join net.pt own.pt -o z.pt", "net.pt: holds whole numbers of a chip"),
+        ("join net.pt own.pt -o z.pt", "net.pt: is a network trained for TrueNorth, not yet compiled; only"),
         ("compile own.pt --target truenorth -o z.loom", "fc3, all 4 neurons: keep 0.2 of their membranes a step"),
     ],
 )

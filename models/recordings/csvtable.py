@@ -59,7 +59,7 @@ def read_table(
         if not (set(required) <= set(names) <= set(known) and len(set(names)) == len(names)):
             raise DataError(
                 f"{where}: line {lines[0]}: columns {plain(', '.join(names)[:99])}, expected are {expected}; "
-                "name them so"
+                "name them so, separated by commas"
             )
         del lines[0], rows[0]
     elif rows and not len(required) <= len(names) <= len(known):

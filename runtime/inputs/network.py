@@ -243,7 +243,7 @@ def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
     """Read a checkpoint as the options say; OptionError or ModelError if it is not there, or not as they say."""
     progress("reading the checkpoint")
     if (kind := stated(Path(shipped(path)), "format")) in (TRAINED, COUNTERS):
-        raise ModelError(f"{path}: is {FORMATS[kind]}; compile, verify and inspect take it, this is for others")
+        raise ModelError(f"{path}: is {FORMATS[kind]}; only compile, verify and inspect take one")
     if Path(shipped(path)).is_file() and is_netlist(shipped(path)):
         raise ModelError(f"{path}: is a netlist, its weights are rounded; give the checkpoint that it was made from")
     if is_recordings(path):

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
-from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.tensors import join as join_networks
 from spikeloom.models.networks.checkpoint import save_again
 from spikeloom.runtime.commands.main_job.inspect import LayerSize, tower_line
 from spikeloom.runtime.inputs.files import require_place, shipped
+from spikeloom.runtime.inputs.network import load_checkpoint
 from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 
@@ -78,10 +77,7 @@ def run(arguments: Namespace) -> Outcome:
 
 
 def _network(name: str, weights: str | None) -> Checkpoint:
-    path = shipped(name)
-    if Path(path).is_file() and is_netlist(path):
-        raise ModelError(f"{name}: holds whole numbers of a chip; give checkpoints of float networks")
-    checkpoint = read_checkpoint(path, weights=weights)
+    checkpoint = load_checkpoint(name, Namespace(run=0, weights=weights, beta=None, theta=None))
     if checkpoint.layout != "spikeloom":
         raise ModelError(f"{name}: does not say its graph and constants; give checkpoints that spikeloom train wrote")
     return checkpoint
