@@ -274,6 +274,12 @@ def test_a_full_disk_behind_standard_output(spikeloom, monkeypatch, capsys):
     )
 
 
+def test_inspect_says_the_bins_that_a_network_was_trained_on(spikeloom, tmp_path):
+    own_file(tmp_path / "binned.pt", training={"data": "taps", "bin_s": 0.05})
+    spikeloom("compile", tmp_path / "binned.pt", "-o", tmp_path / "binned.loom")
+    assert "\n  trained on bins of 0.05 s\n" in spikeloom("inspect", tmp_path / "binned.loom")[1]
+
+
 def test_a_terminal_without_greek_letters(spikeloom, monkeypatch):
     plain = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", plain)

@@ -16,6 +16,7 @@ from spikeloom.compiler.targets.loihi1.layout.place import chip_count
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, words_of_axons
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 
@@ -165,6 +166,8 @@ def sections(facts: NetlistFacts) -> Iterator[Section]:
         lines.append(f"  synapse lists that repeat are stored once a core: {words}")
     if facts.bins is not None:
         lines.append(f"  a step joins {facts.bins} bins of the recordings")
+    if "bin_s" in (origin := origin_of(facts.provenance)):
+        lines.append(f"  trained on bins of {origin['bin_s']:g} s")
     if facts.free_running is not None:
         lines.append(f"  free-running: {facts.free_running.text}")
     yield Section("", [*map(Text, lines), _layer_table(facts.layers)])

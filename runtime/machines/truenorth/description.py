@@ -14,6 +14,7 @@ from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.native import BASES, SYSTEM, highest_level
 from spikeloom.compiler.targets.truenorth.native_file import Trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars
+from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 
@@ -123,6 +124,7 @@ def sections(found: Description) -> list[Section]:
         f"{found.target}: {found.neurons:,} neurons, {found.axons:,} axons, {found.crossing_points:,} crossing points, "
         f"{found.cores:,} cores; {ticks} tick{'s' * (ticks > 1)} a data step, {found.drain_ticks} more to drain"
         + (f"; a step joins {found.bins} bins" if found.bins else "")
+        + (f"; trained on bins of {origin['bin_s']:g} s" if "bin_s" in (origin := origin_of(found.provenance)) else "")
     )
     layers = [
         [layer.name, f"{layer.neurons:,}", f"{layer.distinct:,}", f"{layer.max_fan_in:,}", f"{layer.cores:,}"]
