@@ -51,21 +51,8 @@ def compile_network(
 ) -> Compilation:
     """Lower a network, wherever it comes from, to a placed netlist that obeys every limit of the chip.
 
-    Parameters
-    ----------
-    source : Factored, Network or IntegerNetwork
-        Trained weights on their graph, a float network, or integers that are taken as they stand.
-    options : Options, optional
-        Of the target.
-    target : str
-        Chip.
-    after : callable, optional
-        Called with the name of each pass and the compilation as far as it is.
-
-    Raises
-    ------
-    OptionError, ModelError, DataError, CapacityError
-        As the passes say.
+    Integers are taken as they stand. `after` is called with the name of each pass and the compilation as far as it is.
+    OptionError, ModelError, DataError or CapacityError as the passes say.
     """
     from spikeloom.compiler.targets.base import load_target
 

@@ -30,28 +30,15 @@ def _shared(relative: str) -> Path:
     return path
 
 
-@pytest.fixture(scope="session")
-def objects_zip() -> Path:
-    """The released Objects recordings."""
-    return _shared("data/Ev-Objects.zip")
+def _released(relative: str) -> Callable[[], Path]:
+    """A fixture that finds a released file."""
+    return pytest.fixture(lambda: _shared(relative), scope="session")
 
 
-@pytest.fixture(scope="session")
-def containers_zip() -> Path:
-    """The released Containers recordings."""
-    return _shared("data/Ev-Containers.zip")
-
-
-@pytest.fixture(scope="session")
-def released_checkpoint() -> Path:
-    """A checkpoint in the released layout, trained on Objects with the manual graph."""
-    return _shared("checkpoints/objects_manual.t7")
-
-
-@pytest.fixture(scope="session")
-def shared_dir() -> Path:
-    """The folder that holds the released files."""
-    return _shared("checkpoints").parent
+objects_zip = _released("data/Ev-Objects.zip")
+containers_zip = _released("data/Ev-Containers.zip")
+released_checkpoint = _released("checkpoints/objects_manual.t7")  # trained on Objects with the manual graph
+checkpoints = _released("checkpoints")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -14,6 +14,7 @@ from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.graphs import Graph, normalised_adjacency
 from spikeloom.models.networks.checkpoint import save_checkpoint
+from spikeloom.models.recordings.evtouch import Recordings
 
 TAXELS, FEATURES, CLASSES, STEPS = 6, 5, 4, 24
 
@@ -119,6 +120,13 @@ def recordings_folder(
         for i, recording in enumerate(made if made is not None else events(2)):
             np.save(folder / split / f"sample_{i}_label_{i % classes}.npy", recording.astype(np.float32))
     return folder
+
+
+def recorded(events: np.ndarray, labels: np.ndarray | None = None, split: str = "train") -> Recordings:
+    """The same in memory."""
+    labels = np.arange(len(events)) % CLASSES if labels is None else labels
+    files = tuple(f"{i}.npy" for i in range(len(events)))
+    return Recordings(events=events, labels=labels, files=files, split=split, source="made")
 
 
 def csv_folder(folder: Path, *, taxels: int = TAXELS, samples: int = 8, classes: int = CLASSES) -> Path:

@@ -47,7 +47,6 @@ from spikeloom.compiler.targets.truenorth.native_file import read_trained
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.networks.networks import Architecture
 from spikeloom.models.recordings.events import load_data
-from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.sensors import read_edges, read_taxels
 from spikeloom.models.training.train import train
 from spikeloom.runtime.machines.base import machine_for
@@ -154,9 +153,7 @@ def onnx() -> list[bytes]:
 
 NET = Architecture(taxels=made_files.TAXELS, classes=2, hops=1, features=2, hidden=(3, 3))
 RING = made_files.ring()
-DATA = Recordings(
-    events=made_files.events(samples=2, steps=4), labels=np.arange(2), files=("a", "b"), split="train", source="made"
-)
+DATA = made_files.recorded(made_files.events(samples=2, steps=4))
 
 
 def tables() -> list[bytes]:

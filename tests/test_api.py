@@ -119,9 +119,9 @@ def compiled(tmp_path_factory, released_checkpoint, objects_zip) -> tuple[Path, 
 
 
 @pytest.mark.recordings
-def test_the_chip_is_within_one_sample_of_the_float_model(compiled, objects_zip, shared_dir):
+def test_the_chip_is_within_one_sample_of_the_float_model(compiled, objects_zip, checkpoints):
     report = as_json("run", compiled[0], "--data", objects_zip)
-    expected = json.loads((shared_dir / "checkpoints" / "objects_manual.expected.json").read_text())
+    expected = json.loads((checkpoints / "objects_manual.expected.json").read_text())
     assert report["samples"] == 144
     assert (report["files"], report["labels"]) == (expected["files"], expected["labels"])
     right = sum(a == b for a, b in zip(report["predictions"], report["labels"], strict=True))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_files import CLASSES, FEATURES, TAXELS, events, ring, small_checkpoint, weights
+from made_files import CLASSES, FEATURES, TAXELS, events, recorded, ring, small_checkpoint, weights
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.interpret import channels_last, run_float, vote
@@ -254,8 +254,7 @@ def far_from_thresholds():
 def verdict_far_from_thresholds(folder, **constants):
     checkpoint, adjacency = small_checkpoint(folder, last=far_from_thresholds(), **constants)
     netlist = compile_network(expand(checkpoint, adjacency)).netlist
-    labels, files = np.arange(6) % CLASSES, tuple("abcdef")
-    return verify(netlist, Factored(checkpoint, adjacency), events(2, steps=8), labels, files)
+    return verify(netlist, Factored(checkpoint, adjacency), recorded(events(2, steps=8)))
 
 
 def test_a_network_far_from_its_thresholds_is_certified_whole(tmp_path):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import as_json, refusal, run
-from made_files import recordings_folder
+from made_files import recorded, recordings_folder
 from numpy.testing import assert_array_equal
 from oracles import refused
 
@@ -17,7 +17,6 @@ from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.formats.counters import BLOCK, counting_network, read_counters, write_counters
 from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.models.recordings.events import joined_bins, load_data, of_length
-from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds, held_out, linear_rules
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.studies.counting import decisions_of
@@ -39,8 +38,7 @@ def made(seed=0, samples=30, rate=0.3):
     labels = np.arange(samples) % CLASSES
     often = np.random.default_rng(9).random((CLASSES, TAXELS, 2, 4)).repeat(STEPS // 4, axis=3)
     events = (rng.random((samples, TAXELS, 2, STEPS)) < 2 * rate * often[labels]).astype(np.uint8)
-    files = tuple(f"{each}.npy" for each in range(samples))
-    return Recordings(events=events, labels=labels, files=files, split="train", source="made")
+    return recorded(events, labels)
 
 
 def network_spikes(counters, data):

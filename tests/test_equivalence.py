@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_files import STEPS, events, small_checkpoint, weights
+from made_files import STEPS, events, recorded, small_checkpoint, weights
 from random_netlists import Neuron, build
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
@@ -21,8 +21,7 @@ from spikeloom.runtime.machines.votes import class_counts, predictions
 from spikeloom.runtime.report.numbers import wilson
 
 LAYERS = ["conv1", "fc1", "fc2", "fc3"]
-LABELS = np.array([0, 1, 2, 3, 0, 1])
-FILES = tuple("abcdef")
+GIVEN = recorded(events(2))
 
 
 def rungs(verdict):
@@ -41,7 +40,7 @@ def small(tmp_path_factory):
 @pytest.fixture(scope="module")
 def verdict(small):
     checkpoint, adjacency, netlist = small
-    return verify(netlist, Factored(checkpoint, adjacency), events(2), LABELS, FILES)
+    return verify(netlist, Factored(checkpoint, adjacency), GIVEN)
 
 
 def by_specification(netlist, recordings):
@@ -71,10 +70,10 @@ def test_spikes_and_decisions(small, verdict):
     decisions = [spikes[-1].sum(axis=1).argmax(axis=1) for spikes in (narrow, chip)]
     assert verdict.float_predictions.tolist() == decisions[0].tolist()
     assert verdict.chip_predictions.tolist() == decisions[1].tolist()
-    assert verdict.accuracy["float"] == np.mean(decisions[0] == LABELS)
-    assert verdict.accuracy["chip"] == np.mean(decisions[1] == LABELS)
+    assert verdict.accuracy["float"] == np.mean(decisions[0] == GIVEN.labels)
+    assert verdict.accuracy["chip"] == np.mean(decisions[1] == GIVEN.labels)
     assert verdict.decision_agreement == np.mean(decisions[0] == decisions[1])
-    assert (verdict.files, verdict.labels.tolist()) == (FILES, LABELS.tolist())
+    assert (verdict.files, verdict.labels.tolist()) == (GIVEN.files, GIVEN.labels.tolist())
     assert verdict.spec_equals_engine
     assert verdict.spec_samples == 3
 
@@ -84,9 +83,7 @@ def test_the_first_divergence_is_the_first(tmp_path, seed, bits):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
     options = Options(packings=(Packing(bits=bits),), keep_all=bits == 6)
     netlist, recordings = compile_network(expand(checkpoint, adjacency), options).netlist, events(2 + seed, samples=3)
-    found = verify(
-        netlist, Factored(checkpoint, adjacency), recordings, LABELS[:3], FILES[:3], spec_samples=1
-    ).first_divergence
+    found = verify(netlist, Factored(checkpoint, adjacency), recorded(recordings), spec_samples=1).first_divergence
     reference = list(float_spikes(checkpoint, adjacency, recordings).values())
     chip, registers = by_specification(netlist, recordings)
     sample, step, layer, neuron = next(
@@ -98,7 +95,7 @@ def test_the_first_divergence_is_the_first(tmp_path, seed, bits):
         if reference[layer][sample, step, neuron] != chip[layer][sample, step, neuron]
     )
     compartment = netlist.compartments_of(layer)[neuron]
-    assert (found.file, found.step, found.layer, found.neuron) == (FILES[sample], step, LAYERS[layer], neuron)
+    assert (found.file, found.step, found.layer, found.neuron) == (f"{sample}.npy", step, LAYERS[layer], neuron)
     assert (found.taxel, found.feature) == ((neuron // 5, neuron % 5) if layer == 0 else (None, None))
     membranes = list(float_membranes(checkpoint, adjacency, recordings).values())
     assert found.float_membrane == membranes[layer][sample, step, neuron]
@@ -150,7 +147,7 @@ def test_saturation_is_a_rung_of_its_own(tmp_path):
     recordings = np.zeros((1, 6, 2, 80), np.uint8)
     recordings[:, :, :, 30:] = 1
     netlist = compile_network(expand(checkpoint, adjacency)).netlist
-    found = verify(netlist, Factored(checkpoint, adjacency), recordings, LABELS[:1], FILES[:1])
+    found = verify(netlist, Factored(checkpoint, adjacency), recorded(recordings))
     ladder = rungs(found)
     assert ladder["rounding"]["fc1"] < ladder["saturation"]["fc1"] == found.spikes["fc1"].different
     assert found.first_divergence.layer == "fc1"
@@ -165,14 +162,14 @@ def test_ill_posed_spikes_are_told_from_faults(tmp_path):
     arrays["fc2.weight"][:, :2] = [1.0, 2.0**-25]
     checkpoint, adjacency = small_checkpoint(tmp_path, last=arrays, beta=0.0, theta=1.0)
     netlist = compile_network(expand(checkpoint, adjacency), Options(keep_all=True)).netlist
-    found = verify(netlist, Factored(checkpoint, adjacency), events(0), LABELS, FILES)
+    found = verify(netlist, Factored(checkpoint, adjacency), recorded(events(0)))
     assert found.spikes["fc2"].float == 0
     assert found.spikes["fc2"].ill_posed == 6 * STEPS * 8
     assert found.spikes["fc1"].ill_posed == 0
     assert rungs(found)["float64"] == {"conv1": 0, "fc1": 0, "fc2": 6 * STEPS * 8, "fc3": 0}
     # a finer chip would have sided with float64; this one stands for it
     finer = dataclasses.replace(netlist, threshold=read_only(netlist.threshold - (netlist.layer == 2)))
-    first = verify(finer, Factored(checkpoint, adjacency), events(0), LABELS, FILES).first_divergence
+    first = verify(finer, Factored(checkpoint, adjacency), recorded(events(0))).first_divergence
     assert (first.layer, first.step, first.neuron, first.ill_posed) == ("fc2", 0, 0, True)
 
 
@@ -190,11 +187,9 @@ def test_a_single_wrong_bit_is_found_out(small, monkeypatch, field):
                 getattr(trace.counts, field.removeprefix("counted "))[0, -1] += 1
         return trace
 
-    assert verify(netlist, Factored(checkpoint, adjacency), events(2), LABELS, FILES, spec_samples=1).spec_equals_engine
+    assert verify(netlist, Factored(checkpoint, adjacency), GIVEN, spec_samples=1).spec_equals_engine
     monkeypatch.setattr(engine, "simulate", wrong)
-    assert not verify(
-        netlist, Factored(checkpoint, adjacency), events(2), LABELS, FILES, spec_samples=1
-    ).spec_equals_engine
+    assert not verify(netlist, Factored(checkpoint, adjacency), GIVEN, spec_samples=1).spec_equals_engine
 
 
 def test_the_ladder_carries_thresholds_that_differ(small):

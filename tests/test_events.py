@@ -269,10 +269,7 @@ def test_hot_taxels_exceed_five_times_the_median_and_silence_is_dead():
 
 
 def test_the_table_of_sources_holds_no_formula(tmp_path):
-    made = Recordings(
-        events=np.ones((1, 2, 2, 3), np.uint8), labels=np.zeros(1, np.int64), files=("=1+1.csv",), split="a", source="x"
-    )
-    write_released(tmp_path / "out", [made])
+    write_released(tmp_path / "out", [made(np.ones((1, 2, 2, 3)), files=("=1+1.csv",))])
     assert (tmp_path / "out" / "sources.csv").read_text().endswith(",'=1+1.csv\n")
 
 

@@ -25,8 +25,8 @@ layouts = st.lists(st.tuples(st.integers(-3, 3), st.integers(-3, 3)), min_size=2
 
 
 @pytest.fixture(scope="module")
-def released(shared_dir: Path) -> dict:
-    return json.loads((shared_dir / "checkpoints/released_graphs.json").read_text())
+def released(checkpoints: Path) -> dict:
+    return json.loads((checkpoints / "released_graphs.json").read_text())
 
 
 @pytest.mark.recordings

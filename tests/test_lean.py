@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_files import CLASSES, TAXELS, events, own_file, recordings_folder, small_checkpoint, weights
+from made_files import CLASSES, TAXELS, events, own_file, recorded, recordings_folder, small_checkpoint, weights
 from numpy.testing import assert_array_equal
 from random_netlists import Axon, Neuron, build
 
@@ -17,7 +17,6 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import without_channels
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.models.recordings.events import load_data
-from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.votes import predictions
@@ -39,10 +38,8 @@ def compiled(tmp_path_factory):
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"), last=weights(3, gain=2.5))
     network = expand(checkpoint, adjacency)
     compilation = compile_network(network, Options(training_events=made(1, 24)))
-    labels, names = np.arange(24) % CLASSES, tuple(map(str, range(24)))
-    seen = Recordings(events=made(1, 24), labels=labels, files=names, split="train", source="made")
     loaded = LoadedNetwork(network=network, sha256="", checkpoint=checkpoint, adjacency=adjacency)
-    return loaded, compilation, seen
+    return loaded, compilation, recorded(made(1, 24))
 
 
 def counts(netlist, seen):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from made_files import recorded
 from made_modules import CLASSES, NETS, TAXELS, AllSteps, OneStep, example_of, mlp, seeded
 from oracles import refused
 from torch import nn
@@ -93,8 +94,7 @@ def test_layers_beside_each_other():
     net = seeded(TwoWays)
     network = module_network(net, torch.zeros(1, 4))
     assert [(p.pre, p.post) for p in network.projections] == [(-1, 0), (-1, 1), (0, 2), (1, 2)]
-    events = events_of(network)
-    found = verify(compile_network(network).netlist, network, events, np.arange(3) % 2, tuple("abc"))
+    found = verify(compile_network(network).netlist, network, recorded(events_of(network)))
     assert found.spec_equals_engine
 
 

@@ -127,10 +127,10 @@ def test_recordings_do_not_influence_each_other(tmp_path):
 
 
 @pytest.mark.recordings
-def test_every_released_spike_count(released_checkpoint, objects_zip, shared_dir):
+def test_every_released_spike_count(released_checkpoint, objects_zip, checkpoints):
     checkpoint = read_checkpoint(released_checkpoint)
     data = load_data(objects_zip, "test", classes=checkpoint.classes, taxels=checkpoint.taxels)
-    expected = json.loads((shared_dir / "checkpoints" / "objects_manual.expected.json").read_text())
+    expected = json.loads((checkpoints / "objects_manual.expected.json").read_text())
     spikes = float_spikes(checkpoint, adjacency_of(), data.events)
     assert list(data.files) == expected["files"]
     assert data.labels.tolist() == expected["labels"]
@@ -361,7 +361,7 @@ def test_fine_tuned_on_the_chips_integers_they_are_the_chip(tmp_path, system, bi
     again = saved(tmp_path, network, weights=tuned.net.tensors(), forms=tuned.net.forms)
     netlist = compile_network(expand(again, seen), Options(forms=again.forms)).netlist
     assert {projection.bits for projection in lift(netlist).projections} == {bits}
-    verdict = verify(netlist, Factored(again, seen), test.events, test.labels, test.files)
+    verdict = verify(netlist, Factored(again, seen), test)
     assert verdict.quantised_different == 0
     assert verdict.spikes["fc1"].chip > 0
     model = list(quantised_spikes(Factored(again, seen), test.events).values())[-1]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_files import events, small_checkpoint
+from made_files import events, recorded, small_checkpoint
 from oracles import probed, refused
 from random_networks import (
     assert_same_layers,
@@ -238,9 +238,9 @@ def test_unread_neurons_are_not_compared(tmp_path):
     weak[:, :3] *= 1e-6
     changed = replace(checkpoint, dense=(replace(checkpoint.dense[0], weight=weak), *checkpoint.dense[1:]))
     compilation = compile_network(expand(changed, adjacency))
-    netlist, labels = compilation.netlist, np.zeros(6, np.int64)
+    netlist = compilation.netlist
     assert netlist.layers[0].unread == (0, 1, 2)
-    verdict = verify(netlist, Factored(changed, adjacency), events(2), labels, tuple("abcdef"))
+    verdict = verify(netlist, Factored(changed, adjacency), recorded(events(2)))
     reference = run_float(compilation.network, channels_last(events(2))).spikes[0]
     assert reference[..., :3].any()
     assert verdict.spikes["conv1"].float == int(reference[..., 3:].sum())

@@ -9,7 +9,7 @@ import pytest
 from commands import as_json, run
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from made_files import CLASSES, TAXELS, events, recordings_folder
+from made_files import CLASSES, TAXELS, events, recorded, recordings_folder
 from numpy.testing import assert_array_equal
 from random_netlists import large_netlist, lively, netlists, recordings, voting
 from random_networks import random_checkpoint, ring
@@ -19,7 +19,6 @@ from spikeloom.compiler import compile_network, write_netlist
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.machines.changes import Changes, by_running, joined, single
@@ -127,15 +126,7 @@ def test_what_is_known_again_is_so_after_any_past(seed):
 
 
 def study_of(netlist, given, **options):
-    count = len(given)
-    data = Recordings(
-        events=given,
-        labels=np.arange(count) % netlist.classes,
-        files=tuple(f"r{i}" for i in range(count)),
-        split="test",
-        source="made",
-    )
-    return stability(machine_of(netlist), data, jobs=1, **options)
+    return stability(machine_of(netlist), recorded(given), jobs=1, **options)
 
 
 def decided(netlist, given):
@@ -193,7 +184,7 @@ def test_counters_bear_exactly_so_many_events(plan):
     rng, labels = np.random.default_rng(3), np.arange(24) % 3
     often = np.random.default_rng(4).random((3, 2, 2, 1))
     given = (rng.random((24, 2, 2, 16)) < 0.6 * often[labels]).astype(np.uint8)
-    data = Recordings(events=given, labels=labels, files=tuple(map(str, range(24))), split="train", source="made")
+    data = recorded(given, labels)
     seen = counted(data, plan)
     made = counters_of(seen, fit(seen, 3), data, 3)
     machine = machine_of(compile_network(counting_network(made)).netlist)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_files import CLASSES, STEPS, TAXELS, events, small_checkpoint
+from made_files import CLASSES, STEPS, TAXELS, events, recorded, small_checkpoint
 from numpy.testing import assert_array_equal
 from timed_networks import events_of, written
 
@@ -72,8 +72,7 @@ def test_clean_recordings_are_what_reference_and_engine_say(bench, small):
         ids = bench.pair.netlist.compartments_of(layer)
         assert counted.layers[name][1] == trace.counts.spikes[:, ids].sum()
         assert counted.layers[name][3] == len(ids) * 8 * STEPS
-    known = bench.pair.netlist, Factored(*small), bench.events, bench.labels, bench.files
-    for name, spikes in verify(*known).spikes.items():
+    for name, spikes in verify(bench.pair.netlist, Factored(*small), recorded(bench.events)).spikes.items():
         assert counted.layers[name][:3] == (spikes.float, spikes.chip, spikes.different)
     equal = np.count_nonzero(vote(found.votes["chip"]) == vote(counts))
     assert counted.equal == equal

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_files import recorded
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import refused
 from random_networks import LOIHI, chain, integer_chain, integer_population, small_target, stored
@@ -160,7 +161,7 @@ def test_the_decay_alone_is_a_rung_of_the_ladder(tmp_path):
         assert [p.realised_alpha for p in integer.populations[1:]] == [0.5] * 3
         events = events_of(21, samples=8, steps=200)
         netlist = compile_network(network).netlist
-        verdict = verify(netlist, Factored(checkpoint, seen), events, np.zeros(8, np.int64), ("r",) * 8, spec_samples=1)
+        verdict = verify(netlist, Factored(checkpoint, seen), recorded(events), spec_samples=1)
         different = {rung.stage: sum(rung.different.values()) for rung in verdict.ladder}
         moved.append(different["beta"] - different["float64"])
     assert moved[0] == 0

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from made_files import checkpoint_bytes, ring, small_checkpoint, weights
+from made_files import checkpoint_bytes, recorded, ring, small_checkpoint, weights
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import comparable, load_weights, refused
 from test_checkpoint import rebuilt
@@ -231,13 +231,12 @@ def test_the_validation_part_is_a_fifth_of_every_class_and_disjoint():
 LOIHI = load_target("loihi1")
 
 
-def drawn(checkpoint, seed, *, samples=12, steps=20, split="train"):
+def drawn(checkpoint, seed, *, samples=12, steps=20):
     rng = np.random.default_rng(seed)
     labels = rng.integers(0, checkpoint.classes, samples)
     rate = 0.05 + 0.3 * (labels[:, None, None, None] / max(1, checkpoint.classes - 1))
     events = (rng.random((samples, checkpoint.taxels, 2, steps)) < rate).astype(np.uint8)
-    files = tuple(f"sample_{i}.npy" for i in range(samples))
-    return Recordings(source="made", split=split, events=events, labels=labels, files=files)
+    return recorded(events, labels)
 
 
 def tuned_forms(checkpoint, adjacency, events, bits):

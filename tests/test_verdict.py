@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_files import CLASSES, events, small_checkpoint, weights
+from made_files import events, recorded, small_checkpoint, weights
 
 from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.errors import OptionError
@@ -100,7 +100,6 @@ def test_gates_that_cannot_be_read(words, why):
 
 
 FILES = tuple("abcdef")
-LABELS = np.arange(6) % CLASSES
 
 
 def found(before, after, *, votes=None):
@@ -153,7 +152,7 @@ def test_votes_that_decide_little(before, after, expected):
 def verified(folder, arrays, recordings, packing, **options):
     checkpoint, adjacency = small_checkpoint(folder, last=arrays)
     netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(packing,), **options)).netlist
-    made = verify(netlist, Factored(checkpoint, adjacency), recordings, LABELS, FILES)
+    made = verify(netlist, Factored(checkpoint, adjacency), recorded(recordings))
     return {breakdown.kind: breakdown for breakdown in made.breakdowns}
 
 

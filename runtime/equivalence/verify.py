@@ -15,6 +15,7 @@ from spikeloom.compiler.interpret import channels_last, cut, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
 from spikeloom.runtime.equivalence.certificates import Certifier
 from spikeloom.runtime.equivalence.reference import (
@@ -39,11 +40,8 @@ Layers = Sequence[BoolArray]
 def verify(
     netlist: Netlist,
     source: Factored | Network,
-    events: EventArray,
-    labels: IntArray,
-    files: tuple[str, ...],
+    data: Recordings,
     *,
-    lengths: IntArray | None = None,
     original: Factored | Network | None = None,
     spec_samples: int = 3,
     engine_name: str = ENGINES[0],
@@ -53,29 +51,18 @@ def verify(
 ) -> Verdict:
     """Compare float model, chip and specification.
 
-    Parameters
-    ----------
-    source : Factored or Network
-        What the netlist was compiled from, a checkpoint on its graph or a network, or another of the same architecture.
-    events, labels, files, lengths
-        Recordings (samples, taxels, polarities, steps) uint8, their classes, names, and steps that count.
-    original : Factored or Network, optional
-        Float model to compare with; by default `source` itself.
-    spec_samples, engine_name
-        Recordings on which the specification runs beside the engine; which of ``ENGINES`` runs, too.
-    required : mapping of level to share, optional
-        What has to be reached, see :mod:`equivalence.verdict`; EN always has to be.
-    rounding : Rounding, optional
-        What is known of EN; by default it is found here.
-    progress : callable, optional
-        Called with the name of each part as it starts, and the number of recordings that are done.
+    The `source` is what the netlist was compiled from, a checkpoint on its graph or a network, or another of the same
+    architecture; the float model to compare with is the `original`, by default the same. The specification runs beside
+    the engine on so many samples, one of ``ENGINES`` on all. `required` shares of levels have to be reached, see
+    :mod:`equivalence.verdict`, EN always; `rounding` is what is known of that. `progress` is called with the name of
+    each part as it starts, and the number of recordings that are done.
 
     Raises ModelError, DataError, NumericRangeError or OptionError if the parts do not belong together, a register of
     the chip overflows, or the further engine is not installed or cannot hold the netlist.
     """
     if not 1 <= spec_samples:
         raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")
-    begin = progress or (lambda _part, _done: None)
+    begin, events, lengths = progress or (lambda _part, _done: None), data.events, data.lengths
     model = source if original is None else original
     require_match(netlist, source)
     require_match(netlist, model)
@@ -123,15 +110,15 @@ def verify(
             different[stage] += _differences(reference, lower)
             if stage == LADDER[0] and divergence is None:
                 begin("first divergence", first)
-                divergence = _first_divergence(machine, model, reference, chip, lower, part, files[rows])
+                divergence = _first_divergence(machine, model, reference, chip, lower, part, data.files[rows])
         float_votes[rows] = readout_counts(network.readout, network.classes, reference[network.readout.population])
         chip_votes[rows] = ran.votes
         begin("certificate", first)
         certifier.add(part, chip, ran.decisions, ends)
 
     return Verdict(
-        files=files,
-        labels=labels,
+        files=data.files,
+        labels=data.labels,
         float_predictions=vote(float_votes),
         chip_predictions=vote(chip_votes),
         float_counts=float_votes,
@@ -163,7 +150,7 @@ def verify(
             [theirs for _, theirs in fired],
             neurons,
             (float_votes, chip_votes),
-            files,
+            data.files,
         ),
         not_compared={name: int(out.sum()) for name, out in zip(names, machine.unread, strict=True) if out.any()},
         certificate=certifier.certificate(),

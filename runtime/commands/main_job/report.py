@@ -82,11 +82,8 @@ def _report(
     verdict = verify(
         netlist,
         loaded.model,
-        data.events,
-        data.labels,
-        data.files,
+        data,
         spec_samples=arguments.spec_samples,
-        lengths=data.lengths,
         required={"E0": 1.0},
         progress=account.begin,
     )
