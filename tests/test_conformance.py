@@ -193,20 +193,6 @@ def test_each_recording_is_decided_as_it_is_alone(name):
     assert together.votes.any()
 
 
-@over(LAYERED)
-def test_streams_give_the_votes_of_whole_recordings(name):
-    made = specimen(name)
-    votes = made.machine.run(made.events).votes
-    stream = made.machine.stream()
-    for recording, expected in zip(made.events[:2], votes, strict=False):
-        for column in np.moveaxis(recording, -1, 0):
-            last = stream.step(column)
-        last = (last, *stream.finish())[-1]
-        assert_array_equal(last.counts, expected)
-        assert last.decision == expected.argmax()
-        stream.reset()
-
-
 @over(MAKERS)
 def test_a_file_holds_the_netlist_to_the_byte(name):
     made = specimen(name)
@@ -348,7 +334,7 @@ def test_other_commands_print_the_keys_of_the_table(command, tmp_path):
     require_keys(command, as_json(*words.format(**places).split(), codes=(0, 1)))
 
 
-@over(("timed", "joined", "binned", "recurrent", "netx", "counters"))
+@over(LAYERED)
 def test_watch_decides_as_run(name, tmp_path):
     made = specimen(name)
     lines = []

@@ -16,7 +16,7 @@ import spikeloom.runtime.studies.stress.pair
 from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.formats.text import text
-from spikeloom.compiler.interpret import run_float, run_integer, vote
+from spikeloom.compiler.interpret import run_float, run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent
 from spikeloom.runtime.machines.base import machine_of
@@ -128,10 +128,6 @@ def test_saturation_can_be_left_out():
     free = run_integer(network, events, membranes=True, saturates=False).membranes[0][0, :, 0]
     assert held.tolist() == [-2097152, -4194304, -6291456, -8388607, -8388607, -8388607]
     assert free.tolist() == [-2097152 * k for k in range(1, 7)]
-
-
-def test_the_lowest_class_wins_a_tie():
-    assert vote(np.array([[0, 2, 2], [0, 0, 0], [1, 0, 3]])).tolist() == [1, 0, 2]
 
 
 def lively(weights=3, seed=0, sizes=(8, 6, 5, 4)):

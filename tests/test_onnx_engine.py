@@ -125,17 +125,8 @@ def test_all_recordings(fixture, bits, request, tmp_path):
     for split, size in zip(("train", "test"), sizes, strict=True):
         events = load_data(archive, split).events
         assert len(events) == size
-        words = [
-            "compile",
-            f"pretrained:{name}",
-            "--calibrate",
-            archive,
-            "--weight-bits",
-            bits,
-            "-o",
-            tmp_path / "n.loom",
-        ]
-        assert cli.main([*map(str, words)]) == 0
+        words = ["compile", f"pretrained:{name}", "--calibrate", archive, "--weight-bits", bits]
+        assert cli.main([*map(str, words), "-o", str(tmp_path / "n.loom")]) == 0
         netlist = read_netlist(tmp_path / "n.loom")
         total = 0
         for start in range(0, size, PART):

@@ -87,13 +87,7 @@ def test_votes_count_in_their_window_only(first, votes):
 @given(crossbars(), st.integers(0, 2**31))
 def test_engine_equals_specification(netlist, seed):
     assert faults(netlist, CHIP) == ()
-    both(netlist, events(seed, 3, 20))
-
-
-@settings(max_examples=15)
-@given(crossbars(), st.integers(0, 2**31))
-def test_recordings_of_a_batch_do_not_depend_on_each_other(netlist, seed):
-    recordings, lengths = events(seed, 3, 12, samples=3), np.array([12, 7, 1])
+    recordings, lengths = events(seed, 3, 20, samples=3), np.array([20, 7, 1])
     batch = engine.simulate(netlist, recordings, lengths=lengths, spikes=True, membranes=True)
     for sample, steps in enumerate(lengths):
         assert_equal(spec.simulate(netlist, recordings[sample, :, :steps]), recording_of(batch, sample))
