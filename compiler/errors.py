@@ -6,7 +6,9 @@ and exits with 2; nothing here carries a traceback to a user.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 
 class SpikeloomError(Exception):
@@ -23,6 +25,14 @@ class DataError(SpikeloomError):
 
 class OptionError(SpikeloomError):
     """An option has a value that does not exist: the user mends the command."""
+
+
+def require_least(values: Mapping[str, Any], **least: int) -> None:
+    """Refuse numbers that are less than their options allow, where they are given; OptionError."""
+    for name, lowest in least.items():
+        if values[name] is not None and values[name] < lowest:
+            option = f"--{name.replace('_', '-')} {values[name]}"
+            raise OptionError(f"{option}: allowed are {lowest} or more; choose another")
 
 
 class FormatError(SpikeloomError):

@@ -201,7 +201,7 @@ TABLE = [
     *((WATCH.format(words), f"{words}: ") for words in ("--bin nan", "--bins 0")),
     # training
     (TRAIN.format("--system counters --epochs 3"), "--epochs 3: counters are trained without; omit it"),
-    (TRAIN.format("--system counters --window 50"), "--window 50: counters see what comes later; give --parts 2"),
+    (TRAIN.format("--system counters --window 50"), "--window 50%: counters see what comes later; give --parts 2"),
     (TRAIN.format("--system counters --seed 3"), "omit --recipe, --seed and --seeds"),
     (TRAIN.format("--system mlp --parts 3"), "--parts 3: is for --system counters; omit it"),
     (TRAIN.format("--system mlp --hops 2"), "--hops 2: an MLP has no hops to choose; omit it"),
@@ -211,6 +211,23 @@ TABLE = [
     (SEEDS.format(f"-o x.pt --seed {10**22}"), f"--seed {10**22}: allowed are 0 to {2**63 - 1}"),
     (SEEDS.format("-o x.pt --picture none/x.png"), "--picture none/x.png: the folder does not exist"),
     (SEEDS.format("-o x.pt --epochs 1 --resume"), "nothing was interrupted, neither x.pt nor x.pt.state.validation"),
+    (TRAIN.format("--system counters --levels 0"), "--levels 0: allowed are 1 or more"),
+    *(
+        (f"train --data nowhere --graph manual -o x.pt {words}", f"{words}: allowed are ")
+        for words in ("--epochs 0", "--batch 0", "--robust 2", "--seed -5", "--decay-epochs 0")
+    ),
+    *(
+        (f"finetune net.pt --data nowhere -o x.pt {words}", f"{words}: ")
+        for words in ("--epochs 0", "--seed -5", "--robust 2", "--weight-bits 7")
+    ),
+    *(
+        (f"{command} --jobs 0", "--jobs 0: allowed are 1")
+        for command in ("smallest --data data -o x.loom", "chart net.pt --data data -o x")
+    ),
+    *(
+        (f"smallest --data data -o x.loom --levels {n}", f"--levels {n}: {why}")
+        for n, why in ((0, "allowed are 1"), (3, "4 classes are no"))
+    ),
     # prices
     ("estimate net.loom --data data --detail spikes", "argument --detail: invalid choice|counts|cycle"),
     # places to write

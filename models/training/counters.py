@@ -23,7 +23,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import MOST_CLOCKS
-from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.errors import DataError, OptionError, require_least
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.events import joined_bins
@@ -70,6 +70,7 @@ class Plan:
 
     def require_possible(self) -> None:
         """Refuse numbers that no network has."""
+        require_least({"levels": self.levels}, levels=1)
         if not 1 <= self.parts <= MOST_CLOCKS:
             raise OptionError(f"--parts {self.parts}: allowed are 1 to {MOST_CLOCKS}; choose another")
         if not 1 <= self.window <= WHOLE:
@@ -155,6 +156,12 @@ class Rule:
         return highest
 
 
+def require_levels(levels: int, classes: int) -> None:
+    """Refuse levels that do not divide the classes; OptionError."""
+    if classes % levels:
+        raise OptionError(f"--levels {levels}: {classes} classes are no multiple of it; give another")
+
+
 def linear_rules(data: Counted, classes: int, strengths: Iterable[float]) -> dict[float, Rule]:
     """For each strength a support vector machine without bias, one class against the rest.
 
@@ -163,8 +170,7 @@ def linear_rules(data: Counted, classes: int, strengths: Iterable[float]) -> dic
     boundary below them, on recordings of the thing alone; what a class weighs is the sum of all up to it.
     """
     levels = data.plan.levels
-    if levels < 1 or classes % levels:
-        raise OptionError(f"--levels {levels}: {classes} classes are no multiple of it; give another")
+    require_levels(levels, classes)
     used = np.flatnonzero((data.spikes > 0).sum(axis=0) >= LEAST)
     if not len(used):
         raise DataError("counters: none of them spikes; give other --thresholds, or recordings with events")

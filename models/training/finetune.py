@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from spikeloom.compiler import KEEP, Options, Packing
 from spikeloom.compiler.archive import arrays_digest
-from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.errors import require_least
 from spikeloom.compiler.interpret import channels_last, cut
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.calibrate import calibrate
@@ -95,9 +95,7 @@ def finetune(
     OptionError, ModelError, CapacityError or DataError if options, network or recordings cannot be used, or the loss is
     no longer a number.
     """
-    for name, value, least in (("--epochs", epochs, 1), ("--seed", seed, 0)):
-        if value < least:
-            raise OptionError(f"{name} {value}: allowed are {least} or more; choose another")
+    require_least({"epochs": epochs, "seed": seed}, epochs=1, seed=0)
     require_chance(robust)
     packings = None if bits is None else [Packing(bits=width, groups=groups) for width in bits]
     asked = Options(packings=packings, keep=KEEP, keep_all=True, training_events=training.events)

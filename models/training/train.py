@@ -30,7 +30,7 @@ import torch
 from tqdm import tqdm
 
 from spikeloom.compiler.archive import arrays_digest
-from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.errors import DataError, OptionError, require_least
 from spikeloom.compiler.types import FloatArray
 from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.networks import Sizes, SpikingNet, TrainedModule, Weights
@@ -224,9 +224,7 @@ def _train_epoch(
 
 def _require_options(epochs: int, decay_epochs: int, seed: int) -> None:
     """Refuse numbers that are too small or large."""
-    for name, value, least in (("epochs", epochs, 1), ("decay-epochs", decay_epochs, 1), ("seed", seed, 0)):
-        if value < least:
-            raise OptionError(f"--{name} {value}: allowed are {least} or more; choose another")
+    require_least({"epochs": epochs, "decay_epochs": decay_epochs, "seed": seed}, epochs=1, decay_epochs=1, seed=0)
     if seed > MOST_SEED:
         raise OptionError(f"--seed {seed}: allowed are 0 to {MOST_SEED}; choose another")
 

@@ -22,7 +22,7 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
 
-from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, UnfinishedError
+from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, UnfinishedError, require_least
 from spikeloom.compiler.files import WRITTEN, FileFault, reading, remove_leftovers
 from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.report.console import Progress, progress, tell
@@ -146,8 +146,7 @@ def side_by_side(
     raised; UnfinishedError, if a process ended while it worked, and with it what the others had not finished. If all
     stand still what they had not finished is begun once more.
     """
-    if jobs is not None and jobs < 1:
-        raise OptionError(f"--jobs {jobs}: allowed are 1 or more; choose another")
+    require_least({"jobs": jobs}, jobs=1)
     processes = min(jobs or os.cpu_count() or 1, len(payloads))
     if processes <= 1:
         with _one_thread():

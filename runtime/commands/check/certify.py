@@ -8,7 +8,7 @@ from pathlib import Path
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.archive import arrays_digest
-from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.errors import require_least
 from spikeloom.compiler.files import sha256_of
 from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.commands.options import add_netlist, add_picture, add_recordings
@@ -47,10 +47,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     require_place(arguments.output, "-o", arguments)
     require_picture(arguments, [arguments.output])
-    for name, least in (("shift", 0), ("most", 1), ("jobs", 1)):
-        count = getattr(arguments, name)
-        if count is not None and count < least:
-            raise OptionError(f"--{name} {count}: allowed are {least} or more; choose another")
+    require_least(vars(arguments), shift=0, most=1, jobs=1)
     machine = machine_for(arguments.netlist)
     data = load_recordings(arguments, machine.netlist, labels_for="certify", joined=False)
     singles = int(data.step_counts.sum()) * data.taxels * data.events.shape[2]

@@ -2,7 +2,7 @@
 
 import argparse
 
-from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.errors import OptionError, require_least
 from spikeloom.runtime.commands.options import add_netlist_and_model, add_picture, add_recordings
 from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
 from spikeloom.runtime.report.encode import write_json
@@ -40,10 +40,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; exit code 1 where a requirement is missed."""
     require_place(arguments.output, "-o", arguments)
     require_picture(arguments, [arguments.output])
-    for name in ("seeds", "jobs"):
-        count = getattr(arguments, name)
-        if count is not None and count < 1:
-            raise OptionError(f"--{name} {count}: allowed are 1 or more; choose another")
+    require_least(vars(arguments), seeds=1, jobs=1)
     chosen = list(NAMES) if arguments.only is None else [name.strip() for name in arguments.only.split(",")]
     for name in chosen:
         if name not in NAMES:

@@ -4,7 +4,7 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.errors import OptionError, require_least
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.runtime.commands.options import add_data, add_model
 from spikeloom.runtime.inputs import repeat
@@ -53,6 +53,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     folder = Path(arguments.output)
     if folder.is_file():
         raise OptionError(f"-o {folder}: is not a folder; name another")
+    require_least(vars(arguments), jobs=1)
     require_place(str(folder / STORE if folder.exists() else folder), "-o", arguments)
     networks = read_networks(arguments)
     tables = [table.name for table in target.energy]

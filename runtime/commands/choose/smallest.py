@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler import DEFAULT_TARGET
+from spikeloom.compiler.errors import require_least
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.systems import MLP, SYSTEMS
@@ -17,6 +18,7 @@ from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import taxels_alone
+from spikeloom.models.training.counters import require_levels
 from spikeloom.runtime.commands.options import add_data, add_graph_options
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import require_place
@@ -75,9 +77,11 @@ def run(arguments: argparse.Namespace) -> Outcome:
     for place, option, kinds in ((output, "-o", ["loom"]), (network, "-o", ()), (store, "--store", ())):
         require_place(str(place), option, arguments, kinds)
     require_place(arguments.html, "--html", arguments, ["html"])
+    require_least(vars(arguments), jobs=1, levels=1)
     budgets = parse_budgets([words for each in arguments.budget for words in each.split(",")], LIMITS)
     taxels = None if arguments.taxels is None else len(sensor_places(arguments.taxels))
     training, test = both_splits(arguments.data, taxels, arguments.bin)
+    require_levels(arguments.levels or 1, int(training.labels.max()) + 1)
     arguments.bin = training.seconds
     sensor = _sensor(arguments, training.taxels)
     data = data_of(arguments.data, arguments.bin, training, test)

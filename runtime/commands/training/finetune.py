@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spikeloom.compiler import DEFAULT_TARGET, round_to_forms
+from spikeloom.compiler import DEFAULT_TARGET, Packing, check_packings, round_to_forms
 from spikeloom.compiler.checkpoint import WEIGHTS, layers_of
-from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.errors import ModelError, OptionError, require_least
 from spikeloom.compiler.files import remove_leftovers, sha256_of, write_atomically
 from spikeloom.compiler.formats import NIR
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
@@ -20,6 +20,7 @@ from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import BIN_S, data_digest
 from spikeloom.models.recordings.grasps import SYNTHETIC
+from spikeloom.models.training.robust import require_chance
 from spikeloom.runtime.commands.main_job import compile
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_data, add_network
 from spikeloom.runtime.inputs import repeat
@@ -129,6 +130,8 @@ def _state(output: Path, *, resume: bool) -> Path:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Fine-tune, write the checkpoint, report; the text of a KeyboardInterrupt says what is kept."""
     require_place(arguments.output, "-o", arguments, ["pt", "nir"])
+    require_least(vars(arguments), epochs=1, seed=0)
+    require_chance(arguments.robust or 0.0)
     with only_one(Path(arguments.output)):
         return Outcome(_finetuned(arguments, Path(arguments.output)), finetune_sections)
 
@@ -142,6 +145,8 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
         repeat.refuse(arguments, ("scale_groups",), "is for --weight-bits; held-out recordings choose the storage")
     loaded = load_network(arguments.checkpoint, arguments)
     _require_trainable(arguments, loaded, output)
+    if widths is not None:
+        check_packings([Packing(bits=width) for width in widths], len(loaded.network.populations), target)
     require_splits(arguments.data)
     taken = loaded.network.input
     found = [

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from spikeloom.compiler.checkpoint import WEIGHTS
-from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.errors import DataError, OptionError, require_least
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS, TACTILESGNET, TITLES, Grid
 from spikeloom.compiler.targets.native import BASES, USUAL_COPIES
@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     counting.add_argument("--levels", type=int, metavar="N", help=what)
     what = "of a weight, 2 to 8 (default: 8; truenorth holds up to 5)"
     counting.add_argument("--weight-bits", type=int, metavar="N", help=what)
-    parser.add_argument("--window", metavar="P%%", help="train on the first so many per cent of each recording")
+    parser.add_argument("--window", metavar="PERCENT", help="train on the first so many per cent of each recording")
     parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
     what = "loss of a spike on every synapse in every step: fewer spikes"
     parser.add_argument("--spike-penalty", type=float, metavar="X", help=what)
@@ -96,6 +96,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_bins(arguments.join)
     require_place(arguments.output, "-o", arguments, ["pt"])
     require_picture(arguments, ())
+    require_least(vars(arguments), epochs=1, decay_epochs=1, seed=0)
+    _recipe(arguments)  # which refuses, before the recordings are read
     graph, _ = _sensor(arguments)
     percent = WHOLE if arguments.window is None else parse_window(arguments.window)
     training, test = (first_part(each, percent) for each in both_splits(arguments.data, graph.n_taxels, arguments.bin))
@@ -136,7 +138,7 @@ def _count(arguments: argparse.Namespace) -> Outcome:
     plan.require_possible()
     if plan.window < WHOLE and plan.parts == 1:
         raise OptionError(
-            f"--window {plan.window}: counters see what comes later; give --parts 2 or more, which gates them"
+            f"--window {plan.window}%: counters see what comes later; give --parts 2 or more, which gates them"
         )
     taxels = None if arguments.taxels is None else len(sensor_places(arguments.taxels))
     training, test = both_splits(arguments.data, taxels, arguments.bin)
