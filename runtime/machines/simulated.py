@@ -107,8 +107,10 @@ class Account:
             self._seconds[self._now] += now - self._since
         self._seconds.setdefault(part, 0.0)
         self._now, self._since = part, now
-        if KINDS[part].over != "none":
+        if (over := KINDS[part].over) == "all":
             self._progress(done, part)
+        elif over != "none":
+            progress(part)
 
     def explained(self, wanted: bool) -> tuple[Part, ...] | None:
         """All parts in their order, written to stderr too, if they are wanted; the last one ends now."""

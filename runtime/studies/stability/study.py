@@ -51,9 +51,10 @@ def stability(
         delayed(verdict)(machine, events[..., :length], label, file, shift=shift, most=most, tally=tally)
         for events, length, label, file in zip(data.events, lengths, data.labels.tolist(), data.files, strict=True)
     )
+    progress(0, "certifying")
     for done, found in enumerate(work(each), 1):
         verdicts.append(found)
-        progress(done, "recordings")
+        progress(done, "certifying")
     netlist = machine.netlist
     return Stability(
         target=netlist.target,
