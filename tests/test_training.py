@@ -273,7 +273,7 @@ def test_a_killed_sweep_goes_on_with_what_it_had(tmp_path, end):
 
 def test_a_process_that_dies_leaves_what_the_others_had(tmp_path):
     made = points(tmp_path / "log", 6, trouble={5: "die"}, seconds={5: 1.0})
-    with pytest.raises(UnfinishedError, match=r"ended early.*\n5 of 6 measurements are kept in"):
+    with pytest.raises(UnfinishedError, match=r"ended early.*\n5 of 6 measurements of this stage are kept in"):
         swept_here(tmp_path, made, jobs=2)
     assert list(swept_here(tmp_path, points(tmp_path / "log", 6), jobs=2).values()) == expected(6)
 
@@ -292,13 +292,15 @@ def test_what_a_measurement_raises_arrives_and_results_are_kept(tmp_path, jobs):
     with pytest.raises(DataError, match="is empty") as raised:
         swept_here(tmp_path, made, jobs=jobs)
     assert raised.value.__notes__[0] == "number 2"
-    assert raised.value.__notes__[1].endswith(f"of 4 measurements are kept in {tmp_path / 'x.store'}")
+    assert raised.value.__notes__[1].endswith(f"of 4 measurements of this stage are kept in {tmp_path / 'x.store'}")
     with pytest.raises(ZeroDivisionError, match="a defect"):
         swept_here(tmp_path, points(tmp_path / "log", 5, trouble={4: "defect"}), jobs=jobs)
 
 
 def test_an_interrupt_keeps_all(tmp_path):
-    with pytest.raises(KeyboardInterrupt, match=r"2 of 3 measurements are kept in .*; go on with the same command"):
+    with pytest.raises(
+        KeyboardInterrupt, match=r"2 of 3 measurements of this stage are kept in .*; go on with the same command"
+    ):
         swept_here(tmp_path, points(tmp_path / "log", 3, trouble={2: "interrupt"}), jobs=1)
 
 

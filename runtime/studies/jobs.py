@@ -94,7 +94,9 @@ def sweep(
         waiting = [first[key] for key in keys if key not in results]
 
         def standing() -> str:
-            return f"{sum(key in results for key in keys)} of {len(keys)} measurements are kept in {store}"
+            return (
+                f"{sum(key in results for key in keys)} of {len(keys)} measurements of this stage are kept in {store}"
+            )
 
         progress = Progress(len(waiting))
         try:
