@@ -26,7 +26,7 @@ SYSTEMS = {TACTILESGNET: "TactileSGNet", GRID_CNN: "grid-based CNN", MLP: "MLP",
 PANELS = {"training_loss": "training loss", "test_loss": "test loss", "test_accuracy": "test accuracy, %"}
 
 
-@styled
+@styled()
 def draw(found: dict[str, Any]) -> Drawing:
     """A panel for each figure of an epoch, a line for each system."""
     drawing = sheet("Loss and accuracy of four systems, epoch by epoch", 2.8)

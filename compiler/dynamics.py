@@ -36,11 +36,7 @@ class Clocks:
     length: int | None = field(default=None, metadata={"optional": True})
 
     def events(self, steps: int, *, first: int = 0) -> EventArray:
-        """Events of the steps ``first … first + steps - 1``, (channels, steps).
-
-        >>> Clocks(channels=2, steps=2).events(5).tolist()
-        [[1, 1, 0, 0, 0], [0, 0, 1, 1, 0]]
-        """
+        """Events of the steps ``first … first + steps - 1``, (channels, steps)."""
         part = np.arange(first, first + steps) // self.steps
         return np.asarray((part == np.arange(self.channels)[:, None]).astype(np.uint8))
 
@@ -53,11 +49,7 @@ NO_CLOCKS = Clocks()
 
 
 def clocks_over(channels: int, steps: int) -> Clocks:
-    """Clocks that share recordings of so many steps among them.
-
-    >>> clocks_over(8, 250).steps
-    32
-    """
+    """Clocks that share recordings of so many steps among them."""
     return Clocks(channels=channels, steps=-(-steps // channels)) if channels else NO_CLOCKS
 
 

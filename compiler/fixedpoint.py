@@ -63,11 +63,6 @@ def decay_registers(beta: float, alpha: float = 0.0) -> tuple[int, int]:
 
     The chip's current loses one part in 4096 more than its register says. So it can forget all, which a membrane
     cannot, and cannot keep all.
-
-    >>> decay_registers(0.2)
-    (4095, 3277)
-    >>> decay_registers(0.2, 0.95)
-    (204, 3277)
     """
     return min(4095, max(0, round(4096 * (1 - alpha)) - 1)), min(4095, max(0, round(4096 * (1 - beta))))
 
@@ -96,11 +91,7 @@ def largest_current(worst: IntArray, decay_u: IntArray | int) -> IntArray:
 
 
 def plane_distance(bits: int) -> int:
-    """Largest difference of exponents at which two planes leave no gap between their values.
-
-    >>> [plane_distance(bits) for bits in (8, 4, 2)]
-    [7, 3, 1]
-    """
+    """Largest difference of exponents at which two planes leave no gap between their values."""
     return bits - 1
 
 

@@ -95,11 +95,6 @@ def build_graph(name: str, coordinates: ArrayLike = NEUTOUCH) -> Graph:
     ``released:knn:K`` lists a mutual pair twice in each direction, ``released:mst:SIGMA`` repeats the tree edges
     shorter than sigma; the plain names keep the first of equal rows. Distances are compared after rounding to
     1e-9 mm, because positions are typed in decimals and equal distances differ in their last bits.
-
-    >>> build_graph("manual").edges.shape
-    (146, 2)
-    >>> build_graph("released:knn:3").edges.shape, build_graph("knn:3").edges.shape
-    ((234, 2), (156, 2))
     """
     layout = check_coordinates(coordinates)
     neutouch = np.array_equal(layout, NEUTOUCH)
@@ -135,11 +130,6 @@ def normalised_adjacency(edges: ArrayLike, n: int) -> FloatArray:
     ``gcn_norm``. A taxel that no edge enters has a zero row and a zero column, never NaN.
 
     ModelError if the edges are malformed (see `check_edges`).
-
-    >>> normalised_adjacency([[0, 1], [1, 0]], 3)
-    array([[0., 1., 0.],
-           [1., 0., 0.],
-           [0., 0., 0.]])
     """
     source, target = check_edges(edges, n).T
     adjacency = np.zeros((n, n))

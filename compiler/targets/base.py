@@ -96,11 +96,7 @@ class TimeTable:
         return round(self.latencies[event].value * PICOSECONDS)
 
     def barrier(self, tiles: int) -> int:
-        """Picoseconds of the barrier among so many used tiles, at least one.
-
-        >>> [load_target("loihi1").time[0].barrier(tiles) for tiles in (1, 3, 4, 32)]
-        [600000, 1000000, 1400000, 1800000]
-        """
+        """Picoseconds of the barrier among so many used tiles, at least one."""
         return round(self.barriers[max(least for least in self.barriers if least <= tiles)].value * PICOSECONDS)
 
 
@@ -196,9 +192,6 @@ def load_target(name: str, cores: str | None = None) -> Target:
     """Read a target by name; its cores must be of the kind that the caller can handle, if that is given.
 
     OptionError if there is no such target, or its cores are of the other kind.
-
-    >>> load_target("loihi1").limit("core.synapse_words"), load_target("truenorth").limit("core.axons")
-    (16384, 256)
     """
     found = shipped().get(name)
     if found is None or cores not in (None, found.cores):

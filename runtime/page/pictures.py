@@ -20,7 +20,7 @@ Place = tuple[float, float]
 """Left and upper end of a core in tiles, which are as wide as high."""
 
 
-@styled
+@styled()
 def mesh(cores: CoreMap) -> Drawing:
     """Used part of each chip's mesh: tiles, their cores, and how full the fullest limit is."""
     from matplotlib.patches import Rectangle
@@ -76,7 +76,7 @@ def _places(cores: CoreMap) -> tuple[dict[int, Place], Place, dict[Place, int], 
     return places, (wide, high), tiles, chips
 
 
-@styled
+@styled()
 def fingertip(taxels: Taxels) -> Drawing:
     """Taxels where they lie, joined as the graph joins them; discs grow with events, and with first-layer spikes."""
     from matplotlib.patches import Circle
@@ -116,7 +116,7 @@ def _reach(points: FloatArray) -> float:
     return float(min(max(0.5 * nearest, span / 300), span / 16))
 
 
-@styled
+@styled()
 def membranes(traces: Sequence[Trace]) -> Drawing:
     """Membranes of both sides and their thresholds, a panel for each trace."""
     drawing = sheet(traces[0].title, 2.1 * len(traces) + 0.4)

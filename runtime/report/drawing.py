@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import wraps
-from typing import TYPE_CHECKING, Any, Literal, ParamSpec
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -53,8 +52,6 @@ STYLE = {
     "text.parse_math": False,  # names may hold a dollar
     "svg.hashsalt": "spikeloom",
 }
-
-Options = ParamSpec("Options")
 
 
 @dataclass(eq=False)
@@ -101,26 +98,15 @@ class Drawing:
     def file(self, kind: str, **options: Any) -> bytes:
         """As one of `PICTURES`; the same bytes for the same drawing."""
         content = io.BytesIO()
-        with _in_style():
+        with styled():
             none = dict.fromkeys(PICTURES[kind])
             self.figure.savefig(content, format=kind, dpi=150, metadata=none, **options)
         return content.getvalue()
 
 
-def styled(draw: Callable[Options, Drawing]) -> Callable[Options, Drawing]:
-    """Draw in the common style."""
-
-    @wraps(draw)
-    def in_style(*args: Options.args, **kwargs: Options.kwargs) -> Drawing:
-        with _in_style():
-            return draw(*args, **kwargs)
-
-    return in_style
-
-
 @contextmanager
-def _in_style() -> Iterator[None]:
-    """The common style, whatever the user's matplotlibrc says."""
+def styled() -> Iterator[None]:
+    """The common style, whatever the user's matplotlibrc says; `@styled()` draws in it."""
     from matplotlib import rc_context, rcdefaults, rcParams
 
     with rc_context():
@@ -141,7 +127,7 @@ def scale(axes: Any, unit: str) -> None:
     axes.set_major_formatter(lambda value, _: si(value, unit) if unit else counted(value))
 
 
-@styled
+@styled()
 def bars(title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str], unit: str = "") -> Drawing:
     """Horizontal bars, one for each series in each row, with their values beside them."""
     drawing = sheet(title, 0.5 + 0.21 * len(series) * len(rows) + 0.12 * len(rows))
@@ -166,7 +152,7 @@ def bars(title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str],
     return drawing
 
 
-@styled
+@styled()
 def matrices(title: str, panels: Mapping[str, IntArray]) -> Drawing:
     """Confusion matrices side by side: rows are labels, columns decisions; right ones are of another colour."""
     from matplotlib.patches import Rectangle
@@ -190,7 +176,7 @@ def matrices(title: str, panels: Mapping[str, IntArray]) -> Drawing:
     return drawing
 
 
-@styled
+@styled()
 def raster(
     title: str, neurons: Sequence[int], steps: int, spikes: Mapping[str, IntArray], kind: str = "neuron"
 ) -> Drawing:

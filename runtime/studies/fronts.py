@@ -8,11 +8,7 @@ from spikeloom.compiler.errors import OptionError
 
 
 def front(gains: Sequence[float], costs: Sequence[float]) -> list[bool]:
-    """Which points no other one beats: at least as much gain for at most the cost, and better in one of them.
-
-    >>> front([0.9, 0.8, 0.7, 0.9], [3.0, 1.0, 2.0, 3.0])
-    [True, True, False, True]
-    """
+    """Which points no other one beats: at least as much gain for at most the cost, and better in one of them."""
     order = sorted(range(len(gains)), key=lambda i: (costs[i], -gains[i]))
     on = [False] * len(gains)
     best, best_cost = float("-inf"), float("nan")
@@ -55,11 +51,7 @@ class Budget:
 def parse_budgets(
     given: Sequence[str], limits: Collection[str] = ("energy", "latency", "accuracy")
 ) -> tuple[Budget, ...]:
-    """Read the words of every ``--budget``; an OptionError says which is none of what has `limits`.
-
-    >>> [(each.what, each.limit) for each in parse_budgets(["latency=5ms", "accuracy=88"])]
-    [('latency', 0.005), ('accuracy', 0.88)]
-    """
+    """Read the words of every ``--budget``; an OptionError says which is none of what has `limits`."""
     budgets: dict[str, Budget] = {}
     for words in given:
         what, equals, value = (part.strip() for part in words.partition("="))

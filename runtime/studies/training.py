@@ -262,7 +262,7 @@ def training_sections(result: TrainingReport) -> Iterable[Section]:
     yield Section("Training", [Text(typed), table, Text("\n".join(lines))])
 
 
-@styled
+@styled()
 def picture(records: Sequence[Finished]) -> Drawing:
     """Learning curves of all seeds."""
     drawing = sheet("trainings", 4.2)

@@ -80,15 +80,7 @@ class Layer:
 
 
 def digits(weight: IntArray) -> tuple[Digit, ...]:
-    """Write a matrix of integers in int8 digits.
-
-    >>> [(digit.tolist(), factor.tolist()) for digit, factor in digits(np.array([[508, -254]]))]
-    [([[127, -127]], [4, 2])]
-    >>> [(digit.tolist(), factor.tolist()) for digit, factor in digits(np.array([[300, 1]]))]
-    [([[75, 1]], [4, 1])]
-    >>> [(digit.tolist(), factor.tolist()) for digit, factor in digits(np.array([[301, 128]]))]
-    [([[45, 1]], [1, 128]), ([[1, 0]], [256, 32768])]
-    """
+    """Write a matrix of integers in int8 digits."""
     common = np.bitwise_or.reduce(np.abs(weight), axis=0)
     factor = np.where(common == 0, 1, common & -common)  # the largest power of two in all weights of a neuron
     found: list[Digit] = []

@@ -44,10 +44,6 @@ def list_words(entries: IntArray, weight_bits: IntArray | int, index_bits: IntAr
 
     A list is cut in blocks of up to 64 synapses; a block costs its entries and a header, rounded up to whole words
     (nengo-loihi, ``block.py``, ``Synapse.bits``).
-
-    >>> from spikeloom.compiler.targets.base import load_target
-    >>> list_words(np.array([0, 43, 128]), 8, 0, load_target("loihi1")).tolist()
-    [0, 6, 18]
     """
     block = target.limit("synapse.block")
     header = target.limit("synapse.block_header_bits")

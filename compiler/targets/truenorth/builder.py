@@ -52,11 +52,6 @@ def crossing_points(levels: IntArray, weights: Sequence[int]) -> IntArray:
     """Which axons of an input to join, as 0 and 1 along a new last axis, so that their weights add up to each level.
 
     One weight is negative, the others are 1, 2, 4 as far as they go.
-
-    >>> crossing_points(np.array([-3, -2, -1, 0, 1, 2, 3]), (-3, 1, 2)).tolist()
-    [[1, 0, 0], [1, 1, 0], [1, 0, 1], [0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1]]
-    >>> crossing_points(np.array([-4, -1, 0, 3]), (1, 2, -4)).tolist()
-    [[0, 0, 1], [1, 1, 1], [0, 0, 0], [1, 1, 0]]
     """
     negative = levels < 0
     rest = np.where(negative, levels - min(weights), levels)

@@ -170,11 +170,7 @@ def turning_points(at: Standing) -> FloatArray:
 
 
 def calibrate(points: FloatArray, allowed: float) -> Calibrated:
-    """Smallest factor with which at most the share `allowed` of races ends otherwise, and so with every larger one.
-
-    >>> calibrate(np.array([0.0, 3.0, 1.0, 2.0]), 0.25)
-    Calibrated(allowed=0.25, factor=2.0, races=4, differ=1, bound=0.7514)
-    """
+    """Smallest factor with which at most the share `allowed` of races ends otherwise, and so with every larger one."""
     from scipy.special import betaincinv  # a tenth of a second that other commands need not wait
 
     spared = int(allowed * len(points) + 1e-9)

@@ -34,12 +34,6 @@ def parse_grid(text: str, target: Target) -> Grid:
     """Read a grid; the chip says which widths it stores and how many thresholds a core holds.
 
     An OptionError names the value that cannot be understood, and what is allowed.
-
-    >>> from spikeloom.compiler import DEFAULT_TARGET
-    >>> from spikeloom.compiler.targets.base import load_target
-    >>> found = parse_grid("bits=2-3,8+4+4+8,window=50-100%", load_target(DEFAULT_TARGET))
-    >>> found.bits, found.window
-    (((2,), (3,), (8, 4, 4, 8)), (50, 75, 100))
     """
     axis, found = "", dict[str, dict[Any, None]]()
     for word in re.split("[,/]", text):

@@ -138,7 +138,7 @@ def _tip(by: ChosenBy, point: Point) -> str:
     return "\n".join([f"#{point.number} {point.label}: {figures}", *point.commands])
 
 
-@styled
+@styled()
 def picture(chart: Chart) -> Drawing:
     """Test accuracy over energy and, where the chip has a time table, over time."""
     by, name = chart.chosen_by, chart.data.path.rstrip("/").rsplit("/", 1)[-1]

@@ -159,7 +159,7 @@ def _checked(result: Smallest) -> str:
     )
 
 
-@styled
+@styled()
 def picture(result: Smallest) -> Drawing:
     """Accuracy over energy; baselines of the last rung between what they take on a processor at least and at most."""
     from matplotlib.ticker import NullFormatter

@@ -102,7 +102,7 @@ def _places(taxels: int) -> FloatArray:
     return np.stack([np.cos(turn), np.sin(turn)], axis=1)
 
 
-@styled
+@styled()
 def taxel_map(result: Stability) -> Drawing:
     """Taxels where they lie, coloured by how many decisions hang on each."""
     from matplotlib.cm import ScalarMappable

@@ -66,7 +66,7 @@ def stability(result: Stress) -> list[Section]:
     ]
 
 
-@styled
+@styled()
 def figure(result: Stress, title: str = "", *, across: int = 3) -> Drawing:
     """A panel for each perturbation: accuracies of both sides in per cent over its levels, with their intervals."""
     panels = result.perturbations.items()

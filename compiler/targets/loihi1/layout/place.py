@@ -135,12 +135,7 @@ def chip_tiles(target: Target) -> int:
 
 
 def chip_of_core(core_tile: IntArray, target: Target) -> IntArray:
-    """Chip of each core, from its tile; shape (cores,).
-
-    >>> from spikeloom.compiler.targets.base import load_target
-    >>> chip_of_core(np.array([0, 31, 32, 70]), load_target("loihi1")).tolist()
-    [0, 0, 1, 2]
-    """
+    """Chip of each core, from its tile; shape (cores,)."""
     return core_tile // chip_tiles(target)
 
 

@@ -98,9 +98,6 @@ def current_load(decay_u: int) -> float:
 
     A current that loses ``(decay_u + 1) / 4096`` a step adds up to ``4096 / (decay_u + 1)`` sums, in a register four
     times as wide. At least 1: the accumulator comes first.
-
-    >>> current_load(4095), round(current_load(204), 3)
-    (1.0, 4.995)
     """
     return max(1.0, ONE_STEP_SUM_MAX * (4096 / (decay_u + 1)) * (1 << MEMBRANE_SHIFT) / CURRENT_MAX)
 
