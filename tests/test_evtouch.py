@@ -94,7 +94,7 @@ def test_what_was_written_is_read(tmp_path, events, method, dtype, order):
 @pytest.mark.parametrize(
     ("names", "split", "words"),
     [
-        ([f"elsewhere/{SAMPLE}"], "test", "no recordings (train/ or test/ with sample_N_label_L.npy)"),
+        ([f"elsewhere/{SAMPLE}"], "test", "no recordings (train/ or test/ with .csv, .npz or sample_N_label_L.npy)"),
         ([f"train/{SAMPLE}"], "test", "split 'test' is missing or empty; splits with recordings: train"),
         ([f"train/{SAMPLE}", f"test/{SAMPLE}"], "val", "splits with recordings: test, train"),
         ([f"a/test/{SAMPLE}", f"b/train/{SAMPLE}"], "test", "several data sets (a, b); give one of them"),

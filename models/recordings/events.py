@@ -266,7 +266,7 @@ def _data_set(path: Path, split: str = "test") -> Iterator[tuple[evtouch.Members
             found = {"": flat}
         if not found:
             raise DataError(
-                f"{source}: no recordings (train/ or test/ with sample_N_label_L.npy); "
+                f"{source}: no recordings (train/ or test/ with .csv, .npz or sample_N_label_L.npy); "
                 "give the folder or zip that holds train/ and test/"
             )
         yield members, found
