@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from made_files import checkpoint_bytes, recorded, ring, small_checkpoint, weights
+from made_files import checkpoint_bytes, recorded, recordings_folder, ring, small_checkpoint, weights
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import comparable, load_weights, refused
 from test_checkpoint import rebuilt
@@ -34,6 +34,7 @@ from spikeloom.models.training.record import training_record
 from spikeloom.models.training.robust import worn
 from spikeloom.models.training.train import Epoch, state_files, train, train_both, validation_split
 from spikeloom.runtime.cli import main
+from spikeloom.runtime.commands.training.train import both_splits
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
@@ -404,3 +405,11 @@ def test_the_model_is_the_chip_on_every_recording(tmp_path, objects_zip, contain
                 kept = comparable(netlist, index)  # the chip leaves out what nobody hears
                 ours = aligned(netlist, trace.spikes, index)[..., kept]
                 np.testing.assert_array_equal(ours, model[layer.name][..., kept])
+
+
+def test_a_class_without_training_recordings_is_said(tmp_path, capsys):
+    folder = recordings_folder(tmp_path / "gap")
+    for file in (folder / "train").glob("*_label_1.npy"):
+        file.unlink()
+    both_splits(str(folder), None, None)
+    assert capsys.readouterr().err.endswith("warning: gap: no recordings to train class 1 on\n")

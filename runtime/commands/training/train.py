@@ -23,7 +23,7 @@ from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
 from spikeloom.runtime.inputs.network import load_graph, sensor_places
 from spikeloom.runtime.inputs.recordings import recordings, require_bins, require_splits
-from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.console import progress, tell
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.training import (
     Job,
@@ -154,6 +154,8 @@ def both_splits(data: str, taxels: int | None, bin_s: float | None) -> tuple[Rec
     training, test = (recordings(data, split, **shared) for split in ("train", "test"))
     progress("")
     known = int(training.labels.max())
+    if missing := sorted(set(range(known)) - set(training.labels.tolist())):
+        tell(f"warning: {training.source}: no recordings to train class {', '.join(map(str, missing))} on")
     if test.labels.max() > known:
         first = int((test.labels > known).argmax())
         where = f"{test.source}: {test.split}/{test.files[first]}"
