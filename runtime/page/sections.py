@@ -195,7 +195,10 @@ def _taxels(found: Taxels) -> list[Block]:
         spikes = [] if found.spikes is None else [f"{found.spikes[taxel]:,.1f}"]
         rows.append([str(taxel), str(near), f"{found.events[taxel]:,.1f}", *spikes])
     graph = "no taxel graph" if found.graph is None else f"graph {found.graph} with {len(edges)} edges"
-    where = "" if found.positions_mm is not None else "; their positions are not known, so they are drawn on a circle"
+    unknown = (
+        "; drawn on a circle, as their positions are not known: add --taxels COORDS.csv and the --graph of training"
+    )
+    where = unknown if found.positions_mm is None else ""
     caption = "Discs grow with what a taxel sends, and with what its first-layer neurons fire where there is a graph."
     table = Table(head, rows, "Activity in a mean recording, the busiest first", most=LISTED)
     return [
