@@ -88,7 +88,14 @@ def recordings(source: str, *, bin: float | None = None) -> Data:
         As of ``--data``.
     bin : float, optional
         Seconds of a time bin, for files of single events; 0.02 where it is not given.
+
+    Raises DataError if there are none.
     """
+    from spikeloom.models.recordings.events import data_splits
+    from spikeloom.models.recordings.grasps import SYNTHETIC
+
+    if source != SYNTHETIC:
+        data_splits(source)
     return Data(source, bin)
 
 

@@ -27,6 +27,11 @@ def net(place, data):
     return api.compile(str(place / "net.pt"), calibrate=data.train, weight_bits="4")
 
 
+def test_recordings_are_there_and_show_as_one_line(data):
+    assert repr(data.test).startswith("data, test: 6 recordings, 6 taxels, up to 24 steps")
+    refused(DataError, "nowhere: no such folder or file", api.recordings, "nowhere")
+
+
 def test_results_are_those_of_the_commands(data, net, as_json):
     words = {
         "compile": ["net.pt", "--calibrate", "data", "--weight-bits", "4", "-o", "net.loom"],

@@ -70,6 +70,10 @@ class Recordings:
                 view.flags.writeable = False
                 object.__setattr__(self, name, view)
 
+    def __repr__(self) -> str:
+        """One line instead of the arrays."""
+        return f"{self.source}, {self.split}: {len(self)} recordings, {self.taxels} taxels, up to {self.steps} steps"
+
     def __len__(self) -> int:
         """Return the number of recordings."""
         return len(self.files)
