@@ -195,6 +195,11 @@ TABLE = [
     ),
     # streams
     ("watch net.loom --input none.csv", "none.csv: No such file"),
+    ("watch net.loom --input notes.zip", "--input notes.zip: is no text; give event lines"),
+    (
+        "watch net.loom --input words.txt",
+        "'hello' found; give one event 'time_s,taxel,polarity' a line, three numbers, or reset",
+    ),
     ("watch net.loom --input empty.pt", "empty.pt: empty stream"),
     (WATCH.format("--until-sure"), "--until-sure: |--bins"),
     (WATCH.format("--bins 5 --until-sure -1"), "--until-sure -1: "),

@@ -114,7 +114,7 @@ class EventLines:
             fields = [fields[column] for column in self._order]
             time_s, taxel, polarity = (Decimal(field) for field in fields)
         except (ValueError, InvalidOperation):
-            raise self.complain(f"{content[:60]!r} found", f"{GIVE}, three numbers") from None
+            raise self.complain(f"{content[:60]!r} found", f"{GIVE}, three numbers, or reset") from None
         if not time_s.is_finite() or not 0 <= time_s <= MAX_TIME_S:
             raise self.complain(f"time {fields[0]} found, allowed are 0 to {MAX_TIME_S:.0e}", "give seconds")
         if not taxel.is_finite() or not 0 <= taxel < self._taxels or taxel % 1:

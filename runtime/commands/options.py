@@ -55,7 +55,7 @@ def add_picture(parser: argparse.ArgumentParser, what: str) -> None:
 def add_common(parser: argparse.ArgumentParser) -> None:
     """Add the options of every command."""
     common = group(parser, "output")
-    common.add_argument("--json", action="store_true", help="print the result as one JSON object")
+    common.add_argument("--json", action="store_true", help="print the result as JSON")
     common.add_argument("--debug", action="store_true", help="show a traceback on errors")
 
 

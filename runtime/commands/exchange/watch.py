@@ -16,9 +16,11 @@ import json
 import math
 import sys
 import time
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
+from pathlib import Path
 
 import numpy as np
 
@@ -37,7 +39,7 @@ Lines come in the order of their times: an event whose bin is over, since a late
 once and not used; what comes after a grasp's decision is counted apart. What follows a # is a comment, and a grasp may
 begin with a header that names the columns, in any order. An empty line or the line "reset" ends a grasp. Polarity is
 0 and 1, or -1 and 1. --json prints one object a line: kind "bin" for every bin, "grasp" for every decision, and "end"
-last.
+last. TrueNorth runs whole recordings only.
 """
 
 MAX_GAP = 100_000
@@ -270,6 +272,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _opened(name: str) -> io.FileIO:
     """File of event lines, or standard input."""
+    if name != "-" and Path(name).is_file() and zipfile.is_zipfile(name):
+        raise DataError(
+            f"--input {name}: is no text; give event lines, or the recordings in it to spikeloom run --data"
+        )
     try:
         return io.FileIO(0 if name == "-" else name, closefd=name != "-")
     except OSError as error:
