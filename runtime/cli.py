@@ -1,6 +1,7 @@
 """The command line: name the commands, import the one that is chosen, run it, print what it returns.
 
-Exit codes: 0 fine, 1 a check failed, 2 a user's mistake (one line on stderr, a traceback only with ``--debug``).
+Exit codes: 0 fine, 1 a check failed, 2 an interrupt or a user's mistake (one line on stderr, a traceback only with
+``--debug``).
 Results go to stdout, progress to stderr when it is a terminal.
 """
 

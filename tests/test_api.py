@@ -94,6 +94,10 @@ def test_values_of_python_are_those_of_the_words(place, data, net):
     assert str(net.run(data, limit="2")) == str(net.run(data.test, limit=2))
 
 
+def test_the_module_lists_its_public_names():
+    assert dir(api) == sorted(api.__all__)
+
+
 def test_a_folder_of_the_same_name_is_in_nobodys_way(tmp_path):
     """Scripts in a project with packages ``models``, ``runtime`` and ``compiler`` of its own import both."""
     for name in ("models", "runtime", "compiler"):

@@ -132,7 +132,8 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
     else:
         from spikeloom.compiler.formats.nir.reader import read_nir
 
-        steps = {name: getattr(arguments, name) or made.get(name) for name in ("dt", "convention")}
+        given = {name: getattr(arguments, name) for name in ("dt", "convention")}
+        steps = {name: made.get(name) if value is None else value for name, value in given.items()}
         found = read_nir(path, **steps, **layout)
         training = found.training
     return LoadedNetwork(

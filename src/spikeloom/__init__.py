@@ -23,6 +23,11 @@ __all__ = ["LIF", "Compiled", "SpikeloomError", "__version__", "compile", "finet
 _PLACES = {"SpikeloomError": "compiler.errors", "LIF": "models.networks.lif"}
 
 
+def __dir__() -> list[str]:
+    """The public names."""
+    return __all__
+
+
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used."""
     if name not in __all__:

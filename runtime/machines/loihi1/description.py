@@ -16,6 +16,7 @@ from spikeloom.compiler.targets.loihi1.layout.place import chip_count
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, words_of_axons
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
@@ -150,11 +151,12 @@ def _one_or_many(values: IntArray | FloatArray) -> OneOrMany:
 
 def sections(facts: NetlistFacts) -> Iterator[Section]:
     """Layers, cores and the fullest core of every limit."""
-    where = f"{facts.chips} chips" if facts.chips > 1 else f"tiles {', '.join(map(str, facts.tiles))}"
+    tiles = f"{'tile' if facts.cores == 1 else 'tiles'} {', '.join(map(str, facts.tiles))}"
+    cores = f"{number(facts.cores, 'core')} on {tiles if facts.chips == 1 else number(facts.chips, 'chip')}"
     left = "" if facts.compartments == facts.neurons else f" ({facts.compartments:,} on the chip)"
     lines = [
         f"{facts.target}: {facts.neurons:,} neurons{left}, {facts.synapses:,} synapses "
-        f"({facts.synapses_stored:,} stored, {facts.synapses_nonzero:,} non-zero), {facts.cores} cores on {where}"
+        f"({facts.synapses_stored:,} stored, {facts.synapses_nonzero:,} non-zero), {cores}"
     ]
     if facts.clocks is not None and facts.clocks.channels:
         channels, steps = facts.clocks.channels, facts.clocks.steps
