@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 from made_files import own_file, recordings_folder
 
+from spikeloom.models.recordings.counts import show_counts
 from spikeloom.runtime import cli
 
 SLOW = (HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.function_scoped_fixture)
@@ -58,6 +59,11 @@ def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
         assert text == path.read_text(encoding="utf-8"), f"{path} differs; --update-golden writes it anew"
 
     return compare
+
+
+@pytest.fixture(autouse=True)
+def _counts_are_said_anew() -> None:
+    show_counts.cache_clear()
 
 
 @pytest.fixture

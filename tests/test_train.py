@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from made_files import checkpoint_bytes, recorded, recordings_folder, ring, small_checkpoint, weights
+from made_files import checkpoint_bytes, csv_folder, recorded, recordings_folder, ring, small_checkpoint, weights
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import comparable, load_weights, refused
 from test_checkpoint import rebuilt
@@ -413,3 +413,11 @@ def test_a_class_without_training_recordings_is_said(tmp_path, capsys):
         file.unlink()
     both_splits(str(folder), None, None)
     assert capsys.readouterr().err.endswith("warning: gap: no recordings to train class 1 on\n")
+
+
+def test_counts_of_events_are_said_once(tmp_path, capsys):
+    for split in ("train", "test"):
+        csv_folder(tmp_path / "taps" / split)
+    both_splits(str(tmp_path / "taps"), None, None)
+    both_splits(str(tmp_path / "taps"), None, None)
+    assert capsys.readouterr().err.count("events read") == 2

@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import dataclass, field
+from functools import cache
 
 from spikeloom.compiler.files import plain
 
@@ -32,10 +33,11 @@ class EventCounts:
         )
 
 
-def show_counts(source: str, counts: EventCounts | None) -> None:
-    """Say on stderr what was counted and is worth a second look; the released layout has nothing to say."""
+@cache
+def show_counts(source: str, split: str, counts: EventCounts | None) -> None:
+    """Say on stderr, once, what was counted and is worth a second look; the released layout has nothing to say."""
     if counts is not None:
-        sys.stderr.write(plain(f"{source}: {counts}\n"))
+        sys.stderr.write(plain(f"{source}, {split}: {counts}\n"))
         show_notes(counts)
 
 

@@ -53,7 +53,7 @@ def recordings(
         data = events.load_data(path, split, bin_s=bin_s, usual=usual, limit=limit, classes=classes, taxels=taxels)
         _require_width(data, own)
         _require_sensor(data, split, taxels)
-        show_counts(data.source, data.counts)
+        show_counts(data.source, data.split, data.counts)
         if labels_for is not None:
             events.need_labels(data, labels_for)
     else:
