@@ -274,6 +274,8 @@ def test_a_netlist_remembers_bins_and_data(tmp_path, monkeypatch):
         assert not words or run(*words)[0] == 0
         assert read_checkpoint(network).training["bin_s"] == 0.1
     assert run("export", "x.loom", "--to", "nir", "-o", "x.nir")[1].endswith("in steps of 0.1 s (euler)\n")
+    assert as_json("compile", "x.nir", "-o", "again.loom")["provenance"]["bin_s"] == 0.1
+    assert "--bin 0.1" in as_json("inspect", "c.pt")["training"]["command"]
 
 
 OTHERS = {

@@ -107,7 +107,7 @@ def _members(path: str) -> list[str] | None:
             return None
         with zipfile.ZipFile(path) as archive:
             return archive.namelist()
-    except (zipfile.BadZipFile, OSError, ValueError):
+    except Exception:  # zipfile raises whatever it meets
         return None
 
 

@@ -36,11 +36,11 @@ DENSE_LIMIT = 2**28
 Float32 = npt.NDArray[np.float32]
 
 
-def export(network: IntegerNetwork, dt: float, *, training: str | None = None) -> bytes:
+def export(network: IntegerNetwork, dt: float, *, training: str | None = None, origin: str | None = None) -> bytes:
     """Content of the file, for steps of `dt` seconds; equal networks give equal bytes.
 
     With `training`, how the network was fine-tuned, the file says how each layer is stored, too: it compiles to these
-    very integers.
+    very integers. `origin` is what it keeps of the recordings behind any other network.
 
     Raises ModelError if NIR cannot say what the network does, OptionError if there is no such time step.
     """
@@ -82,8 +82,8 @@ def export(network: IntegerNetwork, dt: float, *, training: str | None = None) -
     bins, length = network.input.bins, network.input.clocks.length
     said |= {"bins": np.array(bins)} if bins > 1 else {}
     said |= {"length": np.array(length)} if length is not None else {}
-    if training is not None:
-        said["training"] = training
+    if (known := training or origin) is not None:
+        said["training"] = known
     graph = {"type": "NIRGraph", "edges": edges, "metadata": said, "nodes": nodes}
     return hdf5_bytes({"version": VERSION, "node": graph})
 

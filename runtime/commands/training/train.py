@@ -101,6 +101,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     graph, _ = _sensor(arguments)
     percent = WHOLE if arguments.window is None else parse_window(arguments.window)
     training, test = (first_part(each, percent) for each in both_splits(arguments.data, graph.n_taxels, arguments.bin))
+    if percent < WHOLE:
+        tell(f"note: of every recording the first {percent} % train; give --window {percent}% to what runs the network")
     records = train_seeds(plan_jobs(arguments, training, test), resume=arguments.resume)
     write_picture(arguments.picture, lambda: picture(records))
     return Outcome(TrainingReport(runs=records, protocols=summary(records)), training_sections)
@@ -127,7 +129,7 @@ def _count(arguments: argparse.Namespace) -> Outcome:
     asked = {name: value for name, value in repeat.given(arguments, COUNTERS_ONLY).items() if value is not None}
     if arguments.window is not None:
         asked["window"] = parse_window(arguments.window)
-    typed = repeat.words({"data": Path(arguments.data).name, "system": COUNTING, **asked})
+    typed = repeat.words({"data": Path(arguments.data).name, "system": COUNTING, "bin": arguments.bin, **asked})
     if arguments.join > 1:
         typed += ["--join", str(arguments.join)]
     if "thresholds" in asked:

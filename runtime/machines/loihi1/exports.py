@@ -1,5 +1,6 @@
 """Netlists in the formats of other programs."""
 
+import json
 from dataclasses import dataclass, field
 
 from spikeloom.compiler.errors import FormatError
@@ -100,8 +101,8 @@ def _onnx(request: Request) -> Export:
 
 def _nir(request: Request) -> Export:
     netlist = read_netlist(request.source)
-    width = origin_of(netlist.provenance).get("bin_s", BIN_S)
-    dt = width * netlist.bins if request.dt is None else request.dt
+    width = origin_of(netlist.provenance).get("bin_s")
+    dt = (width or BIN_S) * netlist.bins if request.dt is None else request.dt
     facts = NirFacts(
         neurons=sum(layer.neurons for layer in netlist.layers),
         synapses=netlist.n_synapses,
@@ -110,7 +111,7 @@ def _nir(request: Request) -> Export:
     )
     lines = (f"in steps of {dt:g} s ({facts.convention})",)
     with reading(request.source, FormatError, "compile it again"):
-        content = nir.export(lift(netlist), dt)
+        content = nir.export(lift(netlist), dt, origin=None if width is None else json.dumps({"bin_s": width}))
     return Export(content=[content], facts=facts, lines=lines)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.errors import FormatError
+from spikeloom.compiler.errors import FormatError, NumericRangeError
 from spikeloom.compiler.files import reading
 from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.ir import IntegerNetwork
@@ -85,7 +85,11 @@ class Loihi(IntegerMachine):
 
     def simulate(self, channels: EventArray, lengths: IntArray | None, *, spikes: bool, membranes: bool) -> Trace:
         """Spikes and membranes by chip step."""
-        return engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
+        try:
+            return engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
+        except NumericRangeError as found:
+            found.args = (f"{self.file}: {found}",)
+            raise
 
     def twice(self, channels: EventArray) -> tuple[Trace, Trace]:
         """Every spike, membrane, update and count."""

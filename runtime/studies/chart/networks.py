@@ -182,6 +182,12 @@ def require_suited(networks: Sequence[NetworkFile], splits: Mapping[str, Recordi
                 f"{network.path}: has {network.taxels} taxels and {network.classes} classes, {first.path} has "
                 f"{first.taxels} and {first.classes}; chart networks of one data set at a time"
             )
+        width, own = splits["test"].seconds, network.training.get("bin_s")
+        if own not in (None, width):
+            raise ModelError(
+                f"{network.path}: was trained on bins of {own:g} s, {first.path} reads bins of {width:g} s; chart "
+                "networks of one width at a time"
+            )
         if network.training.get("data_sha256") not in (None, digest):
             raise ModelError(
                 f"{network.path}: was trained on other recordings ({network.training.get('data', 'others')}) "
