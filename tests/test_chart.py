@@ -162,7 +162,7 @@ def test_a_fine_tuned_network_keeps_its_storage(as_json):
         ("ring.pt ring.pt --data data", "ring.pt: is given twice"),
         ("elsewhere.pt --data data", r"elsewhere.pt: was trained on other recordings \(Grasps.zip\) than data"),
         ("unknown.pt small.pt --data data", f"small.pt: has 4 taxels and {CLASSES} classes, unknown.pt has 6"),
-        ("native.pt --data data", "native.pt: is a network trained for TrueNorth, .*; compile, verify"),
+        ("native.pt --data data", "native.pt: is a network trained for TrueNorth, .*; only compile, verify"),
         ("net.onnx --data data", "net.onnx: is an ONNX file"),
         ("ring.pt --data data -o file", "-o file: is not a folder"),
     ],
