@@ -17,6 +17,7 @@ from spikeloom.compiler.formats import NIR
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
+from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import BIN_S, data_digest
 from spikeloom.models.recordings.grasps import SYNTHETIC
@@ -76,6 +77,10 @@ class FinetuneRecord:
     last: Tuned
     history: Sequence[Sequence[float]]
     bin_s: float | None = field(default=None, metadata=OPTIONAL)
+
+    def to_json(self) -> JsonObject:
+        """JSON values; without a width of bins that nobody said."""
+        return {key: value for key, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -235,7 +240,7 @@ def _write_checkpoint(
     asked = load_graph(arguments, checkpoint.system)
     edges = asked.edges if checkpoint.edges is None and asked is not None else checkpoint.edges
     changed = replace(checkpoint, graph=loaded.graph, edges=edges, forms=net.forms, **layers_of(net.tensors()))
-    save_again(output, changed, training=asdict(record))
+    save_again(output, changed, training=record.to_json())
     round_to_forms(expand(read_checkpoint(output), adjacency), net.forms)  # it compiles, or says why not
 
 
@@ -245,7 +250,7 @@ def _write_nir(arguments: argparse.Namespace, loaded: LoadedNetwork, net: Quanti
 
     integer, _ = round_to_forms(net.learned(), net.forms)
     dt = loaded.read_as.get("dt", (record.bin_s or BIN_S) * integer.input.bins)
-    content = writer.export(integer, dt, training=json.dumps(asdict(record)))
+    content = writer.export(integer, dt, training=json.dumps(record.to_json()))
     with write_atomically(arguments.output) as file:
         file.write(content)
     netlist = Path(arguments.output).with_suffix(".loom")
@@ -271,7 +276,7 @@ def finetune_sections(result: Finetuned) -> Iterable[Section]:
     total, first, last = record.test_samples, record.history[0], record.history[-1]
     rows = [
         ["rounded", "", "", percent(record.before.correct, total)],
-        ["epoch 1", f"{first[0]:.5f}", f"{first[1]:,}", ""],
+        *([["epoch 1", f"{first[0]:.5f}", f"{first[1]:,}", ""]] if record.epochs > 1 else []),
         [f"epoch {record.epochs}", f"{last[0]:.5f}", f"{last[1]:,}", percent(record.last.correct, total)],
     ]
     head = ["on chip integers", "loss", "training right", "test"]
