@@ -17,7 +17,7 @@ from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.report.encode import encode
-from spikeloom.runtime.studies.yardsticks import measure
+from spikeloom.runtime.studies.yardsticks import HOROWITZ, measure
 
 DAVIES = {"synaptic_operation": 23.6, "neuron_idle": 52, "neuron_active": 81, "packet": 1.7}
 DAVIES |= {"hop_east_west": 3, "hop_north_south": 4}
@@ -308,6 +308,10 @@ def test_a_network_counted_by_hand():
     assert rows["dense", "float32"]["energy_j"] == pytest.approx(27 * 4.6e-12)
     assert rows["dense", "int8"]["energy_j"] == pytest.approx(27 * 0.3e-12)
     assert rows["effective", "float32"]["energy_j"] == pytest.approx(9 * 4.6e-12 + 7 * 0.9e-12)
+
+
+def test_prices_are_the_published_ones():
+    assert HOROWITZ == {"float32_add": 0.9, "float32_multiply": 3.7, "int8_multiply": 0.2, "int32_add": 0.1}
 
 
 def test_steps_with_other_inputs_than_ones_are_multiplications():

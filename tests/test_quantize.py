@@ -298,6 +298,17 @@ def mantissas(weight, scale, bits):
     return fixedpoint.round_steps(weight, scale, bits, (0,)) * fixedpoint.weight_step(bits)
 
 
+def test_registers_have_their_published_widths():
+    assert (fixedpoint.ACCUMULATOR_MAX, fixedpoint.CURRENT_MAX, fixedpoint.MEMBRANE_MAX) == (2097151, 8388607, 8388607)
+    assert (fixedpoint.BIAS_MANTISSA_MAX, fixedpoint.BIAS_EXPONENT_MAX, fixedpoint.THRESHOLD_MANTISSA_MAX) == (
+        4095,
+        7,
+        131071,
+    )
+    assert fixedpoint.MEMBRANE_SHIFT == 6
+    assert 64 * fixedpoint.ONE_STEP_SUM_MAX <= fixedpoint.ACCUMULATOR_MAX < 64 * (fixedpoint.ONE_STEP_SUM_MAX + 1)
+
+
 @given(st.integers(-(2**24), 2**24), st.integers(0, 4096))
 def test_decay_rounds_the_exact_product_toward_zero(x, lost):
     assert decayed(x, lost) == int(Fraction(x * (4096 - lost), 4096))  # int of a fraction truncates
