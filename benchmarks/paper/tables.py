@@ -54,8 +54,17 @@ def files(cells: Mapping[str, Cell], *, drawn: bool = True) -> dict[str, bytes]:
         found |= pictures(table, lines) if drawn else {}
         of = {data: [line for line in lines if line.row.data == data] for data in DATA}
         summed[table] = {data: _statistics(each) | {"spans": _spans(each)} for data, each in of.items() if each}
-    found["statistics.json"] = (json.dumps(summed, indent=1, allow_nan=False) + "\n").encode()
+    found["statistics.json"] = (json.dumps(_rounded(summed), indent=1, allow_nan=False) + "\n").encode()
     return found
+
+
+def _rounded(value: Any) -> Any:
+    """Keep 12 digits of every float: the last ones depend on the processor that added them up."""
+    if isinstance(value, dict):
+        return {key: _rounded(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(each) for each in value]
+    return float(f"{value:.12g}") if isinstance(value, float) else value
 
 
 # -- CSV ---------------------------------------------------------------------------------------------------------------
