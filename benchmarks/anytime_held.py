@@ -28,7 +28,7 @@ from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.commands.choose.anytime import ALLOWED
 from spikeloom.runtime.commands.training.train import both_splits, plan_jobs
 from spikeloom.runtime.inputs.network import propagation
-from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.studies.anytime import exits
 

@@ -22,7 +22,7 @@ from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import BIN_S
-from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.backends import machine_of
 
 SCHEMES: dict[str, dict[str, Any]] = {"8 bits": {"packings": (Packing(),)}, "default": {"keep": KEEP}}
 

@@ -20,7 +20,7 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.recordings.events import joined_bins, load_data
 from spikeloom.models.training.counters import FOLDS, Plan, counted, folds, linear_rules
-from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.studies.smallest.space import Candidate
 from spikeloom.runtime.studies.smallest.trained import Sensor, plan_of, without
 

@@ -15,7 +15,8 @@ import time
 import numpy as np
 
 from spikeloom.models.recordings.events import load_data
-from spikeloom.runtime.machines.base import Stream, machine_for
+from spikeloom.runtime.machines.backends import machine_for
+from spikeloom.runtime.machines.base import Stream
 from spikeloom.runtime.machines.loihi1.engine import simulate
 from spikeloom.runtime.machines.votes import class_counts
 

@@ -19,13 +19,13 @@ from spikeloom.compiler.formats import ranc
 from spikeloom.compiler.targets.truenorth.netlist import read_crossbars
 from spikeloom.models.recordings.events import load_data, of_length
 from spikeloom.models.recordings.evtouch import data_digest
-from spikeloom.runtime.machines.truenorth.machine import machine_of
+from spikeloom.runtime.machines.truenorth.machine import TrueNorth
 
 
 def compared(simulator: Path, path: str, data: str, limit: int) -> dict[str, Any]:
     """Votes of every tick of the first recordings, and how many differ."""
     netlist = read_crossbars(path)
-    machine, voters = machine_of(netlist), np.flatnonzero(netlist.readout_class >= 0)
+    machine, voters = TrueNorth(netlist), np.flatnonzero(netlist.readout_class >= 0)
     test = of_length(load_data(data, "test", taxels=netlist.taxels), netlist.clocks.length)
     votes = differing = 0
     for index in range(limit):

@@ -28,7 +28,8 @@ from spikeloom.models.training import usual
 from spikeloom.models.training.kinds import Plan, seen_by
 from spikeloom.models.training.recipes import RELEASED
 from spikeloom.models.training.train import train, validation_split
-from spikeloom.runtime.machines.base import Machine, machine_for
+from spikeloom.runtime.machines.backends import machine_for
+from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.machines.changes import single
 from spikeloom.runtime.studies.stability.bounds import lower_bound, needed
 from spikeloom.runtime.studies.stability.neighbours import cells_of, channels_of

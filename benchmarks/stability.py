@@ -19,7 +19,7 @@ from typing import Any
 from made import made
 
 from spikeloom.models.recordings.events import load_data
-from spikeloom.runtime.machines.base import machine_for
+from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.changes import by_running, single
 from spikeloom.runtime.report.encode import read_json
 from spikeloom.runtime.studies.stability.neighbours import KINDS, cells_of, channels_of

@@ -29,7 +29,7 @@ from spikeloom.models.graphs import build_graph
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import propagation
-from spikeloom.runtime.machines.base import machine_for
+from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.changes import Changes, Effects, by_running, single
 from spikeloom.runtime.studies.stability.neighbours import cells_of, channels_of
 from spikeloom.runtime.studies.stability.results import PHASES

@@ -46,15 +46,13 @@ def compile_network(
     source: Factored | Network | IntegerNetwork,
     options: Options | None = None,
     *,
-    target: str = DEFAULT_TARGET,
     after: Callable[[str, Compilation], object] | None = None,
 ) -> Compilation:
-    """Lower a network, wherever it comes from, to a placed netlist that obeys every limit of the chip.
+    """Lower a network, wherever it comes from, to a placed netlist that obeys every limit of Loihi.
 
     Integers are taken as they stand. `after` is called with the name of each pass and the compilation as far as it is.
     OptionError, ModelError, DataError or CapacityError as the passes say.
     """
-    from spikeloom.compiler.targets.base import load_target
+    from spikeloom.compiler.targets.loihi1 import passes
 
-    done: Compilation = load_target(target).compile(source, options, after=after)
-    return done
+    return passes.compile_network(source, options, after=after)

@@ -132,7 +132,7 @@ class Compiled:
 
     def stream(self) -> Any:
         """Open a live stream: ``step(events)`` takes one bin (taxels, 2), and gives the votes so far."""
-        from spikeloom.runtime.machines.base import machine_for
+        from spikeloom.runtime.machines.backends import machine_for
 
         return machine_for(self.path).stream()
 

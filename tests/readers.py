@@ -49,7 +49,7 @@ from spikeloom.models.networks.networks import Architecture
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.sensors import read_edges, read_taxels
 from spikeloom.models.training.train import train
-from spikeloom.runtime.machines.base import machine_for
+from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import terminal
 from spikeloom.runtime.studies.chart.work import Built

@@ -23,7 +23,7 @@ from spikeloom.models.recordings.events import load_data, of_length
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit
 from spikeloom.runtime import cli
-from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.integer import LONGEST, integer_machine
 from spikeloom.runtime.machines.loihi1 import engine, kernel
 from spikeloom.runtime.machines.loihi1.costs import cost, estimate

@@ -21,6 +21,7 @@ from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.targets.base import EVENTS, load_target
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
+from spikeloom.compiler.targets.loihi1.passes import PASSES
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.runtime import cli
@@ -71,7 +72,7 @@ def test_provenance_names_everything_that_decided(as_json, place):
 
 
 def test_dumps_go_to_standard_error(spikeloom, tmp_path):
-    words = [word for step in load_target("loihi1").module.PASSES for word in ("--dump-after", step.name)]
+    words = [word for step in PASSES for word in ("--dump-after", step.name)]
     code, out, err = spikeloom("compile", "net.pt", *words, "-o", tmp_path / "out.loom", "--json")
     assert (code, json.loads(out)["neurons"]) == (0, 51)
     assert err.endswith(text(read_netlist(tmp_path / "out.loom")))

@@ -26,7 +26,7 @@ from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.inputs.network import load_network
-from spikeloom.runtime.machines.base import machine_for
+from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.trace import aligned

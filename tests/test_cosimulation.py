@@ -20,7 +20,7 @@ from spikeloom.compiler.targets.loihi1.netlist import write_netlist
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron
 from spikeloom.compiler.targets.truenorth.netlist import RESET_NONE, write_crossbars
 from spikeloom.runtime.machines.truenorth import cosimulation
-from spikeloom.runtime.machines.truenorth.machine import machine_of
+from spikeloom.runtime.machines.truenorth.machine import TrueNorth
 
 OURS = Path(__file__).with_name("rtl")
 STEPS = 6
@@ -129,7 +129,7 @@ def defective(place, right, wrong):
 def built(netlist, rtl, folder, ticks):
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
-    return cosimulation.build(machine_of(netlist), folder, cosimulation.sources_in(str(rtl)), "iverilog", ticks)
+    return cosimulation.build(TrueNorth(netlist), folder, cosimulation.sources_in(str(rtl)), "iverilog", ticks)
 
 
 @settings(max_examples=8)

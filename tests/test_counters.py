@@ -18,7 +18,7 @@ from spikeloom.compiler.formats.counters import BLOCK, counting_network, read_co
 from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.models.recordings.events import joined_bins, load_data, of_length
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds, held_out, linear_rules
-from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.studies.counting import decisions_of
 from spikeloom.runtime.studies.stress.bench import NAMES, Bench, distances, warm_state, whole
 from spikeloom.runtime.studies.stress.pair import Pair, evaluate

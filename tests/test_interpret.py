@@ -19,7 +19,7 @@ from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.interpret import run_float, run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent
-from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.studies.stress.pair import Inputs, Pair, evaluate, float_layers

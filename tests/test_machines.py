@@ -1,29 +1,21 @@
-"""The one interface of all chips: what it returns is the simulator's, and a further chip is a folder."""
+"""The one interface of all chips: what it returns is the simulator's."""
 
 import json
-import sys
 from importlib import resources
 
 import numpy as np
 import pytest
 from oracles import refused
-from random_networks import random_checkpoint, ring
 from zoo import specimen
 
-from spikeloom.compiler import compile_network, targets
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.interpret import channels_last, run_integer
-from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets import base
 from spikeloom.compiler.targets.loihi1.legalize import REMEDIES
-from spikeloom.compiler.targets.loihi1.netlist import write_netlist
-from spikeloom.runtime import machines
-from spikeloom.runtime.machines.base import machine_for
-from spikeloom.runtime.machines.integer import integer_machine
+from spikeloom.runtime.machines.backends import BACKENDS
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
-from spikeloom.runtime.machines.votes import class_counts, readout_counts
+from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import terminal
 
@@ -81,71 +73,6 @@ def test_simulators_are_held_against_their_specifications(made, monkeypatch):
         machine.require_sensor(np.zeros((1, 3, 3, 12), np.uint8))
 
 
-PASSES = """
-import numpy as np
-from dataclasses import replace
-from spikeloom.compiler.passes.prune import without_channels
-from spikeloom.compiler.pipeline import Pass
-from spikeloom.compiler.targets.loihi1 import passes
-from spikeloom.compiler.targets.loihi1.options import Options
-
-def unplug(done):
-    return replace(done, integer=without_channels(done.integer, np.arange(done.integer.input.size) == 0))
-
-PASSES = (*passes.FLOATS, Pass(name="unplug", does="ignores channel 0", keeps="the rest", apply=unplug),
-          *passes.INTEGERS, *passes.LAYOUT)
-
-def start(source, options, target):
-    return passes.start(source, options, target)[0], PASSES
-"""
-MACHINE = """
-from spikeloom.runtime.machines.loihi1.machine import Loihi
-from spikeloom.compiler.targets.loihi1.netlist import read_netlist
-
-class Toy(Loihi):
-    details = ("counts",)
-
-def machine_of(netlist):
-    return Toy(netlist)
-
-def load(path):
-    return Toy(read_netlist(path))
-"""
-
-
-def test_a_third_chip_is_a_folder_of_the_compiler_and_one_of_the_machines(tmp_path, monkeypatch):
-    """With cores of eight neurons and one pass more."""
-    limits = (resources.files(targets) / "loihi1" / "chip.toml").read_text("utf-8").replace('"loihi1"', '"toy"')
-    limits = limits.replace("core.compartments = { value = 1024", "core.compartments = { value = 8")
-    for package, texts in ((targets, {"chip.toml": limits, "passes.py": PASSES}), (machines, {"machine.py": MACHINE})):
-        folder = tmp_path / package.__name__ / "toy"
-        folder.mkdir(parents=True)
-        for name, text in texts.items():
-            (folder / name).write_text(text)
-        monkeypatch.setattr(package, "__path__", [*package.__path__, str(folder.parent)])
-    base.shipped.cache_clear()
-    try:
-        done = compile_network(expand(random_checkpoint(), ring(5)), target="toy")
-        assert [step.name for step in base.load_target("toy").module.PASSES][4] == "unplug"
-        assert np.diff(done.netlist.core_compartments).max() <= 8
-        assert not (done.netlist.axon_source == 0).any()
-        write_netlist(done.netlist, tmp_path / "net.loom")
-        machine = machine_for(tmp_path / "net.loom")
-        assert (type(machine).__name__, machine.target.name) == ("Toy", "toy")
-        events = (np.random.default_rng(0).random((4, 5, 2, 12)) < 0.3).astype(np.uint8)
-        expected = run_integer(done.integer, channels_last(events)).spikes[-1]
-        votes = readout_counts(done.integer.readout, done.integer.classes, expected)
-        np.testing.assert_array_equal(machine.run(events).votes, votes)
-        assert votes.any()
-        assert integer_machine(machine).check(events[:1]) == 0
-        with pytest.raises(OptionError, match="toy has no such price model; allowed: counts"):
-            machine.price(events, bin_s=0.02, detail="cycle")
-    finally:
-        base.shipped.cache_clear()
-        for name in [name for name in sys.modules if ".toy" in name]:
-            del sys.modules[name]
-
-
 @pytest.mark.parametrize("name", ["loihi1", "truenorth"])
 def test_every_number_of_a_chip_is_as_published(golden, name):
     golden(f"{name}.chip.json", json.dumps(encode(base.load_target(name)), indent=1) + "\n")
@@ -158,8 +85,8 @@ def test_a_barrier_is_that_of_the_fewest_tiles_it_is_known_for():
     assert set(REMEDIES) == {rule for rule in chip.limits if rule.startswith(("core.", "chip."))}
 
 
-def test_known_targets_are_the_folders():
-    assert base.known_targets() == ("loihi1", "truenorth")
+def test_every_chip_that_is_described_can_be_compiled_for():
+    assert tuple(backend.name for backend in BACKENDS) == base.known_targets() == ("loihi1", "truenorth")
     assert base.known_targets(base.CROSSBARS) == ("truenorth",)
 
 

@@ -23,7 +23,7 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.truenorth.netlist import read_crossbars, write_crossbars
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.equivalence.rounding import check_rounding
-from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.integer import integer_machine
 
 

@@ -13,14 +13,15 @@ from made_files import CLASSES, TAXELS, events, recorded, recordings_folder
 from numpy.testing import assert_array_equal
 from random_netlists import large_netlist, lively, netlists, recordings, voting
 from random_networks import random_checkpoint, ring
-from test_truenorth_counting import CHIP, random_counters, random_events
+from test_truenorth_counting import random_counters, random_events
 
 from spikeloom.compiler import compile_network, write_netlist
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.truenorth.passes import compile_crossbars
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit
-from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.changes import Changes, by_running, joined, single
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.changes.kernel import overflows
@@ -261,7 +262,7 @@ def test_verdicts_are_those_of_plain_runs(bins, clocks):
 
 def test_a_chip_that_knows_no_short_cut_runs_every_change():
     counters = random_counters(1, taxels=2, classes=3)
-    netlist = CHIP.compile(counters).netlist
+    netlist = compile_crossbars(counters).netlist
     given = np.stack([random_events(seed, counters) for seed in (5, 6)])
     for one, found in zip(given, study_of(netlist, given, shift=1).verdicts, strict=True):
         cells, alter = cells_of(one, netlist), 0

@@ -19,8 +19,9 @@ from spikeloom.compiler.formats.counters import counting_network, write_counters
 from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.compiler.targets.truenorth.counting import LARGEST, planned, run_counters
 from spikeloom.compiler.targets.truenorth.netlist import write_crossbars
+from spikeloom.compiler.targets.truenorth.passes import Options, compile_crossbars
 from spikeloom.models.training.counters import rounded
-from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.votes import class_counts
 
 
@@ -49,7 +50,7 @@ def random_events(seed, counters, rate=0.3):
 
 def assert_exact(counters, events, chip=CHIP):
     """Specification, engine and model agree in every spike, and votes with the network in the file; gives the votes."""
-    netlist, plan = CHIP.compile(counters).netlist, planned(counters, chip)
+    netlist, plan = compile_crossbars(counters).netlist, planned(counters, chip)
     trace, steps = both(netlist, with_clocks(events[None], counters.clocks)[0]), events.shape[-1]
     assert trace.counts.overflows.sum() == 0
     model = run_counters(plan, events)
@@ -81,7 +82,7 @@ def test_every_spike_is_the_models_and_the_votes_are_the_files(seed, parts, clas
 def test_both_chips_have_the_same_whole_numbers_and_votes(most):
     counters = random_counters(most, taxels=6, classes=8, most=most, ramp=60)
     events = np.stack([random_events(seed, counters) for seed in range(6)])
-    made = compile_network(counting_network(counters)), CHIP.compile(counters)
+    made = compile_network(counting_network(counters)), compile_crossbars(counters)
     np.testing.assert_array_equal(*(machine_of(each.netlist).run(events).votes for each in made))
     scales = [population.scale for population in made[0].integer.populations]
     for projection, held in zip(made[0].network.projections, made[0].integer.projections, strict=True):
@@ -91,7 +92,7 @@ def test_both_chips_have_the_same_whole_numbers_and_votes(most):
 
 def test_sums_of_several_cores_come_together():
     counters = random_counters(1, taxels=40, classes=12, thresholds=(1, 3, 7), steps=30, ramp=400)
-    netlist = CHIP.compile(counters).netlist
+    netlist = compile_crossbars(counters).netlist
     groups = len(planned(counters, CHIP).groups)
     assert 2 * groups * 12 == np.count_nonzero(netlist.layer == netlist.layers.index("sums")) > 24
     assert netlist.n_cores < groups + 4, "counters use what sums and votes leave"
@@ -108,7 +109,7 @@ def test_counters_spike_again_as_on_other_chips():
 
 
 def test_it_leaves_for_ranc_with_joined_bins_and_its_ramp(tmp_path):
-    netlist = CHIP.compile(replace(random_counters(3, taxels=2), bins=2)).netlist
+    netlist = compile_crossbars(replace(random_counters(3, taxels=2), bins=2)).netlist
     write_crossbars(netlist, tmp_path / "net.loom")
     touches = np.ones((1, 2, 2, 40), np.uint8)
     recordings_folder(tmp_path / "data", train=touches, test=touches)
@@ -122,14 +123,14 @@ def test_it_leaves_for_ranc_with_joined_bins_and_its_ramp(tmp_path):
 def test_what_the_chip_cannot_hold_is_refused(tmp_path):
     counters = random_counters(0, most=127)
     with pytest.raises(ModelError, match=r"weights of up to \d+, 15 allowed; train it with --weight-bits 5 or fewer"):
-        CHIP.compile(counters)
+        compile_crossbars(counters)
     counters = random_counters(0)
     with pytest.raises(ModelError, match=r"a ramp of 0\.5 a step"):
-        CHIP.compile(replace(counters, slope=0.5))
+        compile_crossbars(replace(counters, slope=0.5))
     with pytest.raises(CapacityError, match=r"chip: 2 used, 1 allowed .*--weight-bits"):
-        with_limit("chip.cores", 1).compile(counters)
+        compile_crossbars(counters, target=with_limit("chip.cores", 1))
     with pytest.raises(OptionError, match="--in-time 3: the network is whole numbers already"):
-        CHIP.compile(counters, CHIP.module.Options(in_time=3))
+        compile_crossbars(counters, Options(in_time=3))
     write_counters(tmp_path / "c.pt", random_counters(0, most=127))
     code, _, err = run("compile", tmp_path / "c.pt", "--target", "truenorth", "-o", tmp_path / "c.loom")
     assert (code, "c.pt: weights of up to" in err) == (2, True)

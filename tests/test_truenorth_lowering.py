@@ -18,6 +18,7 @@ from spikeloom.compiler.targets.truenorth import legalize, native
 from spikeloom.compiler.targets.truenorth.builder import crossing_points
 from spikeloom.compiler.targets.truenorth.in_time import first_spikes, lower_in_time
 from spikeloom.compiler.targets.truenorth.native import lower
+from spikeloom.compiler.targets.truenorth.passes import compile_crossbars
 from spikeloom.models.truenorth.network import run_network
 from spikeloom.runtime.machines.truenorth import engine, spec
 from spikeloom.runtime.machines.truenorth.twins import find_twins
@@ -95,7 +96,7 @@ def test_a_neuron_is_there_once_for_each_axon_that_it_reaches():
 def test_networks_beyond_the_chip():
     network = cores.random_network(0, taxels=65, features=1, blocks=1, hidden=(), copies=2, clocks=0)
     with pytest.raises(CapacityError, match=r"core 1: 260 axons, 256 allowed .*core\.axons"):
-        cores.CHIP.compile(network)
+        compile_crossbars(network)
     network = cores.random_network(0, hidden=())
     assert lower(network, cores.CHIP).n_cores == 3
     with pytest.raises(CapacityError, match=r"chip: 3 used, 2 allowed .*chip\.cores.*; train with fewer"):

@@ -25,7 +25,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist, write_netlist
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.commands.exchange import watch
-from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.stream import Step, Stream

@@ -33,7 +33,8 @@ from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.recordings.events import joined_bins, load_data, of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.machines.base import Machine, machine_for
+from spikeloom.runtime.machines.backends import machine_for
+from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.machines.loihi1 import spec
 from spikeloom.runtime.machines.loihi1.trace import Trace
 

@@ -1,24 +1,21 @@
-"""Chips: what a chip is, what events on it cost and take, how its numbers are read, and where each is found.
+"""Chips: what a chip is, what events on it cost and take, and how its numbers are read.
 
-A target is a folder with ``chip.toml``, every number once with unit and source, and a module ``passes`` with ``PASSES``
-(from what is trained to a netlist), ``Options`` and ``start(source, options, target)``, which gives what the passes
-begin with and those that are due. Nothing else knows which chips there are.
+The folder of a chip has ``chip.toml``, every number once with unit and source, and the passes that lower networks to
+it. Which chips can be compiled for and run is listed in :mod:`runtime.machines.backends`.
 """
 
 import math
 import os
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from spikeloom.compiler import targets
 from spikeloom.compiler.errors import OptionError, Violation
 from spikeloom.compiler.files import FileFault, read_whole, reading
-from spikeloom.compiler.pipeline import run
 from spikeloom.compiler.types import JsonObject
 
 MEND = "mend it"
@@ -102,7 +99,7 @@ class TimeTable:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Target:
-    """A chip: its numbers, and how a network is compiled for it."""
+    """The numbers of a chip."""
 
     name: str
     title: str
@@ -120,20 +117,6 @@ class Target:
     def exceeded(self, owner: str, rule: str, used: int, remedy: str) -> Violation:
         """What is said of a limit that a network breaks."""
         return Violation(owner=owner, rule=f"{self.name}.{rule}", used=used, allowed=self.limit(rule), remedy=remedy)
-
-    @property
-    def module(self) -> Any:
-        """Module ``passes`` in the folder of the chip: ``PASSES``, ``Options`` and ``start``."""
-        return import_module(f"{targets.__name__}.{self.name}.passes")
-
-    def compile(self, source: Any, options: Any = None, *, after: Callable[[str, Any], object] | None = None) -> Any:
-        """Lower what is trained to a compilation of the chip, with the result as ``netlist``.
-
-        `after` is called with the name of each pass and all that was made so far. SpikeloomError as the passes say.
-        """
-        module = self.module
-        work, passes = module.start(source, module.Options() if options is None else options, self)
-        return run(passes, work, after)
 
 
 def read_target(path: str | os.PathLike[str]) -> Target:
@@ -178,7 +161,7 @@ def with_tables(target: Target, name: str) -> Target:
 
 @cache
 def shipped() -> Mapping[str, Target]:
-    """Every target there is: a folder beside this file with ``chip.toml`` and a module ``passes``."""
+    """Every target that is described here: a folder beside this file with ``chip.toml``."""
     files = (file for place in targets.__path__ for file in Path(place).glob("*/chip.toml"))
     return {file.parent.name: read_target(file) for file in files}
 

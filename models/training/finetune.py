@@ -30,6 +30,7 @@ from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.quantised import QuantisedNet
 from spikeloom.models.networks.surrogate import RECTANGLE
@@ -99,7 +100,7 @@ def finetune(
     require_chance(robust)
     packings = None if bits is None else [Packing(bits=width, groups=groups) for width in bits]
     asked = Options(packings=packings, keep=KEEP, keep_all=True, training_events=training.events)
-    chosen = target.compile(model, asked).integer
+    chosen = compile_network(model, asked, target=target).integer
     plain = isinstance(model, Factored) and model.checkpoint.dynamics.is_plain
     order = np.random.default_rng(seed)
     history: list[TunedEpoch] = []

@@ -29,7 +29,8 @@ from spikeloom.runtime.equivalence.reference import (
 )
 from spikeloom.runtime.equivalence.rounding import Rounding, check_rounding
 from spikeloom.runtime.equivalence.verdict import Divergence, LayerSpikes, Rung, Verdict
-from spikeloom.runtime.machines.base import ENGINES, machine_of
+from spikeloom.runtime.machines.backends import machine_of
+from spikeloom.runtime.machines.base import ENGINES
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
 from spikeloom.runtime.machines.votes import readout_counts
 

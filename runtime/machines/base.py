@@ -1,25 +1,20 @@
 """What every chip offers to those who run, price, show and stream netlists.
 
-A machine is found by the target that its netlist names: the module ``machines/NAME/machine.py`` of the target
-``compiler/targets/NAME``. What only some chips do in their own way stands in modules beside it, see
-:func:`chip_module`.
+A chip is a :class:`Backend`; all are listed in :mod:`machines.backends`.
 """
 
 import os
 from abc import ABC, abstractmethod
+from argparse import Namespace
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property
-from importlib import import_module
-from importlib.util import find_spec
-from pathlib import Path
-from pkgutil import iter_modules
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.archive import TRAINED, stated
+from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.interpret import vote
@@ -27,8 +22,6 @@ from spikeloom.compiler.targets.base import Target, load_target, with_tables
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime import machines
-from spikeloom.runtime.inputs.files import require_netlist, shipped
 from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting, by_running
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
@@ -43,9 +36,6 @@ PART = 16
 
 HELD = 1 << 25
 """Entries (recording, step, neuron) of these, unless one recording has more."""
-
-DEFAULT = "loihi1"
-"""Whose reader says what is wrong with a file that names no target."""
 
 ENGINES = ("spikeloom", "onnx")
 """What can be held against a chip's specification: our simulator, or another program beside it."""
@@ -158,7 +148,7 @@ class Stream(Protocol):
 
 @dataclass(frozen=True)
 class Machine(ABC):
-    """A netlist on its chip; made by :func:`machine_of` or :func:`machine_for`, prepared when it first runs."""
+    """A netlist on its chip; made by :func:`backends.machine_of` or `machine_for`, prepared when it first runs."""
 
     netlist: Any
     """The placed network as the chip holds it, a :class:`Netlist`."""
@@ -366,67 +356,73 @@ class Format:
     ending: str = ""
 
 
-def _module(name: str) -> Any:
-    return import_module(f"{__package__}.{name}.machine")
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Lowered:
+    """A network as a chip holds it.
 
-
-def has_machine(name: str) -> bool:
-    """Whether there is a simulator of a chip."""
-    return find_spec(f"{__package__}.{name}") is not None
-
-
-def machine_of(netlist: Netlist) -> Machine:
-    """The machine of a netlist in memory."""
-    machine: Machine = _module(netlist.target).machine_of(netlist)
-    return machine
-
-
-def describe(path: str | os.PathLike[str]) -> Outcome:
-    """Layers and cores of a netlist file, and how full each limit is; SpikeloomError if it is none."""
-    outcome: Outcome = chip_module(_chip_of(path), "description").inspect(path)
-    return outcome
-
-
-def _chip_of(path: str | os.PathLike[str]) -> str:
-    name = stated(Path(path), "target")
-    return name if name is not None and name.isidentifier() and has_machine(name) else DEFAULT
-
-
-def machine_for(path: str | os.PathLike[str]) -> Machine:
-    """Read a netlist file, whatever chip it is for; SpikeloomError if it is none."""
-    require_netlist(os.fspath(path))
-    machine: Machine = _module(_chip_of(path)).load(path)
-    return machine
-
-
-def chip_module(name: str, part: str) -> Any:
-    """What only some chips do in their own way: a module in the folder of a chip, or None if it has none of the name.
-
-    - ``description``: ``inspect(path)``, what a netlist file holds; it loads no simulator.
-    - ``commands``: ``compile_network(arguments)`` and ``verify(arguments)`` for all networks; for checkpoints that were
-      trained for the chip, which ``takes(path)`` knows, ``inspect(arguments)``.
-    - ``machine``: ``machine_of`` and ``load``; of networks that count the widest weight, ``COUNTING_BITS``, and what of
-      one is compiled, ``counting_source(counters)``.
-    - ``compiled``: ``outcome(compilation, sha256, facts)``, what the target's ``compile`` chose, proved and removed;
-      `sha256` is of the netlist's file, `facts` are what was read from a file of another format.
-    - ``exports``: ``FORMATS`` of other programs that can be written.
+    write: write the netlist to a file and give its sha256.
+    report: what was chosen, proved and removed, of the netlist in a file with that sha256.
     """
-    module = f"{__package__}.{name}.{part}"
-    return import_module(module) if has_machine(name) and find_spec(module) else None
+
+    netlist: Any
+    write: Callable[[str], str]
+    report: Callable[[str], Outcome]
 
 
-def _chip_modules(part: str) -> list[Any]:
-    chips = [each.name for each in iter_modules(machines.__path__) if each.ispkg]
-    return [module for name in chips if (module := chip_module(name, part)) is not None]
+class Backend(ABC):
+    """What a chip offers; its methods import what is heavy, so that naming a chip loads no simulator."""
 
+    name: ClassVar[str]
+    """Value of ``--target``."""
 
-def trained_for(path: object) -> Any:
-    """Commands of the chip that a checkpoint was trained for; None for any other network."""
-    if not isinstance(path, str) or stated(Path(shipped(path)), "format") != TRAINED:
-        return None  # without a look into the modules of any chip, which load its simulator
-    return next((chip for chip in _chip_modules("commands") if chip.takes(path)), None)
+    @property
+    @abstractmethod
+    def counting_bits(self) -> int:
+        """Widest weights of a counting network."""
 
+    @property
+    def target(self) -> Target:
+        """Its numbers."""
+        return load_target(self.name)
 
-def export_formats() -> list[Format]:
-    """Formats of other programs that the machines can write."""
-    return [each for module in _chip_modules("exports") for each in module.FORMATS]
+    @property
+    def formats(self) -> tuple[Format, ...]:
+        """Formats of other programs that its netlists can be written in."""
+        return ()
+
+    @property
+    @abstractmethod
+    def passes(self) -> tuple[str, ...]:
+        """Names of the passes that lower a network, in order."""
+
+    @abstractmethod
+    def lower(self, arguments: Namespace, after: Callable[[str, Any], object]) -> Lowered:
+        """Read the network that `compile` was given and lower it; `after` as of :func:`pipeline.run`."""
+
+    @abstractmethod
+    def lower_counters(self, counters: Counters) -> Netlist:
+        """Lower a counting network."""
+
+    @abstractmethod
+    def machine(self, netlist: Any) -> Machine:
+        """The machine of a netlist in memory."""
+
+    @abstractmethod
+    def load(self, path: str | os.PathLike[str]) -> Machine:
+        """Read a netlist file; SpikeloomError if it is none."""
+
+    @abstractmethod
+    def describe(self, path: str | os.PathLike[str]) -> Outcome:
+        """Layers and cores of a netlist file, and how full each limit is; loads no simulator."""
+
+    def is_trained_for(self, path: str) -> bool:  # noqa: ARG002 -- no network is, unless the chip says so
+        """Whether a file holds a network that was trained for the chip alone."""
+        return False
+
+    def inspect(self, arguments: Namespace) -> Outcome:
+        """Describe such a network."""
+        raise NotImplementedError(f"no network is trained for {self.name} alone")
+
+    def verify(self, arguments: Namespace) -> Outcome | None:  # noqa: ARG002
+        """Compare chip and network where the chip has a way of its own."""
+        return None

@@ -1,5 +1,6 @@
 """The passes of this chip in their order: a trained network at the top, a netlist that obeys every limit at the end."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.passes.prune import Masks, Removal
 from spikeloom.compiler.passes.range_proof import RangeProof, prove_ranges
 from spikeloom.compiler.pipeline import LATER, Pass, run, step
-from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.idle import forgotten
 from spikeloom.compiler.targets.loihi1.layout.choose import Layout, lay_out
@@ -279,6 +280,19 @@ def start(
     if isinstance(source, IntegerNetwork):
         return replace(work, integer=source), (*INTEGERS, *LAYOUT)
     return work, PASSES
+
+
+def compile_network(
+    source: Factored | Network | IntegerNetwork,
+    options: Options | None = None,
+    *,
+    target: Target | None = None,
+    after: Callable[[str, Compilation], object] | None = None,
+) -> Compilation:
+    """Lower a network by all passes that are due; `after` as of :func:`pipeline.run`."""
+    chip = load_target("loihi1") if target is None else target
+    work, passes = start(source, Options() if options is None else options, chip)
+    return run(passes, work, after)
 
 
 def to_integers(source: expand.Factored | Network, options: Options, target: Target) -> Compilation:

@@ -4,7 +4,7 @@ Networks that were trained for the chip and counting networks are whole numbers 
 network without memory (``--in-time``) is written out, and its weights become levels.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,8 +12,8 @@ from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import CapacityError, ModelError, OptionError
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes import expand
-from spikeloom.compiler.pipeline import LATER, Pass, step
-from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.pipeline import LATER, Pass, run, step
+from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.truenorth.codebook import COPIES, LevelNetwork, in_levels
 from spikeloom.compiler.targets.truenorth.counting import lower_counters
 from spikeloom.compiler.targets.truenorth.in_time import lower_in_time
@@ -122,3 +122,16 @@ def start(source: Source, options: Options, target: Target) -> tuple[Compilation
         raise OptionError(f"--in-time {options.in_time}: allowed are {', '.join(map(str, COPIES))} axons an input")
     work = Compilation(source=source, options=options, target=target)
     return work, PASSES[2:] if whole else PASSES
+
+
+def compile_crossbars(
+    source: Source,
+    options: Options | None = None,
+    *,
+    target: Target | None = None,
+    after: Callable[[str, Compilation], object] | None = None,
+) -> Compilation:
+    """Lower a network by all passes that are due; `after` as of :func:`pipeline.run`."""
+    chip = load_target("truenorth") if target is None else target
+    work, passes = start(source, Options() if options is None else options, chip)
+    return run(passes, work, after)

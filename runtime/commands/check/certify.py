@@ -14,7 +14,7 @@ from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.commands.options import add_netlist, add_picture, add_recordings
 from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
 from spikeloom.runtime.inputs.recordings import load_recordings
-from spikeloom.runtime.machines.base import machine_for
+from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome

@@ -7,7 +7,7 @@ from pathlib import Path
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.commands.options import add_netlist, add_recordings, group
 from spikeloom.runtime.inputs.recordings import load_recordings
-from spikeloom.runtime.machines.base import chip_module, machine_for
+from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.report.sections import Outcome
 
 
@@ -24,9 +24,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; exit code 1 where a spike, a membrane or a packet differs."""
+    from spikeloom.runtime.machines.truenorth import cosimulation
+    from spikeloom.runtime.machines.truenorth.machine import TrueNorth
+
     machine = machine_for(arguments.netlist)
-    chip = chip_module(machine.target.name, "cosimulation")
-    if chip is None:
+    if not isinstance(machine, TrueNorth):
         raise OptionError(
             f"{arguments.netlist}: no hardware description of {machine.target.title} is known; give another netlist"
         )
@@ -36,5 +38,4 @@ def run(arguments: argparse.Namespace) -> Outcome:
         folder = Path(arguments.work or temporary)
         folder.mkdir(parents=True, exist_ok=True)
         options = {"rtl": arguments.rtl, "simulator": arguments.simulator, "bin_s": arguments.bin}
-        outcome: Outcome = chip.cosimulate(machine, data, folder=folder, **options)
-    return outcome
+        return cosimulation.cosimulate(machine, data, folder=folder, **options)

@@ -15,7 +15,7 @@ from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
-from spikeloom.runtime.machines.base import machine_for
+from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.report.sections import Outcome
 

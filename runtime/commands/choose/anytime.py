@@ -7,7 +7,7 @@ from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.commands.options import add_netlist, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import load_recordings
-from spikeloom.runtime.machines.base import machine_for
+from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import write_json

@@ -4,12 +4,12 @@ import argparse
 from functools import partial
 from pathlib import Path
 
+from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.errors import OptionError, require_least
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.runtime.commands.options import add_data, add_model
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.machines.base import DEFAULT
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     from spikeloom.runtime.studies.chart.study import STORE, chart
     from spikeloom.runtime.studies.chart.work import read_splits
 
-    target = load_target(DEFAULT)
+    target = load_target(DEFAULT_TARGET)
     grid = Grid() if arguments.grid is None else parse_grid(arguments.grid, target)
     budgets = parse_budgets(arguments.budget)
     folder = Path(arguments.output)

@@ -13,7 +13,7 @@ from spikeloom.compiler.errors import require_least
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.systems import MLP, SYSTEMS
-from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
+from spikeloom.compiler.targets.base import COMPARTMENTS
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
@@ -23,7 +23,7 @@ from spikeloom.runtime.commands.options import add_data, add_graph_options
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_graph, sensor_places
-from spikeloom.runtime.machines.base import chip_module, machine_for
+from spikeloom.runtime.machines.backends import backend_of, machine_for
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.numbers import dominant
 from spikeloom.runtime.report.sections import Outcome
@@ -85,8 +85,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
     arguments.bin = training.seconds
     sensor = _sensor(arguments, training.taxels)
     data = data_of(arguments.data, arguments.bin, training, test)
-    target = load_target(arguments.target)
-    bits = chip_module(target.name, "machine").COUNTING_BITS
+    backend = backend_of(arguments.target)
+    target = backend.target
+    bits = backend.counting_bits
     systems = () if target.cores != COMPARTMENTS else SYSTEMS if len(sensor.graph.edges) else (MLP,)
     found = smallest(
         [*counting(training.steps, arguments.levels or 1, bits), *networks(training.steps, systems)],

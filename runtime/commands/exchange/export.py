@@ -14,7 +14,8 @@ from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option
 from spikeloom.runtime.inputs.files import require_netlist, require_place
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.inputs.repeat import refuse
-from spikeloom.runtime.machines.base import Request, export_formats
+from spikeloom.runtime.machines.backends import export_formats
+from spikeloom.runtime.machines.base import Request
 from spikeloom.runtime.report.encode import INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 

@@ -198,7 +198,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; its result is the summary, everything else was printed before."""
     from spikeloom.models.recordings.evtouch import BIN_S
     from spikeloom.runtime.inputs.recordings import origin_of
-    from spikeloom.runtime.machines.base import machine_for
+    from spikeloom.runtime.machines.backends import machine_for
     from spikeloom.runtime.machines.integer import integer_machine
     from spikeloom.runtime.studies.anytime import exits
 

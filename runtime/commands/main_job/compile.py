@@ -2,46 +2,16 @@
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Any
 
-from spikeloom.compiler import (
-    DEFAULT_TARGET,
-    GOALS,
-    KEEP,
-    Compilation,
-    Options,
-    __version__,
-    compile_network,
-    invariants,
-    write_netlist,
-)
+from spikeloom.compiler import DEFAULT_TARGET, GOALS, KEEP
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.formats import NETX
-from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.formats.text import text
-from spikeloom.compiler.targets.base import load_target
-from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_bin_option, add_network, group
-from spikeloom.runtime.inputs.compilation import parse_cores, parse_keep, parse_packings, provenance
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.network import load_network
-from spikeloom.runtime.inputs.recordings import origin_of, recordings
-from spikeloom.runtime.inputs.repeat import LAYOUT, NETWORK, ROUNDING, command, given, refuse, words
-from spikeloom.runtime.machines.base import chip_module, describe, trained_for
-from spikeloom.runtime.report.console import Progress, progress
-from spikeloom.runtime.report.encode import INLINE
-from spikeloom.runtime.report.sections import Outcome, Section, Text
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LaidOut:
-    """A netlist of integers as they stood, and what was read from their file."""
-
-    netlist: Any = field(metadata=INLINE)
-    path: str
-    facts: Sequence[str]
+from spikeloom.runtime.machines.backends import backend_of, trained_for
+from spikeloom.runtime.report.console import Progress
+from spikeloom.runtime.report.sections import Outcome
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
@@ -85,108 +55,21 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     require_place(arguments.output, "-o", arguments, ["loom"])
-    chip = load_target(arguments.target)
-    if isinstance(arguments.checkpoint, str) and arguments.checkpoint.endswith(NETX):
-        return _compile_integers(arguments)
-    names = [step.name for step in chip.module.PASSES]
+    backend = backend_of(arguments.target)
+    names = backend.passes
     if unknown := set(arguments.dump_after) - set(names):
         raise OptionError(f"--dump-after {', '.join(sorted(unknown))}: no such pass; allowed: {', '.join(names)}")
-    own = trained_for(arguments.checkpoint) or chip_module(arguments.target, "commands")
-    if own is not None:
-        return own.compile_network(arguments)  # type: ignore[no-any-return]
-    refuse(arguments, ("in_time",), f"{arguments.target} has no such option")
-    options = chip.module.Options(
-        packings=parse_packings(arguments),
-        spike_exact=arguments.spike_exact,
-        keep=parse_keep(arguments),
-        keep_all=arguments.keep_all,
-        prune_unused=arguments.prune_unused,
-        share_lists=arguments.share_lists,
-        cores_for=parse_cores(arguments.cores_for),
-        chips=arguments.chips,
-        optimize=arguments.optimize,
-        free_running=arguments.free_running,
-    )
-    options.require_consistent(calibrated=arguments.calibrate is not None)
-    asked = load_network(arguments.checkpoint, arguments)
-    forms, training, found = asked.network.forms, None, None
-    if forms is not None:
-        refuse(arguments, ("keep",), f"{arguments.checkpoint} was fine-tuned for its own storage")
-    if arguments.calibrate is not None:
-        progress("reading the recordings")
-        found = recordings(
-            arguments.calibrate,
-            "train",
-            classes=asked.network.classes,
-            taxels=asked.network.input.taxels,
-            bin_s=arguments.bin,
-            bins=asked.network.input.bins,
-            trained=origin_of(asked.training),
-        )
-        training = of_length(found, asked.network.input.clocks.length).events
+    only = trained_for(arguments.checkpoint)
+    if only is not None and only is not backend:
+        path = f"{arguments.checkpoint} was trained for {only.target.title}"
+        raise OptionError(f"--target {arguments.target}: {path}; give --target {only.name}")
     passes = Progress(len(names))
-    progress("compiling")
 
-    def dump(name: str, done: Compilation) -> None:
+    def dump(name: str, done: Any) -> None:
         passes(names.index(name) + 1, "compiling")
         if name in arguments.dump_after:
             sys.stderr.write(text(done.newest))
 
-    compilation = compile_network(
-        asked.model,
-        replace(
-            options,
-            forms=forms,
-            training_events=training,
-            provenance=provenance(arguments, asked, calibrated=found),
-        ),
-        target=arguments.target,
-        after=dump,
-    )
-    sha256 = write_netlist(compilation.netlist, arguments.output)
-    helps = _finetune(arguments, checkpoint=asked.checkpoint is not None)
-    shown = chip_module(arguments.target, "compiled").outcome(compilation, sha256, asked.facts, helps)
-    return shown  # type: ignore[no-any-return]
-
-
-def _finetune(arguments: argparse.Namespace, *, checkpoint: bool) -> str:
-    """What to type for training on the chip's integers."""
-    read = words(given(arguments, (*NETWORK, *LAYOUT)))
-    data = ("--data", str(arguments.calibrate), "--weight-bits", "8")
-    return command("finetune", str(arguments.checkpoint), *read, *data, "-o", "TUNED.pt" if checkpoint else "TUNED.nir")
-
-
-def _compile_integers(arguments: argparse.Namespace) -> Outcome:
-    """Compile a file that brings its integers: nothing is rounded, they are laid out as they stand."""
-    path = arguments.checkpoint
-    if load_target(arguments.target).module.Options is not Options:
-        raise OptionError(f"--target {arguments.target}: {path} holds integers of another chip; omit it")
-    floats = ("in_time", "dt", "convention", *ROUNDING, "dump_after", "calibrate", "optimize")
-    refuse(arguments, floats, f"is for float networks, {path} holds integers")
-    refuse(arguments, NETWORK, f"is for checkpoints, the netx file {path} holds all it needs")
-    progress("reading the network")
-    read = read_netx(path, polarities=arguments.polarities, polarities_first=arguments.polarities_first)
-    invariants.verify(read.network)
-    progress("compiling")
-    cores_for = parse_cores(arguments.cores_for)
-    provenance = {
-        "spikeloom": __version__,
-        "checkpoint_sha256": read.sha256,
-        "format": "netx",
-        "keep_all": arguments.keep_all,
-        **({"cores_for": cores_for} if cores_for else {}),
-        **({"chips": arguments.chips} if arguments.chips != 1 else {}),
-    }
-    layout = {"keep_all": arguments.keep_all, "cores_for": cores_for, "free_running": arguments.free_running}
-    options = Options(**layout, chips=arguments.chips, provenance=provenance)
-    done = compile_network(read.network, options, target=arguments.target)
-    sha256 = write_netlist(done.netlist, arguments.output)
-    described = describe(arguments.output)
-
-    def sections(made: LaidOut) -> Iterator[Section]:
-        yield Section("", [*map(Text, made.facts)])
-        *first, last = described.sections(made.netlist)
-        yield from first
-        yield Section("", [*last.blocks, Text(f"sha256 {sha256}")])
-
-    return Outcome(LaidOut(netlist=described.result, path=arguments.output, facts=read.facts), sections)
+    lowered = backend.lower(arguments, dump)
+    sha256 = lowered.write(arguments.output)
+    return lowered.report(sha256)

@@ -7,7 +7,8 @@ from spikeloom.models.recordings.evtouch import Recordings, first_part, parse_wi
 from spikeloom.models.training.counters import BITS
 from spikeloom.runtime.commands.options import add_detail, add_netlist, add_recordings
 from spikeloom.runtime.inputs.recordings import load_recordings
-from spikeloom.runtime.machines.base import Machine, Price, Run, machine_for
+from spikeloom.runtime.machines.backends import machine_for
+from spikeloom.runtime.machines.base import Machine, Price, Run
 from spikeloom.runtime.machines.simulated import Account, Accounted
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies import processor

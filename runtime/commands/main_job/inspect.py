@@ -16,7 +16,7 @@ from spikeloom.runtime.commands.options import add_model
 from spikeloom.runtime.inputs.files import require_inspectable, shipped
 from spikeloom.runtime.inputs.network import load_checkpoint, network_kind
 from spikeloom.runtime.inputs.repeat import NETWORK, refuse
-from spikeloom.runtime.machines.base import describe, trained_for
+from spikeloom.runtime.machines.backends import describe, trained_for
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 
@@ -97,8 +97,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     require_inspectable(arguments.path)
-    if (own := trained_for(arguments.path)) is not None:
-        return own.inspect(arguments)  # type: ignore[no-any-return]
+    backend = trained_for(arguments.path)
+    if backend is not None:
+        return backend.inspect(arguments)
     if is_netlist(arguments.path):
         refuse(arguments, NETWORK, f"is for checkpoints, {arguments.path} is a netlist")
         return describe(arguments.path)

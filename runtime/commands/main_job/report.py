@@ -12,7 +12,7 @@ from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
-from spikeloom.runtime.machines.base import describe, machine_for
+from spikeloom.runtime.machines.backends import describe, machine_for
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
 from spikeloom.runtime.machines.simulated import Account
 from spikeloom.runtime.page.recording import recording

@@ -16,7 +16,8 @@ from spikeloom.runtime.commands.main_job.estimate import priced
 from spikeloom.runtime.commands.options import add_detail, add_netlist, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import load_recordings
-from spikeloom.runtime.machines.base import Machine, Price, Run, machine_for
+from spikeloom.runtime.machines.backends import machine_for
+from spikeloom.runtime.machines.base import Machine, Price, Run
 from spikeloom.runtime.machines.simulated import Account, Accounted
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
 from spikeloom.runtime.report.numbers import percent

@@ -13,7 +13,8 @@ from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.inputs.repeat import refuse
-from spikeloom.runtime.machines.base import ENGINES, chip_module, machine_for
+from spikeloom.runtime.machines.backends import backend_of, machine_for
+from spikeloom.runtime.machines.base import ENGINES
 from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.machines.simulated import Account
 from spikeloom.runtime.report.console import tell
@@ -49,8 +50,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if arguments.data is None:
         refuse(arguments, WITH_DATA, "is about recordings, give --data too")
     machine = machine_for(arguments.netlist)
-    if (own := chip_module(machine.netlist.target, "commands")) is not None:
-        return own.verify(arguments)  # type: ignore[no-any-return]
+    own = backend_of(machine.netlist.target).verify(arguments)
+    if own is not None:
+        return own
     agreement = MIN_AGREEMENT if arguments.min_agreement is None else arguments.min_agreement
     if not 0 <= agreement <= 1:
         raise OptionError(f"--min-agreement {agreement}: not a share; give a number from 0 to 1")

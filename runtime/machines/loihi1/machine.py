@@ -15,7 +15,6 @@ import numpy.typing as npt
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import FormatError, NumericRangeError
 from spikeloom.compiler.files import reading
-from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.idle import forgotten
@@ -239,15 +238,6 @@ class Loihi(IntegerMachine):
     def stream(self) -> Stream:
         """One grasp, bin after bin."""
         return Stream(self._stepwise)
-
-
-machine_of = Loihi
-
-COUNTING_BITS = 8
-"""Widest weights of a counting network."""
-
-counting_source = counting_network
-"""What of a counting network is compiled."""
 
 
 def load(path: str | os.PathLike[str]) -> Loihi:

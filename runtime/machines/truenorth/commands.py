@@ -1,112 +1,41 @@
-"""What TrueNorth does in its own way: networks trained for it, counting ones, and history-free ones (``--in-time``)."""
+"""How chip, specification and model of a TrueNorth netlist are compared."""
 
 import argparse
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from operator import add
-from pathlib import Path
 
 import numpy as np
 
-from spikeloom.compiler import __version__
-from spikeloom.compiler.archive import COUNTERS
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.counters import read_counters
-from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.interpret import channels_last, float_simulation, vote
 from spikeloom.compiler.ir import Network
-from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.codebook import PartialSums, in_levels, run_levels
 from spikeloom.compiler.targets.truenorth.counting import planned, run_counters
 from spikeloom.compiler.targets.truenorth.in_time import first_spikes
-from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
-from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, unlike, write_crossbars
-from spikeloom.compiler.targets.truenorth.passes import Compilation, Options, Source
-from spikeloom.compiler.types import BoolArray, EventArray, IntArray, JsonObject
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, unlike
+from spikeloom.compiler.targets.truenorth.passes import Options, Source, compile_crossbars
+from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.files import shipped
-from spikeloom.runtime.inputs.network import NETWORKS, LoadedNetwork, load_network
-from spikeloom.runtime.inputs.recordings import load_recordings, origin_of
-from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
-from spikeloom.runtime.machines.truenorth.description import describe, describe_trained
-from spikeloom.runtime.machines.truenorth.machine import load, machine_of
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.recordings import load_recordings
+from spikeloom.runtime.inputs.repeat import refuse
+from spikeloom.runtime.machines.truenorth.lowering import COUNTING, TITLE, read
+from spikeloom.runtime.machines.truenorth.machine import TrueNorth, load
 from spikeloom.runtime.machines.votes import class_counts, readout_counts
-from spikeloom.runtime.report.console import Progress, progress
+from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.report.encode import OPTIONAL, key
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
-
-TITLE = "TrueNorth"
-
-COUNTING = NETWORKS[COUNTERS].lower()
-"""What a netlist says of the format that it was compiled from, if that was a counting network."""
 
 VERIFY = ("original", "min_agreement", "require", "engine")
 """Options of ``verify`` where chip and model may differ."""
 
 SPEC_STEPS = 5
 """Data steps of a recording on which the specification runs, too: it takes a second for two hundred ticks."""
-
-
-def takes(path: str) -> bool:
-    """Whether what a user names is a network that was trained for the chip."""
-    return isinstance(path, str) and Path(shipped(path)).is_file() and is_trained(shipped(path))
-
-
-def read(path: str, arguments: argparse.Namespace) -> Trained:
-    """Read a trained network as the options say; OptionError or ModelError if it is not as they say."""
-    others = [name for name in NETWORK if name != "weights"]
-    refuse(arguments, others, f"{path} is a network for {TITLE} and says that itself")
-    return read_trained(shipped(path), weights=arguments.weights)
-
-
-def inspect(arguments: argparse.Namespace) -> Outcome:
-    """Show what a trained network is."""
-    return describe_trained(read(arguments.path, arguments))
-
-
-def compile_network(arguments: argparse.Namespace) -> Outcome:
-    """Place a network on cores and write it; OptionError, ModelError or CapacityError if that cannot be."""
-    path, trained = arguments.checkpoint, takes(arguments.checkpoint)
-    chip = load_target("truenorth")
-    if arguments.target != chip.name:
-        raise OptionError(f"--target {arguments.target}: {path} was trained for {TITLE}; give --target {chip.name}")
-    refuse(arguments, ("calibrate", *ROUNDING, *PLACING), f"is not for {chip.name}")
-    source: Source
-    if trained:
-        network = read(path, arguments)
-        source, origin = network.network, provenance(network)
-    else:
-        loaded = load_network(path, arguments)
-        source = read_counters(shipped(path))[0] if loaded.format == COUNTING else loaded.model
-        origin = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256}
-        origin |= loaded.origin(arguments.run) | {"in_time": arguments.in_time} | origin_of(loaded.training)
-    progress("compiling")
-
-    def dump(name: str, done: Compilation) -> None:
-        if name in arguments.dump_after:
-            sys.stderr.write(text(done.newest))
-
-    try:
-        netlist = chip.compile(source, Options(in_time=arguments.in_time, provenance=origin), after=dump).netlist
-    except ModelError as error:
-        raise ModelError(f"{path if isinstance(path, str) else 'module'}: {error}") from error
-    return describe(netlist, write_crossbars(netlist, arguments.output))
-
-
-def provenance(trained: Trained) -> JsonObject:
-    """What a netlist remembers of the trained network that it is from."""
-    return {
-        "spikeloom": __version__,
-        "checkpoint_sha256": trained.sha256,
-        "weights": trained.weights,
-        "graph": trained.graph,
-        "copies": trained.network.copies,
-        "towers": 1,
-        **origin_of(trained.training),
-    }
 
 
 Modelled = tuple[Mapping[str, BoolArray], tuple[PartialSums, ...]]
@@ -219,7 +148,7 @@ def compare(
     `first` is the tick in which a layer spikes for the first data step. The specification runs on the first
     recordings, too, and there on the first steps, where `spec_steps` says so. `held` is what is known of the netlist.
     """
-    machine, layers = machine_of(netlist), list(netlist.layers)
+    machine, layers = TrueNorth(netlist), list(netlist.layers)
     spikes, differences = dict.fromkeys(first, 0), dict.fromkeys(first, 0)
     votes, overflows, wrong = np.zeros((len(data), netlist.classes), np.int64), 0, 0
     theirs = np.zeros_like(votes)
@@ -329,7 +258,7 @@ def verify(arguments: argparse.Namespace) -> Outcome:
         def model(events: EventArray) -> Modelled:
             return {name: held[0] for name, held in run_network(trained, events[None]).items()}, ()
 
-    again = machine.target.compile(source, Options(in_time=copies or None)).netlist
+    again = compile_crossbars(source, Options(in_time=copies or None)).netlist
     held = AgainstNetlist(tuple(unlike(netlist, again)))
     if arguments.data is None:
         return Outcome(held, lambda held: [Section("Netlist", [Text(held.text)])], 0 if held.holds else 1)

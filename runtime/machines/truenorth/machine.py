@@ -8,10 +8,8 @@ from typing import NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.truenorth.counting import LARGEST
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars
 from spikeloom.compiler.types import EventArray, IntArray
@@ -75,17 +73,6 @@ class TrueNorth(Machine):
     def stream(self) -> NoReturn:
         """Whole recordings only."""
         raise OptionError(f"{self.target.title}: runs whole recordings, not bin after bin; give one for another chip")
-
-
-machine_of = TrueNorth
-
-COUNTING_BITS = 1 + LARGEST.bit_length()
-"""Widest weights of a counting network."""
-
-
-def counting_source(counters: Counters) -> Counters:
-    """What of a counting network is compiled: it itself."""
-    return counters
 
 
 def load(path: str | os.PathLike[str]) -> TrueNorth:

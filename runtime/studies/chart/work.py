@@ -13,7 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import Compilation, Options, __version__, lay_out_again, to_integers, write_netlist
+from spikeloom.compiler import (
+    DEFAULT_TARGET,
+    Compilation,
+    Options,
+    __version__,
+    lay_out_again,
+    to_integers,
+    write_netlist,
+)
 from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
@@ -25,7 +33,8 @@ from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
-from spikeloom.runtime.machines.base import DEFAULT, Machine, Price, machine_of
+from spikeloom.runtime.machines.backends import machine_of
+from spikeloom.runtime.machines.base import Machine, Price
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
@@ -205,7 +214,7 @@ def _compile_options(work: Measurement, layout: str) -> argparse.Namespace:
     """What the command ``compile`` would have parsed."""
     return argparse.Namespace(
         **vars(work.network.arguments())
-        | {"target": DEFAULT}
+        | {"target": DEFAULT_TARGET}
         | {name: repeat.USUAL.get(name) for name in (*repeat.ROUNDING, *repeat.PLACING)}
         | {name: value for name, value in work.storage.options().items() if value is not None}
         | _layout_options(layout)

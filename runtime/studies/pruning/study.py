@@ -9,7 +9,7 @@ from spikeloom.compiler.systems import TACTILESGNET
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
-from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.pruning import trials
 from spikeloom.runtime.studies.pruning.results import Changed, LayerUse, Lean, Removed, Row, TaxelUse

@@ -19,7 +19,7 @@ from spikeloom.compiler.passes.prune import without_channels
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
-from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.studies.pruning.results import Costs
 

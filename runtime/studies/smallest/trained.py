@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import compile_network
+from spikeloom.compiler import Options
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.graphs import Graph
 from spikeloom.models.recordings.events import joined_bins
@@ -70,8 +71,8 @@ def without(plan: Plan, training: Recordings, held: IntArray, epochs: int, targe
         asked = arguments(target)
         asked.weight_bits = str(storage or 8)
         loaded, events = load_network(str(file), asked), np.ascontiguousarray(seen.events)
-        options = target.module.Options(training_events=events, packings=parse_packings(asked))
-        return compile_network(loaded.model, options, target=target.name).netlist
+        options = Options(training_events=events, packings=parse_packings(asked))
+        return compile_network(loaded.model, options, target=target).netlist
 
 
 def arguments(target: Target) -> argparse.Namespace:

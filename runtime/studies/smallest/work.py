@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import __version__, compile_network
+from spikeloom.compiler import __version__
 from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import CapacityError, DataError, ModelError
@@ -28,7 +28,7 @@ from spikeloom.models.training.counters import (
     spikes_of,
 )
 from spikeloom.runtime.inputs.recordings import recordings
-from spikeloom.runtime.machines.base import chip_module, machine_of
+from spikeloom.runtime.machines.backends import backend_of, machine_of
 from spikeloom.runtime.machines.integer import IntegerMachine
 from spikeloom.runtime.report.encode import OPTIONAL, encode
 from spikeloom.runtime.studies.anytime.study import study
@@ -130,8 +130,7 @@ def _counting(work: Trial, training: Recordings) -> Measured:
     def compiled(data: Counted) -> tuple[Counters, Any]:
         rule = linear_rules(data, classes, [strength])[strength]
         made = counters_of(data, Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest), training, classes)
-        source = chip_module(work.target, "machine").counting_source(made)
-        return made, compile_network(source, target=work.target).netlist
+        return made, backend_of(work.target).lower_counters(made)
 
     costs: dict[str, Any]
     certified, held = None, folds(data.labels, FOLDS, np.random.default_rng(0)) == 0

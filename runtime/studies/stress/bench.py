@@ -17,7 +17,7 @@ from spikeloom.models.sensors import read_layout
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_graph, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
-from spikeloom.runtime.machines.base import machine_for
+from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.studies.stress import damages, disturbances
 from spikeloom.runtime.studies.stress.pair import Events, Inputs, Pair, Perturbation, perturbation

@@ -18,7 +18,7 @@ from spikeloom.compiler.errors import NumericRangeError, OptionError
 from spikeloom.compiler.interpret import Simulation, cut, float_simulation, vote
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
-from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
 from spikeloom.runtime.machines.votes import readout_counts
 

@@ -1,0 +1,77 @@
+"""What is compiled for TrueNorth: networks trained for it, counting ones, and history-free ones (``--in-time``)."""
+
+from argparse import Namespace
+from collections.abc import Callable
+from typing import Any
+
+from spikeloom.compiler import __version__
+from spikeloom.compiler.archive import COUNTERS
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.formats import NETX
+from spikeloom.compiler.formats.counters import read_counters
+from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
+from spikeloom.compiler.targets.truenorth.netlist import write_crossbars
+from spikeloom.compiler.targets.truenorth.passes import Options, Source, compile_crossbars
+from spikeloom.compiler.types import JsonObject
+from spikeloom.runtime.inputs.files import shipped
+from spikeloom.runtime.inputs.network import NETWORKS, load_network
+from spikeloom.runtime.inputs.recordings import origin_of
+from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
+from spikeloom.runtime.machines.base import Lowered
+from spikeloom.runtime.machines.truenorth.description import describe
+from spikeloom.runtime.report.console import progress
+
+TITLE = "TrueNorth"
+
+COUNTING = NETWORKS[COUNTERS].lower()
+"""What a netlist says of the format that it was compiled from, if that was a counting network."""
+
+
+def read(path: str, arguments: Namespace) -> Trained:
+    """Read a trained network as the options say; OptionError or ModelError if it is not as they say."""
+    others = [name for name in NETWORK if name != "weights"]
+    refuse(arguments, others, f"{path} is a network for {TITLE} and says that itself")
+    return read_trained(shipped(path), weights=arguments.weights)
+
+
+def lower(arguments: Namespace, after: Callable[[str, Any], object]) -> Lowered:
+    """Place a network on cores; OptionError, ModelError or CapacityError if that cannot be."""
+    path = arguments.checkpoint
+    named = isinstance(path, str)
+    if named and path.endswith(NETX):
+        raise OptionError(f"--target {arguments.target}: {path} holds integers of another chip; omit it")
+    refuse(arguments, ("calibrate", *ROUNDING, *PLACING), "is not for truenorth")
+    source: Source
+    if named and is_trained(shipped(path)):
+        trained = read(path, arguments)
+        source = trained.network
+        provenance = provenance_of(trained)
+    else:
+        loaded = load_network(path, arguments)
+        source = read_counters(shipped(path))[0] if loaded.format == COUNTING else loaded.model
+        provenance = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256}
+        provenance |= loaded.origin(arguments.run) | {"in_time": arguments.in_time} | origin_of(loaded.training)
+    progress("compiling")
+    options = Options(in_time=arguments.in_time, provenance=provenance)
+    try:
+        netlist = compile_crossbars(source, options, after=after).netlist
+    except ModelError as error:
+        raise ModelError(f"{path if named else 'module'}: {error}") from error
+    return Lowered(
+        netlist=netlist,
+        write=lambda output: write_crossbars(netlist, output),
+        report=lambda sha256: describe(netlist, sha256),
+    )
+
+
+def provenance_of(trained: Trained) -> JsonObject:
+    """What a netlist remembers of the trained network that it is from."""
+    return {
+        "spikeloom": __version__,
+        "checkpoint_sha256": trained.sha256,
+        "weights": trained.weights,
+        "graph": trained.graph,
+        "copies": trained.network.copies,
+        "towers": 1,
+        **origin_of(trained.training),
+    }
