@@ -64,8 +64,9 @@ class Layer:
         return moved
 
     def _run(self, *arrays: Any) -> None:
-        from spikeloom.compiler.layer_kernel import run_layer
+        from spikeloom.compiler.layer_kernel import require_below, run_layer
 
+        require_below("source", arrays[0].source, len(self.fixed[0].run) - 1)
         state, listed = np.empty((3, self.size), self._kind), np.empty(self.size, np.int32)
         run_layer(arrays[0], *self.fixed, state, listed, *arrays[1:])
 

@@ -111,6 +111,12 @@ def compiled_and_cached(function: Function) -> Function:
         return cast(Function, numba.njit(**_KERNEL)(function))
 
 
+def require_below(what: str, indices: AnyArray, bound: int) -> None:
+    """Refuse indices outside 0..bound-1 with an IndexError: machine code reads whatever lies there instead."""
+    if indices.size and not 0 <= (low := int(indices.min())) <= (high := int(indices.max())) < bound:
+        raise IndexError(f"{what} {low if low < 0 else high}: allowed are 0..{bound - 1}")
+
+
 # Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the loops.
 
 

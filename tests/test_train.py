@@ -5,7 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from made_files import checkpoint_bytes, csv_folder, recorded, recordings_folder, ring, small_checkpoint, weights
+from made_files import (
+    TAXELS,
+    checkpoint_bytes,
+    csv_folder,
+    recorded,
+    recordings_folder,
+    ring,
+    small_checkpoint,
+    weights,
+)
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import comparable, load_weights, refused
 from test_checkpoint import rebuilt
@@ -413,6 +422,18 @@ def test_a_class_without_training_recordings_is_said(tmp_path, capsys):
         file.unlink()
     both_splits(str(folder), None, None)
     assert capsys.readouterr().err.endswith("warning: gap: no recordings to train class 1 on\n")
+
+
+@pytest.mark.parametrize("command", ["train --system counters -o OUT.pt", "smallest -o OUT.loom"])
+@pytest.mark.parametrize("more", [1, 900])
+def test_taxels_that_only_the_test_split_has_are_refused(tmp_path, capsys, command, more):
+    csv_folder(tmp_path / "taps" / "train")
+    csv_folder(tmp_path / "taps" / "test", taxels=TAXELS + more)
+    words = command.replace("OUT", str(tmp_path / "out")).split()
+    assert main([*words, "--data", str(tmp_path / "taps")]) == 2
+    message = capsys.readouterr().err
+    assert f"allowed are whole numbers 0..{TAXELS - 1}" in message
+    assert f"the training recordings have {TAXELS} taxels; if more exist, give --taxels" in message
 
 
 def test_counts_of_events_are_said_once(tmp_path, capsys):

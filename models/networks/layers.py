@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from spikeloom.compiler.layer_kernel import require_below
 from spikeloom.compiler.types import EventArray
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 
@@ -175,6 +176,7 @@ class _SpikeLinear(torch.autograd.Function):
     def forward(ctx: Any, spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         rows = spikes.reshape(-1, spikes.shape[-1]).contiguous()
         source, bounds = events_of(rows.numpy())
+        require_below("input", source, len(weight))
         out = bias.expand(len(rows), -1).clone(memory_format=torch.contiguous_format)
         gather(source, bounds, weight.detach().contiguous().numpy(), out.numpy())
         ctx.events = source, bounds

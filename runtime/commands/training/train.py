@@ -152,8 +152,14 @@ def both_splits(data: str, taxels: int | None, bin_s: float | None) -> tuple[Rec
     """Training and test recordings of a sensor, every one with its label."""
     progress("reading the recordings")
     require_splits(data)
-    shared: dict[str, Any] = {"taxels": taxels, "bin_s": bin_s, "labels_for": "training", "classes": None}
-    training, test = (recordings(data, split, **shared) for split in ("train", "test"))
+    shared: dict[str, Any] = {"bin_s": bin_s, "labels_for": "training", "classes": None}
+    training = recordings(data, "train", taxels=taxels, **shared)
+    try:
+        test = recordings(data, "test", taxels=training.taxels, **shared)
+    except DataError as error:
+        if taxels is None:
+            error.add_note(f"the training recordings have {training.taxels} taxels; if more exist, give --taxels N")
+        raise
     progress("")
     known = int(training.labels.max())
     if missing := sorted(set(range(known)) - set(training.labels.tolist())):

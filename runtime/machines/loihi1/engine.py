@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import NumericRangeError
+from spikeloom.compiler.layer_kernel import require_below
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.machines.base import Done, require_channels
@@ -154,6 +155,7 @@ def simulate(
     )
     ends = np.full(recordings, length) if lengths is None else np.asarray(lengths, np.int64)
     run_part, size = (_run_steps, 1) if engine.blocks is None else (_run_layers, PART)
+    require_below("length", ends, length + 1)
     given = np.ascontiguousarray(events).view(np.uint8)
     given.flags.writeable = False  # or the kernels would be compiled twice, for either
     if charges is not None:

@@ -23,6 +23,7 @@ from math import lcm
 
 import numpy as np
 
+from spikeloom.compiler.layer_kernel import require_below
 from spikeloom.compiler.targets.base import PICOSECONDS, Target, TimeTable
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count, require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
@@ -201,6 +202,9 @@ def detailed(
     fired, worked, seen = (np.ascontiguousarray(bits).view(np.uint8) for bits in (spikes, updated, events != 0))
     cores, (samples, length) = tables.start.size - 1, spikes.shape[:2]
     own = np.full(samples, length) if steps is None else steps
+    require_below("compartments", np.array(fired.shape[2]), tables.sender.size + 1)
+    require_below("channels", np.array(seen.shape[1]), tables.channel_first.size)
+    require_below("chip steps", own, length + 1)
     blocked, peak = np.zeros((2, samples, length))
     spent = np.zeros((samples, length, 2 * cores))
     for i in range(samples):

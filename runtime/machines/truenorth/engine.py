@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spikeloom.compiler.errors import NumericRangeError
+from spikeloom.compiler.layer_kernel import require_below
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.legalize import signed_range
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO, CrossbarNetlist
@@ -179,6 +180,7 @@ def simulate(
     require_channels(netlist, events.shape[1])
     samples, _, whole = events.shape
     steps = np.full(samples, whole) if lengths is None else np.asarray(lengths, np.int64)
+    require_below("length", steps, whole + 1)
     most = netlist.ticks(whole)
     if most >= MOST_TICKS:
         raise NumericRangeError(f"recordings of {whole} data steps take {most} ticks, {MOST_TICKS - 1} can be counted")

@@ -36,6 +36,7 @@ def lower_bound(votes: IntArray, cells: Cells, effects: Effects, known: Forgetti
 
     `votes` (classes,) are those of the known run, `effects` those of each entry flipped alone.
     """
+    from spikeloom.compiler.layer_kernel import require_below
     from spikeloom.runtime.studies.stability.worst import most_lost  # with numba, which help need not wait for
 
     decision, gaps = needed(votes)
@@ -43,6 +44,8 @@ def lower_bound(votes: IntArray, cells: Cells, effects: Effects, known: Forgetti
     step = cells.cells[:, 1]
     first = np.searchsorted(step, np.arange(steps + 1))
     end = np.minimum(effects.end, steps)
+    for name, indices in (("quiet", known.quiet), ("back", known.back)):
+        require_below(name, indices, steps + 1)
     certified = most
     for other in np.flatnonzero(np.arange(len(votes)) != decision).tolist():
         alone = effects.votes[:, other] - effects.votes[:, decision]

@@ -15,7 +15,16 @@ import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
-from spikeloom.compiler.layer_kernel import Synapses, by_source, clear, compiled, compiled_and_cached, copy, list_fired
+from spikeloom.compiler.layer_kernel import (
+    Synapses,
+    by_source,
+    clear,
+    compiled,
+    compiled_and_cached,
+    copy,
+    list_fired,
+    require_below,
+)
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, reach
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.changes import Changes, Effects
@@ -108,6 +117,7 @@ def chip_of(netlist: Netlist) -> Chip:
 def known_run(chip: Chip, events: AnyArray) -> Known:
     """Run a recording (channels, T) and keep what changed runs need."""
     places, steps = len(chip.bias), events.shape[1] + int(chip.depth.max())
+    require_below("channels", np.array(len(events)), len(chip.synapses.run) - places)
     registers = np.zeros((2, steps + 1, places), np.int32)
     sums, fired = np.zeros((steps, places), np.int32), np.zeros((steps, places), np.uint8)
     known = Known(np.ascontiguousarray(events).view(np.uint8), sums, registers[0], registers[1], fired)
@@ -121,6 +131,8 @@ def effects(chip: Chip, known: Known, classes: int, changes: Changes) -> Effects
     come, gone = np.zeros((2, count, classes), np.int64)
     found = Effects(come, gone, np.zeros(count, np.int64))
     channel, step = np.ascontiguousarray(changes.cells.T, np.int64)
+    require_below("channel", channel, known.events.shape[0])
+    require_below("step", step, known.events.shape[1])
     _run(chip, known, _run_of(chip, known), channel, step, changes.bounds, *found)
     return found
 

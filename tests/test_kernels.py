@@ -1,0 +1,95 @@
+"""Machine code checks no index: what calls it does so, once, before it starts."""
+
+import numpy as np
+import pytest
+import torch
+from random_networks import chain
+from zoo import specimen
+
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.interpret import float_simulation
+from spikeloom.models.networks.layers import spike_linear
+from spikeloom.runtime.machines.changes import Forgetting, single
+from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1.changes import kernel
+from spikeloom.runtime.machines.truenorth import engine as crossbars
+from spikeloom.runtime.studies.stability.bounds import lower_bound
+from spikeloom.runtime.studies.stability.neighbours import cells_of
+
+EVENTS = np.ones((2, 3, 4), np.uint8)
+
+
+def layers():
+    float_simulation(chain(np.ones((3, 4)))).run(np.ones((1, 5, 9), np.bool_))
+
+
+def training():
+    spike_linear(torch.ones(2, 5), torch.ones(4, 3), torch.zeros(3))
+
+
+def long_recording(simulate, name):
+    made = specimen(name)
+    netlist = made.machine.netlist
+    channels = with_clocks(made.events, netlist.clocks)
+    simulate(netlist, channels, lengths=np.full(len(channels), channels.shape[2] + 1))
+
+
+def known_run(*, channels=0):
+    netlist = specimen("counters").machine.netlist
+    chip = kernel.chip_of(netlist)
+    return chip, kernel.known_run(chip, np.ones((netlist.n_inputs + channels, 5), np.uint8))
+
+
+def flipped(channel, step):
+    chip, known = known_run()
+    kernel.effects(chip, known, 3, single(np.array([[channel, step]])))
+
+
+def timed(**more):
+    machine = specimen("tactilesgnet").machine
+    netlist = machine.netlist
+    tables = timing.prepare(netlist, machine.target, machine.target.time[0])
+    sizes = {"compartments": netlist.n_compartments, "channels": netlist.n_inputs, "steps": 6}
+    sizes = {name: size + more.get(name, 0) for name, size in sizes.items()}
+    spikes = np.zeros((1, 6, sizes["compartments"]), np.bool_)
+    events = np.zeros((1, sizes["channels"], 4), np.uint8)
+    timing.detailed(tables, spikes, spikes, events, steps=np.array([sizes["steps"]]))
+
+
+def forgotten(late):
+    netlist = specimen("counters").machine.netlist
+    chip, known = known_run()
+    cells = cells_of(np.ones((netlist.taxels, netlist.polarities, 5), np.uint8), netlist)
+    effects = kernel.effects(chip, known, 3, single(cells.cells))
+    steps = len(known.fired)
+    back = np.full(steps + 1, steps + late)
+    votes = np.zeros((steps + 1, steps, 3), np.int16)
+    state = Forgetting(lag=1, quiet=np.full(steps + 1, steps), back=back, gone=votes, come=votes)
+    lower_bound(np.array([9, 1, 1]), cells, effects, state, 2)
+
+
+OUTSIDE = {
+    "a spike of a source that a layer does not know": layers,
+    "an input of a layer that is trained": training,
+    "a step after the end on Loihi": lambda: long_recording(engine.simulate, "counters"),
+    "a step after the end on TrueNorth": lambda: long_recording(crossbars.simulate, "native"),
+    "an input channel of a known run": lambda: known_run(channels=1),
+    "a channel that is flipped": lambda: flipped(9999, 0),
+    "a step that is flipped": lambda: flipped(0, 5),
+    "a compartment that is timed": lambda: timed(compartments=1),
+    "a channel that is timed": lambda: timed(channels=1),
+    "a chip step that is timed": lambda: timed(steps=1),
+    "a step at which the chip is at rest": lambda: forgotten(1),
+}
+
+
+@pytest.mark.parametrize("call", OUTSIDE.values(), ids=OUTSIDE)
+def test_an_index_outside_is_refused_before_machine_code_runs(call):
+    with pytest.raises(IndexError, match="allowed are 0"):
+        call()
+
+
+def test_indices_inside_are_taken():
+    flipped(0, 4)
+    timed()
+    forgotten(0)
