@@ -62,8 +62,8 @@ PROCESSOR = {
 }
 LAYOUTS = ("", *(f"--cores-for {each}" for each in ("fc1=4", "fc1=6", "fc1=8", "conv1=6,fc1=6,fc2=3")))
 CHARTS = {
-    OBJECTS: ("pretrained:objects", "bits=3,4,8,window=10%,20%,100%,cores=cores/latency"),
-    CONTAINERS: ("pretrained:containers containers-knn1.pt", "bits=2,4,8,window=25-100%,cores=cores/latency"),
+    OBJECTS: ("pretrained:objects", "bits=3,4,8,window=10%,20%,100%"),
+    CONTAINERS: ("pretrained:containers containers-knn1.pt", "bits=2,4,8,window=25-100%"),
 }
 USUAL = ("8b", "cores", 100)
 """Storage, layout and window that others are compared with, of the first network."""
@@ -219,7 +219,7 @@ def free_running(session: Session) -> Json:
 def layouts(session: Session) -> Json:
     """What more cores cost and bring, message by message."""
     found = {}
-    for options in (*LAYOUTS, "--optimize latency"):
+    for options in LAYOUTS:
         session.run(f"compile {MANUAL} --graph manual --calibrate {OBJECTS} {options} -o net.loom".replace("  ", " "))
         found[options or "default"] = session.costs(OBJECTS, "--detail cycle")
     return found

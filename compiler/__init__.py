@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from spikeloom.compiler.passes.expand import Factored
     from spikeloom.compiler.targets.loihi1.lift import lift
     from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist, write_netlist
-    from spikeloom.compiler.targets.loihi1.options import GOALS, KEEP, MAX_PLANES, Options, Packing, check_packings
+    from spikeloom.compiler.targets.loihi1.options import KEEP, MAX_PLANES, Options, Packing, check_packings
     from spikeloom.compiler.targets.loihi1.passes import Compilation, lay_out_again, to_integers, without
     from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
     from spikeloom.compiler.targets.loihi1.storage.scales import layer_of, rounded
@@ -23,7 +23,7 @@ DEFAULT_TARGET = "loihi1"
 _NAMES = {
     "lift": "lift",
     "netlist": "Netlist read_netlist write_netlist",
-    "options": "GOALS KEEP MAX_PLANES Options Packing check_packings",
+    "options": "KEEP MAX_PLANES Options Packing check_packings",
     "passes": "Compilation lay_out_again to_integers without",
     "storage.choose_storage": "round_to_forms",
     "storage.scales": "layer_of rounded",

@@ -186,7 +186,7 @@ def points():
         point(2, 398, 90, 120, 3.0),
         point(3, 396, 70, 60, 2.0, bits=3),
         point(4, 394, 89, 40, 2.5, bits=2),
-        point(5, 400, 60, 300, 1.0, cores="latency"),
+        point(5, 400, 60, 300, 1.0, cores="fc1:6"),
     ]
     return study.with_fronts(study.with_expectations(made, [made_network()]), BY)
 
@@ -292,7 +292,7 @@ def parsed(text):
     [
         ("", {"bits": ((2,), (3,), (4,), (5,), (6,), (8,)), "window": (25, 50, 75, 100)}),
         ("bits=2-6,8,planes=1-2,prune=0/1", {"planes": (1, 2), "prune": (0, 1)}),
-        ("cores=latency/fc1:6+conv1:4,groups=2", {"cores": ("latency", "fc1:6+conv1:4"), "groups": (2,)}),
+        ("cores=cores/fc1:6+conv1:4,groups=2", {"cores": ("cores", "fc1:6+conv1:4"), "groups": (2,)}),
         # in their order, each once
         ("bits=8,2-4,3,4+4+4+4", {"bits": ((8,), (2,), (3,), (4,))}),
         ("bits=8+4+4+8/8", {"bits": ((8, 4, 4, 8), (8,))}),
@@ -322,7 +322,7 @@ def test_values_of_axes(text, axes):
         ("groups=0", "groups=0: allowed are 1 to 8 scale groups"),
         ("prune=2", "prune=2: allowed are 0 (keep) and 1 (leave out)"),
         *((f"window={value}", "1 to 100 per cent") for value in ("50-101%", "0", "80-20%", "20-80%:0", "50%:5")),
-        *((f"cores={value}", "cores, latency, or LAYER:N") for value in ("fast", "a:2+:3", "a:2+a:3", "a:0")),
+        *((f"cores={value}", "cores, or LAYER:N") for value in ("fast", "a:2+:3", "a:2+a:3", "a:0")),
     ],
 )
 def test_a_mistake_names_the_value_and_what_is_allowed(text, telling):

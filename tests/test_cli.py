@@ -216,7 +216,6 @@ NEEDED = {
     "inspect g.loom": "",
     "data describe synthetic": "",
     "export --help": "networkx",
-    "export g.loom --to netx -o g.net": "h5py",
     "verify --help": "numba",
     "run g.loom --data synthetic --spikes g.npz": "",
     "estimate g.loom --data synthetic": "",

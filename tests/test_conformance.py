@@ -318,7 +318,6 @@ COMMANDS = {
         for form, name, suffix in (
             ("onnx", "timed", ".onnx"),
             ("nir", "recurrent", ".nir"),
-            ("netx", "binned", ".net"),
             ("sanafe", "recurrent", ".yaml"),
         )
     },

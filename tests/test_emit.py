@@ -151,9 +151,8 @@ def test_different_decays_in_a_layer_are_refused(field, tmp_path):
     netlist, file = netlist_of(Neuron(), Neuron(**{field: 7}), Neuron(layer=1)), tmp_path / "net.loom"
     refused(FormatError, f"layer0|2 values of {field}", lift, netlist)
     write_netlist(netlist, file)
-    for form in ("nir", "netx"):
-        said = refusal("export", file, "--to", form, "-o", tmp_path / f"out.{form.removesuffix('x')}")
-        assert said.startswith(f"{file}: layer layer0: has 2 values of {field}")
+    said = refusal("export", file, "--to", "nir", "-o", tmp_path / "out.nir")
+    assert said.startswith(f"{file}: layer layer0: has 2 values of {field}")
 
 
 @pytest.mark.parametrize(("votes", "layers"), [([-1, -1], 0), ([0, 0], 2)])
@@ -166,10 +165,8 @@ EVENTS = np.ones((2, 5, 2, 8), np.uint8)
 WIDTHS = "2, 3, 4, 5, 6, 8"
 
 
-def compiling(target="loihi1", graph=5, **options):
-    return lambda: compile_network(
-        expand(nets.random_checkpoint(), nets.ring(graph)), Options(**options), target=target
-    )
+def compiling(graph=5, **options):
+    return lambda: compile_network(expand(nets.random_checkpoint(), nets.ring(graph)), Options(**options))
 
 
 def rounding(weight=1.0, **options):
@@ -202,14 +199,6 @@ OPTIONS = [
     *((f"--planes {planes}|1 to 3", rounding(packings=(Packing(planes=planes),))) for planes in (0, 4)),
     *((f"--scale-groups {n}|8 thresholds|1 to 8", rounding(packings=(Packing(groups=n),))) for n in (0, 9)),
     ("--weight-bits: 2 layers|the network has 1", rounding(packings=(Packing(), Packing()))),
-    (
-        "--optimize latency|no time",
-        lambda: lay_out(full(2, 2), dataclasses.replace(nets.LOIHI, time=()), goal="latency"),
-    ),
-    (
-        "--optimize latency|links between chips|--chips",
-        lambda: Options(optimize="latency", chips=2).require_consistent(calibrated=True),
-    ),
     ("--cores-for fc1=2|3 cores at least", laying_out((2496, 128), fc1=2)),
     # four neurons of seven output axons a core: three listening cores each let two of them sit together
     ("--cores-for fc1=1|2 cores at least", laying_out((1, 4, 9), nets.small_target(core_axons_out=7), fc1=1, fc2=3)),

@@ -1,27 +1,18 @@
-"""lava-dl's ``.net`` files: read as the integers that they are, written within their limits, refused."""
+"""lava-dl's ``.net`` files: read as the integers that they are, or refused."""
 
-import io
 import os
-from itertools import pairwise
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import torch
-from commands import as_json
-from hypothesis import given
-from hypothesis import strategies as st
 from made_netx import conv, dense, even, events, flatten, given_input, neuron, write
 from numpy.testing import assert_array_equal
 from oracles import refused
-from random_networks import chain
-from zoo import specimen
 
-from spikeloom.compiler import Options, Packing, compile_network, lift
+from spikeloom.compiler import compile_network, lift
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats import hdf5
-from spikeloom.compiler.formats.netx import writer as netx_export
 from spikeloom.compiler.formats.netx.reader import integers_of, read_netx
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
@@ -196,102 +187,3 @@ def test_spikes_that_lava_dl_recorded():
     assert hidden.sum() > 1000
     assert_array_equal(ours[0][0], hidden[1:])
     assert_array_equal(ours[1][0], out[1:])
-
-
-@st.composite
-def whole_networks(draw):
-    """Networks that the format holds as they are."""
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    sizes = draw(st.lists(st.integers(1, 6), min_size=2, max_size=4))
-    blocks = [
-        dense(
-            even(rng, rows, columns, most=draw(st.sampled_from([4, 60, 254]))),
-            bias=rng.integers(-30, 31, rows),
-            neuron=neuron(
-                u=draw(st.sampled_from([4096, 1024, 1])),
-                v=draw(st.integers(0, 4095)),
-                threshold=draw(st.integers(1, 300)),
-            ),
-        )
-        for columns, rows in pairwise(sizes)
-    ]
-    for block in draw(st.lists(st.sampled_from(blocks), unique_by=id)):
-        neurons = block["outFeatures"]
-        block |= {"type": ["dense_rec"], "weight_rec": even(rng, neurons, neurons).astype(np.float32)}
-    return blocks, rng
-
-
-@given(whole_networks())
-def test_what_the_format_holds_comes_back_exactly(drawn):
-    blocks, rng = drawn
-    file = io.BytesIO()
-    write(file, *blocks)
-    tree = hdf5.tree_of(file.getvalue())
-    network, _ = integers_of(tree, 1)
-    made = netx_export.blocks_for(network)
-    assert not any(str(block.rounding) for block in made)
-    written_ = hdf5.tree_of(netx_export.file_bytes(network, made))
-    again, _ = integers_of(written_, 1)
-    for ours, back in zip(network.projections, again.projections, strict=True):
-        assert_array_equal(ours.effective().toarray(), back.effective().toarray())
-    for ours, back in zip(network.populations, again.populations, strict=True):
-        for name in ("decay_u", "decay_v", "threshold", "bias"):
-            assert_array_equal(getattr(ours, name), getattr(back, name))
-    given_ = events(rng, network.input.size)
-    moved = netx_export.moved_spikes(network, made, given_[None])
-    assert all(changed == 0 for changed, _ in moved.values())
-
-
-def test_written_files_are_laid_out_as_documented(tmp_path):
-    netlist = compile_network(chain(np.full((3, 4), 0.3), np.full((2, 3), 0.4), biases=[[0.01] * 3, [0.0] * 2])).netlist
-    network = lift(netlist)
-    blocks = netx_export.blocks_for(network)
-    path = tmp_path / "a.net"
-    path.write_bytes(netx_export.file_bytes(network, blocks))
-    with h5py.File(path) as file:
-        assert [file[f"layer/{i}/type"][0] for i in range(3)] == [b"input", b"dense", b"dense"]
-        for number, population in enumerate(network.populations, 1):
-            block = file[f"layer/{number}"]
-            assert block["neuron/type"][()] == b"CUBA"
-            assert block["neuron/iDecay"][()] == population.decay_u + 1
-            assert block["neuron/vDecay"][()] == population.decay_v
-            assert block["neuron/refDelay"][()] == 1
-            assert block["weight"].shape == (block["outFeatures"][()], block["inFeatures"][()])
-            assert block["shape"][()].tolist() == [population.size]
-            weight = block["weight"][()].astype(int)
-            assert not np.any(weight % 2)
-            assert weight.min() >= -256
-            assert weight.max() <= 254
-    assert path.read_bytes() == netx_export.file_bytes(network, blocks)
-
-
-def test_the_command_counts_what_it_moves(tmp_path):
-    made, out = specimen("timed"), tmp_path / "g.net"
-    net = made.netlist
-    report = as_json("export", net, "--to", "netx", "-o", out, "--data", made.data)
-    assert (report["exact"], report["recordings"]) == (False, len(made.events))
-    network = lift(made.machine.netlist)
-    blocks = netx_export.blocks_for(network)
-    assert (
-        sum(layer["biases_rounded"] for layer in report["layers"])
-        == sum(block.rounding.biases_rounded for block in blocks)
-        > 0
-    )
-    assert any(layer["spikes_moved"] for layer in report["layers"])
-    back = read_netx(out, polarities=1).network
-    assert back.input.size == network.input.size
-    assert [population.decay_u for population in back.populations] == [p.decay_u for p in network.populations]
-
-
-@pytest.mark.parametrize(
-    ("packing", "words"),
-    [
-        (Packing(groups=4), "fc1: has 4 thresholds, netx has one for a layer; compile with --scale-groups 1"),
-        (Packing(planes=2), "netx holds 8 bits without an exponent; compile with --planes 1 --weight-bits 8"),
-    ],
-)
-def test_netlists_that_the_format_cannot_hold(packing, words):
-    weight = np.random.default_rng(7).normal(size=(20, 6)) * np.geomspace(0.01, 1, 20)[:, None]
-    netlist = compile_network(chain(weight), Options(packings=[packing])).netlist
-    with pytest.raises(ModelError, match=words):
-        netx_export.blocks_for(lift(netlist))

@@ -159,9 +159,6 @@ TABLE = [
             ("conv1=200", "Intel Loihi 1 has 128 cores (loihi1.chip.cores); give 128 or fewer"),
         )
     ),
-    (COMPILE.format("net.pt --optimize speed"), "--optimize speed: no such goal; give one of cores, latency"),
-    (COMPILE.format("net.pt --optimize latency"), "--optimize latency: needs firing rates; give --calibrate"),
-    (COMPILE.format("net.pt --optimize latency --calibrate data --cores-for fc1=2"), "latency|omit --cores-for"),
     (COMPILE.format("net.pt --calibrate data --keep 2"), "--keep 2: not a share"),
     (COMPILE.format("net.pt --keep 0.9"), "--keep 0.9: no recordings to hold out; give --calibrate"),
     *(
@@ -169,10 +166,9 @@ TABLE = [
         for more in ("--planes 2", "--spike-exact")
     ),
     # formats
-    ("export x.loom -o x --to sanafe --data x", "--data x: is for netx and ranc"),
+    ("export x.loom -o x --to sanafe --data x", "--data x: is for ranc"),
     ("export x.loom -o x --to onnx --recording 0", "--recording 0: is for ranc"),
-    ("export x.loom -o x --to ranc --limit 1 --data x", "--limit 1: is for netx"),
-    ("export x.loom -o x --to netx --limit 2", "--limit 2: says which recording of --data"),
+    ("export x.loom -o x --to ranc --recording 1", "--recording 1: says which recording of --data"),
     ("export x.loom -o x --to nir --form step", "--form step: is for onnx"),
     ("export x.loom -o x --to sanafe --dt 1", "--dt 1.0: is for nir"),
     # studies
@@ -273,7 +269,6 @@ TABLE = [
             ("run net.loom --data data --spikes", ".npz"),
             ("export net.loom --to onnx -o", ".onnx"),
             ("export net.loom --to sanafe -o", ".yaml"),
-            ("export net.loom --to netx -o", ".net"),
         )
     ),
     ("data convert grasp_label_1.npz -o grasp_label_1.npz", "-o grasp_label_1.npz: exists already"),

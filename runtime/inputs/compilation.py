@@ -32,7 +32,6 @@ def provenance(
         "calibrated": calibrated is not None,
         **({"cores_for": cores_for} if cores_for else {}),
         **({"chips": arguments.chips} if arguments.chips != 1 else {}),
-        **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),
     }
 
 

@@ -19,7 +19,7 @@ LAYOUT = ("polarities", "dt", "convention")
 ROUNDING = ("weight_bits", "planes", "scale_groups", "spike_exact", "prune_unused", "keep", "share_lists")
 """Options of ``compile`` that say how a float network is stored."""
 
-PLACING = ("keep_all", "cores_for", "chips", "optimize", "free_running")
+PLACING = ("keep_all", "cores_for", "chips", "free_running")
 """Options of ``compile`` that say where integers go, and who resets them."""
 
 USUAL: Mapping[str, object] = {
@@ -27,7 +27,6 @@ USUAL: Mapping[str, object] = {
     "target": DEFAULT_TARGET,
     "bin": BIN_S,
     "chips": 1,
-    "optimize": "cores",
     "engine": "spikeloom",
     **dict.fromkeys(("directed", "spike_exact", "prune_unused", "share_lists", "keep_all", "free_running"), False),
 }

@@ -9,9 +9,6 @@ from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.types import AnyArray
 
-GOALS = ("cores", "latency")
-"""What a layout may be chosen for."""
-
 KEEP = 0.98
 """Share of equal decisions that storage has to keep if nothing else is asked for."""
 
@@ -48,8 +45,6 @@ class Options:
     # Least number of cores of a layer, by name; they hold no other. Its neurons are cut as evenly as possible.
     cores_for: Mapping[str, int] = field(default_factory=dict)
     chips: int = 1  # Number of chips at most; as few are used as hold the cores
-    # One of ``GOALS``: what the layout is chosen for, see :mod:`layout.choose`; latency needs training events
-    optimize: str = "cores"
     # No layer has a window, and blank steps follow each recording, see :mod:`loihi1.idle`
     free_running: bool = False
     provenance: Mapping[str, Any] = field(default_factory=dict)  # JSON values to store with the netlist
@@ -65,7 +60,6 @@ class Options:
         fine_tuned, packings = self.forms is not None, self.packings or (Packing(),)
         plain = len(packings) == 1 and packings[0] == Packing(bits=packings[0].bits)
         without_evidence = not calibrated or self.keep_all or fine_tuned
-        goal, searched = f"--optimize {self.optimize}", self.optimize != "cores"
         for refused, why in (
             (
                 self.prune_unused and without_evidence,
@@ -81,11 +75,7 @@ class Options:
                 self.spike_exact and not plain,
                 "--spike-exact: finds planes and scales itself; give one width, no --planes or --scale-groups",
             ),
-            (self.optimize not in GOALS, f"{goal}: no such goal; give one of {', '.join(GOALS)}"),
             (self.chips < 1, f"--chips {self.chips}: not a number of chips; give 1 or more"),
-            (searched and self.chips > 1, f"{goal}: links between chips are not modelled; omit --chips"),
-            (searched and self.cores_for, f"{goal}: chooses the cores of every layer itself; omit --cores-for"),
-            (searched and not calibrated, f"{goal}: needs firing rates; give --calibrate"),
         ):
             if refused:
                 raise OptionError(why)

@@ -55,7 +55,6 @@ class Compilation:
     unread: Masks = ()  # Neurons that it does not hold as their spikes reach no neuron
     removals: tuple[Removal, ...] = ()  # The same in numbers, and why
     layout: Layout = LATER  # Cores and tiles (`place`)
-    usual: Layout = LATER  # The layout of fewest cores, often the same
     netlist: Netlist = LATER  # The result (`emit`)
     uses: tuple[LimitUse, ...] = ()  # Use of every limit by every core (`legalize`)
 
@@ -151,7 +150,7 @@ def _cheapest(done: Compilation) -> Compilation:
         if many is None and (packing.planes > 1 or options.prune_unused):
             chosen = events[calibration.evenly_spaced(several, calibration.MANY)]
             many = calibration.calibrate(network, channels_last(chosen, network.input.clocks))
-        asked = replace(options, packings=(packing,), optimize="cores")
+        asked = replace(options, packings=(packing,))
         trial = Trial(planes=packing.planes, groups=packing.groups)
         try:
             tried = run((_quantize, *INTEGERS, *LAYOUT), replace(done, options=asked, calibration=many or few))
@@ -206,24 +205,14 @@ def _remove(done: Compilation) -> Compilation:
 
 
 @step(
-    "cuts the layers over as few cores as every limit allows and puts the cores on tiles with the fewest "
-    "spike-hops, or as --optimize asks",
+    "cuts the layers over as few cores as every limit allows and puts the cores on tiles with the fewest spike-hops",
     keeps="every spike: where a neuron sits has no influence on any",
 )
 def _place(done: Compilation) -> Compilation:
     options = done.options
     rates = done.rates and tuple(rate[ids] for rate, ids in zip(done.rates, done.identity, strict=True))
-    layout, usual = lay_out(
-        done.held,
-        done.target,
-        goal=options.optimize,
-        cores_for=options.cores_for,
-        chips=options.chips,
-        rates=rates,
-        calibration=done.calibration,
-        identity=done.identity,
-    )
-    return replace(done, layout=layout, usual=usual)
+    layout = lay_out(done.held, done.target, cores_for=options.cores_for, chips=options.chips, rates=rates)
+    return replace(done, layout=layout)
 
 
 @step("writes cores, axons and synapse lists down as a netlist", keeps="every synapse that is not zero, stored once")

@@ -22,7 +22,7 @@ from spikeloom.runtime.report.sections import Outcome, Section, Text
 FORMATS = {each.name: each for each in export_formats()}
 """By the value of ``--to``."""
 
-OF_RECORDINGS = ("split", "bin", "recording", "limit")
+OF_RECORDINGS = ("split", "bin", "recording")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,11 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = "; ".join(f"{name}: {each.title}" for name, each in FORMATS.items())
     parser.add_argument("--to", required=True, choices=tuple(FORMATS), help=what)
     parser.add_argument("--form", choices=FORMS, help="onnx: a step and its state, or whole recordings (default: scan)")
-    what = f"ranc: a recording to add; netx: those on which spikes that move are counted; {DATA_HELP}"
+    what = f"ranc: a recording to add; {DATA_HELP}"
     parser.add_argument("--data", metavar="PATH", help=what)
-    parser.add_argument("--split", help="ranc, netx: split to read (default: test)")
+    parser.add_argument("--split", help="ranc: split to read (default: test)")
     parser.add_argument("--recording", type=int, metavar="N", help="ranc: which of them (default: 0)")
-    parser.add_argument("--limit", type=int, metavar="N", help="netx: first N of them only")
     add_bin_option(parser)
     parser.add_argument("--dt", type=float, metavar="SECONDS", help=f"nir: length of a step (default: {BIN_S:g} a bin)")
     parser.add_argument("-o", "--output", required=True, metavar="FILE")
@@ -70,7 +69,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
     def read(netlist: Netlist) -> Recordings:
         split = arguments.split or "test"
-        return load_recordings(argparse.Namespace(**vars(arguments) | {"split": split}), netlist)
+        return load_recordings(argparse.Namespace(**vars(arguments) | {"split": split, "limit": None}), netlist)
 
     request = Request(
         source=arguments.source,

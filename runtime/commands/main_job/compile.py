@@ -4,7 +4,7 @@ import argparse
 import sys
 from typing import Any
 
-from spikeloom.compiler import DEFAULT_TARGET, GOALS, KEEP
+from spikeloom.compiler import DEFAULT_TARGET, KEEP
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.text import text
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_bin_option, add_network, group
@@ -43,8 +43,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     what = "at least N cores for a layer, which it shares with none, as in conv1=4,fc1=6"
     layout.add_argument("--cores-for", metavar="LAYER=N[,…]", help=what)
     layout.add_argument("--chips", type=int, default=1, metavar="N", help="use up to N chips (default: 1)")
-    what = f"choose the layout for {' or '.join(GOALS)}, which needs --calibrate (default: cores)"
-    layout.add_argument("--optimize", default="cores", metavar="GOAL", help=what)
     what = "no host resets the chip: layers always integrate, blank steps after each recording clear them"
     layout.add_argument("--free-running", action="store_true", help=what)
     what = "print the network after a pass, on stderr"

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX
 from spikeloom.compiler.passes.prune import Removal
 from spikeloom.compiler.passes.range_proof import RangeProof, open_ranges
-from spikeloom.compiler.targets.loihi1.layout.choose import Expectation, Layout
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.passes import Compilation
@@ -14,29 +13,12 @@ from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice
 from spikeloom.compiler.targets.loihi1.storage.held_out import Trial
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
 from spikeloom.runtime.machines.loihi1 import description
-from spikeloom.runtime.machines.loihi1.description import LayerFacts, NetlistFacts
+from spikeloom.runtime.machines.loihi1.description import NetlistFacts
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 from spikeloom.runtime.report.sections import Block, Outcome, Section, Table, Text
 
 ZEROED = 0.25
 """Share of a layer's weights from which on it is said that they round to zero."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LayoutFacts:
-    """A layout, and what a step of it is expected to take where that is known."""
-
-    cores: int
-    expected: Expectation | None = field(default=None, metadata=INLINE)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LayoutChoice:
-    """What the layout was chosen for, and beside it the layout of fewest cores."""
-
-    optimize: str
-    expected: LayoutFacts
-    usual: LayoutFacts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +38,6 @@ class CompilationFacts:
     keep: float | None
     core_bound: int
     placement: Placement
-    layout: LayoutChoice
     facts: Sequence[str] | None = field(default=None, metadata=OPTIONAL)
     finetune: str | None = field(default=None, metadata=OPTIONAL)
 
@@ -73,7 +54,6 @@ def outcome(done: Compilation, sha256: str, facts: Sequence[str] = (), finetune:
         keep=done.options.keep if done.trials else None,
         core_bound=core_bound(done.held, done.target),
         placement=done.placement,
-        layout=LayoutChoice(optimize=done.options.optimize, expected=_layout(done.layout), usual=_layout(done.usual)),
         facts=facts or None,
         finetune=finetune if done.trials and not _holds(done.trials, done.options.keep) else None,
     )
@@ -83,10 +63,6 @@ def outcome(done: Compilation, sha256: str, facts: Sequence[str] = (), finetune:
 def _holds(trials: Sequence[Trial], keep: float | None) -> bool:
     """Whether a storage that was tried keeps enough decisions."""
     return any(trial.equal >= (keep or 0) * trial.decisions for trial in trials if not trial.refused)
-
-
-def _layout(layout: Layout) -> LayoutFacts:
-    return LayoutFacts(cores=len(layout.cores), expected=layout.expected)
 
 
 def sections(facts: CompilationFacts) -> Iterator[Section]:
@@ -207,24 +183,3 @@ def _placed(facts: CompilationFacts) -> Iterator[str]:
             f"packets a step that leave their chip{spiking}: {placement.between_chips:.1f}; "
             "links between chips are not modelled"
         )
-    yield from _expected(facts.layout, facts.netlist.layers)
-
-
-def _expected(layout: LayoutChoice, layers: Sequence[LayerFacts]) -> Iterator[str]:
-    """What a step is expected to take, and what another layout would."""
-    chosen, usual = layout.expected.expected, layout.usual.expected
-    if chosen is None:
-        return
-    held = ", ".join(layer.name for layer in layers if chosen.critical_core in layer.cores)
-    yield (
-        f"expected step on the training recordings ({chosen.time_table} table): {chosen.step_ns:,.0f} ns; "
-        f"slowest most often: core {chosen.critical_core} ({held}), "
-        f"{'receiving' if chosen.receiving else 'sweeping its neurons and sending'}"
-    )
-    if layout.expected != layout.usual and usual is not None:
-        yield (
-            f"layout of fewest cores: {layout.usual.cores} instead of {layout.expected.cores}, "
-            f"{usual.step_ns:,.0f} ns; this one takes {chosen.step_ns / usual.step_ns:.2f} times the time"
-        )
-    elif layout.optimize != "cores":
-        yield f"--optimize {layout.optimize}: found nothing better than the layout of fewest cores"

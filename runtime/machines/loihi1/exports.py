@@ -6,18 +6,16 @@ from dataclasses import dataclass, field
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.files import reading
 from spikeloom.compiler.formats import sanafe
-from spikeloom.compiler.formats.netx import writer as netx
 from spikeloom.compiler.formats.nir import CONVENTIONS
 from spikeloom.compiler.formats.nir import writer as nir
 from spikeloom.compiler.formats.onnx import writer as onnx
-from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.models.recordings.evtouch import BIN_S
 from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.machines.base import Export, Facts, Format, Request
-from spikeloom.runtime.report.encode import INLINE, OPTIONAL
+from spikeloom.runtime.report.encode import OPTIONAL
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,24 +43,6 @@ class NirFacts(Facts):
 
     dt: float
     convention: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NetxLayer:
-    """What netx changes in a layer, and the spikes that this moves where recordings were given."""
-
-    rounding: netx.Rounding = field(metadata=INLINE)
-    spikes_moved: int | None = field(default=None, metadata=OPTIONAL)
-    spikes: int | None = field(default=None, metadata=OPTIONAL)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NetxFacts(Facts):
-    """What a netx file holds; `exact` if it is the netlist as it was."""
-
-    exact: bool
-    layers: list[NetxLayer]
-    recordings: int | None = field(default=None, metadata=OPTIONAL)
 
 
 def _sanafe(request: Request) -> Export:
@@ -115,38 +95,6 @@ def _nir(request: Request) -> Export:
     return Export(content=[content], facts=facts, lines=lines)
 
 
-def _netx(request: Request) -> Export:
-    netlist = read_netlist(request.source)
-    with reading(request.source, FormatError, "compile it again"):
-        network = lift(netlist)
-    blocks = netx.blocks_for(network)
-    layers = [NetxLayer(rounding=block.rounding) for block in blocks]
-    rounded = [line for block in blocks if (line := str(block.rounding))]
-    lines = rounded or ["biases, thresholds and weights are the netlist's"]
-    count = None
-    if request.recordings is not None:
-        data = request.recordings(netlist)
-        moved = netx.moved_spikes(network, blocks, channels_last(data.events, netlist.clocks))
-        layers = [
-            NetxLayer(rounding=block.rounding, spikes_moved=differ, spikes=every)
-            for block, (differ, every) in zip(blocks, moved.values(), strict=True)
-        ]
-        count = len(data)
-        shown = ", ".join(f"{name} {differ:,} of {every:,}" for name, (differ, every) in moved.items())
-        lines.append(f"spikes that differ from the netlist's on {count} recordings: {shown}")
-    elif rounded:
-        lines.append("--data counts the spikes that this moves")
-    facts = NetxFacts(
-        neurons=sum(len(block.bias) for block in blocks),
-        synapses=sum(block.synapses for block in blocks),
-        exact=not rounded,
-        layers=layers,
-        recordings=count,
-    )
-    content = netx.file_bytes(network, blocks)
-    return Export(content=[content], facts=facts, lines=tuple(lines))
-
-
 FORMATS = (
     Format(
         name="sanafe",
@@ -158,12 +106,4 @@ FORMATS = (
         name="onnx", title="a netlist as an integer ONNX graph, bit for bit the chip", write=_onnx, options=("form",)
     ),
     Format(name="nir", title="a netlist as a NIR file in weight units", write=_nir, options=("dt",), whole=True),
-    Format(
-        name="netx",
-        title="a netlist as a .net file of lava-dl, biases rounded to whole weight steps",
-        write=_netx,
-        options=("data", "split", "bin", "limit"),
-        whole=True,
-        ending="net",
-    ),
 )

@@ -64,7 +64,6 @@ def _options(arguments: Namespace, **further: Any) -> Options:
         share_lists=arguments.share_lists,
         cores_for=parse_cores(arguments.cores_for),
         chips=arguments.chips,
-        optimize=arguments.optimize,
         free_running=arguments.free_running,
         **further,
     )
@@ -103,7 +102,7 @@ class LaidOut:
 def _lower_integers(arguments: Namespace) -> Lowered:
     """Lay out a file that brings its integers: nothing is rounded."""
     path = arguments.checkpoint
-    floats = ("in_time", "dt", "convention", *ROUNDING, "dump_after", "calibrate", "optimize")
+    floats = ("in_time", "dt", "convention", *ROUNDING, "dump_after", "calibrate")
     refuse(arguments, floats, f"is for float networks, {path} holds integers")
     refuse(arguments, NETWORK, f"is for checkpoints, the netx file {path} holds all it needs")
     progress("reading the network")

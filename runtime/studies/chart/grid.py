@@ -1,7 +1,7 @@
 """What ``--grid`` says: axes and their values.
 
 A grid is ``AXIS=VALUE,VALUE,AXIS=VALUE …``; values stand between commas or slashes, whole numbers may be ranges:
-``bits=2-6,8,cores=cores/latency,window=25-100%:25``. Axes that it does not name keep their usual value.
+``bits=2-6,8,cores=cores/fc1:6,window=25-100%:25``. Axes that it does not name keep their usual value.
 """
 
 import re
@@ -9,10 +9,13 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-from spikeloom.compiler import GOALS, MAX_PLANES
+from spikeloom.compiler import MAX_PLANES
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
 from spikeloom.models.recordings.evtouch import WHOLE
+
+FEWEST = "cores"
+"""The layout of fewest cores."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,7 +26,7 @@ class Grid:
     planes: tuple[int, ...] = (1,)  # Times that a synapse is stored
     groups: tuple[int, ...] = (1,)  # Scales in a layer
     prune: tuple[int, ...] = (0,)  # Whether neurons that never fired on training recordings are left out: 0 or 1
-    cores: tuple[str, ...] = ("cores",)  # As ``--optimize`` names it, or least cores as in ``fc1:6+conv1:4``
+    cores: tuple[str, ...] = (FEWEST,)  # Or least cores as in ``fc1:6+conv1:4``
     window: tuple[int, ...] = (25, 50, 75, WHOLE)  # Per cent of each recording
 
 
@@ -61,7 +64,7 @@ def _readers(target: Target) -> dict[str, tuple[Callable[[str], Sequence[Any]], 
         "planes": (lambda words: _numbers(words, range(1, MAX_PLANES + 1)), f"1 to {MAX_PLANES} planes"),
         "groups": (lambda words: _numbers(words, range(1, slots + 1)), f"1 to {slots} scale groups"),
         "prune": (lambda words: _numbers(words, range(2)), "0 (keep) and 1 (leave out)"),
-        "cores": (_cores, f"{', '.join(GOALS)}, or LAYER:N as in fc1:6+conv1:4, each layer once"),
+        "cores": (_cores, f"{FEWEST}, or LAYER:N as in fc1:6+conv1:4, each layer once"),
         "window": (
             lambda words: _numbers(words, range(1, WHOLE + 1), 25),  # by quarters where a range does not say
             f"1 to {WHOLE} per cent, or ranges as in 25-100%:5",
@@ -91,8 +94,8 @@ def _widths(words: str, allowed: Collection[int]) -> list[tuple[int, ...]]:
 
 
 def _cores(words: str) -> list[str]:
-    """A goal of the layout, or least cores of some layers."""
-    if words in GOALS:
+    """The fewest cores, or least cores of some layers."""
+    if words == FEWEST:
         return [words]
     parts = [re.fullmatch(r"([^:+]+):([1-9][0-9]{0,3})", part, re.ASCII) for part in words.split("+")]
     cores = {part[1]: part[2] for part in parts if part is not None}

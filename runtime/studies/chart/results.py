@@ -7,7 +7,7 @@ from typing import ClassVar
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.runtime.report.encode import INLINE, key
 from spikeloom.runtime.report.numbers import wilson
-from spikeloom.runtime.studies.chart.grid import Grid
+from spikeloom.runtime.studies.chart.grid import FEWEST, Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
 
 FORMAT = 3
@@ -92,7 +92,7 @@ class Point(Configuration):
     @property
     def label(self) -> str:
         """Short name: ``objects 4b 2p, latency, 50 %``."""
-        layout = "" if self.cores == "cores" else f", {self.cores}"
+        layout = "" if self.cores == FEWEST else f", {self.cores}"
         return f"{self.network} {self.storage}{layout}, {self.window} %"
 
 

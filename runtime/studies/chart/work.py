@@ -36,7 +36,7 @@ from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_s
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.base import Machine, Price
 from spikeloom.runtime.report.encode import encode
-from spikeloom.runtime.studies.chart.grid import Grid
+from spikeloom.runtime.studies.chart.grid import FEWEST, Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
 from spikeloom.runtime.studies.chart.results import FORMAT, SPLITS, Data, Figures, Share, share
 from spikeloom.runtime.studies.jobs import Job, content_key
@@ -89,17 +89,13 @@ def measurement(
 
 def _layout_options(layout: str) -> JsonObject:
     """Options of ``compile`` that ask for a layout, where it is not the usual one."""
-    if layout == "cores":
-        return {}
-    if ":" in layout:
-        return {"cores_for": layout.replace(":", "=").replace("+", ",")}
-    return {"optimize": layout}
+    return {} if layout == FEWEST else {"cores_for": layout.replace(":", "=").replace("+", ",")}
 
 
 def commands(work: Measurement, layout: str, window: int) -> tuple[str, str]:
     """What to type for the netlist of a network, and for its figures on a part of every recording."""
     network, storage, data = work.network, work.storage, work.data
-    parts = [network.name, *storage.label().split(), *([] if layout == "cores" else [layout])]
+    parts = [network.name, *storage.label().split(), *([] if layout == FEWEST else [layout])]
     file = "-".join(parts).replace(":", "").replace("+", "-") + ".loom"
     calibrated = {"calibrate": data.path, "bin": data.bin_s}
     stored = repeat.words(dict(network.options) | storage.options() | calibrated | _layout_options(layout))
@@ -171,7 +167,6 @@ def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
     asked = _compile_options(work, layout)
     placing = Options(
         cores_for=parse_cores(asked.cores_for),
-        optimize=asked.optimize,
         provenance=provenance(asked, _loaded(work.network), calibrated=_in_steps(work.data, work.network)["train"]),
     )
     try:
@@ -200,7 +195,7 @@ def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
 
 def _rounded(work: Measurement, loaded: LoadedNetwork) -> Compilation:
     """A network in its storage; how it is laid out is yet to be said."""
-    asked = _compile_options(work, "cores")
+    asked = _compile_options(work, FEWEST)
     options = Options(
         forms=work.network.forms,
         packings=parse_packings(asked),

@@ -8,7 +8,6 @@ needs some for its own chunks, so it is cut again until they are enough.
 """
 
 from bisect import bisect_left
-from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -189,11 +188,6 @@ def cut(needs: Needs, least: Mapping[int, int]) -> list[Chunk]:
     if violations:
         raise CapacityError(violations)
     return sorted(chunks)
-
-
-def chunks_of(chunks: Iterable[Chunk]) -> dict[int, int]:
-    """Number of chunks of each population."""
-    return dict(sorted(Counter(chunk.population for chunk in chunks).items()))
 
 
 def arrange(needs: Needs, groups: Iterable[Core], chips: int = 1) -> Cores:
