@@ -162,7 +162,6 @@ def shipped(session: Session) -> Json:
             "test_samples": verdict["samples"],
             **right,
             "equal": round(verdict["decision_agreement"] * verdict["samples"]),
-            "certified": verdict["certificate"]["decisions"],
             "spikes_moved": {layer: n["different"] / n["float"] for layer, n in verdict["spikes"].items()},
             **session.costs(data),
         }
@@ -299,8 +298,9 @@ def truenorth(session: Session) -> Json:
         verdict = session.run(f"verify net.loom --checkpoint pretrained:{name} --data {data}")
         costs = session.run(f"estimate net.loom --data {data}")
         kept = {key: costs["per_inference"][key] for key in ("ticks", "time_s", "energy_j")}
-        moved = verdict["E1"]["differences"]
-        found[name] = {"right": verdict["correct"], "spikes_differ": moved, "cores": costs["cores"], **kept}
+        moved = sum(layer["different"] for layer in verdict["model"].values())
+        right = round(verdict["accuracy"]["chip"] * verdict["samples"])
+        found[name] = {"right": right, "spikes_differ": moved, "cores": costs["cores"], **kept}
     return found
 
 

@@ -36,7 +36,7 @@ def measured(net: spikeloom.Compiled, test: Any, reference: Any = None) -> dict[
         "own_float_right": int(np.count_nonzero(own == test.labels)),
         "equal": int(np.count_nonzero(decided == own)),
         "equal_to_original": int(np.count_nonzero(decided == (own if reference is None else reference))),
-        "model_differs": verdict.quantised_different,
+        "model_differs": verdict.model_different,
         "spikes": sum(layer.chip for layer in verdict.spikes.values()),
         "missed": list(verdict.missed),
         "operations": price.per_inference.synaptic_operations,

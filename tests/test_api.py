@@ -65,7 +65,7 @@ def test_modules_come_in_as_they_are(data, tmp_path, monkeypatch):
     assert net.report("page.html", data).value.provenance.checkpoint.file == "module"
     refused(OptionError, "example=", api.compile, module)
     tuned = api.finetune(module, data, "tuned.nir", example=torch.zeros(1, 2 * TAXELS), epochs=1)
-    assert tuned.verify(data.test, min_agreement=0.0).value.quantised_different == 0
+    assert tuned.verify(data.test, min_agreement=0.0).value.model_different == 0
     assert "written: tuned.nir, tuned.loom" in str(tuned)
 
 

@@ -20,7 +20,6 @@ from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence.explanation.causes import explain
 from spikeloom.runtime.equivalence.explanation.results import BETA, BIAS, LEFT_OUT, SATURATION, TIE, TRUNCATION, WEIGHTS
 from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots, sources_of
-from spikeloom.runtime.equivalence.rounding import LayerRounding, Rounding
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
@@ -186,8 +185,7 @@ def test_what_moved_most_is_named_where_no_single_change_is_enough():
     assert (root.cause, root.sufficient) == (BIAS, ())
     assert list(root.moved.items()) == [(BIAS, pytest.approx(30 / 256)), (WEIGHTS, pytest.approx(0.05))]
     # in a compensated layer the bias goes with the weights
-    layer = LayerRounding(weights=1, nearest=0, farthest_steps=0.6, compensated=True, faults=())
-    (together,) = explained(network, integer, steps("x"), rounding=Rounding(layers={"fc1": layer})).found
+    (together,) = explained(network, integer, steps("x"), compensated=["fc1"]).found
     assert together.moved == {WEIGHTS: pytest.approx(0.05 + 30 / 256)}
 
 

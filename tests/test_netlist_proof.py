@@ -22,9 +22,9 @@ from spikeloom.compiler.formats.counters import write_counters
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.truenorth.netlist import read_crossbars, write_crossbars
 from spikeloom.models.graphs import normalised_adjacency
-from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.integer import integer_machine
+from spikeloom.runtime.machines.loihi1.rounding import check_rounding
 
 
 def changed(field, place, to):
@@ -119,8 +119,8 @@ def test_verify_names_every_damage_and_fails(place, netlists, tmp_path, name, ro
     words = ("--checkpoint", place / "net.pt", *recordings)
     code, out, _ = run("verify", tmp_path / "x.loom", *words)
     assert code == 1
-    assert re.search(f"^EN  NOT the rounding of this checkpoint: .*({named})", out, re.MULTILINE)
-    assert ("\nmissed: EN: NOT the rounding" in out) == bool(recordings)
+    assert re.search(f"^EN  NOT what this network is lowered to: .*({named})", out, re.MULTILINE)
+    assert ("\nmissed: EN: NOT what" in out) == bool(recordings)
     assert run("verify", place / f"{rounded}.loom", *words)[0] == 0
 
 
@@ -235,13 +235,13 @@ def test_every_damage_to_a_crossbar_has_a_name(tmp_path):
     source, path, words = tmp_path / "c.pt", tmp_path / "x.loom", ("--checkpoint", tmp_path / "c.pt")
     write_counters(source, random_counters(3))
     assert run("compile", source, "--target", "truenorth", "-o", path)[0] == 0
-    assert as_json("verify", path, *words) == {"faults": [], "holds": True}
+    assert as_json("verify", path, *words) == {"layers": {}, "whole": [], "holds": True}
     netlist = read_crossbars(path)
     for damage, named in CROSSBAR_DAMAGES.values():
         write_crossbars(damage(netlist), path)
         code, out, _ = run("verify", path, *words)
         assert code == 1
-        assert re.search(f"EN NOT what the network of the file is lowered to: {named}", out)
+        assert re.search(f"EN  NOT what this network is lowered to: {named}", out)
 
 
 def test_a_netlist_remembers_bins_and_data(tmp_path, monkeypatch):

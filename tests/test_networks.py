@@ -362,7 +362,7 @@ def test_fine_tuned_on_the_chips_integers_they_are_the_chip(tmp_path, system, bi
     netlist = compile_network(expand(again, seen), Options(forms=again.forms)).netlist
     assert {projection.bits for projection in lift(netlist).projections} == {bits}
     verdict = verify(netlist, Factored(again, seen), test)
-    assert verdict.quantised_different == 0
+    assert verdict.model_different == 0
     assert verdict.spikes["fc1"].chip > 0
     model = list(quantised_spikes(Factored(again, seen), test.events).values())[-1]
     assert np.count_nonzero(model.sum(axis=1).argmax(axis=1) == test.labels) == tuned.after

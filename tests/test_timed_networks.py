@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from made_files import recorded
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import refused
@@ -17,7 +15,7 @@ from spikeloom.compiler.dynamics import Dynamics, with_clocks
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
-from spikeloom.compiler.ir import Input, IntegerProjection, Projection
+from spikeloom.compiler.ir import IntegerProjection, Projection
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.passes.prune import never_fires, removable
@@ -28,8 +26,6 @@ from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
-from spikeloom.models.networks.reference import float_spikes
-from spikeloom.runtime.equivalence.certificates import Certainty
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
@@ -121,34 +117,6 @@ def test_relays_tick_with_their_clocks_however_weights_are_stored(timed, options
     assert held.any()
     for sample in conv:
         assert_array_equal(sample[:, -3:][:, held], TIMING.clocks.events(14).T[:, held])
-
-
-@settings(max_examples=4, derandomize=True)
-@given(seed=st.integers(0, 10**6), alpha=st.sampled_from([0.3, 0.95, 0.999]), beta=st.sampled_from([0.0, 0.2, 0.9]))
-def test_what_is_certain_is_so_in_both_precisions(folder, seed, alpha, beta):
-    dynamics = Dynamics(betas=(0.2, beta, beta, beta), alphas=(0.0, alpha, alpha, alpha), clocks=TIMING.clocks)
-    checkpoint, seen, network = float_network(folder, dynamics=dynamics, seed=seed)
-    events = events_of(seed, samples=2, steps=30)
-    certainty = Certainty(Factored(checkpoint, seen)).spikes(events)
-    runs = [list(float_spikes(checkpoint, seen, events, dtype=kind).values()) for kind in ("float32", "float64")]
-    runs.append(list(run_float(network, channels_last(events, TIMING.clocks), dtype=np.float32).spikes))
-    for layer, (sure, doubt) in enumerate(certainty):
-        for run in runs:
-            assert not (sure & ~run[layer]).any()
-            assert not (run[layer] & ~sure & ~doubt).any()
-    assert np.mean(certainty[1][1]) < 0.05, "next to nothing is left open"
-
-
-def test_a_radius_covers_the_gathered_rounding():
-    """An entry whose current gathers to its threshold within the rounding of float32 is open, not certain."""
-    network = chain([[0.025]], beta=0.0)
-    network = replace(network, populations=(replace(network.populations[0], alpha=0.95),))
-    network = replace(network, input=Input(taxels=1, polarities=1))
-    events = np.ones((1, 1, 1, 2000), np.uint8)  # the current climbs to 0.5, the threshold, and stays below
-    ((sure, doubt),) = Certainty(network).spikes(events)
-    assert not sure[0, :100].any()
-    assert not doubt[0, :100].any()
-    assert doubt[0, -1].all()
 
 
 def test_the_decay_alone_is_a_rung_of_the_ladder(tmp_path):

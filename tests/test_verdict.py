@@ -1,7 +1,5 @@
 """What a verdict says: levels, gates, ways to fail by name, and whether a netlist is its checkpoint, rounded."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,10 +10,12 @@ from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
-from spikeloom.runtime.equivalence.rounding import Rounding
 from spikeloom.runtime.equivalence.verdict import (
     LayerSpikes,
     Level,
+    ModelSpikes,
+    Verdict,
+    in_a_sentence,
     levels_of,
     mcnemar,
     parse_requirements,
@@ -23,6 +23,7 @@ from spikeloom.runtime.equivalence.verdict import (
     unmet,
 )
 from spikeloom.runtime.equivalence.verify import verify
+from spikeloom.runtime.machines.netlist_check import NetlistCheck
 
 
 def layer(float_: int, chip: int, different: int) -> LayerSpikes:
@@ -39,26 +40,40 @@ def verdict(**changes):
         "chip_counts": np.array([[3, 0], [1, 3], [1, 2], [1, 2]]),
         "spikes": {"conv1": layer(60, 40, 20), "fc1": layer(10, 10, 1)},
         "spec_samples": 3,
-        "spec_equals_engine": True,
-        "decision_agreement": 0.5,
-        "quantised_different": None,
+        "spec_different": 0,
+        "target": "loihi1",
+        "membranes_saturated": None,
+        "model": None,
         "engine": "spikeloom",
         "engine_different": None,
         "row_different": None,
-        "weights": Rounding(layers={}),
+        "netlist": NetlistCheck(),
     }
-    return SimpleNamespace(**(base | changes))
+    return Verdict(**(base | changes))
+
+
+def lowered(different: int):
+    return {"model": {"conv1": ModelSpikes(spikes=9, different=different)}}
+
+
+def test_levels_without_a_float_model():
+    alone = verdict(**lowered(0), float_predictions=None, float_counts=None, spikes={}, required={"E0": 1, "E1": 1})
+    assert [level.share for level in alone.levels] == [1, 1, 1, None, None]
+    assert (alone.accuracy, alone.decision_agreement, alone.missed) == ({"chip": 0.75}, None, ())
+    assert "every spike of its model and is right on 3 of 4 recordings" in in_a_sentence(alone)
 
 
 def test_levels_of_a_verdict():
     for changes, e0, e1 in (
         ({}, 1.0, None),
-        ({"spec_equals_engine": False}, 0.0, None),
-        ({"quantised_different": 3}, 1, 0),
+        ({"spec_different": 2}, 0.0, None),
+        ({"engine_different": 1}, 0.0, None),
+        (lowered(3), 1, 0),
+        (lowered(0), 1, 1),
+        (lowered(0) | {"membranes_saturated": 1}, 1, 0),
     ):
         levels = {level.name: level.share for level in levels_of(verdict(**changes))}
         assert levels == {"EN": 1.0, "E0": e0, "E1": e1, "E2": 0.8, "E3": 0.5}
-    assert levels_of(verdict(quantised_different=0))[2].share == 1.0
     text = levels_of(verdict())[4].text
     assert "right on float only 1, on chip only 1 (exact McNemar p = 1); class votes moved: 8 of 13" in text
     silent, disjoint = layer(0, 0, 0), layer(5, 5, 10)

@@ -1,9 +1,9 @@
-"""What a comparison of float model and chip comes to: levels of equivalence, and gates that ask for them.
+"""What a comparison of network and chip comes to: levels of equivalence, and gates that ask for them.
 
-*EN*: the netlist is its checkpoint, rounded, see :mod:`equivalence.rounding`. *E0*: specification, engine and the
-netlist as read from disk agree in every spike, membrane and count. *E1*: a quantisation-aware model equals the chip; it
-applies to fine-tuned checkpoints only. *E2*: spikes against the float model, per layer, as ``1 - different / (float +
-chip)``. *E3*: decisions against the float model.
+*EN*: the netlist is what its network is lowered to, see :mod:`machines.netlist_check`. *E0*: specification, engine and
+the netlist as read from disk agree in every spike, membrane and count. *E1*: the whole-number model that the network
+brings (fine-tuned, trained for the chip, or counting) equals the chip. *E2*: spikes against the float model, per layer,
+as ``1 - different / (float + chip)``. *E3*: decisions against the float model.
 """
 
 from __future__ import annotations
@@ -12,27 +12,22 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from textwrap import shorten
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.passes.range_proof import open_ranges
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.equivalence.breakdowns import Breakdown
-from spikeloom.runtime.equivalence.rounding import Rounding
+from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.simulated import Part
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
 from spikeloom.runtime.report.numbers import percent
-from spikeloom.runtime.report.sections import Block, Section, Table, Text
-
-if TYPE_CHECKING:
-    from spikeloom.runtime.equivalence.certificates import Certificate  # it loads numba
+from spikeloom.runtime.report.sections import Section, Table, Text
 
 LEVELS = {
-    "EN": "every number of the netlist is what the checkpoint's becomes by rounding",
+    "EN": "every number of the netlist is what lowering its network gives",
     "E0": "the fast simulator does in every bit what the chip's definition does",
-    "E1": "a model that was trained on the chip's integers does what the chip does",
+    "E1": "the model in whole numbers that the network brings does what the chip does",
     "E2": "share of spikes that float model and chip have in common",
     "E3": "share of recordings that both decide alike",
 }
@@ -96,44 +91,67 @@ class Level:
     text: str
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelSpikes:
+    """Spikes of one layer of the lowered model over all recordings, and those of the chip that are not the same."""
+
+    spikes: int
+    different: int
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Verdict:
-    """Everything that verify finds.
+    """Everything that verify finds, on any chip.
 
-    Predictions are (samples,) int64 and votes (samples, classes) int64. The specification ran beside the engine on
-    `spec_samples` recordings, of a free-running netlist also in a row; `spec_equals_engine` says whether every spike,
-    membrane and count was equal there, and, with onnxruntime beside, whether its spikes and votes are our engine's on
-    all recordings: `engine_different` counts those that are not. `row_different` are decisions that differ where all
-    follow each other on a free-running chip. `quantised_different` counts spikes in
-    which a fine-tuned checkpoint's torch model, on chip integers, and the chip differ. `not_compared` are neurons of
-    each layer that the chip omits because their spikes reach no neuron. Of the levels the shares `required` have to be
-    reached, and EN always.
+    Predictions are (samples,) int64 and votes (samples, classes) int64; those of the float model are None where the
+    network is whole numbers and there is none.
+
+    netlist: level EN.
+    spec_samples, spec_different: recordings on which the specification ran beside the engine, of a free-running netlist
+        also in a row; spikes, membranes and counts that differed.
+    engine, engine_different: the further engine, and its spikes and votes that are not our engine's.
+    model: level E1 by layer; None where the network brings no whole-number model of its own.
+    membranes_saturated: membranes that left their register, which the model's do not; None where the chip saturates
+        by definition.
+    spikes, ladder, first_divergence: level E2; empty where layers of the chip are not those of a float model.
+    not_compared: neurons of each layer that the chip omits because their spikes reach no neuron.
+    row_different: decisions that differ where all recordings follow each other on a free-running chip.
+    required: shares that levels have to reach; EN always.
     """
 
+    target: str
     files: tuple[str, ...] = field(metadata=HIDDEN)
     labels: IntArray = field(metadata=HIDDEN)
-    float_predictions: IntArray = field(metadata=HIDDEN)
     chip_predictions: IntArray = field(metadata=HIDDEN)
-    float_counts: IntArray = field(metadata=HIDDEN)
     chip_counts: IntArray = field(metadata=HIDDEN)
-    spikes: Mapping[str, LayerSpikes]
+    float_predictions: IntArray | None = field(default=None, metadata=HIDDEN)
+    float_counts: IntArray | None = field(default=None, metadata=HIDDEN)
+    netlist: NetlistCheck
     spec_samples: int
-    spec_equals_engine: bool
-    weights: Rounding
-    first_divergence: Divergence | None
-    ladder: tuple[Rung, ...]
-    quantised_different: int | None
-    breakdowns: tuple[Breakdown, ...]
-    not_compared: Mapping[str, int]
-    certificate: Certificate
+    spec_different: int
     engine: str
     engine_different: int | None
-    required: Mapping[str, float] = field(metadata=HIDDEN)
+    model: Mapping[str, ModelSpikes] | None
+    membranes_saturated: int | None
+    spikes: Mapping[str, LayerSpikes] = field(default_factory=dict)
+    ladder: tuple[Rung, ...] = ()
+    first_divergence: Divergence | None = None
+    breakdowns: tuple[Breakdown, ...] = ()
+    not_compared: Mapping[str, int] = field(default_factory=dict)
     row_different: int | None = field(default=None, metadata=OPTIONAL)
+    required: Mapping[str, float] = field(default_factory=dict, metadata=HIDDEN)
     same_checkpoint: bool = True
     explained_cost: tuple[Part, ...] | None = field(default=None, metadata=OPTIONAL)
 
-    json_properties = ("samples", "accuracy", "decision_agreement", "levels", "missed")
+    json_properties = (
+        "samples",
+        "accuracy",
+        "decision_agreement",
+        "votes_moved",
+        "spec_equals_engine",
+        "levels",
+        "missed",
+    )
 
     @property
     def samples(self) -> int:
@@ -141,20 +159,37 @@ class Verdict:
         return len(self.files)
 
     @property
+    def spec_equals_engine(self) -> bool:
+        """Whether specification, engine and the further engine did the same."""
+        return not (self.spec_different or self.engine_different)
+
+    @property
+    def model_different(self) -> int | None:
+        """Spikes that are not the lowered model's."""
+        return None if self.model is None else sum(layer.different for layer in self.model.values())
+
+    @property
     def different(self) -> int:
-        """Spikes that are not the float model's."""
-        return sum(layer.different for layer in self.spikes.values())
+        """Spikes that are not the float model's, or where the network is whole numbers not the lowered model's."""
+        return sum(layer.different for layer in self.spikes.values()) if self.spikes else self.model_different or 0
 
     @property
     def accuracy(self) -> Mapping[str, float]:
         """Shares of recordings that each side, ``float`` and ``chip``, gets right."""
         sides = {"float": self.float_predictions, "chip": self.chip_predictions}
-        return {side: float(np.mean(decided == self.labels)) for side, decided in sides.items()}
+        return {side: float(np.mean(decided == self.labels)) for side, decided in sides.items() if decided is not None}
 
     @property
-    def decision_agreement(self) -> float:
-        """Share of recordings in which both decide alike."""
+    def decision_agreement(self) -> float | None:
+        """Share of recordings in which float model and chip decide alike."""
+        if self.float_predictions is None:
+            return None
         return float(np.mean(self.float_predictions == self.chip_predictions))
+
+    @property
+    def votes_moved(self) -> int | None:
+        """Votes that the chip gives another class than the float model does, or does not give."""
+        return None if self.float_counts is None else int(abs(self.float_counts - self.chip_counts).sum())
 
     @property
     def levels(self) -> tuple[Level, ...]:
@@ -181,12 +216,14 @@ def in_a_sentence(verdict: Verdict) -> str:
     """What it comes to, for a reader of nothing else."""
     if verdict.missed:
         return f"Do not use this netlist: {'; '.join(verdict.missed)}."
+    right = {side: round(share * verdict.samples) for side, share in verdict.accuracy.items()}
+    if verdict.decision_agreement is None:
+        same = "the chip has every spike of its model"
+        return f"The netlist is its network; {same} and is right on {right['chip']} of {verdict.samples} recordings."
     equal = round(verdict.decision_agreement * verdict.samples)
-    chip, model = (round(verdict.accuracy[side] * verdict.samples) for side in ("chip", "float"))
     alike = f"decides as the float model on {equal} of {verdict.samples} recordings"
-    return (
-        f"The netlist is its checkpoint, rounded; the chip {alike} and is right on {chip}, the float model on {model}."
-    )
+    sides = f"is right on {right['chip']}, the float model on {right['float']}"
+    return f"The netlist is its checkpoint, rounded; the chip {alike} and {sides}."
 
 
 def mcnemar(labels: IntArray, first: IntArray, second: IntArray) -> tuple[int, int, float]:
@@ -213,43 +250,65 @@ def mcnemar(labels: IntArray, first: IntArray, second: IntArray) -> tuple[int, i
 
 def levels_of(verdict: Verdict) -> tuple[Level, ...]:
     """Summarise a verdict on all levels."""
-    agreement = {name: spike_agreement(spikes) for name, spikes in verdict.spikes.items()}
-    worst = min(agreement, key=lambda name: agreement[name])
-    equal = round(verdict.decision_agreement * len(verdict.files))
-    only_float, only_chip, p = mcnemar(verdict.labels, verdict.float_predictions, verdict.chip_predictions)
-    moved = int(abs(verdict.float_counts - verdict.chip_counts).sum())
-    further, tuned = "", verdict.quantised_different
-    if verdict.engine_different is not None:
-        where = f"{verdict.engine_different:,} differing spikes on {len(verdict.files)} recordings"
-        further = f"; {verdict.engine} beside it, {where}"
-    if verdict.row_different is not None:
-        further += f", alone and in a row; there {verdict.row_different} of {len(verdict.files)} decisions are others"
-    exact = "not applicable: the checkpoint was not fine-tuned on the chip's integers"
-    if tuned is not None:
-        spikes = sum(layer.chip for layer in verdict.spikes.values())
-        exact = f"fine-tuned model = chip: {tuned:,} differing spikes of {spikes:,} on {len(verdict.files)} recordings"
     return (
-        Level(name="EN", share=float(verdict.weights.holds), text=verdict.weights.text),
-        Level(
-            name="E0",
-            share=float(verdict.spec_equals_engine),
-            text=f"specification = engine {'in' if verdict.spec_equals_engine else 'NOT in'} every spike, membrane and "
-            f"count of {verdict.spec_samples} recordings{further}",
-        ),
-        Level(name="E1", share=None if tuned is None else float(tuned == 0), text=exact),
-        Level(
-            name="E2",
-            share=agreement[worst],
-            text="spikes in common with the float model: "
-            + ", ".join(f"{name} {100 * share:.2f} %" for name, share in agreement.items()),
-        ),
-        Level(
-            name="E3",
-            share=verdict.decision_agreement,
-            text=f"{equal} of {len(verdict.files)} decisions equal; right on float only {only_float}, on chip only "
-            f"{only_chip} (exact McNemar p = {p:.3g}); class votes moved: {moved:,} of {verdict.float_counts.sum():,}",
-        ),
+        Level(name="EN", share=float(verdict.netlist.holds), text=verdict.netlist.text),
+        _engine_level(verdict),
+        _model_level(verdict),
+        _spike_level(verdict),
+        _decision_level(verdict),
     )
+
+
+def _engine_level(verdict: Verdict) -> Level:
+    """E0: specification, our engine and another one."""
+    samples = verdict.samples
+    text = (
+        f"specification = engine {'in' if verdict.spec_equals_engine else 'NOT in'} every spike, membrane and "
+        f"count of {verdict.spec_samples} recordings"
+    )
+    if verdict.engine_different is not None:
+        where = f"{verdict.engine_different:,} differing spikes on {samples} recordings"
+        text += f"; {verdict.engine} beside it, {where}"
+    if verdict.row_different is not None:
+        text += f", alone and in a row; there {verdict.row_different} of {samples} decisions are others"
+    return Level(name="E0", share=float(verdict.spec_equals_engine), text=text)
+
+
+def _model_level(verdict: Verdict) -> Level:
+    """E1: lowered model and chip."""
+    different = verdict.model_different
+    if verdict.model is None or different is None:
+        text = "not applicable: the checkpoint was not fine-tuned on the chip's integers"
+        return Level(name="E1", share=None, text=text)
+    spikes = sum(layer.spikes for layer in verdict.model.values())
+    text = f"lowered model = chip: {different:,} differing spikes of {spikes:,} on {verdict.samples} recordings"
+    if verdict.membranes_saturated is not None:
+        text += f"; membranes that left their register: {verdict.membranes_saturated:,}"
+    return Level(name="E1", share=float(not different and not verdict.membranes_saturated), text=text)
+
+
+def _spike_level(verdict: Verdict) -> Level:
+    """E2: spikes of the float model."""
+    if not verdict.spikes:
+        return Level(name="E2", share=None, text="not applicable: layers of the chip are not those of a float model")
+    agreement = {name: spike_agreement(spikes) for name, spikes in verdict.spikes.items()}
+    shares = ", ".join(f"{name} {100 * share:.2f} %" for name, share in agreement.items())
+    return Level(name="E2", share=min(agreement.values()), text=f"spikes in common with the float model: {shares}")
+
+
+def _decision_level(verdict: Verdict) -> Level:
+    """E3: decisions of the float model."""
+    agreement = verdict.decision_agreement
+    if agreement is None or verdict.float_predictions is None or verdict.float_counts is None:
+        return Level(name="E3", share=None, text="not applicable: there is no float model")
+    equal = round(agreement * verdict.samples)
+    only_float, only_chip, p = mcnemar(verdict.labels, verdict.float_predictions, verdict.chip_predictions)
+    text = (
+        f"{equal} of {verdict.samples} decisions equal; right on float only {only_float}, on chip only "
+        f"{only_chip} (exact McNemar p = {p:.3g}); class votes moved: {verdict.votes_moved:,} "
+        f"of {verdict.float_counts.sum():,}"
+    )
+    return Level(name="E3", share=agreement, text=text)
 
 
 def parse_requirements(words: str) -> dict[str, float]:
@@ -291,27 +350,39 @@ def unmet(levels: tuple[Level, ...], required: Mapping[str, float]) -> list[str]
 
 
 def sections(verdict: Verdict) -> list[Section]:
-    """Accuracies, levels and warnings; spikes; the ladder; the certificate; the first divergence."""
-    spikes = [
+    """Accuracies, levels and warnings; spikes of model and float model; the ladder; the first divergence."""
+    chapters = [Section("Levels", [Text("\n".join(_lines(verdict)))])]
+    if verdict.model is not None:
+        rows = [[name, f"{layer.spikes:,}", f"{layer.different:,}"] for name, layer in verdict.model.items()]
+        chapters.append(Section("Lowered model", [Table(["layer", "spikes of the model", "different"], rows)]))
+    if verdict.spikes:
+        first = verdict.first_divergence
+        divergence = "no spike differs" if first is None else _divergence(first)
+        chapters += [
+            Section("Spikes", [_spike_table(verdict)]),
+            Section("Ladder", [_ladder_table(verdict)]),
+            Section("First divergence", [Text(divergence)]),
+        ]
+    return chapters
+
+
+def _spike_table(verdict: Verdict) -> Table:
+    rows = [
         [name, *(f"{count:,}" for count in (layer.float, layer.chip, layer.different, layer.ill_posed))]
         for name, layer in verdict.spikes.items()
     ]
-    ladder = [[rung.stage, *(f"{rung.different[name]:,}" for name in verdict.spikes)] for rung in verdict.ladder]
-    first = verdict.first_divergence
-    return [
-        Section("Levels", [Text("\n".join(_lines(verdict)))]),
-        Section("Spikes", [Table(["spikes", "float", "chip", "different", "ill-posed"], spikes)]),
-        Section("Ladder", [Table(["different, adding", *verdict.spikes], ladder)]),
-        Section("Certificate", certified(verdict.certificate)),
-        Section("First divergence", [Text("no spike differs" if first is None else _divergence(first))]),
-    ]
+    return Table(["spikes", "float", "chip", "different", "ill-posed"], rows)
+
+
+def _ladder_table(verdict: Verdict) -> Table:
+    rows = [[rung.stage, *(f"{rung.different[name]:,}" for name in verdict.spikes)] for rung in verdict.ladder]
+    return Table(["different, adding", *verdict.spikes], rows)
 
 
 def _lines(verdict: Verdict) -> list[str]:
-    right = {side: round(share * verdict.samples) for side, share in verdict.accuracy.items()}
+    right = {side: percent(round(share * verdict.samples), verdict.samples) for side, share in verdict.accuracy.items()}
     lines = [
-        f"float accuracy:  {percent(right['float'], verdict.samples)}",
-        f"chip accuracy:   {percent(right['chip'], verdict.samples)}",
+        *(f"{side + ' accuracy:':<17}{share}" for side, share in right.items()),
         *(f"{level.name}  {level.text}" for level in verdict.levels),
         *(f"missed: {line}" for line in verdict.missed),
         *(f"breakdown: {breakdown.text}" for breakdown in verdict.breakdowns),
@@ -324,27 +395,6 @@ def _lines(verdict: Verdict) -> list[str]:
         absent = ", ".join(f"{name} {count:,}" for name, count in verdict.not_compared.items())
         lines.append(f"not compared, left out because their spikes reach no neuron: {absent}")
     return lines
-
-
-def certified(certificate: Certificate) -> list[Block]:
-    """Entries that no order of summation changes, certified decisions, and whether registers stay in range."""
-    rows = [
-        [
-            name,
-            f"{layer.entries:,}",
-            f"{100 * layer.equal / max(layer.entries, 1):.4f} %",
-            f"{layer.different:,}",
-            f"{layer.undecided:,}",
-        ]
-        for name, layer in certificate.layers.items()
-    ]
-    proof = (
-        "; ".join(open_ranges(certificate.unproven, certificate.saturating)) or "no register overflows for any input"
-    )
-    return [
-        Table(["certified in any order of sums", "entries", "equal", "different", "undecided"], rows),
-        Text(f"{certificate.decisions} of {certificate.samples} decisions certified equal; {proof}"),
-    ]
 
 
 def _divergence(first: Divergence) -> str:

@@ -17,12 +17,16 @@ import numpy.typing as npt
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.interpret import vote
+from spikeloom.compiler.interpret import cut, vote
+from spikeloom.compiler.ir import Network
+from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.base import Target, load_target, with_tables
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting, by_running
+from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
 
@@ -46,17 +50,31 @@ class Run:
     """Votes (samples, classes) int64 and, by layer, those spikes and membranes (samples, steps, neurons) that are kept.
 
     `counts` are spikes of each neuron that the chip holds, in the order of the netlist; (samples, neurons).
+    `saturated` are membranes that left their register, (samples,), where that is against the chip's model.
     """
 
     votes: IntArray
     counts: IntArray
     spikes: Mapping[str, BoolArray]
     membranes: Mapping[str, npt.NDArray[np.int32]]
+    saturated: IntArray | None = None
 
     @property
     def decisions(self) -> IntArray:
         """Class of each recording; ties go to the lowest."""
         return vote(self.votes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Model:
+    """The whole numbers that a network is lowered to, run without a chip.
+
+    first: chip step in which each layer spikes for the first data step.
+    spikes: of each layer, (samples, steps, neurons), for events (samples, taxels, polarities, steps).
+    """
+
+    first: Mapping[str, int]
+    spikes: Callable[[EventArray], Mapping[str, BoolArray]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -181,6 +199,18 @@ class Machine(ABC):
         """Hold the netlist against every limit of the chip; the SpikeloomError names each that it breaks."""
 
     @abstractmethod
+    def check_lowering(self, network: Any) -> NetlistCheck:
+        """Level EN: hold the netlist against the network that it was lowered from, written out; simulates nothing."""
+
+    def model(self, source: Any) -> Model | None:  # noqa: ARG002
+        """Level E1: the whole numbers that a network brings, as `compile` was given it; None if it brings none."""
+        return None
+
+    def differing(self, run: Run, layer: str, expected: BoolArray, first: int, lengths: IntArray) -> int:  # noqa: ARG002
+        """Spikes of a layer that are not as a model has them, (samples, steps, neurons), its first in step `first`."""
+        return int(np.count_nonzero(run.spikes[layer] != cut(expected, lengths)))
+
+    @abstractmethod
     def of_layer(self, array: npt.NDArray[T], index: int) -> npt.NDArray[T]:
         """Cut one layer out of spikes or membranes of a trace, (samples, steps, neurons)."""
 
@@ -211,7 +241,12 @@ class Machine(ABC):
             counts=trace.counts.spikes,
             spikes=by_layer(trace.spikes),
             membranes=by_layer(trace.membranes),
+            saturated=self.saturated(trace),
         )
+
+    def saturated(self, trace: Any) -> IntArray | None:  # noqa: ARG002
+        """Membranes that left their register, (samples,), where the chip's model has none that do."""
+        return None
 
     def run(
         self, events: EventArray, *, lengths: IntArray | None = None, spikes: bool = False, membranes: bool = False
@@ -369,6 +404,24 @@ class Lowered:
     report: Callable[[str], Outcome]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reference:
+    """What a netlist is held against.
+
+    source: the network as `compile` was given it.
+    network: the same, written out.
+    floats: the float model that decides and spikes beside the chip; None where the network is whole numbers.
+    whole: whether the network is whole numbers, so that the chip must have their every spike.
+    difference: how the file is not what the netlist was compiled from.
+    """
+
+    source: Any
+    network: Any
+    floats: Factored | Network | None
+    whole: bool = False
+    difference: str | None = None
+
+
 class Backend(ABC):
     """What a chip offers; its methods import what is heavy, so that naming a chip loads no simulator."""
 
@@ -423,6 +476,12 @@ class Backend(ABC):
         """Describe such a network."""
         raise NotImplementedError(f"no network is trained for {self.name} alone")
 
-    def verify(self, arguments: Namespace) -> Outcome | None:  # noqa: ARG002
-        """Compare chip and network where the chip has a way of its own."""
-        return None
+    def reference(self, arguments: Namespace, netlist: Any) -> Reference:
+        """Read the network that `verify` was given beside a netlist; by default a network of floats."""
+        loaded = load_network(arguments.checkpoint, arguments, netlist)
+        return Reference(
+            source=loaded.model,
+            network=loaded.network,
+            floats=loaded.model,
+            difference=loaded.differs_from(netlist, arguments.run),
+        )

@@ -41,7 +41,7 @@ KINDS = {
     "float32 reference": Kind("float32, released operator order", "all", "what the chip's spikes are held against"),
     "ladder: float64": Kind("float64 sums", "all", "shows spikes that rounding of sums decides"),
     "chip": Kind(CHIP, "all", "every spike kept, since every one is compared"),
-    "fine-tuned model": Kind("chip integers in torch", "all", "E1: the fine-tuned model has to be the chip"),
+    "lowered model": Kind("whole numbers", "all", "E1: the model that the network brings has to be the chip"),
     "specification": Kind(
         "64-bit integers, and the engine again with membranes", "checked", "E0; --spec-samples says how many"
     ),
@@ -51,7 +51,6 @@ KINDS = {
     "ladder: rounding": Kind(UNBOUNDED, "all", "a membrane might saturate: what that does"),
     "ladder: proven": Kind(UNBOUNDED, "none", "no register can leave its range, so that rung is the chip"),
     "first divergence": Kind("membranes in float32 and on the chip", "one", "the recording that differs first"),
-    "certificate": Kind("float64 intervals", "all", "which spikes no order of summation changes"),
     # of report, beside those of verify
     "costs": Kind(CHIP, "all", SUMS),
     "the recording": Kind(CHIP, "one", "spikes and membranes of the recording that is drawn"),

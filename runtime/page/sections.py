@@ -35,7 +35,6 @@ WORDS = LEVELS | {
     "specification, engine": "the chip's definition, written to be read; the fast simulator that made all figures",
     "ill-posed": "a spike that sums in 32 and 64 bits decide otherwise, so that neither is wrong",
     "ladder": "the chip's deviations from the float model, added one by one, and the spikes that then differ",
-    "certified": "equal in whatever order the float model adds up; undecided: it depends on the order",
     "McNemar p": "how often chance alone splits what only one of the two gets right so unevenly",
     "core, tile, chip step": "cores compute side by side, some share a tile; a step updates every neuron once",
     "compartment, axon": "a neuron as a core holds it; a core's entry for the spikes of one sender",
@@ -84,7 +83,7 @@ def _cards(report: Report) -> dict[str, tuple[str, str]]:
     for side, share in verdict.accuracy.items():
         value, _, note = percent(round(share * verdict.samples), verdict.samples).partition(" (")
         cards[f"{side} accuracy"] = value, note.removesuffix(")")
-    equal = round(verdict.decision_agreement * verdict.samples)
+    equal = round((verdict.decision_agreement or 0) * verdict.samples)
     cards["decisions equal"] = f"{equal} of {verdict.samples}", "chip and float model"
     exact = f"every spike, membrane and count of {verdict.spec_samples} recordings"
     cards["specification = engine"] = "yes" if verdict.spec_equals_engine else "NO", exact

@@ -12,7 +12,6 @@ from spikeloom.runtime.commands.options import add_netlist_and_model, add_record
 from spikeloom.runtime.equivalence.explanation.causes import explain
 from spikeloom.runtime.equivalence.explanation.results import Explained, sections
 from spikeloom.runtime.equivalence.reference import require_match
-from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
 from spikeloom.runtime.machines.backends import machine_for
@@ -55,7 +54,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     chosen = range(len(data)) if arguments.sample is None else [find_recording(data, arguments.sample, "--sample")]
 
     machine.require_windows()
-    rounding = check_rounding(machine, loaded.network, fine_tuned=loaded.network.forms is not None)
+    check = machine.check_lowering(loaded.network)
+    compensated = [name for name, layer in check.layers.items() if layer.compensated]
     for index in chosen:
         events = data.events[index : index + 1, ..., : data.steps_of(index)]
         ran = machine.run(events, spikes=True, membranes=True)
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             channels_last(events, netlist.clocks)[0],
             Activity(spikes=tuple(ran.spikes.values()), membranes=tuple(ran.membranes.values())),
             model=loaded.model,
-            rounding=rounding,
+            compensated=compensated,
             absent=machine.absent,
             unread=machine.unread,
             pruned=bool(netlist.provenance.get("prune_unused", False)),
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         steps=data.steps_of(index),
         graph=loaded.graph,
         explanation=explanation,
-        faults=rounding.faults,
+        faults=check.faults,
         top=explanation.found[: arguments.top],
     )
     return Outcome(result, sections)

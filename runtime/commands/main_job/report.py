@@ -87,9 +87,11 @@ def _report(
         required={"E0": 1.0},
         progress=account.begin,
     )
+    decided = verdict.float_predictions
+    assert decided is not None, "a chip whose layers are a float model's has one"
     if chosen is None:
         first = verdict.first_divergence
-        apart = np.flatnonzero(verdict.float_predictions != verdict.chip_predictions)
+        apart = np.flatnonzero(decided != verdict.chip_predictions)
         chosen = int(apart[0]) if len(apart) else 0 if first is None else data.files.index(first.file)
     account.begin("costs")
     ran, price = machine.price(data.events, lengths=data.lengths, bin_s=arguments.bin)
@@ -102,7 +104,7 @@ def _report(
             classes=netlist.classes,
             files=verdict.files,
             labels=verdict.labels,
-            model=verdict.float_predictions,
+            model=decided,
             chip=verdict.chip_predictions,
         ),
         netlist=described.result,

@@ -1,13 +1,12 @@
 """The command ``verify``: the netlist held against its checkpoint; on recordings their spikes, too."""
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import replace
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_check, add_netlist_and_model, add_recordings
 from spikeloom.runtime.equivalence.reference import require_match
-from spikeloom.runtime.equivalence.rounding import check_rounding
-from spikeloom.runtime.equivalence.rounding import sections as rounding_sections
 from spikeloom.runtime.equivalence.verdict import parse_requirements, sections
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.network import load_network
@@ -15,7 +14,8 @@ from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.inputs.repeat import refuse
 from spikeloom.runtime.machines.backends import backend_of, machine_for
 from spikeloom.runtime.machines.base import ENGINES
-from spikeloom.runtime.machines.integer import integer_machine
+from spikeloom.runtime.machines.integer import IntegerMachine
+from spikeloom.runtime.machines.netlist_check import sections as check_sections
 from spikeloom.runtime.machines.simulated import Account
 from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.sections import Outcome
@@ -49,41 +49,46 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     if arguments.data is None:
         refuse(arguments, WITH_DATA, "is about recordings, give --data too")
+    required = _required(arguments)
     machine = machine_for(arguments.netlist)
-    own = backend_of(machine.netlist.target).verify(arguments)
-    if own is not None:
-        return own
-    agreement = MIN_AGREEMENT if arguments.min_agreement is None else arguments.min_agreement
-    if not 0 <= agreement <= 1:
-        raise OptionError(f"--min-agreement {agreement}: not a share; give a number from 0 to 1")
-    required = {"E0": 1.0, "E3": agreement}
-    if arguments.require is not None:
-        if arguments.min_agreement is not None:
-            raise OptionError(
-                f"--min-agreement {agreement:g}: --require replaces it; write E3={agreement:g} into that instead"
-            )
-        required = parse_requirements(arguments.require)
-    netlist, loaded = machine.netlist, load_network(arguments.checkpoint, arguments, machine.netlist)
-    require_match(netlist, loaded.model)
-    if (difference := loaded.differs_from(netlist, arguments.run)) is not None:
-        tell(f"warning: {arguments.netlist}: {difference}")
-    held = check_rounding(integer_machine(machine), loaded.network, fine_tuned=loaded.network.forms is not None)
-    if arguments.data is None or not held.layers:
-        return Outcome(held, rounding_sections, 0 if held.holds else 1)
-    original = None if arguments.original is None else load_network(arguments.original, arguments)
+    netlist = machine.netlist
+    reference = backend_of(netlist.target).reference(arguments, netlist)
+    if reference.whole:
+        refuse(arguments, ("original", "min_agreement"), "the network is whole numbers, there is no float model")
+    if reference.difference is not None:
+        tell(f"warning: {arguments.netlist}: {reference.difference}")
+    if isinstance(machine, IntegerMachine):
+        require_match(machine.netlist, reference.source)
+    check = machine.check_lowering(reference.network)
+    if arguments.data is None or not check.simulates:
+        return Outcome(check, check_sections, 0 if check.holds else 1)
+    original = None if arguments.original is None else load_network(arguments.original, arguments).model
     data = load_recordings(arguments, netlist, labels_for="verify")
     account = Account(machine, data, checked=arguments.spec_samples)
     verdict = verify(
         netlist,
-        loaded.model,
+        reference.source,
         data,
-        original=None if original is None else original.model,
+        original=reference.floats if original is None else original,
         spec_samples=arguments.spec_samples,
         engine_name=arguments.engine,
-        required=required,
-        rounding=held,
+        required=required or ({"E0": 1.0, "E1": 1.0} if reference.whole else {"E0": 1.0, "E3": MIN_AGREEMENT}),
+        check=check,
         progress=account.begin,
     )
     explained = account.explained(arguments.explain_cost)
-    verdict = replace(verdict, same_checkpoint=difference is None, explained_cost=explained)
+    verdict = replace(verdict, same_checkpoint=reference.difference is None, explained_cost=explained)
     return Outcome(verdict, sections, 1 if verdict.missed else 0)
+
+
+def _required(arguments: argparse.Namespace) -> Mapping[str, float] | None:
+    """Levels and shares that the options require; None where they say nothing."""
+    agreement = arguments.min_agreement
+    if agreement is not None and not 0 <= agreement <= 1:
+        raise OptionError(f"--min-agreement {agreement}: not a share; give a number from 0 to 1")
+    if arguments.require is None:
+        return None if agreement is None else {"E0": 1.0, "E3": agreement}
+    if agreement is not None:
+        instead = f"write E3={agreement:g} into that instead"
+        raise OptionError(f"--min-agreement {agreement:g}: --require replaces it; {instead}")
+    return parse_requirements(arguments.require)

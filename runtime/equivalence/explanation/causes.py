@@ -10,11 +10,11 @@ that it would. The cause is, in this order,
 3. what moved the membrane most.
 
 A netlist is entitled to round weights, biases, decays and membranes, and to the limits of its registers; whether what
-it stores is the rounding of its checkpoint at all is for :mod:`equivalence.rounding` to say.
+it stores is the rounding of its checkpoint at all is for :mod:`loihi1.rounding` to say.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,7 +27,7 @@ from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.equivalence.explanation import results
 from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots, sources_of
 from spikeloom.runtime.equivalence.reference import taxel_and_feature
-from spikeloom.runtime.equivalence.rounding import SLACK, Rounding, summed
+from spikeloom.runtime.machines.loihi1.rounding import SLACK, summed
 
 UNDECIDED = 256 * float(np.finfo(np.float64).eps)
 """Distance to threshold, as a share of all that the neuron adds up, that the order of a sum decides."""
@@ -43,7 +43,7 @@ def explain(
     observed: Activity,
     *,
     model: Factored | Network | None = None,
-    rounding: Rounding | None = None,
+    compensated: Collection[str] = (),
     absent: Sequence[BoolArray] | None = None,
     unread: Sequence[BoolArray] | None = None,
     pruned: bool = False,
@@ -51,9 +51,9 @@ def explain(
     """Find the roots of all differences between float64 model and chip on one recording, and their causes.
 
     `network` is the float stage of `model`, `integer` what the netlist holds, `events` (steps, channels) bool, and
-    `observed` what the chip did on this recording. `rounding` is what is known of the stored weights; by default each
-    is the nearest. The chip does not hold the `absent` neurons of each population, of which the `unread` reach no
-    neuron and are not compared; they were `pruned` on evidence, or cannot fire with their rounded weights.
+    `observed` what the chip did on this recording. Layers that were `compensated` store weights that need not be the
+    nearest. The chip does not hold the `absent` neurons of each population, of which the `unread` reach no neuron and
+    are not compared; they were `pruned` on evidence, or cannot fire with their rounded weights.
     """
     ideal = run_float(network, events[None], membranes=True)
     truth, chip = ([spikes[0] for spikes in side.spikes] for side in (ideal, observed))
@@ -86,7 +86,7 @@ def explain(
             model=model or network,
             absent=absent[post],
             pruned=pruned,
-            compensated=rounding is not None and rounding.layers[population.name].compensated,
+            compensated=population.name in compensated,
         )
         causes |= zip(here, named, strict=True)
     counts = Counter(root.layer for root in roots)

@@ -15,19 +15,22 @@ import numpy.typing as npt
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import FormatError, NumericRangeError
 from spikeloom.compiler.files import reading
-from spikeloom.compiler.ir import IntegerNetwork
+from spikeloom.compiler.interpret import cut
+from spikeloom.compiler.ir import IntegerNetwork, Network
+from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.idle import forgotten
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
-from spikeloom.runtime.machines.base import Done, Price, T, differences, one_by_one
+from spikeloom.runtime.machines.base import Done, Model, Price, Run, T, differences, one_by_one
 from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.stream import Stream
 from spikeloom.runtime.machines.loihi1.trace import Trace, aligned, unpack
+from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Block, Outcome
 
@@ -81,6 +84,27 @@ class Loihi(IntegerMachine):
     def legal(self) -> None:
         """Refuse a netlist that uses too much of a limit."""
         require_legal(self.netlist, self.target)
+
+    def check_lowering(self, network: Network) -> NetlistCheck:
+        """Whether it is the network, rounded."""
+        from spikeloom.runtime.machines.loihi1.rounding import check_rounding
+
+        return check_rounding(self, network, fine_tuned=network.forms is not None)
+
+    def model(self, source: Factored | Network) -> Model | None:
+        """The torch model that a network was fine-tuned with, on the chip's integers."""
+        network = source if isinstance(source, Network) else source.checkpoint
+        if network.forms is None:
+            return None
+        from spikeloom.models.networks.quantised import quantised_spikes  # torch, so only here
+
+        first = {layer.name: layer.depth for layer in self.netlist.layers}
+        return Model(first=first, spikes=lambda events: quantised_spikes(source, events))
+
+    def differing(self, run: Run, layer: str, expected: BoolArray, first: int, lengths: IntArray) -> int:
+        """Of neurons whose spikes reach a neuron; both count time as the float model does."""
+        compared = self.compared()[self.layers.index(layer)]
+        return int(np.count_nonzero(run.spikes[layer][..., compared] != cut(expected, lengths)[..., compared]))
 
     def simulate(self, channels: EventArray, lengths: IntArray | None, *, spikes: bool, membranes: bool) -> Trace:
         """Spikes and membranes by chip step."""

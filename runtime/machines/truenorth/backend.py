@@ -8,7 +8,7 @@ from typing import Any
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.runtime.inputs.files import shipped
-from spikeloom.runtime.machines.base import Backend, Format, Lowered, Machine
+from spikeloom.runtime.machines.base import Backend, Format, Lowered, Machine, Reference
 from spikeloom.runtime.report.sections import Outcome
 
 
@@ -81,8 +81,8 @@ class TrueNorth(Backend):
 
         return describe_trained(read(arguments.path, arguments))
 
-    def verify(self, arguments: Namespace) -> Outcome | None:
-        """Every spike of the model."""
-        from spikeloom.runtime.machines.truenorth.commands import verify
+    def reference(self, arguments: Namespace, netlist: Any) -> Reference:
+        """Whole numbers, whose every spike must be the chip's."""
+        from spikeloom.runtime.machines.truenorth.lowering import reference
 
-        return verify(arguments)
+        return reference(arguments, netlist)

@@ -1,7 +1,7 @@
 """What is compiled for TrueNorth: networks trained for it, counting ones, and history-free ones (``--in-time``)."""
 
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from spikeloom.compiler import __version__
@@ -10,14 +10,14 @@ from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.counters import read_counters
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
-from spikeloom.compiler.targets.truenorth.netlist import write_crossbars
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Options, Source, compile_crossbars
 from spikeloom.compiler.types import JsonObject
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import NETWORKS, load_network
 from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
-from spikeloom.runtime.machines.base import Lowered
+from spikeloom.runtime.machines.base import Lowered, Reference
 from spikeloom.runtime.machines.truenorth.description import describe
 from spikeloom.runtime.report.console import progress
 
@@ -75,3 +75,30 @@ def provenance_of(trained: Trained) -> JsonObject:
         "towers": 1,
         **origin_of(trained.training),
     }
+
+
+def reference(arguments: Namespace, netlist: CrossbarNetlist) -> Reference:
+    """The network that a netlist was compiled from; OptionError if the file is another one."""
+    path = arguments.checkpoint
+    made = netlist.provenance
+    counting = made.get("format") == COUNTING
+    if counting or made.get("in_time"):
+        loaded = load_network(path, arguments)
+        _require_file(arguments, made, loaded.sha256)
+        if not counting:
+            return Reference(source=loaded.model, network=loaded.network, floats=None, whole=True)
+        counters = read_counters(shipped(path))[0]
+        return Reference(source=counters, network=counters, floats=loaded.network, whole=True)
+    trained = read(path, arguments)
+    _require_file(arguments, made, trained.sha256)
+    if made.get("weights") != trained.weights:
+        compiled = f"{arguments.netlist} was compiled from {made.get('weights')}"
+        raise OptionError(f"--weights {trained.weights}: {compiled}; give the same")
+    return Reference(source=trained.network, network=trained.network, floats=None, whole=True)
+
+
+def _require_file(arguments: Namespace, made: Mapping[str, Any], sha256: str) -> None:
+    """Refuse another file than a netlist was compiled from."""
+    if made.get("checkpoint_sha256") != sha256:
+        path = f"--checkpoint {arguments.checkpoint}"
+        raise OptionError(f"{path}: {arguments.netlist} was compiled from another file; give that one")

@@ -1,6 +1,7 @@
 """TrueNorth as a :class:`machines.base.Machine`."""
 
 import os
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NoReturn
@@ -8,12 +9,20 @@ from typing import NoReturn
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.truenorth.codebook import in_levels, run_levels
+from spikeloom.compiler.targets.truenorth.counting import planned, run_counters
+from spikeloom.compiler.targets.truenorth.in_time import first_spikes
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
-from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars
-from spikeloom.compiler.types import EventArray, IntArray
-from spikeloom.runtime.machines.base import Done, Machine, Price, T
+from spikeloom.compiler.targets.truenorth.native import NativeNetwork
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars, unlike
+from spikeloom.compiler.targets.truenorth.passes import Options, Source, compile_crossbars
+from spikeloom.compiler.types import BoolArray, EventArray, IntArray
+from spikeloom.runtime.machines.base import Done, Machine, Model, Price, Run, T
+from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.truenorth import cost, engine, spec
 from spikeloom.runtime.machines.truenorth.spec import Trace
 
@@ -48,6 +57,51 @@ class TrueNorth(Machine):
         """Refuse a netlist that breaks a rule."""
         require_legal(self.netlist, self.target)
 
+    def check_lowering(self, network: Source) -> NetlistCheck:
+        """Lowered again, it is the same."""
+        copies = self.netlist.provenance.get("in_time") or None
+        again = compile_crossbars(network, Options(in_time=copies), target=self.target).netlist
+        what = "every neuron, axon, crossing point, wire and register"
+        return NetlistCheck(
+            whole=tuple(unlike(self.netlist, again)), claim=f"{what} is what the network of the file is lowered to"
+        )
+
+    def model(self, source: Source) -> Model:
+        """Of a trained or counting network in whole numbers, of a history-free one in levels."""
+        if isinstance(source, NativeNetwork):
+            from spikeloom.models.truenorth.network import run_network  # torch, so only here
+
+            first = {stage.name: index for index, stage in enumerate(source.stages)}
+            return Model(first=first, spikes=lambda events: run_network(source, events))
+        if isinstance(source, Counters):
+            plan = planned(source, self.target)
+            return Model(first=plan.first, spikes=lambda events: _stacked(run_counters(plan, each) for each in events))
+        assert isinstance(source, Factored), "a checkpoint on its graph"
+        network = expand(source.checkpoint, source.propagation)
+        levels = in_levels(network, self.netlist.provenance["in_time"], self.target)
+
+        def spikes(events: EventArray) -> Mapping[str, BoolArray]:
+            flat = events.reshape(len(events), -1, events.shape[-1])
+            return _stacked(run_levels(levels, each)[0] for each in flat)
+
+        return Model(first=first_spikes(levels), spikes=spikes)
+
+    def differing(self, run: Run, layer: str, expected: BoolArray, first: int, lengths: IntArray) -> int:
+        """Of every copy of every neuron, in every tick from the layer's first on."""
+        copies = self.netlist.neuron[self.netlist.layer == self.layers.index(layer)]
+        ticks = self.netlist.bin_ticks
+        different = 0
+        for on_chip, model, steps in zip(run.spikes[layer], expected, lengths.tolist(), strict=True):
+            window = on_chip[first : first + steps * ticks]
+            due = np.zeros_like(window)
+            due[::ticks] = model[:steps, copies]
+            different += int(np.count_nonzero(window != due))
+        return different
+
+    def saturated(self, trace: Trace) -> IntArray:
+        """The model's never do."""
+        return np.asarray(trace.counts.overflows.sum(axis=1))
+
     def simulate(
         self, channels: EventArray, lengths: IntArray | None = None, *, spikes: bool, membranes: bool = False
     ) -> Trace:
@@ -73,6 +127,12 @@ class TrueNorth(Machine):
     def stream(self) -> NoReturn:
         """Whole recordings only."""
         raise OptionError(f"{self.target.title}: runs whole recordings, not bin after bin; give one for another chip")
+
+
+def _stacked(recordings: Iterable[Mapping[str, BoolArray]]) -> dict[str, BoolArray]:
+    """Spikes by layer (samples, steps, neurons) of recordings one by one."""
+    parts = list(recordings)
+    return {name: np.stack([part[name] for part in parts]) for name in parts[0]}
 
 
 def load(path: str | os.PathLike[str]) -> TrueNorth:

@@ -97,7 +97,7 @@ def _lines(report: CostReport) -> list[str]:
         lines.append(
             f"static, not in the above: {si(static.chip_w, 'W')} a chip ({static.source}), so an inference "
             f"{'' if static.chips == 1 else f'on {static.chips} chips '}takes {si(static.real_time_j, 'J')} at the "
-            "sensor's pace, more than all else" + (f"; at full speed {full}" if full else "")
+            "sensor's pace" + (f"; at full speed {full}" if full else "")
         )
     if report.static and report.per_inference.energy_j:
         lines.append(dominant([each.real_time_j for each in report.static], report.per_inference.energy_j.values()))

@@ -29,7 +29,7 @@ from spikeloom.compiler.passes.digest import digests
 from spikeloom.compiler.passes.prune import never_fires
 from spikeloom.compiler.types import BoolArray
 from spikeloom.runtime.machines.integer import IntegerMachine
-from spikeloom.runtime.report.sections import Section, Text
+from spikeloom.runtime.machines.netlist_check import NetlistCheck
 
 SLACK = 1 + 1e-9
 """Factor by which a value may miss a limit that it meets in real numbers."""
@@ -59,88 +59,70 @@ class LayerRounding:
     faults: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rounding:
-    """What all layers store, against their checkpoint.
-
-    `whole` says what is wrong about the netlist as a whole: limits of the chip that it breaks, or why it is no network.
-    """
-
-    layers: Mapping[str, LayerRounding]
-    whole: tuple[str, ...] = ()
-
-    json_properties = ("holds",)
-
-    @property
-    def faults(self) -> tuple[str, ...]:
-        """What is not as rounding the checkpoint gives it."""
-        return (*self.whole, *(fault for layer in self.layers.values() for fault in layer.faults))
-
-    @property
-    def holds(self) -> bool:
-        """Whether everything is the rounding of the checkpoint."""
-        return not self.faults
-
-    @property
-    def text(self) -> str:
-        """One line for people."""
-        if self.faults:
-            return f"NOT the rounding of this checkpoint: {'; '.join(self.faults)}"
-        moved = [
-            f"{name} {100 * (1 - layer.nearest / layer.weights):.1f} %"
-            for name, layer in self.layers.items()
-            if layer.nearest < layer.weights
-        ]
-        what = "every connection, weight, bias, threshold and decay is the checkpoint's, rounded"
-        if not moved:
-            return f"{what} to the nearest"
-        return f"{what}; by compensation, as the netlist records, not to the nearest: {', '.join(moved)}"
-
-
-def check_rounding(machine: IntegerMachine, network: Network, *, fine_tuned: bool = False) -> Rounding:
+def check_rounding(machine: IntegerMachine, network: Network, *, fine_tuned: bool = False) -> NetlistCheck:
     """Hold what a netlist stores against the float network that it should have been compiled from; simulates nothing.
 
     A network that was `fine_tuned` on the chip's integers compensates nothing. Otherwise the netlist remembers which
     layers were compensated, and digests of what came of it: without these every weight has to be the nearest.
     """
-    provenance = machine.netlist.provenance
     try:
         integer = machine.integer
     except FormatError as error:
-        return Rounding(layers={}, whole=(str(error),))
-    names = [population.name for population in network.populations]
+        return NetlistCheck(whole=(str(error),), simulates=False)
+    provenance = machine.netlist.provenance
     recorded = provenance.get("digests")
-    compensated = [] if fine_tuned or recorded is None else provenance.get("compensated", [])
-    absent, pruned = machine.absent, bool(provenance.get("prune_unused", False))
+    may_compensate = recorded is not None and not fine_tuned
+    compensated = provenance.get("compensated", []) if may_compensate else []
+    pruned = bool(provenance.get("prune_unused", False))
     zeroed = [_may_be_zero(integer, post, mask, pruned) for post, mask in enumerate(never_fires(network))]
     channels = np.zeros(network.input.size, np.bool_)
     if "lean" in provenance:  # input channels that reach no neuron were pruned on evidence
         channels = ~machine.received
-    held, found = digests(integer, absent), {}
-    for post, name in enumerate(names):
-        known = held[name] if recorded is None else recorded.get(name, {})
-        found[name] = _check_layer(
+    stored = digests(integer, machine.absent)
+    layers = {}
+    for post, population in enumerate(network.populations):
+        name = population.name
+        known = stored[name] if recorded is None else recorded.get(name, {})
+        layers[name] = _check_layer(
             network,
             integer,
             post,
-            absent=absent,
+            absent=machine.absent,
             zeroed=zeroed,
             channels=channels,
             coarsest=max(machine.target.choices["synapse.exponent"]),
             compensates=name in compensated,
             faults=list(_other_registers(machine, network, post)),
-            other=[what for what, digest in held[name].items() if known.get(what) != digest],
+            other=[what for what, digest in stored[name].items() if known.get(what) != digest],
         )
-    whole: list[str] = []
+    whole = [*_broken_limits(machine)]
+    if recorded is None and provenance.get("calibrated") and any(layer.faults for layer in layers.values()):
+        whole.append("it does not record how it was rounded on recordings: compile it again")
+    return NetlistCheck(layers=layers, whole=tuple(whole), claim=_claim(layers))
+
+
+def _broken_limits(machine: IntegerMachine) -> Iterator[str]:
+    """Limits of the chip that the netlist breaks, and blank steps that it lacks."""
     try:
         machine.legal()
     except CapacityError as error:
-        whole += map(str, error.violations)
-    if (found_blank := machine.netlist.blank) != (due := machine.blank_due):
-        whole.append(f"it has {found_blank} blank steps instead of {due}")
-    if recorded is None and provenance.get("calibrated") and any(layer.faults for layer in found.values()):
-        whole.append("it does not record how it was rounded on recordings: compile it again")
-    return Rounding(layers=found, whole=tuple(whole))
+        yield from map(str, error.violations)
+    blank = machine.netlist.blank
+    if blank != machine.blank_due:
+        yield f"it has {blank} blank steps instead of {machine.blank_due}"
+
+
+def _claim(layers: Mapping[str, LayerRounding]) -> str:
+    """What is true of layers without a fault."""
+    moved = [
+        f"{name} {100 * (1 - layer.nearest / layer.weights):.1f} %"
+        for name, layer in layers.items()
+        if layer.nearest < layer.weights
+    ]
+    claim = "every connection, weight, bias, threshold and decay is the checkpoint's, rounded"
+    if not moved:
+        return f"{claim} to the nearest"
+    return f"{claim}; by compensation, as the netlist records, not to the nearest: {', '.join(moved)}"
 
 
 def _other_registers(machine: IntegerMachine, network: Network, post: int) -> Iterator[str]:
@@ -252,8 +234,3 @@ def _check_layer(
     return LayerRounding(
         weights=weights, nearest=weights - wrong, farthest_steps=farthest, compensated=moved, faults=tuple(faults)
     )
-
-
-def sections(found: Rounding) -> list[Section]:
-    """The same for people."""
-    return [Section("Netlist", [Text(f"EN  {found.text}")])]
