@@ -8,12 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from oracles import refused
-from random_networks import LOIHI, chain, small_target
+from random_networks import chain, small_target
 
-from spikeloom.compiler import Options, Packing, compile_network
+from spikeloom.compiler import Options, Packing
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.passes.calibrate import FEW, evenly_spaced
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.targets.loihi1.storage.held_out import HELD, KEPT, split
 
 LADDER = [Packing(planes=planes, groups=groups) for planes in (1, 2) for groups in (1, 8)]
@@ -81,11 +82,12 @@ def test_storage_that_the_chip_does_not_hold_is_not_chosen():
     options = Options(training_events=events, keep=1.0)
     words = compile_network(network, replace(options, keep=0.0)).trials[0].synapse_words
     tight = small_target(core_synapse_words=words, chip_cores=1)
-    done = tight.compile(network, options)
+    done = compile_network(network, options, target=tight)
     assert [bool(trial.refused) for trial in done.trials] == [False, False, True, True]
     assert done.netlist.provenance["planes"] == 1
-    refused(CapacityError, "", small_target(core_synapse_words=words - 1, chip_cores=1).compile, network, options)
-    assert len(LOIHI.compile(network, options).trials) > 1
+    tighter = small_target(core_synapse_words=words - 1, chip_cores=1)
+    refused(CapacityError, "", lambda: compile_network(network, options, target=tighter))
+    assert len(compile_network(network, options).trials) > 1
 
 
 def test_a_single_recording_leaves_none_to_judge_by():

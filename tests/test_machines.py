@@ -1,6 +1,7 @@
 """The one interface of all chips: what it returns is the simulator's."""
 
 import json
+from dataclasses import replace
 from importlib import resources
 
 import numpy as np
@@ -153,3 +154,14 @@ def test_tables_that_are_not_there_or_wrong(tmp_path):
     refused(OptionError, "energy.mine.neuron_active: value is -80.0", base.with_tables, chip, str(path))
     path.write_text(MINE.replace("[energy.mine]", "[energy.mine]\nhopp = 1"))
     refused(OptionError, "energy.mine.hopp: unknown", base.with_tables, chip, str(path))
+
+
+@pytest.mark.parametrize(("joules", "said"), [(1e-9, "static power dominates"), (1e9, "events take 1e+09 J")])
+def test_which_power_dominates_is_said_once(joules, said):
+    """Static power is not called the larger where events take more."""
+    made = specimen("timed")
+    outcome = made.machine.price(made.events, lengths=LENGTHS, bin_s=0.02)[1].outcome
+    mean = replace(outcome.result.per_inference, energy_j=dict.fromkeys(outcome.result.per_inference.energy_j, joules))
+    text = terminal(outcome.sections(replace(outcome.result, per_inference=mean, min=mean, max=mean)))
+    assert f"at the sensor's pace {said}" in text
+    assert "all else" not in text

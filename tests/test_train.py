@@ -20,13 +20,14 @@ from oracles import comparable, load_weights, refused
 from test_checkpoint import rebuilt
 
 import spikeloom.models.training.train
-from spikeloom.compiler import Options, Packing, compile_network
+from spikeloom.compiler import Options, Packing
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.checkpoint import save_checkpoint
@@ -251,7 +252,7 @@ def drawn(checkpoint, seed, *, samples=12, steps=20):
 
 def tuned_forms(checkpoint, adjacency, events, bits):
     asked = Options(packings=[Packing(bits=bits, groups=8)], keep_all=True, training_events=events)
-    return LOIHI.compile(Factored(checkpoint, adjacency), asked).integer.forms
+    return compile_network(Factored(checkpoint, adjacency), asked).integer.forms
 
 
 @pytest.mark.parametrize(("bits", "seed"), [(2, 0), (3, 1), (4, 2), (8, 0)])

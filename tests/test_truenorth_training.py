@@ -234,10 +234,10 @@ VERIFY = "verify net.loom --data data --checkpoint"
     [
         (f"{SYNTHETIC} --recipe timed -o z.pt", "--recipe timed: "),
         ("train --data synthetic --graph manual --copies 2 -o z.pt", "--copies 2: is for"),
-        ("compile net.pt -o z.loom", "--target loihi1: net.pt was trained for TrueNorth"),
+        ("compile net.pt -o z.loom", "--target loihi1: net.pt was trained for IBM TrueNorth"),
         ("compile net.pt --target truenorth --planes 2 -o z.loom", "--planes 2: is not for"),
         ("inspect net.pt --beta 0.3", "--beta 0.3: net.pt is a network for TrueNorth and says that itself"),
-        (f"{VERIFY} net.pt --min-agreement 1", "--min-agreement 1: the network is whole numbers"),
+        (f"{VERIFY} net.pt --min-agreement 1", "--min-agreement 1.0: the network is whole numbers"),
         (f"{VERIFY} two.pt", "--checkpoint two.pt: net.loom was compiled from another file"),
         ("verify two.loom --data data --checkpoint two.pt", "--weights last: two.loom was compiled from best"),
         ("join net.pt own.pt -o z.pt", "net.pt: is a network trained for TrueNorth, not yet compiled; only"),

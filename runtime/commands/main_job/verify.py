@@ -55,10 +55,10 @@ def run(arguments: argparse.Namespace) -> Outcome:
     reference = backend_of(netlist.target).reference(arguments, netlist)
     if reference.whole:
         refuse(arguments, ("original", "min_agreement"), "the network is whole numbers, there is no float model")
-    if reference.difference is not None:
-        tell(f"warning: {arguments.netlist}: {reference.difference}")
     if isinstance(machine, IntegerMachine):
         require_match(machine.netlist, reference.source)
+    if reference.difference is not None:
+        tell(f"warning: {arguments.netlist}: {reference.difference}")
     check = machine.check_lowering(reference.network)
     if arguments.data is None or not check.simulates:
         return Outcome(check, check_sections, 0 if check.holds else 1)
