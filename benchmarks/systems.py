@@ -39,9 +39,10 @@ def measured(name: str, network: str, data: Any) -> dict[str, Any]:
     """Decisions and dynamic energy of one network on the chip."""
     path, _, target = network.partition("@")
     options = {"target": target} if target else {"calibrate": None if "counters" in name else data.train}
-    found = spikeloom.compile(path, **options).run(data.test, detail="counts").value
+    netlist = spikeloom.compile(path, **options)
+    found = netlist.run(data.test).value
     correct = round(found.accuracy * found.samples)
-    costs = found.costs
+    costs = netlist.estimate(data.test).value
     about = {"name": name, "network": Path(path).name, "correct": correct, "samples": found.samples}
     amounts = {"operations": costs.per_inference.synaptic_operations, "cores": len(costs.cores)}
     return about | amounts | {"energy_j": dict(costs.per_inference.energy_j)}

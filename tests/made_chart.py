@@ -77,7 +77,7 @@ def made_chart(*budgets: str) -> results.Chart:
         file = f"{net}-{bits}b.loom"
         energy = bits * window * (0.2 if net == "grasps" else 0.15)
         compiled = f"spikeloom compile {net}.pt --weight-bits {bits} --calibrate 'a <b>' -o {file}"
-        ran = f"spikeloom run {file} --data 'a <b>' --detail counts --window {window}%"
+        ran = f"spikeloom run {file} --data 'a <b>' --window {window}%"
         points.append(
             made_point(
                 len(points) + 1,

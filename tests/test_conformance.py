@@ -280,8 +280,6 @@ def test_run_estimate_and_inspect_agree(name):
     assert decided["predictions"] == run.decisions.tolist()
     costs = as_json("estimate", made.netlist, "--data", made.data)
     require_keys("estimate" + kind, costs)
-    again = as_json("run", made.netlist, "--data", made.data, "--detail", "counts")
-    assert again == decided | {"costs": costs}
     shown = as_json("inspect", made.netlist)
     require_keys("compile, crossbars" if kind else "inspect netlist", shown)
     assert [layer["name"] for layer in shown["layers"]] == list(made.machine.layers)

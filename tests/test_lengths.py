@@ -195,10 +195,7 @@ def test_other_bins_are_refused(refusal, words, told):
 
 @pytest.mark.usefixtures("spikeloom")
 def test_it_decides_on_the_recordings_what_the_other_does_on_longer_bins():
-    ours, theirs = (
-        as_json("run", f"{name}.loom", "--data", data, "--detail", "counts")
-        for name, data in (("x", "fine"), ("plain", "long"))
-    )
+    ours, theirs = (as_json("run", f"{name}.loom", "--data", data) for name, data in (("x", "fine"), ("plain", "long")))
     assert ours["counts"] == theirs["counts"]
     assert any(map(any, ours["counts"]))
     assert ours["predictions"] == theirs["predictions"]

@@ -86,31 +86,18 @@ def add_recordings(parser: argparse.ArgumentParser, *, window: bool = False, req
         options.add_argument("--window", default="100%", metavar="PERCENT", help=what)
 
 
-def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], default: str) -> None:
-    """Add the option that says how deep a run is simulated."""
+def add_prices(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say how closely a run is timed, and by which prices."""
     options = group(parser, "depth and prices")
-    what = {
-        "spikes": "decisions only",
-        "counts": "events, energy, simple time model",
-        "cycle": "the time of every message too",
-    }
-    depths = "; ".join(f"{choice}: {what[choice]}" for choice in choices)
-    options.add_argument("--detail", choices=choices, default=default, help=f"{depths} (default: {default})")
+    what = "counts: events, energy, simple time model; cycle: the time of every message too (default: counts)"
+    options.add_argument("--detail", choices=("counts", "cycle"), default="counts", help=what)
     options.add_argument("--table", metavar="NAME|FILE.toml", help="energy or time by this table alone, or by your own")
-    add_explain_cost(parser)
 
 
 def add_check(parser: argparse.ArgumentParser) -> None:
     """Add the options of a comparison of chip and float model."""
     what = "recordings for spec = engine (default: 3)"
     parser.add_argument("--spec-samples", type=int, default=3, metavar="N", help=what)
-    add_explain_cost(parser)
-
-
-def add_explain_cost(parser: argparse.ArgumentParser) -> None:
-    """Add the option that tells what was simulated."""
-    what = "say on stderr (and in --json) what was simulated, and why"
-    parser.add_argument("--explain-cost", action="store_true", help=what)
 
 
 def add_model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:

@@ -19,7 +19,6 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.equivalence.breakdowns import Breakdown
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
-from spikeloom.runtime.machines.simulated import Part
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Section, Table, Text
@@ -141,7 +140,6 @@ class Verdict:
     row_different: int | None = field(default=None, metadata=OPTIONAL)
     required: Mapping[str, float] = field(default_factory=dict, metadata=HIDDEN)
     same_checkpoint: bool = True
-    explained_cost: tuple[Part, ...] | None = field(default=None, metadata=OPTIONAL)
 
     json_properties = (
         "samples",

@@ -102,7 +102,6 @@ class Report:
     costs: object
     provenance: Provenance
     stress: Stress | None = field(default=None, metadata=OPTIONAL)
-    explained_cost: Any = field(default=None, metadata=OPTIONAL)
     output: str
     described: Outcome = field(metadata=HIDDEN)
     price: Price = field(metadata=HIDDEN)

@@ -14,11 +14,11 @@ from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
 from spikeloom.runtime.machines.backends import describe, machine_for
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
-from spikeloom.runtime.machines.simulated import Account
 from spikeloom.runtime.page.recording import recording
 from spikeloom.runtime.page.results import Decisions, Report, provenance, taxels
 from spikeloom.runtime.page.sections import about, sections
 from spikeloom.runtime.report import html
+from spikeloom.runtime.report.console import Progress, progress
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 from spikeloom.runtime.studies.stress.results import Stress
 from spikeloom.runtime.studies.stress.sections import read_stress
@@ -78,14 +78,14 @@ def _report(
     """All that the page shows."""
     netlist = machine.netlist
     chosen = None if arguments.recording is None else find_recording(data, arguments.recording, "--recording")
-    account = Account(machine, data, checked=arguments.spec_samples)
+    count = Progress(len(data))
     verdict = verify(
         netlist,
         loaded.model,
         data,
         spec_samples=arguments.spec_samples,
         required={"E0": 1.0},
-        progress=account.begin,
+        progress=lambda part, done: count(done, part),
     )
     decided = verdict.float_predictions
     assert decided is not None, "a chip whose layers are a float model's has one"
@@ -93,9 +93,8 @@ def _report(
         first = verdict.first_divergence
         apart = np.flatnonzero(decided != verdict.chip_predictions)
         chosen = int(apart[0]) if len(apart) else 0 if first is None else data.files.index(first.file)
-    account.begin("costs")
+    progress("pricing")
     ran, price = machine.price(data.events, lengths=data.lengths, bin_s=arguments.bin)
-    account.begin("the recording")
     origin = provenance(arguments, netlist, machine.target, loaded, data, data.files[chosen])
     described = describe(arguments.netlist)
     return Report(
@@ -118,5 +117,4 @@ def _report(
         price=price,
         figures=machine.figures(price),
         stress=stress,
-        explained_cost=account.explained(arguments.explain_cost),
     )

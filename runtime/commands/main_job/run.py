@@ -3,7 +3,7 @@
 import argparse
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -12,14 +12,12 @@ from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
-from spikeloom.runtime.commands.main_job.estimate import priced
-from spikeloom.runtime.commands.options import add_detail, add_netlist, add_recordings
+from spikeloom.runtime.commands.options import add_netlist, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
-from spikeloom.runtime.machines.base import Machine, Price, Run
-from spikeloom.runtime.machines.simulated import Account, Accounted
-from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
+from spikeloom.runtime.machines.base import Machine, Run
+from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 
@@ -32,8 +30,6 @@ class Decisions:
     labels: IntArray
     predictions: IntArray
     counts: IntArray
-    price: Price | None = field(default=None, metadata=HIDDEN)
-    costs: object = field(default=None, metadata=OPTIONAL)
 
     json_properties: ClassVar[tuple[str, ...]] = ("samples", "labelled", "accuracy")
 
@@ -58,7 +54,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     add_netlist(parser)
     add_recordings(parser, window=True)
-    add_detail(parser, ("spikes", "counts", "cycle"), "spikes")
     parser.add_argument("--spikes", metavar="OUT.npz", help="write the spikes of every layer, aligned with the data")
 
 
@@ -67,43 +62,29 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_place(arguments.spikes, "--spikes", arguments, ["npz"])
     machine = machine_for(arguments.netlist)
     data = load_recordings(arguments, machine.netlist)
-    account = Account(machine, data)
-    price: Price | None = None
-    if arguments.detail == "spikes":
-        votes = np.concatenate([done.votes for done in _runs("spikes", machine, data, account)])
-    else:
-        done, price = priced(arguments, machine, data, account)
-        votes = done.votes
+    votes = np.concatenate([done.votes for done in _runs("running", machine, data)])
     if arguments.spikes is not None:
-        _write_spikes(arguments.spikes, machine, data, account)
-    account.begin("no float")
-    found = Decisions(
-        files=data.files,
-        labels=data.labels,
-        predictions=vote(votes),
-        counts=votes,
-        price=price,
-        costs=None if price is None else price.outcome.result,
-    )
-    result = Accounted(result=found, explained_cost=account.explained(arguments.explain_cost))
-    return Outcome(result, lambda result: sections(result.result))
+        _write_spikes(arguments.spikes, machine, data)
+    decisions = Decisions(files=data.files, labels=data.labels, predictions=vote(votes), counts=votes)
+    return Outcome(decisions, sections)
 
 
-def _runs(part: str, machine: Machine, data: Recordings, account: Account, *, spikes: bool = False) -> Iterator[Run]:
+def _runs(what: str, machine: Machine, data: Recordings, *, spikes: bool = False) -> Iterator[Run]:
     """Some recordings after others."""
+    count = Progress(len(data))
     for rows in machine.parts(len(data), data.steps):
-        account.begin(part, rows.start)
+        count(rows.start, what)
         lengths = None if data.lengths is None else data.lengths[rows]
         yield machine.run(data.events[rows], lengths=lengths, spikes=spikes)
 
 
-def _write_spikes(path: str, machine: Machine, data: Recordings, account: Account) -> None:
+def _write_spikes(path: str, machine: Machine, data: Recordings) -> None:
     """Write the spikes of every layer; all run again for each, so that no more is held than some recordings."""
     with write_atomically(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in machine.layers:
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 shape: tuple[int, ...] = ()
-                for done in _runs("spikes kept", machine, data, account, spikes=True):
+                for done in _runs(f"writing {name}", machine, data, spikes=True):
                     spikes = np.ascontiguousarray(done.spikes[name])
                     if not shape:
                         shape = len(data), *spikes.shape[1:]
@@ -113,7 +94,7 @@ def _write_spikes(path: str, machine: Machine, data: Recordings, account: Accoun
 
 
 def sections(found: Decisions) -> Iterator[Section]:
-    """Accuracy, recordings that went wrong, decisions where no label is known, and costs."""
+    """Accuracy, recordings that went wrong; decisions where no label is known."""
     rows = list(zip(found.files, found.labels.tolist(), found.predictions.tolist(), found.counts.tolist(), strict=True))
     unknown = [row for row in rows if row[1] == UNLABELLED]
     wrong = [row for row in rows if row[1] not in (UNLABELLED, row[2])]
@@ -129,5 +110,3 @@ def sections(found: Decisions) -> Iterator[Section]:
         cells = [[file, str(chosen), str(votes[chosen])] for file, _, chosen, votes in unknown]
         blocks.append(Table(["without a label" if known else "recording", "decision", "votes"], cells))
     yield Section("Decisions", blocks)
-    if found.price is not None:
-        yield from found.price.outcome.sections(found.price.outcome.result)

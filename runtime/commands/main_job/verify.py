@@ -16,8 +16,7 @@ from spikeloom.runtime.machines.backends import backend_of, machine_for
 from spikeloom.runtime.machines.base import ENGINES
 from spikeloom.runtime.machines.integer import IntegerMachine
 from spikeloom.runtime.machines.netlist_check import sections as check_sections
-from spikeloom.runtime.machines.simulated import Account
-from spikeloom.runtime.report.console import tell
+from spikeloom.runtime.report.console import Progress, tell
 from spikeloom.runtime.report.sections import Outcome
 
 NOTES = """\
@@ -64,7 +63,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         return Outcome(check, check_sections, 0 if check.holds else 1)
     original = None if arguments.original is None else load_network(arguments.original, arguments).model
     data = load_recordings(arguments, netlist, labels_for="verify")
-    account = Account(machine, data, checked=arguments.spec_samples)
+    count = Progress(len(data))
     verdict = verify(
         netlist,
         reference.source,
@@ -74,10 +73,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
         engine_name=arguments.engine,
         required=required or ({"E0": 1.0, "E1": 1.0} if reference.whole else {"E0": 1.0, "E3": MIN_AGREEMENT}),
         check=check,
-        progress=account.begin,
+        progress=lambda part, done: count(done, part),
     )
-    explained = account.explained(arguments.explain_cost)
-    verdict = replace(verdict, same_checkpoint=reference.difference is None, explained_cost=explained)
+    verdict = replace(verdict, same_checkpoint=reference.difference is None)
     return Outcome(verdict, sections, 1 if verdict.missed else 0)
 
 

@@ -92,16 +92,20 @@ def _layout_options(layout: str) -> JsonObject:
     return {} if layout == FEWEST else {"cores_for": layout.replace(":", "=").replace("+", ",")}
 
 
-def commands(work: Measurement, layout: str, window: int) -> tuple[str, str]:
-    """What to type for the netlist of a network, and for its figures on a part of every recording."""
+def commands(work: Measurement, layout: str, window: int) -> tuple[str, ...]:
+    """What to type for the netlist of a network, and for its decisions and costs on a part of every recording."""
     network, storage, data = work.network, work.storage, work.data
     parts = [network.name, *storage.label().split(), *([] if layout == FEWEST else [layout])]
     file = "-".join(parts).replace(":", "").replace("+", "-") + ".loom"
     calibrated = {"calibrate": data.path, "bin": data.bin_s}
     stored = repeat.words(dict(network.options) | storage.options() | calibrated | _layout_options(layout))
     part = None if window == WHOLE else f"{window}%"
-    read = repeat.words({"data": data.path, "bin": data.bin_s, "detail": "counts", "window": part})
-    return repeat.command("compile", network.path, *stored, "-o", file), repeat.command("run", file, *read)
+    read = repeat.words({"data": data.path, "bin": data.bin_s, "window": part})
+    return (
+        repeat.command("compile", network.path, *stored, "-o", file),
+        repeat.command("run", file, *read),
+        repeat.command("estimate", file, *read),
+    )
 
 
 def read_splits(path: str, bin_s: float | None, network: NetworkFile) -> dict[str, Recordings]:
