@@ -251,7 +251,7 @@ def test_progress_goes_to_a_terminal_only(monkeypatch, capsys):
     monkeypatch.setattr(sys, "stderr", terminal)
     assert cli.main(["run", "net.loom", "--data", "data", "--json"]) == 0
     json.loads(capsys.readouterr().out)
-    assert "\r\x1b[Kspikes: 0 of 6 …" in terminal.getvalue()
+    assert "\r\x1b[Krunning: 0 of 6 …" in terminal.getvalue()
     assert terminal.getvalue().endswith("\r\x1b[K")  # and cleared
 
 
