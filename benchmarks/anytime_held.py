@@ -29,7 +29,7 @@ from spikeloom.runtime.commands.choose.anytime import ALLOWED
 from spikeloom.runtime.commands.training.train import both_splits, plan_jobs
 from spikeloom.runtime.inputs.network import propagation
 from spikeloom.runtime.machines.backends import machine_of
-from spikeloom.runtime.machines.integer import integer_machine
+from spikeloom.runtime.machines.capabilities import require_stoppable
 from spikeloom.runtime.studies.anytime import exits
 
 
@@ -66,7 +66,7 @@ def main() -> None:
     checkpoint = read_checkpoint(asked.network)
     weights = expand(checkpoint, propagation(checkpoint, None, str(asked.network))[1])
     netlist = compile_network(weights, Options(training_events=fitted.events)).netlist
-    machine = integer_machine(machine_of(netlist))
+    machine = require_stoppable(machine_of(netlist))
     votes, lengths = {}, {}
     for name, data in (("fitted", fitted), ("held", held), ("test", test)):
         lengths[name] = np.full(len(data), data.steps)

@@ -23,7 +23,7 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.truenorth.netlist import read_crossbars, write_crossbars
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.machines.backends import machine_of
-from spikeloom.runtime.machines.integer import integer_machine
+from spikeloom.runtime.machines.capabilities import require_comparable
 from spikeloom.runtime.machines.loihi1.rounding import check_rounding
 
 
@@ -134,7 +134,7 @@ def random_network(kind, seed, folder):
 
 def checked(netlist, network, **provenance):
     netlist = dataclasses.replace(netlist, provenance=netlist.provenance | provenance)
-    return check_rounding(integer_machine(machine_of(netlist)), network)
+    return check_rounding(require_comparable(machine_of(netlist)), network)
 
 
 MADE = {

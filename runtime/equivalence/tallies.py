@@ -21,7 +21,7 @@ from spikeloom.runtime.equivalence.reference import (
 )
 from spikeloom.runtime.equivalence.verdict import Divergence, LayerSpikes, ModelSpikes, Rung
 from spikeloom.runtime.machines.base import Machine, Model, Run
-from spikeloom.runtime.machines.integer import IntegerMachine
+from spikeloom.runtime.machines.capabilities import Comparable
 from spikeloom.runtime.machines.votes import readout_counts
 
 Layers = Sequence[BoolArray]
@@ -78,7 +78,7 @@ class FloatTally:
         self._readout = network.readout
         self._reference = reference_of(model)
         self.votes = np.zeros((samples, network.classes), np.int64)
-        self.spikes = SpikeTally(machine, model, network, begin) if isinstance(machine, IntegerMachine) else None
+        self.spikes = SpikeTally(machine, model, network, begin) if isinstance(machine, Comparable) else None
 
     def add(self, part: Part) -> None:
         """Run the model on some recordings."""
@@ -93,7 +93,7 @@ class FloatTally:
 class SpikeTally:
     """Spikes in which chip and float model differ, and which deviation of the chip costs what."""
 
-    def __init__(self, machine: IntegerMachine, model: Factored | Network, network: Network, begin: Begin) -> None:
+    def __init__(self, machine: Comparable, model: Factored | Network, network: Network, begin: Begin) -> None:
         self._machine = machine
         self._model = model
         self._begin = begin

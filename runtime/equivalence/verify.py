@@ -22,7 +22,7 @@ from spikeloom.runtime.equivalence.tallies import Begin, FloatTally, ModelTally,
 from spikeloom.runtime.equivalence.verdict import Verdict
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.base import ENGINES, Machine
-from spikeloom.runtime.machines.integer import IntegerMachine
+from spikeloom.runtime.machines.capabilities import Comparable
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
 
 
@@ -73,7 +73,7 @@ def verify(
     begin = progress or (lambda _part, _done: None)
     checked = min(spec_samples, len(data))
     floats = source if original is None and isinstance(source, Factored | Network) else original
-    if isinstance(machine, IntegerMachine):
+    if isinstance(machine, Comparable):
         require_match(machine.netlist, source)
         require_match(machine.netlist, source if floats is None else floats)
     machine.require_sensor(data.events)
@@ -132,9 +132,8 @@ def _run(
 
 def _different_in_a_row(machine: Machine, data: Recordings, votes: Any) -> int | None:
     """Decisions that differ where recordings follow each other; None unless the chip runs freely."""
-    if not isinstance(machine, IntegerMachine) or not machine.free_running:
-        return None
-    return int(np.sum(vote(machine.in_a_row(data.events, data.lengths)) != vote(votes)))
+    in_a_row = machine.in_a_row(data.events, data.lengths)
+    return None if in_a_row is None else int(np.sum(vote(in_a_row) != vote(votes)))
 
 
 def _of_floats(tally: FloatTally, votes: Any, files: tuple[str, ...]) -> dict[str, Any]:

@@ -24,11 +24,12 @@ from spikeloom.compiler.targets.base import Target, load_target, with_tables
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.inputs.network import load_network
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting, by_running
+from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.votes import class_counts
-from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.report.sections import Block, Outcome
 
 Done = Callable[[int], object] | None
 """Called with the number of recordings done."""
@@ -185,9 +186,9 @@ class Machine(ABC):
         """Their names."""
 
     @property
-    @abstractmethod
     def kernel(self) -> str:
         """How the simulator goes through a recording, in a few words."""
+        return "step by step"
 
     @property
     @abstractmethod
@@ -197,6 +198,28 @@ class Machine(ABC):
     @abstractmethod
     def legal(self) -> None:
         """Hold the netlist against every limit of the chip; the SpikeloomError names each that it breaks."""
+
+    @property
+    def free_running(self) -> bool:
+        """Whether nobody resets the chip: layers have no windows, and blank steps follow a recording."""
+        return False
+
+    def require_windows(self) -> None:
+        """Refuse a free-running netlist: an OptionError."""
+        if self.free_running:
+            raise OptionError("netlist: is free-running, which this cannot take; compile it without --free-running")
+
+    def in_a_row(self, events: EventArray, lengths: IntArray | None) -> IntArray | None:  # noqa: ARG002
+        """Votes (samples, classes) of recordings that follow each other on a free-running chip; None on another."""
+        return None
+
+    def core_map(self, events: EventArray, lengths: IntArray, counts: IntArray) -> CoreMap | None:  # noqa: ARG002
+        """Where the cores lie, and their traffic in recordings that gave these ``counts`` of a :class:`Run`."""
+        return None
+
+    def figures(self, price: Price) -> list[Block]:  # noqa: ARG002
+        """What a price looks like, for the page of the netlist."""
+        return []
 
     @abstractmethod
     def check_lowering(self, network: Any) -> NetlistCheck:
@@ -323,13 +346,13 @@ class Machine(ABC):
                 "the network was compiled for"
             )
 
-    @abstractmethod
-    def batch(self, steps: int) -> int:
+    def batch(self, steps: int) -> int:  # noqa: ARG002
         """Recordings of so many data steps whose price is worked out at a time where memory is short."""
+        return PART
 
-    @abstractmethod
     def stream(self) -> Stream:
         """State of one grasp that runs bin after bin; OptionError if the simulator runs whole recordings only."""
+        raise OptionError(f"{self.target.title}: runs whole recordings, not bin after bin; give one for another chip")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -410,16 +433,21 @@ class Reference:
 
     source: the network as `compile` was given it.
     network: the same, written out.
-    floats: the float model that decides and spikes beside the chip; None where the network is whole numbers.
+    loaded: the float network beside the chip, and where it is from; None where there is none.
     whole: whether the network is whole numbers, so that the chip must have their every spike.
     difference: how the file is not what the netlist was compiled from.
     """
 
     source: Any
     network: Any
-    floats: Factored | Network | None
+    loaded: LoadedNetwork | None
     whole: bool = False
     difference: str | None = None
+
+    @property
+    def floats(self) -> Factored | Network | None:
+        """The float model that decides and spikes beside the chip."""
+        return None if self.loaded is None else self.loaded.model
 
 
 class Backend(ABC):
@@ -482,6 +510,6 @@ class Backend(ABC):
         return Reference(
             source=loaded.model,
             network=loaded.network,
-            floats=loaded.model,
+            loaded=loaded,
             difference=loaded.differs_from(netlist, arguments.run),
         )

@@ -12,7 +12,7 @@ from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.reference import membranes_of, reference_of, taxel_and_feature
 from spikeloom.runtime.inputs.network import LoadedNetwork
-from spikeloom.runtime.machines.integer import IntegerMachine
+from spikeloom.runtime.machines.capabilities import Comparable
 from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.encode import key
 
@@ -108,7 +108,7 @@ class Recording:
     membranes: tuple[Trace, ...]
 
 
-def recording(machine: IntegerMachine, loaded: LoadedNetwork, data: Recordings, index: int) -> Recording:
+def recording(machine: Comparable, loaded: LoadedNetwork, data: Recordings, index: int) -> Recording:
     """Everything that the page shows of one recording.
 
     Neurons whose spikes reach no neuron are silent on both sides.
@@ -152,7 +152,7 @@ def recording(machine: IntegerMachine, loaded: LoadedNetwork, data: Recordings, 
 
 
 def _traces(
-    machine: IntegerMachine,
+    machine: Comparable,
     loaded: LoadedNetwork,
     spikes: tuple[Sequence[BoolArray], Sequence[BoolArray]],
     ours: Sequence[Floats],

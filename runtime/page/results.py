@@ -22,9 +22,9 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.verdict import Verdict
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.network import LoadedNetwork, sensor_places
-from spikeloom.runtime.machines.base import Price
+from spikeloom.runtime.machines.base import Machine, Price
+from spikeloom.runtime.machines.capabilities import Comparable
 from spikeloom.runtime.machines.core_map import CoreMap
-from spikeloom.runtime.machines.integer import IntegerMachine
 from spikeloom.runtime.page.recording import Recording
 from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL, key
 from spikeloom.runtime.report.sections import Block, Outcome
@@ -96,9 +96,9 @@ class Report:
     verify: Verdict
     decisions: Decisions
     netlist: object
-    cores: CoreMap
+    cores: CoreMap | None
     taxels: Taxels
-    recording: Recording
+    recording: Recording | None
     costs: object
     provenance: Provenance
     stress: Stress | None = field(default=None, metadata=OPTIONAL)
@@ -108,9 +108,7 @@ class Report:
     figures: Sequence[Block] = field(metadata=HIDDEN)
 
 
-def taxels(
-    machine: IntegerMachine, loaded: LoadedNetwork, data: Recordings, counts: IntArray, sensor: str | None
-) -> Taxels:
+def taxels(machine: Machine, loaded: LoadedNetwork, data: Recordings, counts: IntArray, sensor: str | None) -> Taxels:
     """Taxels, the graph over them where there is one, and what each sends and its neurons fire in a mean recording.
 
     `counts` are those of the chip's :class:`Run`; `sensor` is what the user named by ``--taxels``.
@@ -121,7 +119,7 @@ def taxels(
     edges: IntArray = np.zeros((0, 2), np.int64)
     spikes: FloatArray | None = None
     has_graph = checkpoint is not None and checkpoint.system in GRAPH_SYSTEMS
-    if checkpoint is not None and loaded.adjacency is not None and has_graph:
+    if checkpoint is not None and loaded.adjacency is not None and has_graph and isinstance(machine, Comparable):
         seen = loaded.adjacency.reshape(-1, netlist.taxels, netlist.taxels)[0]
         target, source = np.nonzero(seen)
         edges = np.stack([source, target], axis=1)[source != target]

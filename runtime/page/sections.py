@@ -52,9 +52,9 @@ def sections(report: Report) -> list[Section]:
             "Verdict", [Text(in_a_sentence(report.verify)), Facts(_cards(report)), *verdict_sections(report.verify)]
         ),
         Section("Decisions", _decisions(report.decisions)),
-        Section("Cores", [*_of_chip(report.described), *_cores(report.cores)]),
+        Section("Cores", [*_of_chip(report.described), *([] if report.cores is None else _cores(report.cores))]),
         Section("Taxels", _taxels(report.taxels)),
-        Section("One recording", _recording(report.recording)),
+        Section("One recording", [] if report.recording is None else _recording(report.recording)),
         Section("Energy and time", [*_of_chip(report.price.outcome), Section("", report.figures)]),
         Section("Stability", [] if report.stress is None else stability(report.stress)),
         Section("Provenance", _provenance(report.provenance)),
@@ -72,8 +72,8 @@ def about(report: Report) -> str:
     """The page in a sentence."""
     system = TITLES.get(report.provenance.checkpoint.facts["system"], "a network")
     graph = f", graph {report.taxels.graph}" if report.taxels.graph else ""
-    cores, samples = len(report.cores.cores), report.verify.samples
-    where = f"on {number(cores, 'core')}, compared with its float model on {number(samples, 'recording')}"
+    cores = "" if report.cores is None else f"on {number(len(report.cores.cores), 'core')}, "
+    where = f"{cores}compared with its float model on {number(report.verify.samples, 'recording')}"
     return f"{system[0].upper()}{system[1:]}{graph}, {where}."
 
 
@@ -96,6 +96,8 @@ def _cards(report: Report) -> dict[str, tuple[str, str]]:
             cards[name] = " … ".join(ends), ", ".join(rising)
     for table, seconds in list(price.time_s.items())[:1]:
         cards["time an inference"] = si(float(seconds.mean()), "s"), f"at full speed, {table}, simple model"
+    if report.cores is None:
+        return cards
     held = sum(core.compartments for core in report.cores.cores)
     return cards | {"cores": (str(len(report.cores.cores)), f"{held:,} neurons on the chip")}
 

@@ -15,7 +15,7 @@ from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
 from spikeloom.runtime.machines.backends import machine_for
-from spikeloom.runtime.machines.integer import integer_machine
+from spikeloom.runtime.machines.capabilities import require_comparable
 from spikeloom.runtime.report.sections import Outcome
 
 NOTES = """\
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; differences are its subject, not a failure."""
     if arguments.top < 1:
         raise OptionError(f"--top {arguments.top}: at least 1 root can be shown; give a positive number")
-    machine = integer_machine(machine_for(arguments.netlist), arguments.netlist, "explain")
+    machine = require_comparable(machine_for(arguments.netlist), arguments.netlist, "explain")
     netlist = machine.netlist
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, loaded.model)

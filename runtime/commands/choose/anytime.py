@@ -8,7 +8,7 @@ from spikeloom.runtime.commands.options import add_netlist, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
-from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
+from spikeloom.runtime.machines.capabilities import Stoppable, require_stoppable
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     require_place(arguments.output, "-o", arguments)
     allowed = _allowed(arguments)
-    machine = integer_machine(machine_for(arguments.netlist), arguments.netlist, "anytime")
+    machine = require_stoppable(machine_for(arguments.netlist), arguments.netlist, "anytime")
     data = load_recordings(arguments, machine.netlist)
     machine.require_sensor(data.events)
     points = _races(arguments, machine)
@@ -72,7 +72,7 @@ def _allowed(arguments: argparse.Namespace) -> list[float]:
     return [chosen, *(share for share in ALLOWED if share != chosen)]
 
 
-def _races(arguments: argparse.Namespace, machine: IntegerMachine) -> FloatArray | None:
+def _races(arguments: argparse.Namespace, machine: Stoppable) -> FloatArray | None:
     """Turning points of races or decisions of the training split, if there is something to calibrate on."""
     if arguments.calibrate is None:
         return None

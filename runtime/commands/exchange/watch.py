@@ -199,7 +199,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     from spikeloom.models.recordings.evtouch import BIN_S
     from spikeloom.runtime.inputs.recordings import origin_of
     from spikeloom.runtime.machines.backends import machine_for
-    from spikeloom.runtime.machines.integer import integer_machine
+    from spikeloom.runtime.machines.capabilities import require_stoppable
     from spikeloom.runtime.studies.anytime import exits
 
     bin_s = None if arguments.bin is None else _duration(arguments.bin)
@@ -245,7 +245,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             real=arguments.speed == "real",
             may_end=None
             if factor is None
-            else exits.live(integer_machine(machine, arguments.netlist, "--until-sure"), arguments.bins, factor),
+            else exits.live(require_stoppable(machine, arguments.netlist, "--until-sure"), arguments.bins, factor),
             found=Summary(early=None if factor is None else 0),
         )
         session.run()

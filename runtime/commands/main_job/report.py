@@ -1,19 +1,22 @@
 """The command ``report``: everything about one netlist on one page, and the same as tables on the terminal."""
 
 import argparse
+from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_check, add_netlist_and_model, add_recordings
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
-from spikeloom.runtime.machines.backends import describe, machine_for
-from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
+from spikeloom.runtime.machines.backends import backend_of, describe, machine_for
+from spikeloom.runtime.machines.base import Machine
+from spikeloom.runtime.machines.capabilities import Comparable
 from spikeloom.runtime.page.recording import recording
 from spikeloom.runtime.page.results import Decisions, Report, provenance, taxels
 from spikeloom.runtime.page.sections import about, sections
@@ -45,18 +48,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; nothing is written before everything is known."""
     require_place(arguments.output, "-o", arguments, ["html"])
-    machine = integer_machine(machine_for(arguments.netlist), arguments.netlist, "report")
+    machine = machine_for(arguments.netlist)
     netlist = machine.netlist
     battery = None
     if arguments.stress is not None:
         sha256 = sha256_of(arguments.netlist)
         battery = read_stress(arguments.stress, arguments.netlist, sha256)
-    loaded = load_network(arguments.checkpoint, arguments, netlist)
-    require_match(netlist, loaded.model)
-    loaded.require_same(arguments.netlist, netlist, arguments.run)
+    reference = backend_of(netlist.target).reference(arguments, netlist)
+    if reference.loaded is None:
+        raise OptionError(f"--checkpoint {arguments.checkpoint}: there is no float model to show beside the chip")
+    if isinstance(machine, Comparable):
+        require_match(netlist, reference.loaded.model)
+    reference.loaded.require_same(arguments.netlist, netlist, arguments.run)
     data = load_recordings(arguments, netlist, labels_for="report")
     machine.require_sensor(data.events)
-    report = _report(arguments, machine, loaded, data, battery)
+    report = _report(arguments, machine, reference.source, reference.loaded, data, battery)
     made = report.provenance
     title = f"{made.netlist.file} on {made.data.file}"
     with write_atomically(arguments.output) as file:
@@ -70,7 +76,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
 def _report(
     arguments: argparse.Namespace,
-    machine: IntegerMachine,
+    machine: Machine,
+    source: Any,
     loaded: LoadedNetwork,
     data: Recordings,
     stress: Stress | None,
@@ -81,14 +88,15 @@ def _report(
     count = Progress(len(data))
     verdict = verify(
         netlist,
-        loaded.model,
+        source,
         data,
+        original=loaded.model,
         spec_samples=arguments.spec_samples,
         required={"E0": 1.0},
         progress=lambda part, done: count(done, part),
     )
     decided = verdict.float_predictions
-    assert decided is not None, "a chip whose layers are a float model's has one"
+    assert decided is not None, "there is a float model"
     if chosen is None:
         first = verdict.first_divergence
         apart = np.flatnonzero(decided != verdict.chip_predictions)
@@ -109,7 +117,7 @@ def _report(
         netlist=described.result,
         cores=machine.core_map(data.events, data.step_counts, ran.counts),
         taxels=taxels(machine, loaded, data, ran.counts, arguments.taxels),
-        recording=recording(machine, loaded, data, chosen),
+        recording=recording(machine, loaded, data, chosen) if isinstance(machine, Comparable) else None,
         costs=price.outcome.result,
         provenance=origin,
         output=arguments.output,

@@ -14,7 +14,7 @@ from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.inputs.repeat import refuse
 from spikeloom.runtime.machines.backends import backend_of, machine_for
 from spikeloom.runtime.machines.base import ENGINES
-from spikeloom.runtime.machines.integer import IntegerMachine
+from spikeloom.runtime.machines.capabilities import Comparable
 from spikeloom.runtime.machines.netlist_check import sections as check_sections
 from spikeloom.runtime.report.console import Progress, tell
 from spikeloom.runtime.report.sections import Outcome
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     reference = backend_of(netlist.target).reference(arguments, netlist)
     if reference.whole:
         refuse(arguments, ("original", "min_agreement"), "the network is whole numbers, there is no float model")
-    if isinstance(machine, IntegerMachine):
+    if isinstance(machine, Comparable):
         require_match(machine.netlist, reference.source)
     if reference.difference is not None:
         tell(f"warning: {arguments.netlist}: {reference.difference}")

@@ -24,8 +24,8 @@ from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.machines.base import Done, Model, Price, Run, T, differences, one_by_one
+from spikeloom.runtime.machines.capabilities import Cumulative, Stoppable, Threaded
 from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting
-from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.stream import Stream
@@ -45,7 +45,7 @@ SUMS = 1 << 24
 
 
 @dataclass(frozen=True)
-class Loihi(IntegerMachine):
+class Loihi(Threaded, Stoppable):
     """A netlist and its simulator."""
 
     netlist: Netlist
@@ -132,12 +132,43 @@ class Loihi(IntegerMachine):
         return found
 
     @property
+    def free_running(self) -> bool:
+        """Whether blank steps follow a recording."""
+        return bool(self.netlist.blank)
+
+    @property
+    def absent(self) -> tuple[BoolArray, ...]:
+        """Neurons without a compartment."""
+        return tuple(
+            ~np.isin(np.arange(layer.neurons), self.netlist.neuron[self.netlist.compartments_of(index)])
+            for index, layer in enumerate(self.netlist.layers)
+        )
+
+    @property
+    def unread(self) -> tuple[BoolArray, ...]:
+        """As the compiler wrote them down."""
+        return tuple(np.isin(np.arange(layer.neurons), layer.unread) for layer in self.netlist.layers)
+
+    @property
+    def received(self) -> BoolArray:
+        """Input channels, (channels,) bool, that some core takes in."""
+        return np.asarray(np.isin(np.arange(self.netlist.n_inputs), self.netlist.axon_source))
+
+    @property
+    def read_out_lag(self) -> int:
+        """The depth of the latest layer that votes."""
+        voting = np.unique(self.netlist.layer[self.netlist.readout_class >= 0])
+        return max(int(self.netlist.layers[layer].depth) for layer in voting.tolist())
+
+    @property
     def blank_due(self) -> int:
-        """By bounds on its registers."""
+        """Blank steps after which the chip forgets no more, by bounds on its registers; 0 if it is reset."""
         return forgotten(self.netlist).steps if self.free_running else 0
 
-    def in_a_row(self, events: EventArray, lengths: IntArray | None) -> IntArray:
+    def in_a_row(self, events: EventArray, lengths: IntArray | None) -> IntArray | None:
         """Registers are carried over from one to the next."""
+        if not self.free_running:
+            return None
         state, lag, counts = engine.start(self._stepwise), self.netlist.max_depth, []
         for channels in one_by_one(with_clocks(events, self.netlist.clocks), lengths):
             before, steps = state.spikes.copy(), channels.shape[1]

@@ -15,8 +15,11 @@ weights must be the nearest, and no bias may make up for more than its neuron's 
 calibration moves it by at most.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
@@ -28,8 +31,10 @@ from spikeloom.compiler.passes.calibrate import NUDGES
 from spikeloom.compiler.passes.digest import digests
 from spikeloom.compiler.passes.prune import never_fires
 from spikeloom.compiler.types import BoolArray
-from spikeloom.runtime.machines.integer import IntegerMachine
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
+
+if TYPE_CHECKING:
+    from spikeloom.runtime.machines.loihi1.machine import Loihi
 
 SLACK = 1 + 1e-9
 """Factor by which a value may miss a limit that it meets in real numbers."""
@@ -59,7 +64,7 @@ class LayerRounding:
     faults: tuple[str, ...]
 
 
-def check_rounding(machine: IntegerMachine, network: Network, *, fine_tuned: bool = False) -> NetlistCheck:
+def check_rounding(machine: Loihi, network: Network, *, fine_tuned: bool = False) -> NetlistCheck:
     """Hold what a netlist stores against the float network that it should have been compiled from; simulates nothing.
 
     A network that was `fine_tuned` on the chip's integers compensates nothing. Otherwise the netlist remembers which
@@ -101,7 +106,7 @@ def check_rounding(machine: IntegerMachine, network: Network, *, fine_tuned: boo
     return NetlistCheck(layers=layers, whole=tuple(whole), claim=_claim(layers))
 
 
-def _broken_limits(machine: IntegerMachine) -> Iterator[str]:
+def _broken_limits(machine: Loihi) -> Iterator[str]:
     """Limits of the chip that the netlist breaks, and blank steps that it lacks."""
     try:
         machine.legal()
@@ -125,7 +130,7 @@ def _claim(layers: Mapping[str, LayerRounding]) -> str:
     return f"{claim}; by compensation, as the netlist records, not to the nearest: {', '.join(moved)}"
 
 
-def _other_registers(machine: IntegerMachine, network: Network, post: int) -> Iterator[str]:
+def _other_registers(machine: Loihi, network: Network, post: int) -> Iterator[str]:
     """What is not the checkpoint's of a layer, beside weights and biases: its numbers, its window, its votes."""
     netlist, chip, wanted = machine.netlist, machine.integer.populations[post], network.populations[post]
     layer, ids = netlist.layers[post], netlist.compartments_of(post)

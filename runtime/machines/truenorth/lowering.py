@@ -86,15 +86,15 @@ def reference(arguments: Namespace, netlist: CrossbarNetlist) -> Reference:
         loaded = load_network(path, arguments)
         _require_file(arguments, made, loaded.sha256)
         if not counting:
-            return Reference(source=loaded.model, network=loaded.network, floats=None, whole=True)
+            return Reference(source=loaded.model, network=loaded.network, loaded=None, whole=True)
         counters = read_counters(shipped(path))[0]
-        return Reference(source=counters, network=counters, floats=loaded.network, whole=True)
+        return Reference(source=counters, network=counters, loaded=loaded, whole=True)
     trained = read(path, arguments)
     _require_file(arguments, made, trained.sha256)
     if made.get("weights") != trained.weights:
         compiled = f"{arguments.netlist} was compiled from {made.get('weights')}"
         raise OptionError(f"--weights {trained.weights}: {compiled}; give the same")
-    return Reference(source=trained.network, network=trained.network, floats=None, whole=True)
+    return Reference(source=trained.network, network=trained.network, loaded=None, whole=True)
 
 
 def _require_file(arguments: Namespace, made: Mapping[str, Any], sha256: str) -> None:

@@ -4,13 +4,11 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.counters import Counters
-from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.codebook import in_levels, run_levels
@@ -119,14 +117,6 @@ class TrueNorth(Machine):
         """By synaptic events and ticks."""
         trace = self.simulate(channels, lengths, spikes=False)
         return trace, cost.price(self.netlist, chip, trace.counts, bin_s * self.netlist.bins)
-
-    def batch(self, steps: int) -> int:
-        """Recordings whose counts are held at a time."""
-        return 16
-
-    def stream(self) -> NoReturn:
-        """Whole recordings only."""
-        raise OptionError(f"{self.target.title}: runs whole recordings, not bin after bin; give one for another chip")
 
 
 def _stacked(recordings: Iterable[Mapping[str, BoolArray]]) -> dict[str, BoolArray]:

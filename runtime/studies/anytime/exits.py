@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.machines.integer import IntegerMachine
+from spikeloom.runtime.machines.capabilities import Stoppable
 from spikeloom.runtime.machines.votes import wins
 from spikeloom.runtime.report.encode import key
 
@@ -72,7 +72,7 @@ def standing(votes: IntArray, lengths: IntArray) -> Standing:
     return Standing(leader=np.argmax(votes, axis=2), lead=ahead, left=left)
 
 
-def most_votes(machine: IntegerMachine, steps: int) -> IntArray:
+def most_votes(machine: Stoppable, steps: int) -> IntArray:
     """Most votes that each class can still get when 0 … `steps` steps are left; shape (classes, steps + 1)."""
     netlist, interval = machine.netlist, machine.least_intervals
     left = np.arange(steps + 1)
@@ -82,7 +82,7 @@ def most_votes(machine: IntegerMachine, steps: int) -> IntArray:
     return most
 
 
-def steady_classes(machine: IntegerMachine) -> BoolArray:
+def steady_classes(machine: Stoppable) -> BoolArray:
     """Classes that get a vote in every step after their first one; shape (classes,)."""
     classes, readout = machine.netlist.classes, machine.netlist.readout_class
     votes = readout[readout >= 0]
@@ -110,7 +110,7 @@ def exits(sure: BoolArray, at: Standing, factor: float = np.inf) -> IntArray:
     return np.asarray(np.argmax(sure | (at.confidence > factor), axis=1))
 
 
-def live(machine: IntegerMachine, bins: int, factor: float) -> Callable[[int, IntArray], bool]:
+def live(machine: Stoppable, bins: int, factor: float) -> Callable[[int, IntArray], bool]:
     """The rule of a grasp of so many bins that is stepped live.
 
     It takes a chip step, from 0, and the votes (classes,) after it, and says whether the grasp may end.

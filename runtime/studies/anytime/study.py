@@ -7,7 +7,7 @@ import numpy as np
 
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
-from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
+from spikeloom.runtime.machines.capabilities import Cumulative, Stoppable
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.anytime import exits
@@ -105,7 +105,7 @@ class Anytime:
 
 
 def study(
-    machine: IntegerMachine,
+    machine: Stoppable,
     data: Recordings,
     ran: Cumulative,
     calibrated: Sequence[exits.Calibrated] = (),

@@ -29,7 +29,7 @@ from spikeloom.models.training.counters import (
 )
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.backends import backend_of, machine_of
-from spikeloom.runtime.machines.integer import IntegerMachine
+from spikeloom.runtime.machines.capabilities import Stoppable
 from spikeloom.runtime.report.encode import OPTIONAL, encode
 from spikeloom.runtime.studies.anytime.study import study
 from spikeloom.runtime.studies.chart.results import Data
@@ -218,7 +218,7 @@ def decisions(made: Counters, data: Counted) -> IntArray:
 def costs_of(netlist: Any, of: Recordings) -> dict[str, Costs]:
     """`costs` of a mean inference until its decision is proven, where the chip can be stopped there, and `whole`."""
     machine, costs = machine_of(netlist), priced(netlist, of)[1]
-    if not isinstance(machine, IntegerMachine):
+    if not isinstance(machine, Stoppable):
         return {"costs": costs}
     proven = study(machine, of, machine.cumulative(of.events, of.step_counts)).rules[0].mean
     stopped = replace(costs, operations=proven.operations, energy_j=proven.energy_j, time_s=proven.time_s)

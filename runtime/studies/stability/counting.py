@@ -20,7 +20,7 @@ from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.ir import IntegerNetwork, Sparse, added_up
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.base import Machine
-from spikeloom.runtime.machines.integer import IntegerMachine
+from spikeloom.runtime.machines.capabilities import Comparable
 from spikeloom.runtime.studies.stability.neighbours import Cells
 
 FAR = 1 << 40
@@ -64,7 +64,7 @@ class Tally:
 def tally_of(machine: Machine) -> Tally | None:
     """What a counting network (:mod:`formats.counters`) is on the chip; None where a network is none."""
     length = machine.netlist.clocks.length
-    if machine.layers[-2:] != ("sums", "votes") or length is None or not isinstance(machine, IntegerMachine):
+    if machine.layers[-2:] != ("sums", "votes") or length is None or not isinstance(machine, Comparable):
         return None
     network: IntegerNetwork = machine.integer
     names = [population.name for population in network.populations]

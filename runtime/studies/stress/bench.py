@@ -18,7 +18,7 @@ from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_graph, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
-from spikeloom.runtime.machines.integer import integer_machine
+from spikeloom.runtime.machines.capabilities import require_threaded
 from spikeloom.runtime.studies.stress import damages, disturbances
 from spikeloom.runtime.studies.stress.pair import Events, Inputs, Pair, Perturbation, perturbation
 
@@ -112,7 +112,7 @@ NAMES = {each.name: each for each in _ALL if isinstance(each, Perturbation)}
 
 def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
     """Everything that is stressed, the float network, and a hash of the recordings."""
-    netlist = integer_machine(machine_for(arguments.netlist), arguments.netlist, "stress").netlist
+    netlist = require_threaded(machine_for(arguments.netlist), arguments.netlist, "stress").netlist
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, loaded.model)
     loaded.require_same(arguments.netlist, netlist, arguments.run)

@@ -19,7 +19,7 @@ from spikeloom.compiler.interpret import Simulation, cut, float_simulation, vote
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.runtime.machines.backends import machine_of
-from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine
+from spikeloom.runtime.machines.capabilities import Threaded, require_threaded
 from spikeloom.runtime.machines.votes import readout_counts
 
 Events = EventArray
@@ -46,9 +46,9 @@ class Pair:
     network: Network
 
     @cached_property
-    def chip(self) -> IntegerMachine:
+    def chip(self) -> Threaded:
         """The netlist, ready to run."""
-        return integer_machine(machine_of(self.netlist))
+        return require_threaded(machine_of(self.netlist))
 
     @cached_property
     def model(self) -> Simulation:

@@ -10,14 +10,14 @@ from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, largest_cu
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
-from spikeloom.runtime.machines.integer import LONGEST, Cumulative
+from spikeloom.runtime.machines.capabilities import LONGEST, Cumulative
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.trace import Charges, side_by_side
 
 
 def least_intervals(netlist: Netlist) -> IntArray:
-    """See :attr:`IntegerMachine.least_intervals`; in the order of compartments."""
+    """See :attr:`Stoppable.least_intervals`; in the order of compartments."""
     voters = np.flatnonzero(netlist.readout_class >= 0)
     current = largest_current(one_step_bounds(netlist)[0][voters], netlist.decay_u[voters])
     gain = current + (netlist.bias_mantissa << netlist.bias_exponent)[voters]
@@ -38,7 +38,7 @@ def least_intervals(netlist: Netlist) -> IntArray:
 
 
 def steady(netlist: Netlist) -> BoolArray:
-    """See :attr:`IntegerMachine.steady`: what nothing lowers, and its own spike alone lifts over the threshold."""
+    """See :attr:`Stoppable.steady`: what nothing lowers, and its own spike alone lifts over the threshold."""
     voters = np.flatnonzero(netlist.readout_class >= 0)
     sender, receiver = netlist.axon_source[netlist.axon_of_synapse()] - netlist.n_inputs, netlist.synapse_compartment()
     own = np.bincount(receiver, np.where(sender == receiver, netlist.effective_weight(), 0), netlist.n_compartments)

@@ -1,0 +1,128 @@
+"""What some chips offer beyond :class:`machines.base.Machine`, one class for each thing that a study may need."""
+
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.ir import IntegerNetwork
+from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
+from spikeloom.runtime.machines.base import Machine
+
+
+@dataclass(frozen=True)
+class Comparable(Machine):
+    """Its layers are a float model's, neuron by neuron.
+
+    Runs count time as the float model does, and have membranes: registers before the comparison, so that ``register /
+    (scale * 2**MEMBRANE_SHIFT)`` is in the model's units. What the chip does not hold stays at zero.
+    """
+
+    @property
+    @abstractmethod
+    def integer(self) -> IntegerNetwork:
+        """The netlist, cores forgotten; raises FormatError where it is no such network."""
+
+    @property
+    @abstractmethod
+    def absent(self) -> tuple[BoolArray, ...]:
+        """Neurons of each layer, (neurons,) bool, that the chip does not hold."""
+
+    @property
+    @abstractmethod
+    def unread(self) -> tuple[BoolArray, ...]:
+        """Those of them whose spikes reach no neuron, so that they cannot be compared."""
+
+    def compared(self) -> list[slice | IntArray]:
+        """Neurons of each layer whose spikes can be compared."""
+        return [np.flatnonzero(~unread) if unread.any() else slice(None) for unread in self.unread]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Cumulative:
+    """Sums over chip steps up to and with each; after a recording's end they stay as they are.
+
+    Votes (samples, steps, classes) are those after each step of the read-out, which lags `depth` chip steps behind the
+    data; operations, joules by table and seconds by table and the simple model are (samples, chip steps). Tables that
+    cannot price the run are missing, and all times for several chips.
+    """
+
+    votes: IntArray
+    depth: int
+    lengths: IntArray
+    chip_steps: IntArray
+    operations: FloatArray
+    energy: Mapping[str, FloatArray]
+    time: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True)
+class Stoppable(Machine):
+    """A recording can be stopped before its end, with bounds on the votes that are still to come."""
+
+    @property
+    @abstractmethod
+    def read_out_lag(self) -> int:
+        """Chip steps by which the votes are behind the data."""
+
+    @abstractmethod
+    def cumulative(self, events: EventArray, lengths: IntArray) -> Cumulative:
+        """Votes and costs step by step, from one run; `lengths` (samples,) are the data steps of each recording."""
+
+    @property
+    @abstractmethod
+    def least_intervals(self) -> IntArray:
+        """Least steps from one spike to the next of each neuron that votes, whatever its input; 0 if it never spikes.
+
+        In the order of ``readout_class``; after :data:`LONGEST` steps nothing is looked for any more.
+        """
+
+    @property
+    @abstractmethod
+    def steady(self) -> BoolArray:
+        """Which neurons that vote spike in every step after their first spike, in the order of ``readout_class``."""
+
+
+@dataclass(frozen=True)
+class Threaded(Comparable):
+    """Several recordings can run side by side, a thread each."""
+
+    @abstractmethod
+    def on_a_thread(self, channels: EventArray, lengths: IntArray, first: int) -> tuple[Iterable[BoolArray], IntArray]:
+        """Spikes of each layer from the step `first` on, (samples, steps, neurons), and clipped membranes, (samples,).
+
+        Channels (samples, channels, steps) include the clocks. Raises NumericRangeError if a register overflows in any
+        recording.
+        """
+
+
+LONGEST = 4096
+"""Steps after which :attr:`Stoppable.least_intervals` looks no further: a spike may follow then."""
+
+
+def require_comparable(machine: Machine, path: str = "netlist", command: str = "this command") -> Comparable:
+    """The same machine, if a float model can be compared with it; else an OptionError, which names file and command."""
+    if not isinstance(machine, Comparable):
+        raise _lacking(machine, path, command)
+    return machine
+
+
+def require_stoppable(machine: Machine, path: str = "netlist", command: str = "this command") -> Stoppable:
+    """The same machine, if recordings can be stopped on it; else an OptionError, which names file and command."""
+    if not isinstance(machine, Stoppable):
+        raise _lacking(machine, path, command)
+    return machine
+
+
+def require_threaded(machine: Machine, path: str = "netlist", command: str = "this command") -> Threaded:
+    """The same machine, if recordings can run side by side on it; else an OptionError, which names file and command."""
+    if not isinstance(machine, Threaded):
+        raise _lacking(machine, path, command)
+    return machine
+
+
+def _lacking(machine: Machine, path: str, command: str) -> OptionError:
+    title = machine.target.title
+    return OptionError(f"{path}: is for {title}, which {command} does not take; give one for another chip")
