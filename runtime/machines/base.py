@@ -186,11 +186,6 @@ class Machine(ABC):
         """Their names."""
 
     @property
-    def kernel(self) -> str:
-        """How the simulator goes through a recording, in a few words."""
-        return "step by step"
-
-    @property
     @abstractmethod
     def weight_bits(self) -> int:
         """Bits of the widest weight that a synapse has, or an input of a crossbar on all its axons."""

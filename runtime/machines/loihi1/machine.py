@@ -27,7 +27,6 @@ from spikeloom.runtime.machines.base import Done, Model, Price, Run, T, differen
 from spikeloom.runtime.machines.capabilities import Cumulative, Stoppable, Threaded
 from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.stream import Stream
 from spikeloom.runtime.machines.loihi1.trace import Trace, aligned, unpack
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
@@ -65,12 +64,6 @@ class Loihi(Threaded, Stoppable):
     def layers(self) -> tuple[str, ...]:
         """Names of the layers."""
         return tuple(layer.name for layer in self.netlist.layers)
-
-    @property
-    def kernel(self) -> str:
-        """Which kernel the engine takes."""
-        found = lay_out_blocks(self.netlist)
-        return f"step by step: {found}" if isinstance(found, str) else "layer by layer, 64 neurons at a time"
 
     def of_layer(self, array: npt.NDArray[T], index: int) -> npt.NDArray[T]:
         """As the float model counts time."""

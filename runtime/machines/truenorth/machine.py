@@ -31,7 +31,6 @@ class TrueNorth(Machine):
 
     netlist: CrossbarNetlist
     details = ("counts",)
-    kernel = "tick by tick"
 
     @cached_property
     def _engine(self) -> engine.Engine:
