@@ -24,7 +24,6 @@ from spikeloom.compiler.errors import FormatError, VerifyError
 from spikeloom.compiler.files import FileFault, reading
 from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
 from spikeloom.compiler.ir import IntegerNetwork, Network
-from spikeloom.compiler.targets.base import known_targets
 from spikeloom.compiler.types import IntArray
 
 N = TypeVar("N")
@@ -86,7 +85,7 @@ class NetlistFile(Generic[N]):
 
     format: str
     version: int
-    cores: str  # Kind that the target must have
+    targets: tuple[str, ...]  # Chips whose netlists it holds
     netlist: type[N]  # A dataclass of arrays and of the entries
     entries: dict[str, archive.Kind]  # Of the manifest, beside the common ones; ``layers`` among them
     layer: Callable[[Any], Any]  # Makes a layer of its entry
@@ -143,8 +142,8 @@ class NetlistFile(Generic[N]):
             if manifest["taxels"] * manifest["polarities"] > MOST:
                 raise FileFault(f"has more than {MOST} input channels")
             archive.require_none(archive.array_faults(members, dict.fromkeys(self.tables, 2), self.floats))
-            if manifest["target"] not in (known := known_targets(self.cores)):
-                raise FileFault(f"is for {manifest['target'][:40]!r}, this program knows {', '.join(known)}")
+            if manifest["target"] not in self.targets:
+                raise FileFault(f"is for {manifest['target'][:40]!r}, this program knows {', '.join(self.targets)}")
             values = {name: manifest[name] for name in kinds | further}
             values |= {"clocks": Clocks(**values["clocks"]), "layers": tuple(map(self.layer, values["layers"]))}
             netlist = self.netlist(**values, **{name: self._held(name, members[name]) for name in self.arrays})

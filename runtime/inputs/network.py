@@ -71,7 +71,9 @@ class LoadedNetwork:
                 return why
         for name in ("beta", "theta") if self.checkpoint is not None else ():
             for layer, ours in zip(netlist.layers, self.network.populations, strict=False):
-                if (due := getattr(layer, name)) != (found := getattr(ours, name)):
+                found = getattr(ours, name)
+                due = getattr(layer, name, found)
+                if due != found:
                     return f"{layer.name} was compiled with {name} {due:g}, this has {found:g}; give --{name} {due:g}"
         return None
 

@@ -34,7 +34,6 @@ from spikeloom.compiler.archive import Kind
 from spikeloom.compiler.dynamics import MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, in_units, largest_current
 from spikeloom.compiler.targets import netlist_file
-from spikeloom.compiler.targets.base import COMPARTMENTS
 from spikeloom.compiler.targets.netlist_file import MOST, NetlistFile, column_faults, is_outside, part_of
 from spikeloom.compiler.types import FloatArray, IntArray
 
@@ -283,7 +282,7 @@ def _layer(entry: dict[str, Any]) -> Layer:
 FILE = NetlistFile(
     format="spikeloom-netlist",
     version=5,
-    cores=COMPARTMENTS,
+    targets=("loihi1",),
     netlist=Netlist,
     entries={"layers": [LAYER, ...], "bins": (1, MOST_STEPS)},
     optional={"blank": (1, MOST_BLANK)},

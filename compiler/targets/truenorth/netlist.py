@@ -28,7 +28,6 @@ import numpy as np
 
 from spikeloom.compiler.dynamics import MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.targets import netlist_file
-from spikeloom.compiler.targets.base import CROSSBARS
 from spikeloom.compiler.targets.netlist_file import COMMON, NetlistFile, column_faults, part_of
 from spikeloom.compiler.types import IntArray
 
@@ -246,7 +245,7 @@ def unlike(netlist: CrossbarNetlist, due: CrossbarNetlist) -> list[str]:
 FILE = NetlistFile(
     format="spikeloom-crossbars",
     version=2,
-    cores=CROSSBARS,
+    targets=("truenorth",),
     netlist=CrossbarNetlist,
     entries={"layers": [str], "bin_ticks": (1, MOST_TICKS), "bins": (1, MOST_STEPS)},
     layer=str,
