@@ -26,7 +26,7 @@ from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.inputs.network import load_network
-from spikeloom.runtime.machines.backends import machine_for
+from spikeloom.runtime.machines.backends import backend_of, machine_for
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.trace import aligned
@@ -246,6 +246,22 @@ def test_the_expanded_network_is_the_float_model(name):
         for ours, (layer, theirs) in zip(found, wanted.items(), strict=True):
             assert_array_equal(ours, theirs, err_msg=layer)
             assert theirs.any(), layer
+
+
+@over(MAKERS)
+def test_the_lowered_model_is_the_chip(name, monkeypatch, tmp_path):
+    made, lowered = specimen(name), []
+    backend = backend_of(made.machine.netlist.target)
+    lower = backend.lower
+    monkeypatch.setattr(type(backend), "lower", lambda _, *words: lowered.append(lower(*words)) or lowered[0])
+    assert run(*made.compilation, "-o", tmp_path / "net.loom")[0] == 0
+    (found,) = lowered
+    data = made.recordings
+    ran = made.machine.run(data.events, lengths=data.lengths, spikes=True)
+    expected = found.model.spikes(data.events)
+    for layer, first in found.model.first.items():
+        assert not made.machine.differing(ran, layer, expected[layer], first, data.step_counts), layer
+    assert any(spikes.any() for spikes in expected.values())
 
 
 @over((*FLOAT, *CROSSBARS))

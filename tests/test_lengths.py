@@ -199,9 +199,10 @@ def test_it_decides_on_the_recordings_what_the_other_does_on_longer_bins():
     assert ours["counts"] == theirs["counts"]
     assert any(map(any, ours["counts"]))
     assert ours["predictions"] == theirs["predictions"]
-    own, other = ours["costs"]["per_inference"], theirs["costs"]["per_inference"]
-    assert own["energy_j"] == other["energy_j"]
-    pace, others = (found["costs"]["pace"] for found in (ours, theirs))
+    own = as_json("estimate", "x.loom", "--data", "fine")
+    other = as_json("estimate", "plain.loom", "--data", "long")
+    assert own["per_inference"]["energy_j"] == other["per_inference"]["energy_j"]
+    pace, others = own["pace"], other["pace"]
     assert pace["bin_s"] == others["bin_s"] == pytest.approx(BINS * BIN_S)  # which convert wrote beside the bins
     for table, watt in pace["real_time_w"].items():
         assert watt == pytest.approx(others["real_time_w"][table])

@@ -214,6 +214,7 @@ class Abacus(Backend):
         netlist = lowered(loaded.network, {"checkpoint_sha256": loaded.sha256, **loaded.origin(arguments.run)})
         return Lowered(
             netlist=netlist,
+            model=Machinery(netlist).model(loaded.network),
             write=lambda path: FILE.write(netlist, path),
             report=lambda sha256: described(netlist, sha256),
         )

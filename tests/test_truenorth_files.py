@@ -238,7 +238,7 @@ def test_the_command_for_ranc(tmp_path, monkeypatch):
     assert json.loads(Path("net.json").read_text("utf-8"))["packets"] == [[]]
     assert "1 neurons on the chip and 1 synapses for ranc" in first
     assert second.startswith("run: ranc_sim net.json net.out net.json TICKS")
-    for command in ("anytime", "report --checkpoint x -o x.html", "explain --checkpoint x", "stress --checkpoint x"):
+    for command in ("anytime", "explain --checkpoint x", "stress --checkpoint x"):
         name, *more = command.split()
         said = refusal(name, "net.loom", *more, "--data", "data")
         assert said == f"net.loom: is for IBM TrueNorth, which {name} does not take; give one for another chip"

@@ -413,11 +413,14 @@ class Format:
 class Lowered:
     """A network as a chip holds it.
 
+    netlist: the placed network.
+    model: its whole numbers, run without the chip.
     write: write the netlist to a file and give its sha256.
     report: what was chosen, proved and removed, of the netlist in a file with that sha256.
     """
 
     netlist: Any
+    model: Model
     write: Callable[[str], str]
     report: Callable[[str], Outcome]
 

@@ -1,20 +1,22 @@
 """What is compiled for Loihi: networks of floats, which are rounded, and netx files, which bring their integers."""
 
 from argparse import Namespace
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from spikeloom.compiler import Options, __version__, compile_network, invariants, write_netlist
+from spikeloom.compiler import Compilation, Options, __version__, compile_network, invariants, write_netlist
 from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
+from spikeloom.compiler.interpret import channels_last, run_integer
+from spikeloom.compiler.types import BoolArray, EventArray
 from spikeloom.models.recordings.events import of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_keep, parse_packings, provenance
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings
 from spikeloom.runtime.inputs.repeat import LAYOUT, NETWORK, ROUNDING, command, given, refuse, words
-from spikeloom.runtime.machines.base import Lowered
+from spikeloom.runtime.machines.base import Lowered, Model
 from spikeloom.runtime.machines.loihi1 import compiled, description
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE
@@ -50,9 +52,23 @@ def lower(arguments: Namespace, after: Callable[[str, Any], object]) -> Lowered:
     helps = _finetune(arguments, checkpoint=loaded.checkpoint is not None)
     return Lowered(
         netlist=done.netlist,
+        model=_model(done),
         write=lambda output: write_netlist(done.netlist, output),
         report=lambda sha256: compiled.outcome(done, sha256, loaded.facts, helps),
     )
+
+
+def _model(done: Compilation) -> Model:
+    """The integers before they are placed."""
+    network = done.integer
+    names = [population.name for population in network.populations]
+    first = {layer.name: layer.depth for layer in done.netlist.layers}
+
+    def spikes(events: EventArray) -> Mapping[str, BoolArray]:
+        layers = run_integer(network, channels_last(events, network.input.clocks)).spikes
+        return dict(zip(names, layers, strict=True))
+
+    return Model(first=first, spikes=spikes)
 
 
 def _options(arguments: Namespace, **further: Any) -> Options:
@@ -125,9 +141,11 @@ def _lower_integers(arguments: Namespace) -> Lowered:
         chips=arguments.chips,
         provenance=origin,
     )
-    netlist = compile_network(read.network, options).netlist
+    done = compile_network(read.network, options)
+    netlist = done.netlist
     return Lowered(
         netlist=netlist,
+        model=_model(done),
         write=lambda output: write_netlist(netlist, output),
         report=lambda sha256: _laid_out(arguments.output, sha256, read.facts),
     )

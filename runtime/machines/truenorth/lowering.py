@@ -9,6 +9,7 @@ from spikeloom.compiler.archive import COUNTERS
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.counters import read_counters
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Options, Source, compile_crossbars
@@ -19,6 +20,7 @@ from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
 from spikeloom.runtime.machines.base import Lowered, Reference
 from spikeloom.runtime.machines.truenorth.description import describe
+from spikeloom.runtime.machines.truenorth.model import model_of
 from spikeloom.runtime.report.console import progress
 
 TITLE = "TrueNorth"
@@ -59,6 +61,7 @@ def lower(arguments: Namespace, after: Callable[[str, Any], object]) -> Lowered:
         raise ModelError(f"{path if named else 'module'}: {error}") from error
     return Lowered(
         netlist=netlist,
+        model=model_of(source, load_target("truenorth"), arguments.in_time),
         write=lambda output: write_crossbars(netlist, output),
         report=lambda sha256: describe(netlist, sha256),
     )

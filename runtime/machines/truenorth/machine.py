@@ -1,27 +1,21 @@
 """TrueNorth as a :class:`machines.base.Machine`."""
 
 import os
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.counters import Counters
-from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.truenorth.codebook import in_levels, run_levels
-from spikeloom.compiler.targets.truenorth.counting import planned, run_counters
-from spikeloom.compiler.targets.truenorth.in_time import first_spikes
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
-from spikeloom.compiler.targets.truenorth.native import NativeNetwork
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars, unlike
 from spikeloom.compiler.targets.truenorth.passes import Options, Source, compile_crossbars
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.machines.base import Done, Machine, Model, Price, Run, T
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.truenorth import cost, engine, spec
+from spikeloom.runtime.machines.truenorth.model import model_of
 from spikeloom.runtime.machines.truenorth.spec import Trace
 
 
@@ -64,24 +58,8 @@ class TrueNorth(Machine):
         )
 
     def model(self, source: Source) -> Model:
-        """Of a trained or counting network in whole numbers, of a history-free one in levels."""
-        if isinstance(source, NativeNetwork):
-            from spikeloom.models.truenorth.network import run_network  # torch, so only here
-
-            first = {stage.name: index for index, stage in enumerate(source.stages)}
-            return Model(first=first, spikes=lambda events: run_network(source, events))
-        if isinstance(source, Counters):
-            plan = planned(source, self.target)
-            return Model(first=plan.first, spikes=lambda events: _stacked(run_counters(plan, each) for each in events))
-        assert isinstance(source, Factored), "a checkpoint on its graph"
-        network = expand(source.checkpoint, source.propagation)
-        levels = in_levels(network, self.netlist.provenance["in_time"], self.target)
-
-        def spikes(events: EventArray) -> Mapping[str, BoolArray]:
-            flat = events.reshape(len(events), -1, events.shape[-1])
-            return _stacked(run_levels(levels, each)[0] for each in flat)
-
-        return Model(first=first_spikes(levels), spikes=spikes)
+        """In whole numbers, or in levels."""
+        return model_of(source, self.target, self.netlist.provenance.get("in_time"))
 
     def differing(self, run: Run, layer: str, expected: BoolArray, first: int, lengths: IntArray) -> int:
         """Of every copy of every neuron, in every tick from the layer's first on."""
@@ -116,12 +94,6 @@ class TrueNorth(Machine):
         """By synaptic events and ticks."""
         trace = self.simulate(channels, lengths, spikes=False)
         return trace, cost.price(self.netlist, chip, trace.counts, bin_s * self.netlist.bins)
-
-
-def _stacked(recordings: Iterable[Mapping[str, BoolArray]]) -> dict[str, BoolArray]:
-    """Spikes by layer (samples, steps, neurons) of recordings one by one."""
-    parts = list(recordings)
-    return {name: np.stack([part[name] for part in parts]) for name in parts[0]}
 
 
 def load(path: str | os.PathLike[str]) -> TrueNorth:
