@@ -11,8 +11,7 @@ from worker import Job, Task, UnfitError, serve
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import BoolArray
-from spikeloom.runtime.machines.loihi1 import timing
-from spikeloom.runtime.machines.loihi1.costs import cost
+from spikeloom.runtime.machines.loihi1.costs import cost, timing
 from spikeloom.runtime.machines.loihi1.engine import prepare, simulate
 from spikeloom.runtime.machines.loihi1.trace import Trace, unpack
 

@@ -10,8 +10,9 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.interpret import float_simulation
 from spikeloom.models.networks.layers import spike_linear
 from spikeloom.runtime.machines.changes import Forgetting, single
-from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.changes import kernel
+from spikeloom.runtime.machines.loihi1.costs import timing
 from spikeloom.runtime.machines.truenorth import engine as crossbars
 from spikeloom.runtime.studies.stability.bounds import lower_bound
 from spikeloom.runtime.studies.stability.neighbours import cells_of

@@ -18,8 +18,8 @@ from spikeloom.compiler.targets.loihi1.layout.partition import core_bound, parti
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count, chip_of_core, place_on_chips, share
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, require_legal
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist, write_netlist
-from spikeloom.runtime.machines.loihi1 import engine, timing
-from spikeloom.runtime.machines.loihi1.costs import page
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.costs import page, timing
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.machines.loihi1.trace import aligned

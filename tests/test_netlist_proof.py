@@ -23,8 +23,6 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.truenorth.netlist import read_crossbars, write_crossbars
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.machines.backends import machine_of
-from spikeloom.runtime.machines.capabilities import require_comparable
-from spikeloom.runtime.machines.loihi1.rounding import check_rounding
 
 
 def changed(field, place, to):
@@ -134,7 +132,7 @@ def random_network(kind, seed, folder):
 
 def checked(netlist, network, **provenance):
     netlist = dataclasses.replace(netlist, provenance=netlist.provenance | provenance)
-    return check_rounding(require_comparable(machine_of(netlist)), network)
+    return machine_of(netlist).check_lowering(network)
 
 
 MADE = {

@@ -12,8 +12,8 @@ from random_netlists import Axon, Neuron, build, by_engine, large_netlist, netli
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.targets.base import LATENCIES, Quantity, load_target
-from spikeloom.runtime.machines.loihi1 import engine, timing
-from spikeloom.runtime.machines.loihi1.costs import cost
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.costs import cost, timing
 
 LOIHI = load_target("loihi1")
 (SANAFE,) = LOIHI.time

@@ -1,4 +1,4 @@
-"""The definition of the two time models of :mod:`loihi1.timing`: plain Python, one message at a time.
+"""The definition of the two time models of :mod:`costs.timing`: plain Python, one message at a time.
 
 Both must agree on every figure, exactly. All times are picoseconds.
 """
@@ -17,8 +17,8 @@ from spikeloom.compiler.targets.loihi1.layout.place import hops
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray
 from spikeloom.runtime.machines.loihi1.costs import cost
-from spikeloom.runtime.machines.loihi1.timing import SimpleTimes, charges, simple_times
-from spikeloom.runtime.machines.loihi1.timing_kernel import Tables
+from spikeloom.runtime.machines.loihi1.costs.timing import SimpleTimes, charges, simple_times
+from spikeloom.runtime.machines.loihi1.costs.timing_kernel import Tables
 
 Link = tuple[int, int, str]
 

@@ -67,24 +67,15 @@ def verify(
         If the parts do not belong together, a register of the chip overflows, or the further engine is not installed
         or cannot hold the netlist.
     """
-    if spec_samples < 1:
-        raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")
     machine = machine_of(netlist)
-    begin = progress or (lambda _part, _done: None)
-    checked = min(spec_samples, len(data))
     floats = source if original is None and isinstance(source, Factored | Network) else original
-    if isinstance(machine, Comparable):
-        require_match(machine.netlist, source)
-        require_match(machine.netlist, source if floats is None else floats)
-    machine.require_sensor(data.events)
-    beside = machine.beside(engine_name)
-    begin("specification", 0)
-    spec_different = machine.check(data.events[:checked], lengths=data.lengths)
-    engine_different = None if beside is None else beside(data.events, data.lengths)
+    begin = progress or (lambda _part, _done: None)
+    _require_fit(machine, source, floats, data, spec_samples)
+    engines = _compare_engines(machine, data, min(spec_samples, len(data)), engine_name, begin)
     model = machine.model(source)
-    model_tally = None if model is None else ModelTally(machine, model, begin)
-    float_tally = None if floats is None else FloatTally(machine, floats, len(data), begin)
-    votes, saturated = _run(machine, data, [each for each in (model_tally, float_tally) if each is not None], begin)
+    lowered = None if model is None else ModelTally(machine, model, begin)
+    reference = None if floats is None else FloatTally(machine, floats, len(data), begin)
+    votes, saturated = _run(machine, data, [tally for tally in (lowered, reference) if tally is not None], begin)
     return Verdict(
         target=netlist.target,
         files=data.files,
@@ -92,16 +83,37 @@ def verify(
         chip_predictions=vote(votes),
         chip_counts=votes,
         netlist=check or machine.check_lowering(_written_out(source)),
-        spec_samples=checked,
-        spec_different=spec_different,
-        engine=engine_name,
-        engine_different=engine_different,
-        model=None if model_tally is None else model_tally.layers,
+        model=None if lowered is None else lowered.layers,
         membranes_saturated=saturated,
         row_different=_different_in_a_row(machine, data, votes),
         required={} if required is None else required,
-        **({} if float_tally is None else _of_floats(float_tally, votes, data.files)),
+        **engines,
+        **({} if reference is None else _of_floats(reference, votes, data.files)),
     )
+
+
+def _require_fit(
+    machine: Machine, source: Any, floats: Factored | Network | None, data: Recordings, spec_samples: int
+) -> None:
+    """Refuse networks or recordings of another size, and a specification that would run on nothing."""
+    if spec_samples < 1:
+        raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")
+    if isinstance(machine, Comparable):
+        require_match(machine.netlist, source)
+        require_match(machine.netlist, source if floats is None else floats)
+    machine.require_sensor(data.events)
+
+
+def _compare_engines(machine: Machine, data: Recordings, samples: int, name: str, begin: Begin) -> dict[str, Any]:
+    """Fields of E0: the specification on the first recordings, a further engine on all."""
+    beside = machine.beside(name)
+    begin("specification", 0)
+    return {
+        "spec_samples": samples,
+        "spec_different": machine.check(data.events[:samples], lengths=data.lengths),
+        "engine": name,
+        "engine_different": None if beside is None else beside(data.events, data.lengths),
+    }
 
 
 def _written_out(source: Any) -> Any:

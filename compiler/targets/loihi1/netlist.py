@@ -35,7 +35,7 @@ from spikeloom.compiler.dynamics import MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, in_units, largest_current
 from spikeloom.compiler.targets import netlist_file
 from spikeloom.compiler.targets.netlist_file import MOST, NetlistFile, column_faults, is_outside, part_of
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
 MOST_BLANK = 4096
 """Blank steps after a recording."""
@@ -143,6 +143,14 @@ class Netlist(netlist_file.Netlist):
         """Compartment ids of a layer, ordered by neuron; shape (compartments of the layer,)."""
         ids = np.flatnonzero(self.layer == layer)
         return ids[np.argsort(self.neuron[ids], kind="stable")]
+
+    @property
+    def absent(self) -> tuple[BoolArray, ...]:
+        """Neurons of each layer, (neurons,) bool, without a compartment."""
+        present = (self.neuron[self.compartments_of(index)] for index in range(len(self.layers)))
+        return tuple(
+            ~np.isin(np.arange(layer.neurons), neurons) for layer, neurons in zip(self.layers, present, strict=True)
+        )
 
     def number_in_layer(self) -> IntArray:
         """Place of each compartment among those of its layer; shape (compartments,)."""

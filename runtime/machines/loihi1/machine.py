@@ -19,7 +19,6 @@ from spikeloom.compiler.interpret import cut
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.idle import forgotten
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
@@ -82,7 +81,11 @@ class Loihi(Threaded, Stoppable):
         """Whether it is the network, rounded."""
         from spikeloom.runtime.machines.loihi1.rounding import check_rounding
 
-        return check_rounding(self, network, fine_tuned=network.forms is not None)
+        try:
+            integer = self.integer
+        except FormatError as error:
+            return NetlistCheck(whole=(str(error),), simulates=False)
+        return check_rounding(self.netlist, integer, self.target, network)
 
     def model(self, source: Factored | Network) -> Model | None:
         """The torch model that a network was fine-tuned with, on the chip's integers."""
@@ -132,10 +135,7 @@ class Loihi(Threaded, Stoppable):
     @property
     def absent(self) -> tuple[BoolArray, ...]:
         """Neurons without a compartment."""
-        return tuple(
-            ~np.isin(np.arange(layer.neurons), self.netlist.neuron[self.netlist.compartments_of(index)])
-            for index, layer in enumerate(self.netlist.layers)
-        )
+        return self.netlist.absent
 
     @property
     def unread(self) -> tuple[BoolArray, ...]:
@@ -143,20 +143,10 @@ class Loihi(Threaded, Stoppable):
         return tuple(np.isin(np.arange(layer.neurons), layer.unread) for layer in self.netlist.layers)
 
     @property
-    def received(self) -> BoolArray:
-        """Input channels, (channels,) bool, that some core takes in."""
-        return np.asarray(np.isin(np.arange(self.netlist.n_inputs), self.netlist.axon_source))
-
-    @property
     def read_out_lag(self) -> int:
         """The depth of the latest layer that votes."""
         voting = np.unique(self.netlist.layer[self.netlist.readout_class >= 0])
         return max(int(self.netlist.layers[layer].depth) for layer in voting.tolist())
-
-    @property
-    def blank_due(self) -> int:
-        """Blank steps after which the chip forgets no more, by bounds on its registers; 0 if it is reset."""
-        return forgotten(self.netlist).steps if self.free_running else 0
 
     def in_a_row(self, events: EventArray, lengths: IntArray | None) -> IntArray | None:
         """Registers are carried over from one to the next."""

@@ -15,26 +15,24 @@ weights must be the nearest, and no bias may make up for more than its neuron's 
 calibration moves it by at most.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler import fixedpoint
-from spikeloom.compiler.errors import CapacityError, FormatError
+from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection, Network, Projection, Sparse, depths
 from spikeloom.compiler.passes.calibrate import NUDGES
 from spikeloom.compiler.passes.digest import digests
 from spikeloom.compiler.passes.prune import never_fires
-from spikeloom.compiler.types import BoolArray
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.idle import forgotten
+from spikeloom.compiler.targets.loihi1.legalize import require_legal
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
-
-if TYPE_CHECKING:
-    from spikeloom.runtime.machines.loihi1.machine import Loihi
 
 SLACK = 1 + 1e-9
 """Factor by which a value may miss a limit that it meets in real numbers."""
@@ -64,57 +62,115 @@ class LayerRounding:
     faults: tuple[str, ...]
 
 
-def check_rounding(machine: Loihi, network: Network, *, fine_tuned: bool = False) -> NetlistCheck:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Silence:
+    """What stores no weight for a reason: by layer, neurons that the chip lacks and neurons whose weights may be zero.
+
+    Input `channels` that were left out send nothing.
+    """
+
+    absent: Sequence[BoolArray]
+    zeroed: Sequence[BoolArray]
+    channels: BoolArray
+
+    def counts(self, pre: int, post: int, row: IntArray, column: IntArray, stored: FloatArray) -> BoolArray:
+        """Which weights, from `column` of one layer to `row` of another, must be there."""
+        sends = ~self.channels if pre == INPUT else ~self.absent[pre]
+        silent = np.zeros(len(self.channels), np.bool_) if pre == INPUT else self.zeroed[pre]
+        may_be_zero = (stored == 0) & (self.zeroed[post][row] | silent[column])
+        return np.asarray(~self.absent[post][row] & sends[column] & ~may_be_zero)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class _Weights:
+    """Weights into a layer: how many, how many are not the nearest, and the farthest of these.
+
+    `lost` and `gained` are what the weights of each neuron lose to, and gain on, the checkpoint's; weight units.
+    """
+
+    lost: FloatArray
+    gained: FloatArray
+    count: int = 0
+    wrong: int = 0
+    farthest: float = 0.0
+    where: str = ""
+
+    @property
+    def moved(self) -> bool:
+        """Whether compensation may have moved those that are not the nearest."""
+        return 0 < self.wrong <= MOVED * self.count
+
+    def add(self, row: IntArray, column: IntArray, error: FloatArray, step: float, source: str) -> None:
+        """Count weights from a source that miss the checkpoint's by an error, of which a grid's step is the unit."""
+        self.count += len(error)
+        self.wrong += int(np.count_nonzero(2 * np.abs(error) > step * SLACK))
+        farthest = float(np.abs(error).max(initial=0)) / step
+        if farthest > self.farthest:
+            self.farthest = farthest
+            worst = int(np.argmax(np.abs(error)))
+            self.where = f"the farthest, from {source} {column[worst]} to neuron {row[worst]}, by {farthest:.3g} steps"
+        self.lost += np.bincount(row, np.maximum(-error, 0), len(self.lost))
+        self.gained += np.bincount(row, np.maximum(error, 0), len(self.gained))
+
+
+def check_rounding(netlist: Netlist, integer: IntegerNetwork, target: Target, network: Network) -> NetlistCheck:
     """Hold what a netlist stores against the float network that it should have been compiled from; simulates nothing.
 
-    A network that was `fine_tuned` on the chip's integers compensates nothing. Otherwise the netlist remembers which
-    layers were compensated, and digests of what came of it: without these every weight has to be the nearest.
+    `integer` is the netlist, cores forgotten. A network that was fine-tuned on the chip's integers compensates nothing.
+    Otherwise the netlist remembers which layers were compensated, and digests of what came of it: without these every
+    weight has to be the nearest.
     """
-    try:
-        integer = machine.integer
-    except FormatError as error:
-        return NetlistCheck(whole=(str(error),), simulates=False)
-    provenance = machine.netlist.provenance
+    provenance = netlist.provenance
+    absent = netlist.absent
     recorded = provenance.get("digests")
-    may_compensate = recorded is not None and not fine_tuned
+    may_compensate = recorded is not None and network.forms is None
     compensated = provenance.get("compensated", []) if may_compensate else []
     pruned = bool(provenance.get("prune_unused", False))
-    zeroed = [_may_be_zero(integer, post, mask, pruned) for post, mask in enumerate(never_fires(network))]
-    channels = np.zeros(network.input.size, np.bool_)
-    if "lean" in provenance:  # input channels that reach no neuron were pruned on evidence
-        channels = ~machine.received
-    stored = digests(integer, machine.absent)
+    silence = _Silence(
+        absent=absent,
+        zeroed=[_may_be_zero(integer, post, mask, pruned) for post, mask in enumerate(never_fires(network))],
+        # input channels that reach no neuron were pruned on evidence
+        channels=~np.isin(np.arange(netlist.n_inputs), netlist.axon_source)
+        if "lean" in provenance
+        else np.zeros(network.input.size, np.bool_),
+    )
+    coarsest = max(target.choices["synapse.exponent"])
+    stored = digests(integer, absent)
     layers = {}
     for post, population in enumerate(network.populations):
         name = population.name
         known = stored[name] if recorded is None else recorded.get(name, {})
-        layers[name] = _check_layer(
-            network,
-            integer,
-            post,
-            absent=machine.absent,
-            zeroed=zeroed,
-            channels=channels,
-            coarsest=max(machine.target.choices["synapse.exponent"]),
-            compensates=name in compensated,
-            faults=list(_other_registers(machine, network, post)),
-            other=[what for what, digest in stored[name].items() if known.get(what) != digest],
+        weights = _compare_weights(network, integer, post, silence, coarsest)
+        faults = [
+            *_other_registers(netlist, integer, network, post),
+            *_wrong_numbers(network, integer, post, silence, weights, compensates=name in compensated),
+        ]
+        other = [what for what, digest in stored[name].items() if known.get(what) != digest]
+        for what in () if faults else other:
+            where = f"; {weights.where}" if what == "weights" else ""
+            faults.append(f"{name} has other {what} than the compiler chose, by the netlist's own record{where}")
+        layers[name] = LayerRounding(
+            weights=weights.count,
+            nearest=weights.count - weights.wrong,
+            farthest_steps=weights.farthest,
+            compensated=name in compensated and weights.moved,
+            faults=tuple(faults),
         )
-    whole = [*_broken_limits(machine)]
+    whole = [*_broken_limits(netlist, target)]
     if recorded is None and provenance.get("calibrated") and any(layer.faults for layer in layers.values()):
         whole.append("it does not record how it was rounded on recordings: compile it again")
     return NetlistCheck(layers=layers, whole=tuple(whole), claim=_claim(layers))
 
 
-def _broken_limits(machine: Loihi) -> Iterator[str]:
+def _broken_limits(netlist: Netlist, target: Target) -> Iterator[str]:
     """Limits of the chip that the netlist breaks, and blank steps that it lacks."""
     try:
-        machine.legal()
+        require_legal(netlist, target)
     except CapacityError as error:
         yield from map(str, error.violations)
-    blank = machine.netlist.blank
-    if blank != machine.blank_due:
-        yield f"it has {blank} blank steps instead of {machine.blank_due}"
+    due = forgotten(netlist).steps if netlist.blank else 0
+    if netlist.blank != due:
+        yield f"it has {netlist.blank} blank steps instead of {due}"
 
 
 def _claim(layers: Mapping[str, LayerRounding]) -> str:
@@ -130,27 +186,29 @@ def _claim(layers: Mapping[str, LayerRounding]) -> str:
     return f"{claim}; by compensation, as the netlist records, not to the nearest: {', '.join(moved)}"
 
 
-def _other_registers(machine: Loihi, network: Network, post: int) -> Iterator[str]:
+def _other_registers(netlist: Netlist, integer: IntegerNetwork, network: Network, post: int) -> Iterator[str]:
     """What is not the checkpoint's of a layer, beside weights and biases: its numbers, its window, its votes."""
-    netlist, chip, wanted = machine.netlist, machine.integer.populations[post], network.populations[post]
-    layer, ids = netlist.layers[post], netlist.compartments_of(post)
-    registers = (
-        f"{u} and {v}" for u, v in ((chip.decay_u, chip.decay_v), fixedpoint.decay_registers(wanted.beta, wanted.alpha))
-    )
+    chip = integer.populations[post]
+    wanted = network.populations[post]
+    layer = netlist.layers[post]
+    ids = netlist.compartments_of(post)
     theta = wanted.theta * chip.scale
-    if (bad := ~machine.absent[post] & (np.abs(chip.threshold - theta) > 1e-6 * np.maximum(theta, 1))).any():
-        worst = int(np.argmax(bad))
+    wrong_threshold = ~netlist.absent[post] & (np.abs(chip.threshold - theta) > 1e-6 * np.maximum(theta, 1))
+    if wrong_threshold.any():
+        worst = int(np.argmax(wrong_threshold))
         yield f"{wanted.name} neuron {worst} has threshold {chip.threshold[worst]} instead of {theta[worst]:g}"
-    for what, found, due in (
-        ("decay registers", *registers),
+    decay_u, decay_v = fixedpoint.decay_registers(wanted.beta, wanted.alpha)
+    for what, stored, due in (
+        ("decay registers", f"{chip.decay_u} and {chip.decay_v}", f"{decay_u} and {decay_v}"),
         *((name, getattr(layer, name), getattr(wanted, name)) for name in ("beta", "alpha", "theta")),
         ("a window from step", layer.depth, depths(network)[post]),
     ):
-        if found != due:
-            yield f"{wanted.name} has {what} {found} instead of {due}"
+        if stored != due:
+            yield f"{wanted.name} has {what} {stored} instead of {due}"
     votes = network.readout.label[netlist.neuron[ids]] if post == network.readout.population else -1
-    if wrong := np.count_nonzero(netlist.readout_class[ids] != votes):
-        yield f"{wanted.name} has {wrong:,} of {len(ids):,} neurons that vote for another class"
+    elsewhere = np.count_nonzero(netlist.readout_class[ids] != votes)
+    if elsewhere:
+        yield f"{wanted.name} has {elsewhere:,} of {len(ids):,} neurons that vote for another class"
 
 
 def _may_be_zero(integer: IntegerNetwork, post: int, silent: BoolArray, pruned: bool) -> BoolArray:
@@ -176,66 +234,56 @@ def summed(stage: Network | IntegerNetwork, pre: int, post: int) -> Sparse:
     return found
 
 
-def _check_layer(
-    network: Network,
-    integer: IntegerNetwork,
-    post: int,
-    *,
-    absent: Sequence[BoolArray],
-    zeroed: Sequence[BoolArray],
-    channels: BoolArray,
-    coarsest: int,
-    compensates: bool,
-    faults: list[str],
-    other: Sequence[str],
-) -> LayerRounding:
-    """What one layer stores; `faults` are known, and so is what is `other` than the compiler chose."""
-    wanted, chip, held = network.populations[post], integer.populations[post], ~absent[post]
-    planes = [p for p in integer.projections if p.post == post]
-    bits, exponents = min(p.bits for p in planes), tuple(sorted({p.exponent for p in planes if p.weight.nnz}))
+def _compare_weights(
+    network: Network, integer: IntegerNetwork, post: int, silence: _Silence, coarsest: int
+) -> _Weights:
+    """Hold the weights into a layer against the checkpoint's, on the layer's grid of steps."""
+    chip = integer.populations[post]
+    planes = [projection for projection in integer.projections if projection.post == post]
+    bits = min(plane.bits for plane in planes)
+    exponents = tuple(sorted({plane.exponent for plane in planes if plane.weight.nnz}))
     exponents = exponents or (coarsest,)  # a layer that stores no weight: all of them rounded to zero at some step
     step = fixedpoint.step_units(bits, exponents)
     most = fixedpoint.reach(bits, exponents) * step
-    weights, wrong, farthest, where = 0, 0, 0.0, ""
-    lost = np.zeros((2, wanted.size))  # what each neuron's weights lose to, and gain on, the checkpoint's; weight units
-    for pre in sorted({p.pre for stage in (network, integer) for p in stage.projections if p.post == post}):
-        real, stored = summed(network, pre, post), summed(integer, pre, post)
+    weights = _Weights(lost=np.zeros(chip.size), gained=np.zeros(chip.size))
+    for pre in sorted({each.pre for stage in (network, integer) for each in stage.projections if each.post == post}):
+        real = summed(network, pre, post)
+        stored = summed(integer, pre, post)
         real.data = np.clip(real.data * np.repeat(chip.scale, np.diff(real.indptr)), -most, most)
         row, column = (abs(real) + abs(stored)).nonzero()
         if not len(row):
             continue
-        off = np.asarray((stored - real)[row, column]).ravel()
-        kept = np.asarray(stored[row, column]).ravel()
-        sends, silent = (~channels, np.zeros(len(channels), np.bool_)) if pre == INPUT else (~absent[pre], zeroed[pre])
-        counts = held[row] & sends[column] & ~((kept == 0) & (zeroed[post][row] | silent[column]))
-        row, column, off = row[counts], column[counts], off[counts]
-        weights += len(off)
-        wrong += int(np.count_nonzero(2 * np.abs(off) > step * SLACK))
-        if (most_off := float(np.abs(off).max(initial=0)) / step) > farthest:
-            worst, farthest = int(np.argmax(np.abs(off))), most_off
-            source = "channel" if pre == INPUT else f"{network.populations[pre].name} neuron"
-            where = f"the farthest, from {source} {column[worst]} to neuron {row[worst]}, by {most_off:.3g} steps"
-        lost[0] += np.bincount(row, np.maximum(-off, 0), wanted.size)
-        lost[1] += np.bincount(row, np.maximum(off, 0), wanted.size)
+        mantissa = np.asarray(stored[row, column]).ravel()
+        counts = silence.counts(pre, post, row, column, mantissa)
+        error = np.asarray((stored - real)[row, column]).ravel()[counts]
+        source = "channel" if pre == INPUT else f"{network.populations[pre].name} neuron"
+        weights.add(row[counts], column[counts], error, step, source)
+    return weights
 
-    moved = compensates and 0 < wrong <= MOVED * weights
-    if wrong and not moved:
-        faults.append(f"{wanted.name} has {wrong:,} of {weights:,} weights that are not the nearest, {where}")
+
+def _wrong_numbers(
+    network: Network, integer: IntegerNetwork, post: int, silence: _Silence, weights: _Weights, *, compensates: bool
+) -> Iterator[str]:
+    """Weights that are not the nearest, and biases that are neither that nor make up for what weights lost."""
+    wanted = network.populations[post]
+    chip = integer.populations[post]
+    if weights.wrong and not (compensates and weights.moved):
+        yield (
+            f"{wanted.name} has {weights.wrong:,} of {weights.count:,} weights that are not the nearest, "
+            f"{weights.where}"
+        )
     unit = chip.scale * (1 << fixedpoint.MEMBRANE_SHIFT)
     bias = np.clip(wanted.bias * unit, -BIAS_LIMIT, BIAS_LIMIT)
     coarse = 0.5 * (1 << np.maximum(fixedpoint.encode_bias(bias)[1], chip.bias_exponent)) * SLACK
-    # where no weight was moved, the bias takes up what the nearest ones lose
-    slack = compensates and wrong <= MOVED * weights
-    nudged = sum(NUDGES) * wanted.theta * unit
-    more, less = (lost * (1 << fixedpoint.MEMBRANE_SHIFT) * SLACK + nudged) if slack else np.zeros((2, wanted.size))
-    off = chip.bias - bias
-    bad = held & ((off > more + coarse) | (-off > less + coarse)) & ~(zeroed[post] & (chip.bias == 0))
-    if bad.any():
-        share = f"{np.count_nonzero(bad):,} of {np.count_nonzero(held):,}"
-        faults.append(f"{wanted.name} has {share} biases that are not, the first of neuron {np.argmax(bad)}")
-    for what in () if faults else other:
-        told = f"; {where}" if what == "weights" else ""
-        faults.append(f"{wanted.name} has other {what} than the compiler chose, by the netlist's own record{told}")
-    return LayerRounding(
-        weights=weights, nearest=weights - wrong, farthest_steps=farthest, compensated=moved, faults=tuple(faults)
-    )
+    above = below = coarse
+    if compensates and weights.wrong <= MOVED * weights.count:
+        # where no weight was moved, the bias takes up what the nearest ones lose
+        shift = sum(NUDGES) * wanted.theta * unit
+        above = weights.lost * (1 << fixedpoint.MEMBRANE_SHIFT) * SLACK + shift + coarse
+        below = weights.gained * (1 << fixedpoint.MEMBRANE_SHIFT) * SLACK + shift + coarse
+    error = chip.bias - bias
+    present = ~silence.absent[post]
+    wrong = present & ((error > above) | (-error > below)) & ~(silence.zeroed[post] & (chip.bias == 0))
+    if wrong.any():
+        share = f"{np.count_nonzero(wrong):,} of {np.count_nonzero(present):,}"
+        yield f"{wanted.name} has {share} biases that are not, the first of neuron {np.argmax(wrong)}"

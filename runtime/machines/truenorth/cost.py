@@ -97,11 +97,7 @@ class Estimate:
 
 def price(netlist: CrossbarNetlist, chip: Target, counts: Counts, bin_s: float) -> Price:
     """Count and price a batch of recordings: `counts` has one leading axis."""
-    layers = len(netlist.layers)
-    points = np.zeros((netlist.n_axons, layers), np.int64)
-    np.add.at(points, (netlist.axon_of_synapse(), netlist.layer[netlist.neuron_of_synapse()]), 1)
-    received = counts.axons @ points  # (samples, layers) synaptic events, by the layer that receives
-    sent = counts.spikes @ np.eye(layers, dtype=np.int64)[netlist.layer]
+    received, sent = _by_layer(netlist, counts)
     packets = counts.spikes[:, netlist.wire_neuron]
     counted = {
         "synaptic_events": received.sum(axis=1),
@@ -115,23 +111,10 @@ def price(netlist: CrossbarNetlist, chip: Target, counts: Counts, bin_s: float) 
     tick_s = chip.limit("tick.length") * 1e-6
     time_s: FloatArray = counts.ticks.astype(np.float64) * tick_s
     step_s = netlist.bin_ticks * tick_s
-    energy, dynamic, readings = {}, {}, []
-    for table in chip.energy:
-        events_j, floor_j = joules(table, counted["synaptic_events"], time_s)
-        energy[table.name] = events_j if floor_j is None else events_j + floor_j
-        if floor_j is not None:  # else the price of an event holds standing power, too
-            dynamic[table.name] = events_j
-        floor = None if floor_j is None else float(floor_j.mean())
-        readings.append(
-            Reading(
-                table=table.name,
-                title=table.title,
-                events_j=float(events_j.mean()),
-                floor_j=floor,
-                floor_of_used_cores_j=None if floor is None else floor * (netlist.n_cores / chip.limit("chip.cores")),
-                total_j=float(energy[table.name].mean()),
-            )
-        )
+    parts = {table.name: joules(table, counted["synaptic_events"], time_s) for table in chip.energy}
+    energy = {name: events if floor is None else events + floor for name, (events, floor) in parts.items()}
+    # where there is no floor, the price of an event holds standing power, too
+    dynamic = {name: events for name, (events, floor) in parts.items() if floor is not None}
 
     def amounts(reduce: Callable[[Any], Any]) -> Amounts:
         return Amounts(
@@ -141,6 +124,7 @@ def price(netlist: CrossbarNetlist, chip: Target, counts: Counts, bin_s: float) 
         )
 
     means = zip(netlist.layers, received.mean(axis=0).tolist(), sent.mean(axis=0).tolist(), strict=True)
+    used = netlist.n_cores / chip.limit("chip.cores")
     result = Estimate(
         samples=len(time_s),
         cores=netlist.n_cores,
@@ -149,7 +133,7 @@ def price(netlist: CrossbarNetlist, chip: Target, counts: Counts, bin_s: float) 
         min=amounts(np.min),
         max=amounts(np.max),
         layers=tuple(LayerCosts(*each) for each in means),
-        energy=tuple(readings),
+        energy=tuple(_reading(table, *parts[table.name], energy[table.name], used) for table in chip.energy),
         pace=Pace(bin_s=bin_s, step_s=step_s, real_time=step_s <= bin_s),
         static_w={name: power.value * 1e-3 for name, power in chip.static.items()},
     )
@@ -161,6 +145,29 @@ def price(netlist: CrossbarNetlist, chip: Target, counts: Counts, bin_s: float) 
         dynamic_j=dynamic or energy,
         static_w=result.static_w,
         outcome=Outcome(result, sections),
+    )
+
+
+def _by_layer(netlist: CrossbarNetlist, counts: Counts) -> tuple[IntArray, IntArray]:
+    """Synaptic events by the layer that receives, and spikes by the layer that sends; (samples, layers)."""
+    layers = len(netlist.layers)
+    points = np.zeros((netlist.n_axons, layers), np.int64)
+    np.add.at(points, (netlist.axon_of_synapse(), netlist.layer[netlist.neuron_of_synapse()]), 1)
+    return counts.axons @ points, counts.spikes @ np.eye(layers, dtype=np.int64)[netlist.layer]
+
+
+def _reading(
+    table: EnergyTable, events_j: FloatArray, floor_j: FloatArray | None, total_j: FloatArray, used: float
+) -> Reading:
+    """Means over recordings, (samples,); `used` is the share of the chip's cores."""
+    floor = None if floor_j is None else float(floor_j.mean())
+    return Reading(
+        table=table.name,
+        title=table.title,
+        events_j=float(events_j.mean()),
+        floor_j=floor,
+        floor_of_used_cores_j=None if floor is None else floor * used,
+        total_j=float(total_j.mean()),
     )
 
 

@@ -11,8 +11,8 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.runtime.machines.capabilities import LONGEST, Cumulative
-from spikeloom.runtime.machines.loihi1 import engine, timing
-from spikeloom.runtime.machines.loihi1.costs import cost
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.costs import cost, timing
 from spikeloom.runtime.machines.loihi1.trace import Charges, side_by_side
 
 

@@ -14,10 +14,10 @@ from spikeloom.compiler.targets.loihi1.layout.place import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import EventArray, FloatArray, IntArray
 from spikeloom.runtime.machines.base import Done
-from spikeloom.runtime.machines.loihi1 import engine, timing
-from spikeloom.runtime.machines.loihi1.costs import cost
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.costs import cost, timing
 from spikeloom.runtime.machines.loihi1.costs.cost import Costs
-from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
+from spikeloom.runtime.machines.loihi1.costs.timing import DetailedTimes, SimpleTimes
 from spikeloom.runtime.machines.loihi1.trace import Counts, Trace, side_by_side
 
 T = TypeVar("T", Counts, SimpleTimes, DetailedTimes)

@@ -12,7 +12,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.machines.loihi1.costs.cost import NOT_PRICED, Costs, by_part
 from spikeloom.runtime.machines.loihi1.costs.estimate import Estimate
-from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, StepTimes
+from spikeloom.runtime.machines.loihi1.costs.timing import DetailedTimes, StepTimes
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 
 INPUTS = (

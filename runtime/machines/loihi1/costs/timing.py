@@ -28,7 +28,7 @@ from spikeloom.compiler.targets.base import PICOSECONDS, Target, TimeTable
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count, require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, FloatArray, IntArray
-from spikeloom.runtime.machines.loihi1.timing_kernel import Tables, schedule
+from spikeloom.runtime.machines.loihi1.costs.timing_kernel import Tables, schedule
 from spikeloom.runtime.machines.loihi1.trace import Charges
 
 EAST, WEST, NORTH, SOUTH, PORTS = range(5)

@@ -1,4 +1,4 @@
-"""Loops of :mod:`loihi1.timing`, compiled with numba.
+"""Loops of :mod:`costs.timing`, compiled with numba.
 
 Latencies are whole picoseconds and link loads are whole multiples of one over ``Tables.unit``, so sums neither round
 nor depend on their order. Only what congestion and blocking add is fractional.
