@@ -40,7 +40,7 @@ NUMERIC = {
     "compiler/targets/loihi1": "emit legalize lift",
     "compiler/targets/loihi1/layout": "choose core_needs partition place",
     "compiler/targets/loihi1/storage": "choose_storage compensate scales spike_exact weight_storage",
-    "compiler/targets/truenorth": "codebook in_time legalize lower native",
+    "compiler/targets/truenorth": "legalize lower native",
     "models": "graphs",
     "models/networks": "layers lif quantised reference",
     "models/truenorth": "neurons",

@@ -275,7 +275,7 @@ def test_verify_holds_every_network_to_its_file(name):
         assert all(layer["spikes"] and not layer["different"] for layer in found["model"].values())
     if name in CROSSBARS:
         assert (found["missed"], found["membranes_saturated"]) == ([], 0)
-        if found["decision_agreement"] is not None and name != "in-time":
+        if found["decision_agreement"] is not None:
             assert (found["decision_agreement"], found["votes_moved"]) == (1, 0)
         return
     assert not any(found["ladder"][0]["different"].values()), "the float network in float64"

@@ -14,12 +14,12 @@ from random_crossbars import CHIP, both, with_limit
 from spikeloom.compiler import compile_network
 from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.errors import CapacityError, ModelError, OptionError
+from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.formats.counters import counting_network, write_counters
 from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.compiler.targets.truenorth.counting import LARGEST, planned, run_counters
 from spikeloom.compiler.targets.truenorth.netlist import write_crossbars
-from spikeloom.compiler.targets.truenorth.passes import Options, compile_crossbars
+from spikeloom.compiler.targets.truenorth.passes import compile_crossbars
 from spikeloom.models.training.counters import rounded
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.votes import class_counts
@@ -129,8 +129,6 @@ def test_what_the_chip_cannot_hold_is_refused(tmp_path):
         compile_crossbars(replace(counters, slope=0.5))
     with pytest.raises(CapacityError, match=r"chip: 2 used, 1 allowed .*--weight-bits"):
         compile_crossbars(counters, target=with_limit("chip.cores", 1))
-    with pytest.raises(OptionError, match="--in-time 3: the network is whole numbers already"):
-        compile_crossbars(counters, Options(in_time=3))
     write_counters(tmp_path / "c.pt", random_counters(0, most=127))
     code, _, err = run("compile", tmp_path / "c.pt", "--target", "truenorth", "-o", tmp_path / "c.loom")
     assert (code, "c.pt: weights of up to" in err) == (2, True)

@@ -1,22 +1,17 @@
-"""Networks on crossbar cores, whole numbers and sums that travel in time: every spike is the model's."""
+"""Networks on crossbar cores, in whole numbers: every spike is the model's."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
 import random_crossbars as cores
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from random_networks import chain
 
-from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks, with_clocks
-from spikeloom.compiler.errors import CapacityError, ModelError
-from spikeloom.compiler.interpret import run_float
-from spikeloom.compiler.targets.truenorth import codebook as book
+from spikeloom.compiler.dynamics import NO_CLOCKS, with_clocks
+from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.targets.truenorth import legalize, native
 from spikeloom.compiler.targets.truenorth.builder import crossing_points
-from spikeloom.compiler.targets.truenorth.in_time import first_spikes, lower_in_time
 from spikeloom.compiler.targets.truenorth.native import lower
 from spikeloom.compiler.targets.truenorth.passes import compile_crossbars
 from spikeloom.models.truenorth.network import run_network
@@ -34,7 +29,7 @@ NETWORKS = st.builds(
 )
 
 
-@pytest.mark.parametrize("weights", [*native.BASES.values(), *book.WEIGHTS.values()])
+@pytest.mark.parametrize("weights", native.BASES.values())
 def test_axons_of_an_input_make_every_level(weights):
     levels = np.arange(min(weights), sum(weight for weight in weights if weight > 0) + 1)
     points = crossing_points(levels, weights)
@@ -121,118 +116,3 @@ def test_what_contradicts_itself_is_named():
     assert native.faults(replace(network, clocks=NO_CLOCKS)) == [
         f"{stage.name}: receives 2 clocks of 0" for stage in rest
     ]
-
-
-NARROW = cores.with_limit("core.axons", 60)
-"""The same chip with few axons, so that small layers are split."""
-
-
-def forgetful(seed, *sizes, spread=0.5, bias=0.3):
-    rng = np.random.default_rng(seed)
-    weights = [rng.normal(0, spread, (after, before)) for before, after in pairwise(sizes)]
-    return chain(*weights, biases=[rng.normal(0, bias, len(weight)) for weight in weights], beta=0.0)
-
-
-def assert_equal(levels, netlist, recording):
-    """Every spike of every copy is the model's, in its tick, and no other tick of its data has one."""
-    trace = cores.both(netlist, recording)
-    assert trace.counts.overflows.sum() == 0
-    model, sums = book.run_levels(levels, recording)
-    steps = recording.shape[1]
-    for name, first in first_spikes(levels).items():
-        chosen = np.flatnonzero(netlist.layer == netlist.layers.index(name))
-        on_chip = trace.spikes[first : first + steps * book.BIN_TICKS][:, chosen]
-        due = np.zeros_like(on_chip)
-        due[:: book.BIN_TICKS] = model[name][:, netlist.neuron[chosen]]
-        np.testing.assert_array_equal(on_chip, due, name)
-    expected = np.bincount(levels.label, weights=model[levels.layers[-1].name].sum(axis=0), minlength=levels.classes)
-    np.testing.assert_array_equal(class_counts(netlist, trace.counts.votes[None])[0], expected)
-    return model, sums
-
-
-@pytest.mark.parametrize("largest", [1, 2, 3, -4])
-def test_weights_in_levels_are_found_again(largest):
-    weight = 0.37 * np.array([[largest, 0, 1, -1], [largest, largest, 0, 0]])
-    level, step = book.codebook(weight, 3)
-    np.testing.assert_allclose(level * step[:, None], weight, rtol=1e-6)
-
-
-def test_a_network_in_levels_is_the_float_network_with_rounded_weights():
-    network = forgetful(0, 20, 15, 8, 4)
-    levels = book.in_levels(network, 3, cores.CHIP)
-    books = [book.codebook(projection.weight.toarray(), 3) for projection in network.projections]
-    rounded = chain(
-        *(level * step[:, None] for level, step in books),
-        biases=[population.bias for population in network.populations],
-        beta=0.0,
-    )
-    events = (np.random.default_rng(1).random((20, 30)) < 0.3).astype(np.uint8)
-    spikes, sums = book.run_levels(levels, events)
-    for mine, expected in zip(spikes.values(), run_float(rounded, events.T[None]).spikes, strict=True):
-        np.testing.assert_array_equal(mine, expected[0])
-    assert sums == ()
-
-
-def test_partial_sums_saturate_and_are_counted():
-    layer = book.Layer(name="fc1", level=np.full((1, 60), 1), threshold=np.array([book.MOST + 21]), copies=2, width=40)
-    network = book.LevelNetwork(taxels=60, polarities=1, classes=1, layers=(layer,), label=np.array([0]))
-    events = np.zeros((60, 3), np.uint8)
-    events[:25, 0] = events[:19, 1] = 1
-    events[40:, :2] = 1
-    spikes, sums = book.run_levels(network, events)
-    assert sums == (book.PartialSums("fc1", 6, 3, 25),)
-    assert sums[0] + book.PartialSums("fc1", 4, 1, 30) == book.PartialSums("fc1", 10, 4, 30)
-    assert spikes["fc1"][:, 0].tolist() == [False, False, False]  # 19 and 19 of 25 and 20
-    for threshold, spiked in ((39, False), (38, True)):
-        other = replace(network, layers=(replace(layer, threshold=np.array([threshold])),))
-        assert book.run_levels(other, events)[0]["fc1"][0, 0] == spiked
-
-
-def test_layers_that_receive_a_clock_take_three_axons_an_input():
-    levels = book.in_levels(forgetful(2, 8, 300, 6, bias=0.0), 4, cores.CHIP)
-    assert [(layer.copies, layer.is_split) for layer in levels.layers] == [(4, False), (3, True)]
-    lifted = book.in_levels(forgetful(2, 8, 30, 6, bias=3.0), 4, cores.CHIP)  # some would spike without inputs
-    assert {layer.copies for layer in lifted.layers} == {3}
-
-
-def test_what_cannot_be_in_levels():
-    network = forgetful(0, 6, 5, 3)
-    (one, two), (first, second) = network.populations, network.projections
-    for changes, said in (
-        ({"populations": (one, replace(two, beta=0.2))}, "fc2: keeps 0.2 of its membranes"),
-        ({"populations": (one, replace(two, alpha=0.5))}, "fc2: keeps 0.5 of its currents"),
-        ({"projections": (first, replace(second, pre=-1))}, "fc2: does not receive from the layer before"),
-        ({"input": replace(network.input, clocks=Clocks(channels=2, steps=5))}, "has clocks"),
-        ({"input": replace(network.input, bins=2)}, "a step joins 2 bins"),
-    ):
-        with pytest.raises(ModelError, match=said):
-            book.in_levels(replace(network, **changes), 3, cores.CHIP)
-
-
-SHAPES = st.sampled_from([(9, 12, 4), (24, 30, 12, 3), (30, 4), (25, 26, 5), (8, 40, 33, 6)])
-
-
-@settings(max_examples=15)
-@given(
-    seed=st.integers(0, 2**31), shape=SHAPES, copies=st.sampled_from(book.COPIES), bias=st.sampled_from([0.0, 0.3, 2.0])
-)
-def test_every_spike_on_the_chip_is_the_models(seed, shape, copies, bias):
-    levels = book.in_levels(forgetful(seed, *shape, bias=bias), copies, NARROW)
-    netlist = lower_in_time(levels, NARROW)
-    assert legalize.faults(netlist, NARROW) == ()
-    recording = (np.random.default_rng(seed).random((shape[0], 6)) < 0.5).astype(np.uint8)
-    assert_equal(levels, netlist, recording)
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_sums_that_saturate_leave_nothing_for_the_next_step(sign):
-    level = sign * np.array([[3] * 60, [1] * 60])
-    threshold = np.array([sign * 2 * book.MOST + (sign < 0), 1])
-    layer = book.Layer(name="fc1", level=level, threshold=threshold, copies=3, width=30)
-    network = book.LevelNetwork(taxels=60, polarities=1, classes=2, layers=(layer,), label=np.array([0, 1]))
-    recording = np.zeros((60, 5), np.uint8)
-    recording[:, 0] = recording[:, 2] = 1
-    recording[3, 3] = 1
-    model, (sums,) = assert_equal(network, lower_in_time(network, cores.CHIP), recording)
-    assert sums.saturated == 8
-    assert model["fc1"][0].any() == (sign > 0)

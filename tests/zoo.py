@@ -16,7 +16,7 @@ import made_nir
 import nir
 import numpy as np
 import pytest
-from made_files import CLASSES, own_file, recordings_folder
+from made_files import CLASSES, recordings_folder
 from made_modules import TAXELS
 from random_crossbars import random_network as native_network
 from timed_networks import GRAPH, TIMING, written
@@ -186,11 +186,6 @@ def native(folder: Path) -> Made:
     return "net.pt", TAXELS, "", "--target truenorth"
 
 
-def in_time(folder: Path) -> Made:
-    own_file(folder / "net.pt", beta=0.0)
-    return "net.pt", TAXELS, "", "--target truenorth --in-time 3"
-
-
 MAKERS: dict[str, Callable[[Path], Made]] = {
     "tactilesgnet": of_system("tactilesgnet", PLAIN, "--planes 2 --scale-groups 4"),
     "mlp": of_system("mlp", PLAIN, "--weight-bits 4"),
@@ -208,9 +203,8 @@ MAKERS: dict[str, Callable[[Path], Made]] = {
     "netx": netx,
     "native": native,
     "counters-crossbars": counting_crossbars,
-    "in-time": in_time,
 }
-CROSSBARS = ("native", "in-time", "counters-crossbars")
+CROSSBARS = ("native", "counters-crossbars")
 INTEGERS = (*CROSSBARS, "netx")
 """Those without a float network that compiles for the chip of the others."""
 LAYERED = tuple(name for name in MAKERS if name not in CROSSBARS)

@@ -38,8 +38,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     what = f"share of equal decisions on held-out training recordings that storage has to keep (default: {KEEP:g})"
     storage.add_argument("--keep", type=float, metavar="X", help=what)
     add_bin_option(sub)
-    what = "truenorth: lower a history-free network, N axons an input (2 to 4), whose sums travel in 20 ticks a step"
-    storage.add_argument("--in-time", type=int, metavar="N", help=what)
     what = "at least N cores for a layer, which it shares with none, as in conv1=4,fc1=6"
     layout.add_argument("--cores-for", metavar="LAYER=N[,…]", help=what)
     layout.add_argument("--chips", type=int, default=1, metavar="N", help="use up to N chips (default: 1)")

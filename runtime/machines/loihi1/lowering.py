@@ -28,7 +28,6 @@ def lower(arguments: Namespace, after: Callable[[str, Any], object]) -> Lowered:
     path = arguments.checkpoint
     if isinstance(path, str) and path.endswith(NETX):
         return _lower_integers(arguments)
-    refuse(arguments, ("in_time",), f"{arguments.target} has no such option")
     packings = parse_packings(arguments)
     keep = parse_keep(arguments)
     parse_cores(arguments.cores_for)
@@ -118,7 +117,7 @@ class LaidOut:
 def _lower_integers(arguments: Namespace) -> Lowered:
     """Lay out a file that brings its integers: nothing is rounded."""
     path = arguments.checkpoint
-    floats = ("in_time", "dt", "convention", *ROUNDING, "dump_after", "calibrate")
+    floats = ("dt", "convention", *ROUNDING, "dump_after", "calibrate")
     refuse(arguments, floats, f"is for float networks, {path} holds integers")
     refuse(arguments, NETWORK, f"is for checkpoints, the netx file {path} holds all it needs")
     progress("reading the network")

@@ -1,4 +1,4 @@
-"""What is compiled for TrueNorth: networks trained for it, counting ones, and history-free ones (``--in-time``)."""
+"""What is compiled for TrueNorth: networks that were trained for it, and counting ones."""
 
 from argparse import Namespace
 from collections.abc import Callable, Mapping
@@ -9,7 +9,8 @@ from spikeloom.compiler.archive import COUNTERS
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.counters import read_counters
-from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.ir import Network
+from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Options, Source, compile_crossbars
@@ -43,7 +44,7 @@ def lower(arguments: Namespace, after: Callable[[str, Any], object]) -> Lowered:
     if named and path.endswith(NETX):
         raise OptionError(f"--target {arguments.target}: {path} holds integers of another chip; omit it")
     refuse(arguments, ("calibrate", *ROUNDING, *PLACING), "is not for truenorth")
-    source: Source
+    source: Source | Factored | Network
     if named and is_trained(shipped(path)):
         trained = read(path, arguments)
         source = trained.network
@@ -52,16 +53,16 @@ def lower(arguments: Namespace, after: Callable[[str, Any], object]) -> Lowered:
         loaded = load_network(path, arguments)
         source = read_counters(shipped(path))[0] if loaded.format == COUNTING else loaded.model
         provenance = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256}
-        provenance |= loaded.origin(arguments.run) | {"in_time": arguments.in_time} | origin_of(loaded.training)
+        provenance |= loaded.origin(arguments.run) | origin_of(loaded.training)
     progress("compiling")
-    options = Options(in_time=arguments.in_time, provenance=provenance)
     try:
-        netlist = compile_crossbars(source, options, after=after).netlist
+        done = compile_crossbars(source, Options(provenance=provenance), after=after)
     except ModelError as error:
         raise ModelError(f"{path if named else 'module'}: {error}") from error
+    netlist = done.netlist
     return Lowered(
         netlist=netlist,
-        model=model_of(source, load_target("truenorth"), arguments.in_time),
+        model=model_of(done.source, done.target),
         write=lambda output: write_crossbars(netlist, output),
         report=lambda sha256: describe(netlist, sha256),
     )
@@ -84,12 +85,9 @@ def reference(arguments: Namespace, netlist: CrossbarNetlist) -> Reference:
     """The network that a netlist was compiled from; OptionError if the file is another one."""
     path = arguments.checkpoint
     made = netlist.provenance
-    counting = made.get("format") == COUNTING
-    if counting or made.get("in_time"):
+    if made.get("format") == COUNTING:
         loaded = load_network(path, arguments)
         _require_file(arguments, made, loaded.sha256)
-        if not counting:
-            return Reference(source=loaded.model, network=loaded.network, loaded=None, whole=True)
         counters = read_counters(shipped(path))[0]
         return Reference(source=counters, network=counters, loaded=loaded, whole=True)
     trained = read(path, arguments)

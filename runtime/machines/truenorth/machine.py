@@ -10,7 +10,7 @@ import numpy.typing as npt
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars, unlike
-from spikeloom.compiler.targets.truenorth.passes import Options, Source, compile_crossbars
+from spikeloom.compiler.targets.truenorth.passes import Source, compile_crossbars
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.machines.base import Done, Machine, Model, Price, Run, T
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
@@ -50,16 +50,15 @@ class TrueNorth(Machine):
 
     def check_lowering(self, network: Source) -> NetlistCheck:
         """Lowered again, it is the same."""
-        copies = self.netlist.provenance.get("in_time") or None
-        again = compile_crossbars(network, Options(in_time=copies), target=self.target).netlist
+        again = compile_crossbars(network, target=self.target).netlist
         what = "every neuron, axon, crossing point, wire and register"
         return NetlistCheck(
             whole=tuple(unlike(self.netlist, again)), claim=f"{what} is what the network of the file is lowered to"
         )
 
     def model(self, source: Source) -> Model:
-        """In whole numbers, or in levels."""
-        return model_of(source, self.target, self.netlist.provenance.get("in_time"))
+        """The network itself."""
+        return model_of(source, self.target)
 
     def differing(self, run: Run, layer: str, expected: BoolArray, first: int, lengths: IntArray) -> int:
         """Of every copy of every neuron, in every tick from the layer's first on."""
