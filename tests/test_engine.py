@@ -68,6 +68,13 @@ def test_any_network(data, exponents, length, gated, blank):
     assert_twins_agree(netlist, events, gated=gated, blank=blank)
 
 
+def test_blank_steps_of_an_empty_recording_do_not_vote():
+    netlist = large_netlist(7, proved=True)
+    netlist = replace(netlist, layers=tuple(replace(layer, depth=0) for layer in netlist.layers))
+    nothing = np.zeros((netlist.n_inputs, 0), np.uint8)
+    assert assert_twins_agree(netlist, nothing, blank=3).counts.spikes.any()
+
+
 def test_large_networks_reach_every_regime():
     saturations = 0
     for seed, proved in itertools.product(range(3), (True, False)):

@@ -232,7 +232,7 @@ def _run_steps(
                 membranes=None if trace.membranes is None else trace.membranes[index, begin:end],
                 updated=worked[begin:end],
             )
-            if begin == 0:
+            if end == steps:
                 trace.counts.votes[index] = state.spikes
     except NumericRangeError as error:
         error.add_note(f"recording {index} of {len(trace.counts.inputs)}, counted from 0")
