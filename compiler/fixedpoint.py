@@ -129,7 +129,9 @@ def split_planes(steps: IntArray, bits: int, exponents: tuple[int, ...]) -> list
     >>> [plane.tolist() for plane in split_planes(np.array([5, 127, 128, -300]), 8, (-1, 6))]
     [[10, 254, 0, -88], [0, 0, 2, -4]]
     """
-    codes, rest, mantissas = reach(bits, (0,)), steps, []
+    codes = reach(bits, (0,))
+    rest = steps
+    mantissas = []
     for k in range(len(exponents) - 1, 0, -1):
         ratio = 1 << (exponents[k] - exponents[0])
         code = np.clip(np.rint(rest / ratio), -codes, codes).astype(np.int64)

@@ -49,7 +49,8 @@ class Layer:
     def run(self, sources: Sequence[BoolArray], *, membranes: bool = False) -> tuple[BoolArray, AnyArray]:
         """Spikes, and membranes if wanted, of recordings from the spikes of `pres`, all (samples, steps, neurons)."""
         shape = *sources[0].shape[:2], self.size
-        spikes, kept = np.empty(shape, np.bool_), np.empty(shape if membranes else _NONE, self._kind)
+        spikes = np.empty(shape, np.bool_)
+        kept = np.empty(shape if membranes else _NONE, self._kind)
         moved = np.zeros((2, 0), np.int32)
         self._run(raster(sources), spikes.view(np.uint8), kept, np.empty(_NONE, np.uint8), moved)
         return spikes, kept
@@ -59,7 +60,8 @@ class Layer:
 
         `wanted` (samples, steps, bytes) has a bit for each neuron, the first lowest.
         """
-        moved, fired = np.zeros((2, self.size), np.int32), np.empty((1, 2, self.size), np.uint8)
+        moved = np.zeros((2, self.size), np.int32)
+        fired = np.empty((1, 2, self.size), np.uint8)
         self._run(sources, fired, np.empty(_NONE, self._kind), np.ascontiguousarray(wanted), moved)
         return moved
 
@@ -67,7 +69,8 @@ class Layer:
         from spikeloom.compiler.layer_kernel import require_below, run_layer
 
         require_below("source", arrays[0].source, len(self.fixed[0].run) - 1)
-        state, listed = np.empty((3, self.size), self._kind), np.empty(self.size, np.int32)
+        state = np.empty((3, self.size), self._kind)
+        listed = np.empty(self.size, np.int32)
         run_layer(arrays[0], *self.fixed, state, listed, *arrays[1:])
 
     @property

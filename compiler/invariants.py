@@ -89,7 +89,8 @@ def _registers_hold(network: ir.IntegerNetwork) -> Faults:
 
 def _mantissas_hold(network: ir.IntegerNetwork) -> Faults:
     for i, projection in enumerate(network.projections):
-        step, data = weight_step(projection.bits), projection.weight.data
+        step = weight_step(projection.bits)
+        data = projection.weight.data
         if data.dtype.kind != "i" or np.any(data % step) or np.any(data < -256) or np.any(data > 256 - step):
             yield f"projection {i} has mantissas that {projection.bits} bits cannot hold"
         if projection.exponent < -1:

@@ -246,7 +246,8 @@ def row_parts(weight: Sparse) -> Iterator[slice]:
     >>> list(row_parts(sparse.csr_array((2, 5))))
     [slice(0, 2, None)]
     """
-    first, rows = 0, weight.shape[0]
+    first = 0
+    rows = weight.shape[0]
     while first < rows:
         last = int(np.searchsorted(weight.indptr, weight.indptr[first] + PART, side="right")) - 1
         last = min(max(last, first + 1), rows)

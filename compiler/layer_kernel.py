@@ -199,7 +199,8 @@ def flush(values: Any, least: Any) -> None:
 def raster_of(spikes: BoolArray) -> Raster:
     """List spikes (recordings, steps, sources)."""
     rows = np.ascontiguousarray(spikes).view(np.uint8).reshape(-1, spikes.shape[2])
-    source, bounds = np.empty(np.count_nonzero(rows) + 1, np.int32), np.zeros(len(rows) + 1, np.int64)
+    source = np.empty(np.count_nonzero(rows) + 1, np.int32)
+    bounds = np.zeros(len(rows) + 1, np.int64)
     _list_rows(rows, source, bounds)
     return Raster(source[:-1], bounds)
 
@@ -220,9 +221,11 @@ def _list_rows(rows: Any, source: Any, bounds: Any) -> None:
 def _compare(fired: Any, wanted: Any, moved: Any, more: Any) -> None:
     # byte by byte, and unsigned: only then is the inner loop vectorised
     for byte in range(np.uint64(len(wanted))):
-        first, bits = np.uint64(8) * byte, np.int32(wanted[byte])
+        first = np.uint64(8) * byte
+        bits = np.int32(wanted[byte])
         for k in range(min(np.uint64(8), np.uint64(len(moved)) - first)):
-            ours, theirs = np.int32(fired[first + k]), (bits >> np.int32(k)) & np.int32(1)
+            ours = np.int32(fired[first + k])
+            theirs = (bits >> np.int32(k)) & np.int32(1)
             moved[first + k] += ours ^ theirs
             more[first + k] += ours - theirs
 
@@ -242,17 +245,20 @@ def _integrate_integer(membrane: Any, current: Any, sums: Any, bias: Any, regist
     # every result is cast: otherwise they are 64 bits wide, and half as many fit a vector
     threshold, keep_u, keep_v, limit = registers
     kind = membrane.dtype.type
-    zero, low = kind(0), kind(2**DECAY_BITS - 1)
+    zero = kind(0)
+    low = kind(2**DECAY_BITS - 1)
     for i in range(len(bias)):
         arrived = kind(sums[i] << MEMBRANE_SHIFT)
         if keep_u:
             magnitude = kind(abs(current[i]))
-            high, rest = kind(magnitude >> DECAY_BITS), kind(magnitude & low)
+            high = kind(magnitude >> DECAY_BITS)
+            rest = kind(magnitude & low)
             kept = kind(kind(high * keep_u) + kind(kind(rest * keep_u) >> DECAY_BITS))
             arrived = kind(arrived + (kind(-kept) if current[i] < zero else kept))
             current[i] = arrived
         magnitude = kind(abs(membrane[i]))
-        high, rest = kind(magnitude >> DECAY_BITS), kind(magnitude & low)
+        high = kind(magnitude >> DECAY_BITS)
+        rest = kind(magnitude & low)
         kept = kind(kind(high * keep_v) + kind(kind(rest * keep_v) >> DECAY_BITS))
         kept = kind(-kept) if membrane[i] < zero else kept
         v = kind(kind((zero if membrane[i] > threshold[i] else kept) + arrived) + bias[i])
@@ -287,7 +293,9 @@ def run_layer(
     """
     recordings, steps = (wanted if len(wanted) else fired).shape[:2]
     kept, last, _ = fired.shape
-    membrane, current, sums = state[0], state[1], state[2]
+    membrane = state[0]
+    current = state[1]
+    sums = state[2]
     for recording in range(recordings):
         clear(membrane)
         clear(current)
@@ -299,7 +307,8 @@ def run_layer(
             else:
                 arriving = sums
                 clear(sums)
-            at, now = recording * steps + t, fired[recording % kept, t % last]
+            at = recording * steps + t
+            now = fired[recording % kept, t % last]
             arrive(arriving, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
             if len(own.run) and t:  # a plain 0 is a type of its own: all would be compiled once more
                 arrive(arriving, own, before, np.int64(0), list_fired(fired[recording % kept, (t - 1) % last], before))

@@ -106,10 +106,12 @@ def build_graph(name: str, coordinates: ArrayLike = NEUTOUCH) -> Graph:
                 f"graph {name!r}: drawn by hand for the NeuTouch layout, not for this one of {len(layout)} taxels; "
                 "use knn:K or mst:SIGMA"
             )
-        canonical, edges = "manual", _manual_edges()
+        canonical = "manual"
+        edges = _manual_edges()
     elif kind == "knn" and colon:
         k = _read_k(name, value, len(layout))
-        canonical, edges = f"knn:{k}", _knn_edges(_distances(layout), k, neutouch=neutouch)
+        canonical = f"knn:{k}"
+        edges = _knn_edges(_distances(layout), k, neutouch=neutouch)
     elif kind == "mst" and colon:
         sigma = _read_sigma(name, value)
         canonical = f"mst:{int(sigma) if sigma.is_integer() else sigma!r}"
@@ -221,7 +223,8 @@ def _tree(distance: FloatArray, start: int, first: list[list[int]]) -> IntArray:
 
     outside = np.ones(n, dtype=bool)
     outside[start] = False
-    nearest, origin = place[start].copy(), np.full(n, start)
+    nearest = place[start].copy()
+    origin = np.full(n, start)
     rows = np.empty((n - 1, 2), dtype=np.int64)
     for row in rows:
         end = int(np.argmin(np.where(outside, nearest, len(order) + 1)))

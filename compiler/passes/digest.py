@@ -24,7 +24,8 @@ def digests(network: IntegerNetwork, gone: Sequence[BoolArray]) -> dict[str, dic
     """
     found = {}
     for post, population in enumerate(network.populations):
-        held, synapses = np.flatnonzero(~gone[post]), []
+        held = np.flatnonzero(~gone[post])
+        synapses = []
         into = added_up((p.pre, p.effective()) for p in network.projections if p.post == post)
         for pre, weight in sorted(into.items()):
             part = zeroed(weight, gone[post], of_source(gone, pre, weight.shape[1])).copy()

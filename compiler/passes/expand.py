@@ -95,7 +95,8 @@ def expand_dense(checkpoint: Checkpoint, layer: int) -> Sparse:
 
     The stored entries are all pairs within a tower, and those from the relays of clocks, whatever their weight.
     """
-    weight, before = checkpoint.dense[layer - 1].weight, towers_of(checkpoint)[layer - 1]
+    weight = checkpoint.dense[layer - 1].weight
+    before = towers_of(checkpoint)[layer - 1]
     inputs = np.stack([np.flatnonzero((before == t) | (before == SHARED)) for t in range(checkpoint.towers)])
     column = np.repeat(inputs, len(weight) // len(inputs), axis=0)
     first = np.arange(0, weight.size + 1, weight.shape[1])
@@ -115,7 +116,8 @@ def expand(checkpoint: Checkpoint, propagation: FloatArray) -> Network:
     stages = [("conv1", *expand_first_layer(checkpoint, propagation))]
     for layer, dense in enumerate(checkpoint.dense, 1):
         stages.append((dense.name, expand_dense(checkpoint, layer), dense.bias.astype(np.float64)))
-    polarities, bins = checkpoint.hops.shape[2], checkpoint.bins
+    polarities = checkpoint.hops.shape[2]
+    bins = checkpoint.bins
     return Network(
         input=Input(taxels=checkpoint.taxels, polarities=polarities, clocks=dynamics.clocks, bins=bins),
         populations=tuple(

@@ -56,14 +56,18 @@ def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:
     before. Without a leak that is all that arrives in a recording, where the network says how long one is.
     """
     proofs = []
-    length, unit = network.input.clocks.length or np.inf, 1 << MEMBRANE_SHIFT
+    length = network.input.clocks.length or np.inf
+    unit = 1 << MEMBRANE_SHIFT
     spikes: dict[int, FloatArray] = {INPUT: np.full(network.input.size, length)}  # in a recording, at most
     for post, population in enumerate(network.populations):
         into = [projection for projection in network.projections if projection.post == post]
         positive, negative = one_sided(into, population.size)
-        kept_u, kept_v = population.realised_alpha, population.realised_beta
-        up, down = settled(positive * unit, kept_u), settled(negative * unit, kept_u)
-        own, others = np.zeros(population.size), np.zeros(population.size)
+        kept_u = population.realised_alpha
+        kept_v = population.realised_beta
+        up = settled(positive * unit, kept_u)
+        down = settled(negative * unit, kept_u)
+        own = np.zeros(population.size)
+        others = np.zeros(population.size)
         for p in into:
             inhibition = -p.effective().minimum(0)
             inhibition.eliminate_zeros()  # a zero of what has no end is none

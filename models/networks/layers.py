@@ -95,7 +95,8 @@ class _Lif(torch.autograd.Function):
     def forward(ctx: Any, current: Tensor, beta: float, theta: float, surrogate: Surrogate) -> tuple[Tensor, Tensor]:
         ctx.beta, ctx.theta, ctx.surrogate = beta, theta, surrogate
         current = current.contiguous()
-        spikes, membrane = torch.empty_like(current), torch.empty_like(current)
+        spikes = torch.empty_like(current)
+        membrane = torch.empty_like(current)
         kind = kind_of(current)
         _integrate(rows_of(current), kind(beta), kind(theta), rows_of(spikes), rows_of(membrane))
         ctx.save_for_backward(membrane)
@@ -232,7 +233,8 @@ def kind_of(like: Tensor) -> type[np.float32] | type[np.float64]:
 
 @numba.njit(cache=True)
 def _integrate_step(current: Any, before: Any, beta: Any, theta: Any, spikes: Any, membrane: Any) -> None:
-    zero, one = membrane.dtype.type(0), membrane.dtype.type(1)
+    zero = membrane.dtype.type(0)
+    one = membrane.dtype.type(1)
     for i in range(len(membrane)):
         u = (zero if before[i] > theta else before[i] * beta) + current[i]
         membrane[i] = u
@@ -253,7 +255,8 @@ def differentiate_step(
     from_above: Any, membrane: Any, later: Any, beta: Any, theta: Any, width: Any, reset: Any, smooth: Any, out: Any
 ) -> None:
     """Gradient of the current of a step from that of its spikes, and `later`, that of the step after."""
-    zero, one = membrane.dtype.type(0), membrane.dtype.type(1)
+    zero = membrane.dtype.type(0)
+    one = membrane.dtype.type(1)
     for i in range(len(membrane)):
         u = membrane[i]
         through_spike = from_above[i] - reset * (later[i] * (u * beta))

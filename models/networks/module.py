@@ -90,7 +90,8 @@ def _weights(stages: _Stages) -> tuple[list[list[Sparse]], list[FloatArray]]:
     """Weights from each source into each layer and the output, ``[target][source]``, and the biases."""
     sources = [torch.zeros(shape, dtype=torch.float64, requires_grad=True) for shape in stages.shapes]
     nothing = sum(source.sum() * 0 for source in sources)  # so that every response depends on every source
-    weights, biases = [], []
+    weights = []
+    biases = []
     for response in stages.respond(sources):
         flat = response.reshape(-1) + nothing
         rows: list[list[Sparse]] = [[] for _ in sources]

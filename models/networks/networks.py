@@ -162,7 +162,8 @@ class SpikingNet(TrainedModule):
     def _integrate(self, index: int, layer: nn.Module, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Spikes and membranes of one layer; its bias goes past a current that outlasts its step."""
         dynamics = self.architecture.dynamics
-        alpha, bias = dynamics.alpha(index), layer.get_parameter("bias")
+        alpha = dynamics.alpha(index)
+        bias = layer.get_parameter("bias")
         (weight,) = (values for name, values in layer.named_parameters() if name != "bias")
         if alpha:
             current = lasting_current(layer(*inputs, self._scaled(index, weight), torch.zeros_like(bias)), alpha)
@@ -188,7 +189,8 @@ class SpikingNet(TrainedModule):
 
     def activity(self, layers: Mapping[str, tuple[Tensor, Tensor]], lengths: Tensor | None = None) -> Tensor:
         """Share of the synapses behind neurons that carry a spike, mean over steps and samples; one number."""
-        used, there = torch.zeros(()), 0
+        used = torch.zeros(())
+        there = 0
         for source, layer in zip(layers, self.dense, strict=False):
             inputs, outputs = self.get_submodule(layer).get_parameter("weight").shape
             spikes = layers[source][0]
@@ -215,7 +217,8 @@ class SpikingNet(TrainedModule):
 
     def _order(self) -> IntArray:
         """Neuron of ours that is the first, second … one in the order of the system."""
-        features, clocks = self.architecture.features, self.architecture.dynamics.clocks.channels
+        features = self.architecture.features
+        clocks = self.architecture.dynamics.clocks.channels
         own = np.arange(self.places * features).reshape(self.places, features)
         return np.append(in_order(self.architecture.system, own), np.arange(own.size, own.size + clocks))
 
@@ -229,7 +232,9 @@ def relayed(clocks: Clocks, like: Tensor) -> Tensor:
 
 def _first_layer(architecture: Architecture, generator: torch.Generator) -> Affine:
     """As the layers of those names start in torch and torch_geometric; a GCN with Glorot's weights and no bias."""
-    channels, features, system = architecture.channels, architecture.features, architecture.system
+    channels = architecture.channels
+    features = architecture.features
+    system = architecture.system
     if system == MLP:  # a weight for each input, which are few and spikes
         inputs = architecture.taxels * channels
         return Affine(_over_all_taxels, "weight", (inputs, features), inputs, generator)

@@ -68,7 +68,8 @@ class Stage:
 
     def one_sided(self, steps: Array) -> tuple[Array, Array]:
         """Largest positive and negative sum of each neuron, each plane by itself, as :func:`ir.one_sided`."""
-        sides, exponents = np.zeros((2, self.shape[0])), self.form.exponents
+        sides = np.zeros((2, self.shape[0]))
+        exponents = self.form.exponents
         for mantissa, exponent in zip(
             fixedpoint.split_planes(steps, self.form.bits, exponents), exponents, strict=True
         ):
@@ -128,7 +129,8 @@ class QuantisedNet(nn.Module):
         for post, stage in list(enumerate(self.stages))[self.first :]:
             planes = ir.added_up((p.pre, p.effective()) for p in integer.projections if p.post == post)
             units = sparse.hstack([planes[pre] for pre in stage.sources]).toarray()
-            weight, bias = self.weights[post - self.first], self.biases[post - self.first]
+            weight = self.weights[post - self.first]
+            bias = self.biases[post - self.first]
             learned = slice(len(weight))
             steps = units[stage.row[learned], stage.column[learned]] / stage.step
             step = (stage.step / stage.scale)[stage.row[learned]]
@@ -143,7 +145,8 @@ class QuantisedNet(nn.Module):
         """Weights of a layer's synapses and biases of its neurons in float64, a convolution expanded, with relays."""
         stage = self.stages[post]
         if post >= self.first or self.stack is None:
-            weight, bias = self.weights[post - self.first].double(), self.biases[post - self.first].double()
+            weight = self.weights[post - self.first].double()
+            bias = self.biases[post - self.first].double()
         else:
             held, (places, features) = len(stage.weight), (self.stack.shape[1], self.hops.shape[1])
             conv = torch.einsum("kij,kfc->ifjc", torch.tensor(self.stack), self.hops.double())
@@ -156,11 +159,13 @@ class QuantisedNet(nn.Module):
 
     def learned(self) -> ir.Network:
         """The network with its present weights and biases, thresholds as of :func:`in_thresholds`."""
-        populations, projections = [], []
+        populations = []
+        projections = []
         for post, stage in enumerate(self.stages):
             weight, bias = (each.detach().numpy() for each in self.given(post))
             populations.append(replace(stage.population, bias=bias))
-            whole, first = sparse.csr_array((weight, (stage.row, stage.column)), shape=stage.shape), 0
+            whole = sparse.csr_array((weight, (stage.row, stage.column)), shape=stage.shape)
+            first = 0
             for pre in stage.sources:
                 size = self.network.input.size if pre == ir.INPUT else self.network.populations[pre].size
                 projections.append(ir.Projection(pre=pre, post=post, weight=whole[:, first : first + size]))
@@ -210,14 +215,17 @@ class QuantisedNet(nn.Module):
             self.round()
             while any((integers.full > fixedpoint.ONE_STEP_SUM_MAX).any() for integers in self.integers):
                 for post, integers in enumerate(self.integers):
-                    wrong, stage = integers.full > fixedpoint.ONE_STEP_SUM_MAX, integers.stage
+                    wrong = integers.full > fixedpoint.ONE_STEP_SUM_MAX
+                    stage = integers.stage
                     if post >= self.first:
-                        weight, bias = self.weights[post - self.first], self.biases[post - self.first]
+                        weight = self.weights[post - self.first]
+                        bias = self.biases[post - self.first]
                         weight[torch.tensor(wrong[stage.row[: len(weight)]])] *= SHRINK
                         if stage.population.alpha:  # what lasts fills the membrane together with the bias
                             bias[torch.tensor(wrong[: stage.learning])] *= SHRINK
                     elif self.stack is not None:
-                        places, features = self.stack.shape[1], self.hops.shape[1]
+                        places = self.stack.shape[1]
+                        features = self.hops.shape[1]
                         feature = in_order(self.system, np.tile(np.arange(features), (places, 1)))
                         self.hops[:, torch.tensor(np.unique(feature[wrong[: stage.learning]]))] *= SHRINK
                         if stage.population.alpha and wrong.any():
@@ -226,7 +234,8 @@ class QuantisedNet(nn.Module):
 
     def spikes_of(self, events: Tensor) -> list[Tensor]:
         """Spikes of every layer, (steps, samples, neurons), for events (steps, samples, taxels, channels)."""
-        clocks, inputs = self.network.input.clocks, events.flatten(2)
+        clocks = self.network.input.clocks
+        inputs = events.flatten(2)
         if clocks.channels:
             ticks = torch.tensor(clocks.events(len(inputs)), dtype=torch.float32).t()[:, None]
             inputs = torch.cat([inputs, ticks.expand(-1, inputs.shape[1], -1)], dim=2)
@@ -265,12 +274,14 @@ class _ChipLayer(torch.autograd.Function):
         ctx: Any, spikes: Tensor, _weight: Tensor, _bias: Tensor, integers: Integers, surrogate: Surrogate
     ) -> Tensor:
         steps, samples, inputs = spikes.shape
-        registers, stage = integers.registers, integers.stage
+        registers = integers.registers
+        stage = integers.stage
         source, bounds = events_of(spikes.detach().reshape(-1, inputs).contiguous().numpy())
         sums = np.zeros((steps * samples, registers.size), np.float32)
         gather(source, bounds, integers.units[:inputs], sums)
         shape = steps, samples * registers.size
-        fired, membrane = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        fired = np.empty(shape, np.float32)
+        membrane = np.empty(shape, np.float32)
         unit = 1 / (stage.scale * (1 << fixedpoint.MEMBRANE_SHIFT))  # membrane of the float model in one membrane unit
         threshold = registers.threshold << fixedpoint.MEMBRANE_SHIFT
         bias, threshold, unit = (np.tile(each, samples) for each in (registers.bias, threshold, unit))
@@ -285,7 +296,9 @@ class _ChipLayer(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor, None, None]:
         source, bounds, fired, membrane, integers, samples, surrogate = ctx.kept
-        stage, inputs, neurons = integers.stage, integers.stage.inputs, integers.registers.size
+        stage = integers.stage
+        inputs = integers.stage.inputs
+        neurons = integers.registers.size
         above = gradients[0].contiguous().view(membrane.shape).numpy()
         current, through_bias = _backwards(above, membrane, integers, samples, surrogate)
         rows = current.reshape(len(membrane) * samples, -1)
@@ -304,11 +317,14 @@ def _backwards(
     above: Array, membrane: Array, integers: Integers, samples: int, surrogate: Surrogate
 ) -> tuple[Array, Array]:
     """Gradients of what flows into the currents and of the bias, both (steps, samples * neurons), from the spikes'."""
-    own, registers = integers.real[:, integers.stage.inputs :], integers.registers
-    alpha, theta = np.float32(registers.realised_alpha), np.float32(integers.stage.population.theta)
+    own = integers.real[:, integers.stage.inputs :]
+    registers = integers.registers
+    alpha = np.float32(registers.realised_alpha)
+    theta = np.float32(integers.stage.population.theta)
     beta, width, reset = map(np.float32, (registers.realised_beta, surrogate.width, surrogate.reset))
     smooth = surrogate.shape == FAST_SIGMOID
-    current, direct = np.empty_like(membrane), np.empty_like(membrane)
+    current = np.empty_like(membrane)
+    direct = np.empty_like(membrane)
     later, drained = np.zeros((2, membrane.shape[1]), np.float32)
     for t in range(len(membrane) - 1, -1, -1):
         given = above[t] + (drained.reshape(samples, -1) @ own).ravel() if own.size else above[t]
@@ -324,7 +340,8 @@ def _chip_step(
     sums: Any, i: Any, v: Any, bias: Any, threshold: Any, unit: Any, keep_u: Any, keep_v: Any, fired: Any, membrane: Any
 ) -> None:
     for n in range(len(v)):
-        left, magnitude = abs(i[n]) * keep_u >> fixedpoint.DECAY_BITS, abs(v[n]) * keep_v >> fixedpoint.DECAY_BITS
+        left = abs(i[n]) * keep_u >> fixedpoint.DECAY_BITS
+        magnitude = abs(v[n]) * keep_v >> fixedpoint.DECAY_BITS
         i[n] = (left if i[n] >= 0 else -left) + (np.int64(sums[n]) << fixedpoint.MEMBRANE_SHIFT)
         u = (magnitude if v[n] >= 0 else -magnitude) + i[n] + bias[n]
         u = min(max(u, -fixedpoint.MEMBRANE_MAX), fixedpoint.MEMBRANE_MAX)
@@ -343,7 +360,8 @@ def _integrate_chip(
     `own` (neurons, neurons), or (0, neurons), are weights from what the layer fired in the step before.
     """
     neurons = own.shape[1]
-    i, v = np.zeros(sums.shape[1], np.int64), np.zeros(sums.shape[1], np.int64)
+    i = np.zeros(sums.shape[1], np.int64)
+    v = np.zeros(sums.shape[1], np.int64)
     for t in range(len(sums)):
         if t > 0 and len(own) > 0:
             for n in range(len(v)):

@@ -50,7 +50,8 @@ def _run(
     if checkpoint.towers > 1:
         every = [_run(each, adjacency, events, dtype, membranes=membranes) for each in members(checkpoint)]
         return side_by_side(checkpoint, every)
-    shape, kind = (len(events), events.shape[3]), dtype if membranes else np.bool_
+    shape = (len(events), events.shape[3])
+    kind = dtype if membranes else np.bool_
     found = {name: np.empty((*shape, neurons), kind) for name, neurons in checkpoint.neurons.items()}
 
     def batch(start: int) -> None:
@@ -73,14 +74,17 @@ def _layers(
     checkpoint: Checkpoint, adjacency: AnyArray, dtype: np.dtype[Any]
 ) -> list[Callable[[AnyArray], tuple[AnyArray, AnyArray]]]:
     """What turns spikes of some steps into spikes and membranes of each layer, from rest at first."""
-    dynamics, hops = checkpoint.dynamics, checkpoint.hops.astype(dtype)
-    propagation, bias = adjacency.astype(dtype), checkpoint.conv_bias.astype(dtype)
+    dynamics = checkpoint.dynamics
+    hops = checkpoint.hops.astype(dtype)
+    propagation = adjacency.astype(dtype)
+    bias = checkpoint.conv_bias.astype(dtype)
     # the bias is part of what the spikes bring, unless that outlasts its step
     inside = np.zeros_like(bias) if dynamics.alpha(0) else bias
     drives = [lambda x: _first(checkpoint.system, x, propagation, hops, inside)]
     biases = [in_order(checkpoint.system, np.tile(bias, (checkpoint.places, 1)))]
     for layer, dense in enumerate(checkpoint.dense, 1):
-        weight, bias = dense.weight.T.astype(dtype), dense.bias.astype(dtype)
+        weight = dense.weight.T.astype(dtype)
+        bias = dense.bias.astype(dtype)
         drives.append(_linear(weight, np.zeros_like(bias) if dynamics.alpha(layer) else bias))
         biases.append(bias)
     return [

@@ -88,7 +88,8 @@ def read_text(path: Path, where: str) -> str:
 
 def _rows(text: str, known: tuple[str, ...]) -> tuple[list[int], list[str]]:
     """Number and content of every line that counts; the names may stand in a comment, as numpy.savetxt writes them."""
-    lines, rows = list[int](), list[str]()
+    lines = list[int]()
+    rows = list[str]()
     for at, line in enumerate(io.StringIO(text, newline=None), 1):
         content = line.partition("#")[0].strip()
         if not (content or rows):

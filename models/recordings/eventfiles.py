@@ -49,7 +49,8 @@ def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, wher
         at: Callable[[int], str] = table.at
     else:
         columns, at = _read_npz(path, where)
-    time_s, taxel = columns["time_s"], columns["taxel"]
+    time_s = columns["time_s"]
+    taxel = columns["taxel"]
     wrong = ~(np.isfinite(time_s) & (time_s >= 0))
     if wrong.any():
         row = int(np.argmax(wrong))
@@ -76,7 +77,9 @@ def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, wher
 
 def _polarity(where: str, values: FloatArray, at: Callable[[int], str]) -> EventArray:
     """1 for rising, 0 for falling, from either code."""
-    low, zero, high = values == -1, values == 0, values == 1
+    low = values == -1
+    zero = values == 0
+    high = values == 1
     wrong = ~(low | zero | high)
     codes = "allowed are 0 and 1, or -1 and 1"
     if wrong.any():

@@ -192,7 +192,9 @@ def bin_events(
     evtouch.require_memory(stream.name, n * 2 * steps)
     grid = np.zeros((n, 2, steps), dtype=np.uint8)
     grid[stream.taxel, stream.polarity, step] = 1
-    sent, first, note = len(stream.time_s), float(stream.time_s.min()), ""
+    sent = len(stream.time_s)
+    first = float(stream.time_s.min())
+    note = ""
     if odd:
         note = f"times up to {last:g} s with less than an event a second; write seconds"
     elif first > max(last - first, 10 * GAP_S):

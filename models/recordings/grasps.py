@@ -114,7 +114,8 @@ def _grasp(rng: np.random.Generator, shape: str, place: FloatArray, steps: int) 
     size = _draw(rng, _SIZES)
     x, y = ((place - _SHIFT * (2 * rng.random(2) - 1)) / size).T
     half = 2 * rng.random() - 1  # tangent of half the angle: a half turn without sine or cosine
-    cosine, sine = (1 - half * half) / (1 + half * half), 2 * half / (1 + half * half)
+    cosine = (1 - half * half) / (1 + half * half)
+    sine = 2 * half / (1 + half * half)
     gap = size * _gap(shape, cosine * x + sine * y, cosine * y - sine * x)
 
     full = _draw(rng, _DEPTHS)
@@ -149,7 +150,9 @@ def _gap(shape: str, x: FloatArray, y: FloatArray) -> FloatArray:
 def _course(rng: np.random.Generator, steps: int) -> FloatArray:
     """Depth over time, 0 to about 1, (steps,): press, hold with a tremor, lift."""
     time = np.arange(steps) / steps
-    onset, rise, fall = _draw(rng, _ONSETS), _draw(rng, _RISES), _draw(rng, _FALLS)
+    onset = _draw(rng, _ONSETS)
+    rise = _draw(rng, _RISES)
+    fall = _draw(rng, _FALLS)
     pressed = np.minimum((time - onset) / rise, (1 - time) / fall)
     wave = time / _draw(rng, _PERIODS)
     sway = _draw(rng, _SWAYS) * (2 * np.abs(wave - np.floor(wave) - 0.5) - 0.5)

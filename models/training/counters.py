@@ -108,7 +108,8 @@ def counted(data: Recordings, plan: Plan, steps: int | None = None) -> Counted:
     length = -(-steps // plan.parts)
     if (plan.parts - 1) * length >= steps:
         raise OptionError(f"--parts {plan.parts}: a recording has {steps} steps, the last part none; give fewer")
-    rows, kinds = [], []
+    rows = []
+    kinds = []
     for part in range(plan.parts):
         first = part * length
         total = np.cumsum(flat[..., first : first + length], axis=-1, dtype=np.int16)
@@ -176,7 +177,8 @@ def linear_rules(data: Counted, classes: int, strengths: Iterable[float]) -> dic
         raise DataError("counters: none of them spikes; give other --thresholds, or recordings with events")
     spikes = data.spikes[:, used].astype(np.float32)  # whole numbers: what they have in common is exact
     alike = (spikes @ spikes.T).astype(np.float64)
-    label, each = data.labels[:, None], np.arange(classes)
+    label = data.labels[:, None]
+    each = np.arange(classes)
     here = label // levels == each // levels
     sign = np.where(here & (label >= each), 1.0, np.where(here | (each % levels == 0), -1.0, 0.0))
     ordered = sorted(strengths)  # so that each starts at what the one before has found
@@ -215,13 +217,15 @@ def _newton(alike: FloatArray, sign: FloatArray, share: FloatArray, strength: fl
         pull = alike[short]
         goal = np.zeros_like(share)
         goal[short] = _least_squares(pull[:, short], sign[short], strength)
-        ahead, step = goal[short] @ pull - sums, 1.0
+        ahead = goal[short] @ pull - sums
+        step = 1.0
         if np.array_equal(np.flatnonzero(_short(sign, sums + ahead)), short):
             return goal
         here = loss(share, sums)
         while step > LEAST_STEP and loss(share + step * (goal - share), sums + step * ahead) > here:
             step /= 2
-        share, sums = share + step * (goal - share), sums + step * ahead
+        share = share + step * (goal - share)
+        sums = sums + step * ahead
     return share
 
 
@@ -275,7 +279,8 @@ def rounded(weight: FloatArray, spikes: FloatArray, most: int) -> FloatArray:
     order = np.argsort(-np.diag(alike), kind="stable")
     alike += RIDGE * np.diag(alike).mean() * np.eye(len(alike))
     pull = np.linalg.cholesky(np.linalg.inv(alike[order[:, None], order])).T
-    left, whole = weight[:, order], np.zeros_like(weight)
+    left = weight[:, order]
+    whole = np.zeros_like(weight)
     for n, place in enumerate(order):
         whole[:, place] = np.clip(np.rint(left[:, n]), -most, most)
         missing = (left[:, n] - whole[:, place]) / pull[n, n]
@@ -295,7 +300,8 @@ def counters_of(data: Counted, fitted: Fitted, recordings: Recordings, classes: 
     Half of its ramp leads from the largest sum that the training recordings ever reach down to the lowest that may win.
     The other half is for lower ones: noise lowers all sums.
     """
-    plan, most = data.plan, (1 << (data.plan.bits - 1)) - 1
+    plan = data.plan
+    most = (1 << (data.plan.bits - 1)) - 1
     unit = float(np.abs(fitted.rule.weight).max()) / most
     weight = np.rint(fitted.rule.weight / unit)
     if plan.bits < BITS[-1]:  # as few levels as these need to make up for each other

@@ -19,7 +19,8 @@ TEST_BATCH = 2  # larger batches outgrow the cache
 
 def evaluate(network: torch.nn.Module, recordings: Recordings, recipe: Recipe = RELEASED) -> tuple[float, int]:
     """Mean loss, and how many recordings are classified correctly; equal top rates count for the lowest class."""
-    loss, correct = 0.0, 0
+    loss = 0.0
+    correct = 0
     with torch.no_grad():
         for chosen, events in _batches(recordings):
             labels = recordings.labels[chosen]
@@ -33,7 +34,8 @@ def _batches(recordings: Recordings) -> Iterator[tuple[slice, EventArray]]:
     """All recordings in order, a few of one length at a time: where they stand, and their events without filling."""
     start = 0
     while start < len(recordings):
-        steps, stop = recordings.steps_of(start), start + 1
+        steps = recordings.steps_of(start)
+        stop = start + 1
         while stop < min(start + TEST_BATCH, len(recordings)) and recordings.steps_of(stop) == steps:
             stop += 1
         yield slice(start, stop), recordings.events[start:stop, ..., :steps]

@@ -162,7 +162,8 @@ def _epoch(
 ) -> TunedEpoch:
     order = draw.permutation(len(training))
     steps = math.ceil(len(order) / BATCH)
-    total, correct = 0.0, 0
+    total = 0.0
+    correct = 0
     for step in range(steps):
         set_rate(optimizer, rate * 0.5 * (1 + math.cos(math.pi * (index * steps + step) / (epochs * steps))))
         chosen = order[step * BATCH : (step + 1) * BATCH]

@@ -87,7 +87,8 @@ def kind_of(system: str) -> Kind:
 
 def seen_by(plan: Plan) -> FloatArray:
     """What the first layer sees; systems of a single chip convolve as TactileSGNet does."""
-    taxels, system = plan.graph.n_taxels, plan.system if plan.system in SYSTEMS else TACTILESGNET
+    taxels = plan.graph.n_taxels
+    system = plan.system if plan.system in SYSTEMS else TACTILESGNET
     return propagation_of(system, plan.graph.edges, taxels, plan.grid, filters_of(system, taxels, plan.recipe.hops))
 
 

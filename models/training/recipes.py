@@ -79,7 +79,8 @@ class Recipe:
 
         Decays are the nearest that the chip's registers hold: what is trained with them need not be rounded.
         """
-        betas, alphas = dict(self.betas), dict(self.alphas)
+        betas = dict(self.betas)
+        alphas = dict(self.alphas)
         return Dynamics(
             betas=tuple(held_decays(betas.get(name, beta), 0.0)[0] for name in layers) if betas else (),
             alphas=tuple(held_decays(beta, alphas.get(name, 0.0))[1] for name in layers) if alphas else (),

@@ -86,7 +86,8 @@ def restore(
                 f"{path}: belongs to a training with other {', '.join(differing)[:100]}; give the same options and "
                 "data, or delete it to train anew"
             )
-        kinds, figures = get_type_hints(epoch), state["history"]
+        kinds = get_type_hints(epoch)
+        figures = state["history"]
         right = all({name: type(value) for name, value in each.items()} == kinds for each in figures)
         if not right or [each["epoch"] for each in figures] != [*range(1, min(len(figures), options["epochs"]) + 1)]:
             raise FileFault("has no usable history")

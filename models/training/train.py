@@ -174,7 +174,8 @@ def train(
 
 def _optimizer_of(recipe: Recipe, network: torch.nn.Module) -> torch.optim.Optimizer:
     """Optimizer of a recipe on the parameters of a network."""
-    rate, parameters = recipe.learning_rate, network.parameters()
+    rate = recipe.learning_rate
+    parameters = network.parameters()
     if recipe.optimizer == ADAMW:
         return torch.optim.AdamW(parameters, lr=rate, weight_decay=recipe.weight_decay, amsgrad=True, fused=True)
     return torch.optim.Adam(parameters, lr=rate, amsgrad=True, fused=True)
@@ -197,7 +198,8 @@ def _train_epoch(
     *,
     epoch: int,
 ) -> float:
-    total, order = 0.0, draw.permutation(len(recordings))
+    total = 0.0
+    order = draw.permutation(len(recordings))
     for step, start in enumerate(range(0, len(order), recipe.batch), 1):
         chosen = order[start : start + recipe.batch]
         if course is not None:
@@ -232,7 +234,8 @@ def _require_options(epochs: int, decay_epochs: int, seed: int) -> None:
 def _require_suited(recordings: Recordings, architecture: Sizes) -> None:
     """Refuse recordings of another sensor, or of more classes than a network has."""
     where = f"{recordings.source}: split {recordings.split!r}"
-    found, wanted = recordings.events.shape[1:3], (architecture.taxels, architecture.channels)
+    found = recordings.events.shape[1:3]
+    wanted = (architecture.taxels, architecture.channels)
     if found != wanted:
         raise DataError(
             f"{where}: {found[0]} taxels and {found[1]} polarities, the network has {wanted[0]} and {wanted[1]}; "

@@ -52,7 +52,8 @@ class _Integrate(torch.autograd.Function):
 
 @numba.njit(cache=True)
 def _run_step(current: Any, held: Any, threshold: Any, floor: Any, spikes: Any, membrane: Any) -> None:
-    zero, one = np.float32(0), np.float32(1)
+    zero = np.float32(0)
+    one = np.float32(1)
     for i in range(len(held)):
         m = held[i] + current[i]
         fires = m >= threshold[i]
@@ -74,7 +75,8 @@ def _run(current: Any, threshold: Any, floor: Any, spikes: Any, membrane: Any) -
 def _differentiate_step(
     above: Any, membrane: Any, later: Any, threshold: Any, floor: Any, width: Any, smooth: bool, out: Any
 ) -> None:
-    zero, one = np.float32(0), np.float32(1)
+    zero = np.float32(0)
+    one = np.float32(1)
     for i in range(len(membrane)):
         m = membrane[i]
         far = abs(m / threshold[i] - one) / width
@@ -99,5 +101,6 @@ def block_sums(spikes: Tensor, weight: Tensor) -> Tensor:
     `spikes` (steps, samples, blocks * width) are zeros and ones, the inputs of a block side by side; with `weight`
     (blocks, width, size) they give (steps, samples, blocks * size).
     """
-    blocks, nothing = spikes.chunk(len(weight), dim=2), torch.zeros(weight.shape[2])
+    blocks = spikes.chunk(len(weight), dim=2)
+    nothing = torch.zeros(weight.shape[2])
     return torch.cat([spike_linear(*block, nothing) for block in zip(blocks, weight, strict=True)], dim=2)

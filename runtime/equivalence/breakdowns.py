@@ -77,7 +77,8 @@ def _fallen(name: str, before: IntArray, after: IntArray, ids: IntArray) -> list
 def undecided(before: IntArray, after: IntArray, files: Sequence[str]) -> list[Breakdown]:
     """Decisions that say nothing about the recording; votes (samples, classes) of the reference and of the chip."""
     found = []
-    decided, wanted = vote(after), vote(before)
+    decided = vote(after)
+    wanted = vote(before)
     if len(set(decided)) == 1 and len(set(wanted)) > 1:
         text = f"the chip decides class {decided[0]} for every recording, the float model {len(set(wanted))} classes"
         found.append(Breakdown(kind="one class", layer=None, count=len(decided), text=text))

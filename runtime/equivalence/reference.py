@@ -60,7 +60,8 @@ def _timing(clocks: Clocks, bins: int) -> dict[str, int]:
 def reference_of(model: Factored | Network) -> Callable[[EventArray], list[BoolArray]]:
     """What gives the spikes of each layer in float32: of a checkpoint in its own operator order, else synapse sums."""
     if isinstance(model, Network):
-        clocks, ready = model.input.clocks, float_simulation(model, np.float32)
+        clocks = model.input.clocks
+        ready = float_simulation(model, np.float32)
         return lambda events: list(ready.run(channels_last(events, clocks)).spikes)
     from spikeloom.models.networks.reference import float_spikes
 
@@ -72,8 +73,12 @@ def votes_so_far(network: Network, model: Factored | Network, data: Recordings) 
 
     `network` is the model's float stage.
     """
-    lengths, votes, reference, progress = data.step_counts, [], reference_of(model), Progress(len(data))
-    readout, neurons = network.readout, sum(population.size for population in network.populations)
+    lengths = data.step_counts
+    votes = []
+    reference = reference_of(model)
+    progress = Progress(len(data))
+    readout = network.readout
+    neurons = sum(population.size for population in network.populations)
     for part in parts_of(len(data), data.steps * neurons):
         progress(part.start, "float model")
         spikes = reference(data.events[part])[readout.population]

@@ -44,7 +44,8 @@ def wins(decisions: IntArray, least: IntArray, most: IntArray) -> BoolArray:
     >>> wins(np.array([0, 0, 0]), least, most).tolist()
     [True, False, True]
     """
-    rows, classes = np.arange(len(decisions)), np.arange(least.shape[1])
+    rows = np.arange(len(decisions))
+    classes = np.arange(least.shape[1])
     ahead = least[rows, decisions][:, None] - most
     ahead[rows, decisions] = 0  # no class has to beat itself
     return np.asarray(np.all(ahead >= (classes < decisions[:, None]), axis=1))

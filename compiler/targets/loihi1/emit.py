@@ -83,7 +83,8 @@ def emit(
     parts: dict[str, list[AnyArray]] = {key: [] for key in ("source", "format", "length", "target", "weight")}
     needs = core_needs.Needs(network, target)
     for core, chunks in enumerate(cores):
-        base, lean = 0, needs.lean(chunks)
+        base = 0
+        lean = needs.lean(chunks)
         for chunk in chunks:
             index = core_needs.index_bits(base + chunk.size - 1, target)
             for lists in needs.lists(chunk):

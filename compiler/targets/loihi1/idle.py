@@ -41,14 +41,20 @@ class Forgotten:
 
 def forgotten(netlist: Netlist) -> Forgotten:
     """Bound a netlist's registers step by step; OptionError if some never decay, or take too long."""
-    n, sent = netlist.n_compartments, netlist.axon_source[netlist.axon_of_synapse()] - netlist.n_inputs
-    inner, weight = sent >= 0, netlist.effective_weight() << MEMBRANE_SHIFT
+    n = netlist.n_compartments
+    sent = netlist.axon_source[netlist.axon_of_synapse()] - netlist.n_inputs
+    inner = sent >= 0
+    weight = netlist.effective_weight() << MEMBRANE_SHIFT
     pairs = netlist.synapse_compartment()[inner], sent[inner]
     less, more = (sparse.csr_array((part(weight[inner], 0), pairs), shape=(n, n)) for part in (np.minimum, np.maximum))
-    reached, threshold = reach(netlist), netlist.threshold << MEMBRANE_SHIFT
-    most, bias = np.minimum(reached.current, CURRENT_MAX), netlist.bias_mantissa << netlist.bias_exponent
-    current, ends = np.stack([-most, most]), np.minimum(reached.stored, MEMBRANE_MAX)
-    membrane, spikes = np.stack([-ends, threshold]), np.repeat([[False], [True]], n, axis=1)
+    reached = reach(netlist)
+    threshold = netlist.threshold << MEMBRANE_SHIFT
+    most = np.minimum(reached.current, CURRENT_MAX)
+    bias = netlist.bias_mantissa << netlist.bias_exponent
+    current = np.stack([-most, most])
+    ends = np.minimum(reached.stored, MEMBRANE_MAX)
+    membrane = np.stack([-ends, threshold])
+    spikes = np.repeat([[False], [True]], n, axis=1)
     for step in range(MOST_BLANK + 1):
         before, (sure, may) = (current, membrane, spikes), spikes.astype(np.int64)
         sums = np.stack([more @ sure + less @ may, less @ sure + more @ may])

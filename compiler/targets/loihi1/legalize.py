@@ -73,7 +73,8 @@ def stored_once(form: IntArray, lengths: IntArray, place: IntArray, weight: IntA
     place = place.astype(np.int32)
     first = np.minimum.reduceat(np.append(place, np.int32(1 << 30)), bounds[:-1])  # Of an empty list anything
     alike = (place - np.repeat(first, lengths) << WEIGHT_BITS) + weight
-    content, size = alike.astype(np.int32).tobytes(), 4 * bounds
+    content = alike.astype(np.int32).tobytes()
+    size = 4 * bounds
     seen: dict[tuple[int, int, bytes], int] = {}
     copy = first // (target.limit("core.dense_base") + 1)
     columns = (form, copy, size[:-1], size[1:])

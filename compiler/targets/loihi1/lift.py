@@ -56,12 +56,15 @@ def lift(netlist: Netlist) -> IntegerNetwork:
             )
         )
     axon = netlist.axon_of_synapse()
-    source, form = netlist.axon_source[axon], netlist.axon_format[axon]
+    source = netlist.axon_source[axon]
+    form = netlist.axon_format[axon]
     target = netlist.synapse_compartment()
     pre = np.concatenate([np.full(netlist.n_inputs, INPUT), netlist.layer])[source]
     column = np.concatenate([np.arange(netlist.n_inputs), netlist.neuron])[source]
-    post, row = netlist.layer[target], netlist.neuron[target]
-    exponent, bits = netlist.format_exponent[form], netlist.format_weight_bits[form]
+    post = netlist.layer[target]
+    row = netlist.neuron[target]
+    exponent = netlist.format_exponent[form]
+    bits = netlist.format_weight_bits[form]
     sizes = {INPUT: netlist.n_inputs} | {i: layer.neurons for i, layer in enumerate(netlist.layers)}
     projections = []
     code = ((post * (len(netlist.layers) + 1) + pre + 1) * 64 + exponent + 32) * 16 + bits  # one number sorts faster

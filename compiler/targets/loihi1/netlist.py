@@ -165,7 +165,8 @@ class Netlist(netlist_file.Netlist):
         """Synapses of one core: source, compartment and effective weight of each; all (synapses of the core,) int64."""
         axons = slice(*self.core_axons[core : core + 2].tolist())
         ends = self.axon_synapses[axons.start : axons.stop + 1]
-        held, length = slice(*ends[[0, -1]].tolist()), np.diff(ends)
+        held = slice(*ends[[0, -1]].tolist())
+        length = np.diff(ends)
         exponent = np.repeat(self.format_exponent[self.axon_format[axons]], length)
         return (
             np.repeat(self.axon_source[axons], length),
@@ -190,7 +191,8 @@ def one_step_bounds(netlist: Netlist) -> tuple[IntArray, IntArray]:
     No order of arrival and no input can bring a running sum outside ``-negative … positive``: it is reached when
     every positive (negative) synapse is hit at once. Both are magnitudes, (compartments,), in weight units.
     """
-    compartment, weight = netlist.synapse_compartment(), netlist.effective_weight()
+    compartment = netlist.synapse_compartment()
+    weight = netlist.effective_weight()
     # float64 sums of integers below 2**53 are exact
     both = [np.bincount(compartment, np.maximum(each, 0), netlist.n_compartments) for each in (weight, -weight)]
     return both[0].astype(np.int64), both[1].astype(np.int64)
@@ -211,7 +213,8 @@ def reach(netlist: Netlist) -> Reach:
     up, down = (largest_current(sums, netlist.decay_u) for sums in bounds)
     bias = netlist.bias_mantissa << netlist.bias_exponent
     # a membrane is left at the threshold at most; below zero it loses as much as it can gain at the far end
-    above, lost = np.maximum(netlist.threshold << MEMBRANE_SHIFT, 0), netlist.decay_v
+    above = np.maximum(netlist.threshold << MEMBRANE_SHIFT, 0)
+    lost = netlist.decay_v
     gained = down + np.maximum(-bias, 0)
     endless = np.where(gained > 0, MEMBRANE_MAX + 1, 0)
     below = np.where(lost > 0, (gained << DECAY_BITS) // np.maximum(lost, 1), endless)
@@ -236,7 +239,9 @@ LAYER: Kind = {
 
 def inconsistencies(netlist: Netlist) -> list[str]:
     """Say what in a netlist points nowhere: a file can match its hash and still be nonsense."""
-    compartments, axons, synapses = netlist.n_compartments, netlist.n_axons, netlist.n_synapses
+    compartments = netlist.n_compartments
+    axons = netlist.n_axons
+    synapses = netlist.n_synapses
     formats = len(netlist.format_exponent)
     bounds = {
         "core_compartments": (netlist.n_cores, compartments),

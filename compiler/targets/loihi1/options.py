@@ -57,7 +57,8 @@ class Options:
 
     def require_consistent(self, *, calibrated: bool) -> None:
         """Refuse options that contradict each other; `calibrated` where there are, or will be, training events."""
-        fine_tuned, packings = self.forms is not None, self.packings or (Packing(),)
+        fine_tuned = self.forms is not None
+        packings = self.packings or (Packing(),)
         plain = len(packings) == 1 and packings[0] == Packing(bits=packings[0].bits)
         without_evidence = not calibrated or self.keep_all or fine_tuned
         for refused, why in (

@@ -87,7 +87,8 @@ def _expand(done: Compilation) -> Compilation:
 
 @step("runs the float network on training recordings, where there are any", keeps="the network")
 def _calibrate(done: Compilation) -> Compilation:
-    options, events = done.options, done.options.training_events
+    options = done.options
+    events = done.options.training_events
     if events is None:
         return done
     if not (options.spike_exact or options.prune_unused):
@@ -119,7 +120,9 @@ def _disconnect(done: Compilation) -> Compilation:
     keeps="the decisions, as well as the width allows; every training spike where --spike-exact succeeds",
 )
 def _quantize(done: Compilation) -> Compilation:
-    options, network, target = done.options, done.connected, done.target
+    options = done.options
+    network = done.connected
+    target = done.target
     if options.chooses:
         return _cheapest(done)
     packings = options.packings or (Packing(),)
@@ -139,13 +142,19 @@ def _quantize(done: Compilation) -> Compilation:
 
 def _cheapest(done: Compilation) -> Compilation:
     """Round to the cheapest storage that keeps decisions of held-out recordings, or to the one that keeps most."""
-    options, network, few = done.options, done.network, done.calibration
-    events, keep = options.training_events, options.keep
+    options = done.options
+    network = done.network
+    few = done.calibration
+    events = options.training_events
+    keep = options.keep
     if events is None or keep is None or few is None or len(events) < 2:
         return _quantize.apply(replace(done, options=replace(options, keep=None)))
     _, several, held = held_out.split(len(events))
-    judge, many = HeldOut(network, events[held]), None
-    best, most, trials = done, -1, list[Trial]()
+    judge = HeldOut(network, events[held])
+    many = None
+    best = done
+    most = -1
+    trials = list[Trial]()
     for packing in held_out.ladder(done.target):
         if many is None and (packing.planes > 1 or options.prune_unused):
             chosen = events[calibration.evenly_spaced(several, calibration.MANY)]
@@ -169,7 +178,8 @@ def _cheapest(done: Compilation) -> Compilation:
         )
         trials.append(measured)
         if measured.equal > most:
-            best, most = tried, measured.equal
+            best = tried
+            most = measured.equal
         if most >= keep * len(judge):
             break
     rounded = {"integer": best.integer, "choices": best.choices, "connected": LATER}
@@ -195,7 +205,8 @@ def _prove(done: Compilation) -> Compilation:
     keeps="every spike of the neurons that are left, on any input",
 )
 def _remove(done: Compilation) -> Compilation:
-    integer, network = done.integer, done.network
+    integer = done.integer
+    network = done.network
     none = prune.none_of(integer)
     silent, unread = (none, none) if done.options.keep_all else prune.removable(integer)
     silent = prune.either(silent, done.gone or none)

@@ -156,7 +156,8 @@ class Draft:
             (first[core] + number, self.cores[end].x, self.cores[end].y, line, delay)
             for core, number, end, line, delay in self.wires
         ]
-        label, opens = np.full(len(neurons), -1), np.zeros(len(neurons), np.int64)
+        label = np.full(len(neurons), -1)
+        opens = np.zeros(len(neurons), np.int64)
         for core, number, voted, tick in self.votes:
             label[first[core] + number], opens[first[core] + number] = voted, tick
         weights = [(*neuron.weights, *[0] * (AXON_TYPES - len(neuron.weights))) for neuron, _, _ in neurons]

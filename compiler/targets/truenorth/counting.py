@@ -92,7 +92,8 @@ def lower_counters(counters: Counters, chip: Target, *, provenance: Mapping[str,
     plan = planned(counters, chip)
     draft = Draft()
     reached = _sums(draft, plan, _votes(draft, plan, chip))
-    channels, source = counters.taxels * counters.polarities, _sources(counters)
+    channels = counters.taxels * counters.polarities
+    source = _sources(counters)
     wanted = list[Wanted]()
     for n in np.argsort(source, kind="stable").tolist():
         made = Neuron(threshold=int(counters.counter[n, 2]), reset=-BLOCK, negative_threshold=BLOCK)
@@ -123,9 +124,13 @@ def _least(counters: Counters) -> int:
 
 def _votes(draft: Draft, plan: Plan, chip: Target) -> dict[Place, Place]:
     """Add the votes; returns the axon that each sum reaches, by its group and its place in the group."""
-    counters, ends = plan.counters, dict[Place, Place]()
-    used, first, slope = plan.magnitude.sum(axis=2) > 0, plan.first["votes"], int(counters.slope)
-    core, lowest = draft.core(), (1 << chip.limit("neuron.threshold_bits")) - 1
+    counters = plan.counters
+    ends = dict[Place, Place]()
+    used = plan.magnitude.sum(axis=2) > 0
+    first = plan.first["votes"]
+    slope = int(counters.slope)
+    core = draft.core()
+    lowest = (1 << chip.limit("neuron.threshold_bits")) - 1
     for label in range(counters.classes):
         own = np.argwhere(used[:, 2 * label : 2 * label + 2]).tolist()
         if len(draft.cores[core].axons) + len(own) > chip.limit("core.axons"):
@@ -150,7 +155,8 @@ def _sums(draft: Draft, plan: Plan, ends: Mapping[Place, Place]) -> list[list[Pl
     """Add the sums, which reach the axons `ends`; returns the axons that each counter reaches."""
     reached = [list[Place]() for _ in plan.counters.counter]
     for number, group in enumerate(plan.groups):
-        core, rows = draft.core(), sorted(row for each, row in ends if each == number)
+        core = draft.core()
+        rows = sorted(row for each, row in ends if each == number)
         for row in rows:
             held = Neuron(weights=MAGNITUDES, reset_mode=RESET_LINEAR)
             added = draft.neuron(core, held, layer="sums", number=number * plan.magnitude.shape[1] + row)
@@ -163,7 +169,8 @@ def _sums(draft: Draft, plan: Plan, ends: Mapping[Place, Place]) -> list[list[Pl
 
 def _filled(draft: Draft, chip: Target, layer: str, wanted: Iterable[Wanted]) -> list[tuple[int, Place]]:
     """Add neurons; gives each source and an axon that waits for it."""
-    neurons, axons = chip.limit("core.neurons"), chip.limit("core.axons")
+    neurons = chip.limit("core.neurons")
+    axons = chip.limit("core.axons")
     awaited = defaultdict[int, dict[int, list[int]]](dict)  # neurons of each core by the source that they wait for
     for made, number, end, sources in wanted:
         for core, held in enumerate(draft.cores):
@@ -187,21 +194,26 @@ def run_counters(plan: Plan, events: EventArray) -> dict[str, BoolArray]:
 
     Step s of a layer is the tick ``s`` after its first, see :attr:`Plan.first`.
     """
-    counters, first, steps = plan.counters, plan.first, events.shape[-1]
+    counters = plan.counters
+    first = plan.first
+    steps = events.shape[-1]
     active = with_clocks(events[None], counters.clocks)[0].T > 0
-    channels, spikes = counters.taxels * counters.polarities, dict[str, BoolArray]()
+    channels = counters.taxels * counters.polarities
+    spikes = dict[str, BoolArray]()
     source = active[:, :channels]
     if counters.parts > 1:
         source = (active[:, channels:, None] & source[:, None]).reshape(steps, -1)
         spikes["gates"] = source
-    seen, count = source[:, _sources(counters)], counters.counter[:, 2]
+    seen = source[:, _sources(counters)]
+    count = counters.counter[:, 2]
     over = np.cumsum(seen, axis=0) - count
     spikes["counters"] = seen & (over >= 0) & (over % (count + BLOCK) == 0)
 
     late = first["votes"] - first["sums"]
     arriving = np.zeros((steps + late, plan.magnitude.shape[0] * plan.magnitude.shape[1]), np.int64)
     arriving[:steps] = spikes["counters"].astype(np.int64) @ plan.magnitude.reshape(arriving.shape[1], -1).T
-    sent, held = np.zeros(arriving.shape, np.bool_), np.zeros(arriving.shape[1], np.int64)
+    sent = np.zeros(arriving.shape, np.bool_)
+    held = np.zeros(arriving.shape[1], np.int64)
     for tick, more in enumerate(arriving):
         held += more
         sent[tick] = held > 0

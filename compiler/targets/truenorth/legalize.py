@@ -69,20 +69,29 @@ def _beyond(values: IntArray, low: int, high: int) -> BoolArray:
 
 
 def _cores(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
-    x, y, right, top = netlist.core_x, netlist.core_y, chip.limit("mesh.width") - 1, chip.limit("mesh.height") - 1
-    off, mesh = _beyond(x, 0, right) | _beyond(y, 0, top), f"x 0 … {right} and y 0 … {top}"
+    x = netlist.core_x
+    y = netlist.core_y
+    right = chip.limit("mesh.width") - 1
+    top = chip.limit("mesh.height") - 1
+    off = _beyond(x, 0, right) | _beyond(y, 0, top)
+    mesh = f"x 0 … {right} and y 0 … {top}"
     yield off, lambda core: f"at ({x[core]}, {y[core]})", mesh, "mesh", "place it on the mesh"
-    neurons, axons = np.diff(netlist.core_neurons), np.diff(netlist.core_axons)
+    neurons = np.diff(netlist.core_neurons)
+    axons = np.diff(netlist.core_axons)
     most = chip.limit("core.neurons")
     yield neurons > most, lambda core: f"{neurons[core]} neurons", str(most), "core.neurons", "use more cores"
-    most, remedy = chip.limit("core.axons"), "fewer inputs or copies of inputs, or more cores"
+    most = chip.limit("core.axons")
+    remedy = "fewer inputs or copies of inputs, or more cores"
     yield axons > most, lambda core: f"{axons[core]} axons", str(most), "core.axons", remedy
 
 
 def _axons(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
-    line, kind = netlist.axon_line, netlist.axon_type
-    lines, kinds = chip.limit("core.axons") - 1, chip.limit("core.axon_types") - 1
-    off, odd = _beyond(line, 0, lines), _beyond(kind, 0, kinds)
+    line = netlist.axon_line
+    kind = netlist.axon_type
+    lines = chip.limit("core.axons") - 1
+    kinds = chip.limit("core.axon_types") - 1
+    off = _beyond(line, 0, lines)
+    odd = _beyond(kind, 0, kinds)
     yield off, lambda axon: f"line {line[axon]}", f"0 … {lines}", "core.axons", "use a line of the core"
     yield odd, lambda axon: f"type {kind[axon]}", f"0 … {kinds}", "core.axon_types", "use one of the types"
 
@@ -111,7 +120,8 @@ def _neurons(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
     ends = np.unique(np.stack([netlist.wire_neuron, netlist.wire_x, netlist.wire_y]), axis=1)
     wires, cores = (np.bincount(each, minlength=netlist.n_neurons) for each in (netlist.wire_neuron, ends[0]))
     one = str(limit), "neuron.targets"
-    many, out = wires > limit, (wires > 0) & (netlist.readout_class >= 0)
+    many = wires > limit
+    out = (wires > 0) & (netlist.readout_class >= 0)
     yield many & (cores > 1), lambda n: f"targets on {cores[n]} cores without a splitter", *one, RELAYS
     one_axon = f"let one axon reach all neurons, {RELAYS}"
     yield many & (cores == 1), lambda n: f"{wires[n]} targets on one core", *one, one_axon
@@ -119,11 +129,15 @@ def _neurons(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
 
 
 def _wires(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
-    delay, longest = netlist.wire_delay, chip.limit("neuron.delay")
-    late, ticks = _beyond(delay, 1, longest), f"1 … {longest} ticks"
+    delay = netlist.wire_delay
+    longest = chip.limit("neuron.delay")
+    late = _beyond(delay, 1, longest)
+    ticks = f"1 … {longest} ticks"
     yield late, lambda wire: f"delay {delay[wire]}", ticks, "neuron.delay", "add relays for longer ways"
-    source, reach = netlist.core_of_neuron()[netlist.wire_neuron], chip.limit("mesh.reach")
-    across, up = netlist.core_x[source] - netlist.wire_x, netlist.core_y[source] - netlist.wire_y
+    source = netlist.core_of_neuron()[netlist.wire_neuron]
+    reach = chip.limit("mesh.reach")
+    across = netlist.core_x[source] - netlist.wire_x
+    up = netlist.core_y[source] - netlist.wire_y
     far = np.maximum(np.abs(across), np.abs(up))
     remedy = "place the cores nearer to each other"
     yield far > reach, lambda wire: f"{far[wire]} cores away", str(reach), "mesh.reach", remedy
@@ -140,7 +154,8 @@ def needs(network: Network, chip: Target) -> tuple[Violation, ...]:
 
 def _needs_of(network: Network, layer: int, chip: Target) -> Iterator[tuple[str, str, str, str, str]]:
     """Owner, what is needed, what is allowed, the rule, and what to do."""
-    population, axons = network.populations[layer], chip.limit("core.axons")
+    population = network.populations[layer]
+    axons = chip.limit("core.axons")
     name = population.name
     everyone = f"{name}, all {population.size:,} neurons"
     if 0 < population.beta < 1:
@@ -155,9 +170,11 @@ def _needs_of(network: Network, layer: int, chip: Target) -> Iterator[tuple[str,
         remedy = "split the sum, or give the layer fewer inputs"
         yield _worst(name, inputs, axons), f"{most:,} inputs", str(axons), "core.axons", remedy
     copies = min(max(axons // max(most, 1), 1), chip.limit("core.axon_types"))
-    distinct, allowed = _distinct_weights(network, layer), 2**copies - 1
+    distinct = _distinct_weights(network, layer)
+    allowed = 2**copies - 1
     if distinct.max(initial=0) > allowed:
-        where, found = _worst(name, distinct, allowed), f"{distinct.max():,} different weights"
+        where = _worst(name, distinct, allowed)
+        found = f"{distinct.max():,} different weights"
         beside = f"{allowed} with {copies} axon{'s' * (copies > 1)} an input"
         remedy = "fewer weights, or each input on several axons of different types"
         yield where, found, beside, "neuron.weight_bits", remedy

@@ -126,7 +126,8 @@ def faults(network: NativeNetwork) -> list[str]:
     """What in a network contradicts itself or the rules above; empty if it can be placed."""
     if network.copies not in BASES:
         return [f"{network.copies} copies of an input, allowed are {', '.join(map(str, BASES))}"]
-    found, fan_in = [], network.taxels * network.polarities
+    found = []
+    fan_in = network.taxels * network.polarities
     for depth, stage in enumerate(network.stages):
         found += [f"{stage.name}: {fault}" for fault in _stage_faults(network, stage, depth, fan_in)]
         fan_in = stage.neurons
@@ -157,7 +158,8 @@ def _stage_faults(network: NativeNetwork, stage: Stage, depth: int, fan_in: int)
 def lower(network: NativeNetwork, chip: Target, *, provenance: Mapping[str, Any] | None = None) -> CrossbarNetlist:
     """Place a network without faults; CapacityError if there are more cores than on the chip."""
     assert not faults(network), "networks are checked where they are read or made"
-    draft, ends = Draft(), None
+    draft = Draft()
+    ends = None
     for depth in range(len(network.stages) - 1, -1, -1):
         ends = _place(draft, network, depth, ends, chip.limit("core.neurons"))
     remedy = "train with fewer features or copies"
@@ -168,14 +170,18 @@ def _place(
     draft: Draft, network: NativeNetwork, depth: int, ends: list[list[Place]] | None, most: int
 ) -> list[list[Place]]:
     """Add the cores of a stage whose neurons reach the axons `ends`; returns those that each of its inputs reaches."""
-    stage, copies = network.stages[depth], network.copies
-    first_clock, width = network.taxels * network.polarities, stage.inputs.shape[1]
+    stage = network.stages[depth]
+    copies = network.copies
+    first_clock = network.taxels * network.polarities
+    width = stage.inputs.shape[1]
     reached: list[list[Place]] = [[] for _ in range(stage.inputs.size)]
     for block in range(stage.blocks):
-        points, offset = crossing_points(stage.level[block], BASES[copies]), block * stage.size
+        points = crossing_points(stage.level[block], BASES[copies])
+        offset = block * stage.size
         aims = [(n, end) for n in range(stage.size) for end in ([None] if ends is None else ends[offset + n])]
         for first in range(0, len(aims), most):
-            core, part = draft.core(), aims[first : first + most]
+            core = draft.core()
+            part = aims[first : first + most]
             for n, end in part:
                 made = _neuron(stage, offset + n, depth, copies)
                 number = draft.neuron(core, made, layer=stage.name, number=offset + n)

@@ -182,7 +182,9 @@ def _places(held: tuple[IntArray, IntArray], wanted: tuple[IntArray, IntArray]) 
 
 def inconsistencies(netlist: CrossbarNetlist) -> list[str]:
     """Say what in a network points nowhere, so that nothing could be made of it."""
-    cores, neurons, axons = netlist.n_cores, netlist.n_neurons, netlist.n_axons
+    cores = netlist.n_cores
+    neurons = netlist.n_neurons
+    axons = netlist.n_axons
     bounds = {
         "core_neurons": (cores, neurons),
         "core_axons": (cores, axons),
@@ -228,14 +230,16 @@ def unlike(netlist: CrossbarNetlist, due: CrossbarNetlist) -> list[str]:
     """Say what in a netlist is not as it is due, an entry for each field; what it remembers aside."""
     found = []
     for name in (*COMMON, *FILE.entries, *FILE.arrays):
-        ours, theirs = getattr(netlist, name), getattr(due, name)
+        ours = getattr(netlist, name)
+        theirs = getattr(due, name)
         if name not in FILE.arrays:
             if name != "provenance" and ours != theirs:
                 found.append(f"{name} is {ours} instead of {theirs}")
         elif ours.shape != theirs.shape:
             found.append(f"{name} has {len(ours):,} entries instead of {len(theirs):,}")
         elif len(other := np.argwhere(ours != theirs)):
-            first, more = tuple(other[0].tolist()), f", and {len(other) - 1:,} more" if len(other) > 1 else ""
+            first = tuple(other[0].tolist())
+            more = f", and {len(other) - 1:,} more" if len(other) > 1 else ""
             of = (name in PER_NEURON or name == "weight") and int(netlist.layer[first[0]])
             owner = "" if of is False else f" of {netlist.layers[of]} neuron {netlist.neuron[first[0]]}"
             found.append(f"{name}{list(first)}{owner} is {ours[first]} instead of {theirs[first]}{more}")

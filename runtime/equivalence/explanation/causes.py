@@ -58,7 +58,8 @@ def explain(
     ideal = run_float(network, events[None], membranes=True)
     truth, chip = ([spikes[0] for spikes in side.spikes] for side in (ideal, observed))
     none = [np.zeros(population.size, np.bool_) for population in network.populations]
-    absent, unread = absent or none, unread or none
+    absent = absent or none
+    unread = unread or none
     differs = [(a != b) & ~mute for a, b, mute in zip(truth, chip, unread, strict=True)]
     resets = [
         a & b if population.decay_u == 4095 else np.zeros_like(a)
@@ -120,14 +121,16 @@ def _name_causes(
     compensated: bool,
 ) -> list[results.RootCause]:
     """Causes of roots of one population, which are sorted by the length of what they remember."""
-    population, chip = network.populations[post], integer.populations[post]
+    population = network.populations[post]
+    chip = integer.populations[post]
     rows = np.array([root.neuron for root in roots])
     steps = np.array([root.step for root in roots])
     begins = np.array([root.begin for root in roots])
     variants = variants_of(network, integer, post, rows, compensated=compensated)
     weights = weights_into(network, integer, post, rows)
     inflows = np.stack([arrived @ weight.T for weight in weights])
-    fires, fired = ideal.spikes[post][0], observed.spikes[post][0]
+    fires = ideal.spikes[post][0]
+    fired = observed.spikes[post][0]
     threshold = chip.threshold[rows].astype(np.float64) * (1 << MEMBRANE_SHIFT)
     margins, early = run_variants(variants, threshold, inflows, begins, steps, (fires & fired)[:, rows])
 
@@ -146,7 +149,8 @@ def _name_causes(
     magnitude = population.theta + sums + np.abs(population.bias[rows])
     undecided = np.abs(membrane - population.theta) <= UNDECIDED * magnitude
     stored = [p for p in integer.projections if p.post == post]
-    bits, planes = max(p.bits for p in stored), len({p.exponent for p in stored})
+    bits = max(p.bits for p in stored)
+    planes = len({p.exponent for p in stored})
     found = []
     for i, root in enumerate(roots):
         held = not absent[root.neuron]
@@ -216,14 +220,16 @@ def sources_into(network: Network, integer: IntegerNetwork, post: int) -> tuple[
 
 def weights_into(network: Network, integer: IntegerNetwork, post: int, rows: IntArray) -> FloatArray:
     """Weights in membrane units into neurons of a population, (3, neurons, sources), by ``Variant.weights``."""
-    pres, scale = sources_into(network, integer, post), integer.populations[post].scale[rows]
+    pres = sources_into(network, integer, post)
+    scale = integer.populations[post].scale[rows]
     real, stored = (
         np.concatenate([summed(stage, pre, post)[rows].toarray() for pre in pres], axis=1)
         for stage in (network, integer)
     )
     real *= scale[:, None]
     planes = {(p.bits, p.exponent) for p in integer.projections if p.post == post}
-    bits, exponents = min(b for b, _ in planes), tuple(sorted({e for _, e in planes}))
+    bits = min(b for b, _ in planes)
+    exponents = tuple(sorted({e for _, e in planes}))
     clipped = np.abs(real) > reach(bits, exponents) * step_units(bits, exponents) * SLACK
     return np.stack([stored, real, np.where(clipped, real, stored)]) * (1 << MEMBRANE_SHIFT)
 
@@ -232,7 +238,9 @@ def variants_of(
     network: Network, integer: IntegerNetwork, post: int, rows: IntArray, *, compensated: bool
 ) -> list[Variant]:
     """What to run for neurons of a population: the netlist as it is, then without each deviation."""
-    wanted, chip, one = network.populations[post], integer.populations[post], 1 << DECAY_BITS
+    wanted = network.populations[post]
+    chip = integer.populations[post]
+    one = 1 << DECAY_BITS
     exact = wanted.bias[rows] * chip.scale[rows] * (1 << MEMBRANE_SHIFT)
     netlist = Variant(
         cause=results.UNKNOWN,
@@ -273,15 +281,20 @@ def run_variants(
         return np.array(values, np.float64)[:, None]
 
     bias = np.stack([v.bias for v in variants])
-    keep_u, keep_v = column([v.keep_u for v in variants]), column([v.keep_v for v in variants])
-    limit, which = column([v.limit for v in variants]), [v.weights for v in variants]
+    keep_u = column([v.keep_u for v in variants])
+    keep_v = column([v.keep_v for v in variants])
+    limit = column([v.limit for v in variants])
+    which = [v.weights for v in variants]
     length = steps - begins + 1
     place = np.arange(len(length))
-    u, v = np.zeros(bias.shape), np.zeros(bias.shape)
-    margins, early = np.zeros(bias.shape), np.zeros(bias.shape, np.bool_)
+    u = np.zeros(bias.shape)
+    v = np.zeros(bias.shape)
+    margins = np.zeros(bias.shape)
+    early = np.zeros(bias.shape, np.bool_)
     running = len(length)
     for k in range(int(length[0])):
-        u, v = keep_u * u[:, :running], keep_v * v[:, :running]
+        u = keep_u * u[:, :running]
+        v = keep_v * v[:, :running]
         for state in (u, v):
             np.trunc(state[:-1], out=state[:-1])
         u += inflows[:, begins[:running] + k, place[:running]][which]

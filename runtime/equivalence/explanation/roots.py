@@ -114,7 +114,8 @@ def _inherit(known: list[int], arisen: dict[int, int], connected: BoolArray) -> 
 
 def _count(sets: list[int], roots: int) -> tuple[list[int], list[int]]:
     """How many sets hold each root, and how many hold nothing else."""
-    held, alone = np.zeros(roots, np.int64), np.zeros(roots, np.int64)
+    held = np.zeros(roots, np.int64)
+    alone = np.zeros(roots, np.int64)
     width = -(-roots // 8)
     for start in range(0, len(sets), 1024):
         part = sets[start : start + 1024]

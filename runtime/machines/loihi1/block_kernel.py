@@ -171,7 +171,9 @@ def _sum_rows(builder: Any, tables: Any, active: Any, at: Any, block: Any, *, ma
     builder.branch(links)
 
     builder.position_at_end(links)
-    e, total, arrived = builder.phi(_WORD), builder.phi(_SUMS), builder.phi(_WORD)
+    e = builder.phi(_WORD)
+    total = builder.phi(_SUMS)
+    arrived = builder.phi(_WORD)
     for phi, value in ((e, begin), (total, _all(_SUMS, 0)), (arrived, _number(0))):
         phi.add_incoming(value, before)
     builder.cbranch(builder.icmp_signed("<", e, end), link, done)
@@ -184,7 +186,9 @@ def _sum_rows(builder: Any, tables: Any, active: Any, at: Any, block: Any, *, ma
     builder.branch(sources)
 
     builder.position_at_end(sources)
-    left, part, marked = builder.phi(_WORD), builder.phi(_SUMS), builder.phi(_WORD)
+    left = builder.phi(_WORD)
+    part = builder.phi(_SUMS)
+    marked = builder.phi(_WORD)
     for phi, value in ((left, both), (part, total), (marked, arrived)):
         phi.add_incoming(value, link)
     builder.cbranch(builder.icmp_unsigned("!=", left, _number(0)), source, link_end)
@@ -247,7 +251,8 @@ def _sum_listed(builder: Any, tables: Any, sources: Any, bounds: Any, block: Any
 
 def _decayed(builder: Any, old: Any, keep: Any, *, wide: bool) -> Any:
     """Emit the decay of 64 registers, rounding toward zero; `wide` where a product may leave 32 bits."""
-    zero, bits = _all(_STATES, 0), _all(_STATES, DECAY_BITS)
+    zero = _all(_STATES, 0)
+    bits = _all(_STATES, DECAY_BITS)
     below = builder.icmp_signed("<", old, zero)
     magnitude = builder.select(below, builder.sub(zero, old), old)
     if wide:
@@ -371,8 +376,10 @@ def _bits(typing: Any, word: Any) -> Any:
 
 def scratch_of(blocks: Blocks, channels: int, steps: int, *, membranes: bool) -> tuple[Scratch, Lasting | None]:
     """What recordings of up to so many steps are run in; networks without lasting currents do without the code."""
-    n_words, n_blocks = -(-channels // LANES), blocks.keep.size
-    widest, positions = max(n_words, int(np.diff(blocks.stage).max(initial=0))), n_blocks * LANES
+    n_words = -(-channels // LANES)
+    n_blocks = blocks.keep.size
+    widest = max(n_words, int(np.diff(blocks.stage).max(initial=0)))
+    positions = n_blocks * LANES
     scratch = Scratch(
         words=np.empty(steps * n_words, np.uint64),
         listed=np.empty(steps * widest * LANES + LISTED, np.int32),
@@ -390,11 +397,13 @@ def scratch_of(blocks: Blocks, channels: int, steps: int, *, membranes: bool) ->
 @compiled
 def _pack(events: AnyArray, steps: int, words: AnyArray) -> None:
     """Turn the events of a recording into words, channel after channel."""
-    n_words, columns = (events.shape[0] + LANES - 1) // LANES, events.shape[1]
+    n_words = (events.shape[0] + LANES - 1) // LANES
+    columns = events.shape[1]
     for at in range(steps * n_words):
         words[at] = 0
     for channel in range(events.shape[0]):
-        place, bit = channel >> 6, np.uint64(channel & 63)
+        place = channel >> 6
+        bit = np.uint64(channel & 63)
         whole = steps - steps % LANES
         for begin in range(0, whole, LANES):
             left = _gathered(events, channel * columns + begin)
@@ -408,7 +417,8 @@ def _pack(events: AnyArray, steps: int, words: AnyArray) -> None:
 @compiled
 def _list(words: AnyArray, start: int, width: int, steps: int, scratch: Scratch, count: AnyArray) -> None:
     """List the bits that are set in each step, and count them."""
-    listed, bounds = scratch.listed, scratch.bounds
+    listed = scratch.listed
+    bounds = scratch.bounds
     n = 0
     for t in range(steps):
         bounds[t] = n
@@ -445,13 +455,16 @@ def _block_runner(*, lasts: bool) -> Function:
         scratch: Scratch,
         lasting: Lasting | None,
     ) -> None:
-        listed, bounds = scratch.listed, scratch.bounds
-        begin, end = blocks.stage[s], blocks.stage[s + 1]
+        listed = scratch.listed
+        bounds = scratch.bounds
+        begin = blocks.stage[s]
+        end = blocks.stage[s + 1]
         rests = blocks.restful[block] != 0
         for t in range(steps):
             place = steps * begin + t * (end - begin) + block - begin
             kept = place * LANES if scratch.membranes.size else -1
-            at, last = start + t * width, bounds[t + 1]
+            at = start + t * width
+            last = bounds[t + 1]
             if not blocks.dense[s]:
                 if rests:
                     fired = restful(blocks, words, at, 0, block, scratch, lasting, place, kept)
@@ -472,16 +485,23 @@ _run_block, _run_lasting_block = (_block_runner(lasts=lasts) for lasts in (False
 @compiled
 def _run_stages(blocks: Blocks, inputs: IntArray, steps: int, scratch: Scratch, lasting: Lasting | None) -> None:
     """Let all stages integrate, one after the other, and count spikes and events."""
-    active, start, width, count = scratch.words, np.int64(0), (inputs.size + LANES - 1) // LANES, inputs
+    active = scratch.words
+    start = np.int64(0)
+    width = (inputs.size + LANES - 1) // LANES
+    count = inputs
     for s in range(blocks.stage.size - 1):
         _list(active, start, width, steps, scratch, count)
-        begin, end = blocks.stage[s], blocks.stage[s + 1]
+        begin = blocks.stage[s]
+        end = blocks.stage[s + 1]
         for block in range(begin, end):  # one after another: their rows and membranes stay in cache
             if lasting is not None and lasting.keep_u[block] != 0:
                 _run_lasting_block(blocks, s, block, steps, active, start, width, scratch, lasting)
             else:
                 _run_block(blocks, s, block, steps, active, start, width, scratch, None)
-        active, start, width, count = scratch.raster, steps * begin, end - begin, scratch.spikes[begin * LANES :]
+        active = scratch.raster
+        start = steps * begin
+        width = end - begin
+        count = scratch.spikes[begin * LANES :]
     _list(active, start, width, steps, scratch, count)
 
 
@@ -489,7 +509,8 @@ def _run_stages(blocks: Blocks, inputs: IntArray, steps: int, scratch: Scratch, 
 def _pack_compartments(blocks: Blocks, steps: int, words: AnyArray, out: AnyArray, inverse: Any) -> None:
     """Write bits into a (chip steps, words) array, compartment c at bit c % 64 of word c // 64."""
     for s in range(blocks.stage.size - 1):
-        begin, end = blocks.stage[s], blocks.stage[s + 1]
+        begin = blocks.stage[s]
+        end = blocks.stage[s + 1]
         for t in range(steps):
             for block in range(begin, end):
                 left = words[steps * begin + t * (end - begin) + block - begin]
@@ -497,7 +518,8 @@ def _pack_compartments(blocks: Blocks, steps: int, words: AnyArray, out: AnyArra
                     left = ~left & blocks.held[block]
                 row = t + blocks.depth[block]
                 if blocks.whole[block] >= 0:
-                    to, by = blocks.whole[block] >> 6, np.uint64(blocks.whole[block] & 63)
+                    to = blocks.whole[block] >> 6
+                    by = np.uint64(blocks.whole[block] & 63)
                     out[row, to] |= left << by
                     rest = left >> np.uint64(1) >> (np.uint64(LANES - 1) - by)  # a shift by 64 is not defined
                     if rest:
@@ -512,7 +534,8 @@ def _pack_compartments(blocks: Blocks, steps: int, words: AnyArray, out: AnyArra
 @compiled
 def _count_idle(blocks: Blocks, block: int, s: int, steps: int, idle: AnyArray) -> int:
     """Idle compartment-steps of a block of a stage."""
-    begin, width = blocks.stage[s], blocks.stage[s + 1] - blocks.stage[s]
+    begin = blocks.stage[s]
+    width = blocks.stage[s + 1] - blocks.stage[s]
     total = 0
     for t in range(steps):
         total += _bits(idle[steps * begin + t * width + block - begin])

@@ -64,7 +64,8 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
     if len(rows) * LANES * 2 > SPARE + BYTES_A_SYNAPSE * netlist.n_synapses:
         return "synapses too scattered for rows of 64"
     row_block, row_source = np.divmod(rows, width)
-    net, reached = np.zeros(len(rows) * LANES, np.int16), np.zeros(len(rows), np.uint64)
+    net = np.zeros(len(rows) * LANES, np.int16)
+    reached = np.zeros(len(rows), np.uint64)
     row = np.searchsorted(rows, pair)
     # of several synapses of one entry, what leaves 16 bits on the way comes back into them
     np.add.at(net, row * LANES + lane, netlist.effective_weight().astype(np.int16))
@@ -78,7 +79,8 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
     np.bitwise_or.at(linked, link, _bit(row_source % LANES))
 
     size = len(seats.layer) * LANES
-    bias, threshold = np.zeros(size, np.int32), np.full(size, NEVER, np.int32)
+    bias = np.zeros(size, np.int32)
+    threshold = np.full(size, NEVER, np.int32)
     bias[seats.position] = netlist.bias_mantissa << netlist.bias_exponent
     threshold[seats.position] = netlist.threshold << MEMBRANE_SHIFT
     compartment = np.full(size, -1)
@@ -123,7 +125,8 @@ class _Seats(NamedTuple):
 def _seats(netlist: Netlist) -> _Seats:
     """Seat compartments by depth, layer and neuron; a layer begins a block, and so does another decay within it."""
     depth = np.array([layer.depth for layer in netlist.layers])
-    keep, keep_u = 2**DECAY_BITS - netlist.decay_v, 2**DECAY_BITS - 1 - netlist.decay_u
+    keep = 2**DECAY_BITS - netlist.decay_v
+    keep_u = 2**DECAY_BITS - 1 - netlist.decay_u
     order = np.lexsort((netlist.neuron, keep_u, keep, netlist.layer, depth[netlist.layer]))
     groups = np.stack([netlist.layer, keep, keep_u])[:, order]
     begins = np.flatnonzero(np.append(True, np.any(np.diff(groups) != 0, axis=0))[: len(order)])

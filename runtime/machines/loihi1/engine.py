@@ -182,7 +182,8 @@ def _run_layers(
     engine: Engine, events: EventArray, ends: IntArray, trace: Trace, part: slice
 ) -> tuple[WordArray, WordArray]:
     """Run some recordings layer after layer, `part` of the trace; spikes and updates at a bit each where wanted."""
-    blocks, nothing = engine.blocks, (0, 0, 0)
+    blocks = engine.blocks
+    nothing = (0, 0, 0)
     assert blocks is not None, "laid out for the kernel of steps"
     n = engine.netlist.n_compartments
     words = len(events), events.shape[2] + engine.netlist.drain, -(-n // 64)
@@ -215,8 +216,11 @@ def _run_steps(
     engine: Engine, events: EventArray, ends: IntArray, trace: Trace, part: slice
 ) -> tuple[WordArray, WordArray]:
     """Run the one recording of a part step after step; its spikes and updates at a bit each."""
-    netlist, index, length = engine.netlist, part.start, int(ends[0])
-    state, steps = start(engine), length + netlist.max_depth
+    netlist = engine.netlist
+    index = part.start
+    length = int(ends[0])
+    state = start(engine)
+    steps = length + netlist.max_depth
     size = events.shape[2] + netlist.drain, netlist.n_compartments
     fired = np.zeros(size, np.bool_) if trace.spikes is None else trace.spikes[index]
     worked = np.zeros(size, np.bool_) if trace.updated is None else trace.updated[index]

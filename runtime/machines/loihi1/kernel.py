@@ -78,7 +78,8 @@ def tables_of(netlist: Netlist) -> Tables:
 
 def state_of(netlist: Netlist) -> State:
     """State of a chip before the first step: that of a recording, or the blank ones before the first."""
-    n, channels = netlist.n_compartments, netlist.n_inputs
+    n = netlist.n_compartments
+    channels = netlist.n_inputs
     current, membrane = np.zeros((2, n), np.int32)
     spikes, updates, saturations = np.zeros((3, n), np.int64)
     worked, flags = np.zeros((2, n), np.bool_)
@@ -126,7 +127,10 @@ def _list_sources(state: State, events: AnyArray, t: int, length: int) -> Any:
 def _deliver(tables: Tables, state: State, sources: IntArray) -> None:
     """Let the synapses of the sources arrive."""
     # an array taken out of a tuple costs as much as some synapses: take them out once
-    first, sum_of, magnitude, sums = tables.first, tables.sum_of, tables.magnitude, state.sums
+    first = tables.first
+    sum_of = tables.sum_of
+    magnitude = tables.magnitude
+    sums = state.sums
     sums[:] = 0
     for source in sources:
         for synapse in range(first[source], first[source + 1]):
@@ -136,15 +140,25 @@ def _deliver(tables: Tables, state: State, sources: IntArray) -> None:
 @compiled
 def _integrate(tables: Tables, state: State, step: int, length: int) -> bool:
     """Let all compartments whose window is open integrate, and say whether a register overflows."""
-    begin, keep_u, keep_v, bias, threshold = tables.begin, tables.keep_u, tables.keep_v, tables.bias, tables.threshold
-    current, membrane, sums, flags, worked = state.current, state.membrane, state.sums, state.flags, state.worked
-    saturations, any_overflow = state.saturations, False
+    begin = tables.begin
+    keep_u = tables.keep_u
+    keep_v = tables.keep_v
+    bias = tables.bias
+    threshold = tables.threshold
+    current = state.current
+    membrane = state.membrane
+    sums = state.sums
+    flags = state.flags
+    worked = state.worked
+    saturations = state.saturations
+    any_overflow = False
     for c in range(begin.size):
         is_open = (begin[c] <= step) & (step - begin[c] < length)
         arrived = (sums[2 * c] | sums[2 * c + 1]) != 0
         worked[c] = is_open & (arrived | ((current[c] | membrane[c] | bias[c]) != 0))
         # the current decays, and the sums are added
-        positive, negative = sums[2 * c] >> ARRIVAL_BITS, sums[2 * c + 1] >> ARRIVAL_BITS
+        positive = sums[2 * c] >> ARRIVAL_BITS
+        negative = sums[2 * c + 1] >> ARRIVAL_BITS
         u = np.int32(kept(current[c], keep_u[c]) + np.int32(np.int32(positive - negative) << MEMBRANE_SHIFT))
         any_overflow |= is_open & ((max(positive, negative) > SUM_MAX) | (abs(u) > CURRENT_MAX))
         # the membrane decays, current and bias are added, it saturates and is compared
@@ -161,7 +175,8 @@ def _first_overflow(state: State, begin: AnyArray, step: int, length: int) -> tu
     """Lowest compartment that overflows: its id, its register (0 sum, 1 current) and the value."""
     for c in range(state.current.size):
         if begin[c] <= step and step - begin[c] < length:
-            positive, negative = state.sums[2 * c] >> ARRIVAL_BITS, state.sums[2 * c + 1] >> ARRIVAL_BITS
+            positive = state.sums[2 * c] >> ARRIVAL_BITS
+            negative = state.sums[2 * c + 1] >> ARRIVAL_BITS
             if positive > SUM_MAX:
                 return c, 0, positive << MEMBRANE_SHIFT
             if negative > SUM_MAX:
@@ -174,7 +189,11 @@ def _first_overflow(state: State, begin: AnyArray, step: int, length: int) -> tu
 @compiled
 def _reset_and_count(state: State) -> None:
     """Reset the membranes of the compartments that spiked, count and list them for the next step."""
-    fired, listed, flags, worked, updates = 0, state.fired, state.flags, state.worked, state.updates
+    fired = 0
+    listed = state.fired
+    flags = state.flags
+    worked = state.worked
+    updates = state.updates
     for c in range(flags.size):
         updates[c] += worked[c]
         listed[fired] = c

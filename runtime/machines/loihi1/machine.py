@@ -152,9 +152,12 @@ class Loihi(Threaded, Stoppable):
         """Registers are carried over from one to the next."""
         if not self.free_running:
             return None
-        state, lag, counts = engine.start(self._stepwise), self.netlist.max_depth, []
+        state = engine.start(self._stepwise)
+        lag = self.netlist.max_depth
+        counts = []
         for channels in one_by_one(with_clocks(events, self.netlist.clocks), lengths):
-            before, steps = state.spikes.copy(), channels.shape[1]
+            before = state.spikes.copy()
+            steps = channels.shape[1]
             engine.advance(self._stepwise, state, channels, length=steps, steps=steps + lag)
             counts.append(state.spikes - before)
             engine.advance(self._stepwise, state, channels[:, :0], length=steps, steps=self.netlist.blank - lag)

@@ -77,7 +77,8 @@ def differences(onnx: OnnxEngine, ours: Engine, events: EventArray, lengths: Int
     """Spikes (recording, chip step, compartment) and votes in which onnxruntime and our engine differ."""
     found = 0
     for start in range(0, len(events), PART):
-        part, ends = events[start : start + PART], None if lengths is None else lengths[start : start + PART]
+        part = events[start : start + PART]
+        ends = None if lengths is None else lengths[start : start + PART]
         expected = engine.simulate(ours, part, lengths=ends, spikes=True)
         spikes, votes = simulate(onnx, part, lengths=ends)
         found += int(np.count_nonzero(spikes != expected.spikes))

@@ -83,11 +83,13 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trac
     """
     require_channels(netlist, events.shape[0])
     n_inputs, length = events.shape
-    neurons, chip_steps = netlist.n_compartments, length + netlist.drain
+    neurons = netlist.n_compartments
+    chip_steps = length + netlist.drain
     synapses = read_synapses(netlist)
     begin = netlist.begins[netlist.layer]
     end = begin + length if not netlist.blank else chip_steps
-    threshold, bias = UNIT * netlist.threshold, netlist.bias_mantissa * 2**netlist.bias_exponent
+    threshold = UNIT * netlist.threshold
+    bias = netlist.bias_mantissa * 2**netlist.bias_exponent
 
     spikes, updated = np.zeros((2, chip_steps, neurons), np.bool_)
     membranes = np.zeros((chip_steps, neurons), np.int32)

@@ -94,7 +94,8 @@ class Stream:
 
     def _advance(self, length: int) -> Step:
         """Run one chip step on the events in the column."""
-        netlist, state = self._engine.netlist, self._state
+        netlist = self._engine.netlist
+        state = self._state
         index = self.index
         try:
             advance(self._engine, state, self._column, length=length)

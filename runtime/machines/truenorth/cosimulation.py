@@ -130,17 +130,20 @@ class Built:
         trace = self.machine.simulate(events[None], spikes=True, membranes=True)
         assert trace.spikes is not None, "spikes are kept"
         assert trace.membranes is not None, "membranes are kept"
-        spikes, membranes = trace.spikes[0], trace.membranes[0] * self.terms.scale + self.terms.shift
+        spikes = trace.spikes[0]
+        membranes = trace.membranes[0] * self.terms.scale + self.terms.shift
         ticks, cycles, lost, errors = map(int, (here / "end.txt").read_text("utf-8").split())
         if ticks < len(spikes):
             raise OptionError(f"--rtl: tick {max(ticks, 0)} does not end; give RANC's sources as they are")
 
-        netlist, bits = self.machine.netlist, self.sizes["MEMBRANE_BITS"]
+        netlist = self.machine.netlist
+        bits = self.sizes["MEMBRANE_BITS"]
         wrong_spikes = wrong_membranes = 0
         for core, place in enumerate((self.mesh.x + self.mesh.width * self.mesh.y).tolist()):
             ours = slice(*netlist.core_neurons[core : core + 2].tolist())
             words = np.fromfile(here / f"core_{place:03d}.bin", "<u4").astype(np.int64).reshape(ticks, -1)
-            fired, held = words >> 31, words & ((1 << bits) - 1)
+            fired = words >> 31
+            held = words & ((1 << bits) - 1)
             held -= (held >> (bits - 1)) << bits
             count = spikes[:, ours].shape[1]
             wrong_spikes += int(np.count_nonzero(fired[:, :count] != spikes[:, ours]) + fired[:, count:].sum())
@@ -178,7 +181,8 @@ def build(machine: TrueNorth, folder: Path, sources: Sequence[Path], simulator: 
         _call(words, folder)
         stamp.write_text(made, "utf-8")
     files |= memories(terms, found)
-    key, mesh = hashlib.sha256("\0".join([made, *files.values()]).encode()).hexdigest(), mesh_of(machine.netlist)
+    key = hashlib.sha256("\0".join([made, *files.values()]).encode()).hexdigest()
+    mesh = mesh_of(machine.netlist)
     return Built(machine=machine, terms=terms, mesh=mesh, sizes=found, folder=folder, files=files, key=key)
 
 
@@ -203,10 +207,13 @@ def cosimulate(
 
     What is finished stays in the `folder`, and is not done again. Raises as :func:`build` and :meth:`Built.run`.
     """
-    sources, program, netlist = sources_in(rtl), simulator_for(simulator), machine.netlist
+    sources = sources_in(rtl)
+    program = simulator_for(simulator)
+    netlist = machine.netlist
     progress("building the hardware")
     built = build(machine, folder.absolute(), sources, program, netlist.ticks(data.events.shape[-1]))
-    count, found = Progress(len(data)), dict[str, Compared]()
+    count = Progress(len(data))
+    found = dict[str, Compared]()
     for index, name in enumerate(data.files):
         count(index, f"{program} runs recording")
         events = with_clocks(data.events[index : index + 1], netlist.clocks)[0, :, : data.steps_of(index)]

@@ -44,7 +44,8 @@ def prepare(netlist: CrossbarNetlist, *, careful: bool = False) -> Engine:
     bits = load_target(netlist.target).limit("neuron.membrane_bits")
     low, high = signed_range(bits)
     twins, steady, cap = _steady_first(netlist, find_twins(netlist, kernel.HALF), low, high, careful=careful)
-    first, axons = twins.first_neuron, len(twins.first_axon)
+    first = twins.first_neuron
+    axons = len(twins.first_axon)
     feeds, clocks, wires = netlist.aims()
     ticking, clocked = _held(twins, clocks)
     rows, fed = _held(twins, feeds)
@@ -60,7 +61,8 @@ def prepare(netlist: CrossbarNetlist, *, careful: bool = False) -> Engine:
     bounds, segments, row = _segments(axon, neuron, halves, axons)
     axon, neuron, halves = (column[~near] for column in synapses)
     # of each neuron: the axon that its spikes reach, and their delay
-    target, delay = np.full(netlist.n_neurons, -1), np.zeros(netlist.n_neurons, np.int64)
+    target = np.full(netlist.n_neurons, -1)
+    delay = np.zeros(netlist.n_neurons, np.int64)
     target[netlist.wire_neuron], delay[netlist.wire_neuron] = twins.axon[wires], netlist.wire_delay
     votes = np.where(netlist.readout_class >= 0, netlist.readout_first, -1)
     columns = [*(getattr(netlist, name) for name in kernel.PARAMETERS), target, delay, votes]
@@ -91,7 +93,8 @@ def prepare(netlist: CrossbarNetlist, *, careful: bool = False) -> Engine:
 
 def _registers(netlist: CrossbarNetlist) -> tuple[IntArray, ...]:
     """Leak, threshold, reset, lowest membrane, what one below that becomes, and whether a spike takes the threshold."""
-    linear, lowest = (netlist.reset_mode == RESET_LINEAR).astype(np.int64), -netlist.negative_threshold
+    linear = (netlist.reset_mode == RESET_LINEAR).astype(np.int64)
+    lowest = -netlist.negative_threshold
     under = np.where(netlist.negative_saturates == 1, lowest, -netlist.reset)
     return netlist.leak, netlist.threshold, np.where(linear == 1, 0, netlist.reset), lowest, under, linear
 
@@ -112,7 +115,8 @@ def _steady_first(
         for part in (twins.synapse_halves >> kernel.HALF, twins.synapse_halves & kernel.LOWER)
     )
     leak, threshold, reset, lowest, under, linear = (column[first] for column in _registers(netlist))
-    initial, held = netlist.initial[first], netlist.negative_saturates[first] == 1
+    initial = netlist.initial[first]
+    held = netlist.negative_saturates[first] == 1
     simple = (netlist.leak_reversal == 0)[first]
     cap = high - positive - np.maximum(leak, 0)
     most = np.maximum.reduce([threshold - 1, reset, under, initial])

@@ -146,7 +146,9 @@ def _integrate(slot: Any, wiring: Any, state: Any, axons: Any) -> None:
         state.flagged[slot, axon] = False
         axons[axon] += 1
         for s in range(wiring.segment_bounds[axon], wiring.segment_bounds[axon + 1]):
-            first, end, at = wiring.segments[s, 0], wiring.segments[s, 1], wiring.segments[s, 2]
+            first = wiring.segments[s, 0]
+            end = wiring.segments[s, 1]
+            at = wiring.segments[s, 2]
             _add(state.steady_sum[first:end], wiring.row[at : at + end - first])
         for s in range(wiring.axon_synapses[axon], wiring.axon_synapses[axon + 1]):
             state.arrived[wiring.synapse_neuron[s]] += wiring.synapse_weight[s]
@@ -157,8 +159,12 @@ def _integrate(slot: Any, wiring: Any, state: Any, axons: Any) -> None:
 def _update(n: Any, low: Any, high: Any, wiring: Any, state: Any, tallies: Any) -> Any:
     """A tick of a neuron that is not steady: whether it spiked."""
     p = wiring.parameters
-    leak, threshold, below = np.int64(p[n, LEAK]), np.int64(p[n, THRESHOLD]), np.int64(p[n, NEGATIVE])
-    before, positive, negative = np.int64(state.membrane[n]), state.arrived[n] >> HALF, state.arrived[n] & LOWER
+    leak = np.int64(p[n, LEAK])
+    threshold = np.int64(p[n, THRESHOLD])
+    below = np.int64(p[n, NEGATIVE])
+    before = np.int64(state.membrane[n])
+    positive = state.arrived[n] >> HALF
+    negative = state.arrived[n] & LOWER
     state.arrived[n] = 0
     summed = min(max(before + positive - negative, low), high)
     wanted = leaked(summed, leak, p[n, REVERSAL])
@@ -212,7 +218,8 @@ def _send_steady(
     steady: Any, tick: Any, ticks: Any, window: Any, slots: Any, wiring: Any, state: Any, tallies: Any
 ) -> Any:
     """Lead on all spikes of steady neurons; returns those that merge."""
-    merged, words = 0, state.steady_spike.view(np.uint64)
+    merged = 0
+    words = state.steady_spike.view(np.uint64)
     for word in range(len(words)):
         if words[word]:
             for n in range(WORD * word, min(WORD * word + WORD, steady)):
@@ -228,9 +235,12 @@ def run(events: Any, bin_ticks: int, ticks: int, low: int, high: int, slots: int
     `events` is (steps, channels); `slots` is a power of two above every delay: spikes that are due in a tick wait in
     the slot of its lowest bits.
     """
-    neurons, axons, window = len(wiring.initial), len(tallies.axons), len(events) * bin_ticks
+    neurons = len(wiring.initial)
+    axons = len(tallies.axons)
+    window = len(events) * bin_ticks
     w = wiring.steady
-    steady, merged = w.shape[1], 0
+    steady = w.shape[1]
+    merged = 0
     state = State(
         wiring.initial.copy(),
         np.zeros(steady, np.int32),
@@ -244,7 +254,9 @@ def run(events: Any, bin_ticks: int, ticks: int, low: int, high: int, slots: int
         slot = tick & (slots - 1)
         merged += _inject(events, bin_ticks, tick, slot, wiring, state)
         _integrate(slot, wiring, state, tallies.axons)
-        membrane, sums, spikes = state.membrane[:steady], state.steady_sum, state.steady_spike[:steady]
+        membrane = state.membrane[:steady]
+        sums = state.steady_sum
+        spikes = state.steady_spike[:steady]
         if _update_steady(membrane, sums, spikes, w[0], w[1], w[2], w[3], w[4], w[5], w[6]):
             return BROKEN_OFF
         merged += _send_steady(steady, tick, ticks, window, slots, wiring, state, tallies)

@@ -146,7 +146,8 @@ def injected(netlist: CrossbarNetlist, events: EventArray) -> defaultdict[int, l
     for channel, axon, offset in zip(netlist.feed_channel.tolist(), fed, netlist.feed_tick.tolist(), strict=True):
         for step in np.flatnonzero(events[channel]).tolist():
             due[step * netlist.bin_ticks + offset].append(axon)
-    periods, phases = netlist.clock_period.tolist(), netlist.clock_phase.tolist()
+    periods = netlist.clock_period.tolist()
+    phases = netlist.clock_phase.tolist()
     for axon, period, phase in zip(clocked, periods, phases, strict=True):
         for tick in range(phase, netlist.ticks(events.shape[1]), period):
             due[tick].append(axon)

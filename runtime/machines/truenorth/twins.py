@@ -40,13 +40,16 @@ class Twins:
 
 def find_twins(netlist: CrossbarNetlist, half: int) -> Twins:
     """Kinds of a network that breaks no rule; positive sums are shifted by `half` bits."""
-    neuron, axon, aims = netlist.neuron_of_synapse(), netlist.axon_of_synapse(), netlist.aims()
+    neuron = netlist.neuron_of_synapse()
+    axon = netlist.axon_of_synapse()
+    aims = netlist.aims()
     weight = netlist.weight[neuron, netlist.axon_type[axon]]
     halves = np.where(weight > 0, weight << half, -weight)
     single = np.bincount(np.concatenate(aims), minlength=netlist.n_axons) == 1
     sources = _sources(netlist, aims, single)
     registers = _registers(netlist, single[aims[_WIRE]])
-    kind, wired = np.arange(netlist.n_neurons), sources[:, 0] == _WIRE
+    kind = np.arange(netlist.n_neurons)
+    wired = sources[:, 0] == _WIRE
     while True:
         known = sources.copy()
         known[wired, 1] = kind[sources[wired, 1]]
@@ -61,7 +64,9 @@ def find_twins(netlist: CrossbarNetlist, half: int) -> Twins:
     stays = np.zeros(netlist.n_neurons, np.bool_)
     stays[first_neuron] = True
     kept = stays[pairs[0]]
-    ends, starts, sums = kind[pairs[0][kept]], pairs[1][kept], weights[kept]
+    ends = kind[pairs[0][kept]]
+    starts = pairs[1][kept]
+    sums = weights[kept]
     order = np.lexsort((ends, starts))
     return Twins(
         neuron=kind,

@@ -61,7 +61,8 @@ def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
         if projection.post == chunk.population:
             part = projection.weight[chunk.first : chunk.last].tocsc()
             part.eliminate_zeros()
-            bounds, row = part.indptr.astype(np.int64), part.indices.astype(np.int64)
+            bounds = part.indptr.astype(np.int64)
+            row = part.indices.astype(np.int64)
             source = np.flatnonzero(np.diff(bounds))
             lists = Lists(
                 projection=index,
@@ -127,7 +128,8 @@ class Needs:
         """
         key = (chunk, base, lean, unrolled)
         if key not in self._stored:
-            words, formats = 0, set()
+            words = 0
+            formats = set()
             for lists in self.lists(chunk):
                 projection = self.network.projections[lists.projection]
                 dense, taken = choose_dense(lists, projection, base, chunk.size, lean=lean, target=self.target)

@@ -133,7 +133,8 @@ def _pack(needs: Needs, chunks: list[Chunk], rates: tuple[FloatArray, ...] | Non
 
     alone: list[Core] = [(chunk,) for chunk in chunks]
     traffic = core_traffic(needs.network, tuple(alone), rates)
-    best, best_kept = alone, 0.0
+    best = alone
+    best_kept = 0.0
 
     def search(index: int, cores: list[Core], kept: float) -> None:
         nonlocal best, best_kept
@@ -141,7 +142,8 @@ def _pack(needs: Needs, chunks: list[Chunk], rates: tuple[FloatArray, ...] | Non
             return
         if index == len(chunks):
             if (len(cores), -kept) < (len(best), -best_kept):
-                best, best_kept = list(cores), kept
+                best = list(cores)
+                best_kept = kept
             return
         chunk = chunks[index]
         for i, core in enumerate(cores):
@@ -156,7 +158,8 @@ def _pack(needs: Needs, chunks: list[Chunk], rates: tuple[FloatArray, ...] | Non
 
 
 def _spread(needs: Needs, population: int, least: int) -> list[Chunk]:
-    name, size = needs.network.populations[population].name, needs.network.populations[population].size
+    name = needs.network.populations[population].name
+    size = needs.network.populations[population].size
     for parts in range(least, size + 1):
         bounds = [i * size // parts for i in range(parts + 1)]
         chunks = [Chunk(population=population, first=first, last=last) for first, last in pairwise(bounds)]

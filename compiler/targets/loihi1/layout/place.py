@@ -73,7 +73,8 @@ def _grow(between: FloatArray, price: FloatArray, tile_cores: int, first: int) -
     site = np.full(len(between), -1)
     load = np.zeros(len(price), np.int64)
     middle = int(np.argmin(price.sum(axis=1)))
-    core, where = first, middle
+    core = first
+    where = middle
     while True:
         site[core] = where
         load[where] += 1
@@ -113,8 +114,10 @@ def place(traffic: FloatArray, target: Target) -> Placement:
     the optimum, by branch and bound, on every network tried that has up to ten cores. `traffic` is packets per step,
     (cores, cores).
     """
-    width, height = target.limit("mesh.width"), target.limit("mesh.height")
-    cores, tile_cores = len(traffic), target.limit("mesh.tile_cores")
+    width = target.limit("mesh.width")
+    height = target.limit("mesh.height")
+    cores = len(traffic)
+    tile_cores = target.limit("mesh.tile_cores")
     if cores == 1:
         return Placement(tiles=(0,), spike_hops=0.0)
     between = traffic + traffic.T

@@ -101,7 +101,8 @@ def best_scale(
     Without `clip` every weight must fit its planes. Lists that a core of `shared` stores once stay alike.
     """
     population = layer.population
-    calibration, post = layer.calibration, layer.post
+    calibration = layer.calibration
+    post = layer.post
     factors = CLIPPING if clip and calibration is not None and packing.planes == 1 else (1.0,)
     # one scale at two exponents is two candidates: mantissas and clipping differ
     scales = dict[tuple[tuple[int, ...], int], Rounded]()
@@ -138,28 +139,33 @@ def round_with_more(layer: FloatLayer, chosen: Rounded, calibration: Calibration
 
     What keeps fewer spikes there is dropped.
     """
-    many, plain = fewer(calibration, MANY), rounded(layer, chosen.form)
+    many = fewer(calibration, MANY)
+    plain = rounded(layer, chosen.form)
     stored = plain and compensated(layer, judged(plain, layer.post, many), many)
     return min(judged(chosen, layer.post, many), stored or chosen, key=attrgetter("cost"))
 
 
 def nudged(layer: FloatLayer, stored: Rounded, calibration: Calibration) -> Rounded:
     """Move the bias of each neuron by what keeps most of its calibration spikes, and their number."""
-    before, relays = stored.population, layer.population.relays
-    unit, most = (before.threshold << MEMBRANE_SHIFT).astype(np.float64), BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX
+    before = stored.population
+    relays = layer.population.relays
+    unit = (before.threshold << MEMBRANE_SHIFT).astype(np.float64)
+    most = BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX
     unit[before.size - relays :] = 0  # a relay has no bias
 
     def at(bias: FloatArray) -> IntegerPopulation:
         mantissa, exponent = encode_bias(np.clip(bias, -most, most))
         return replace(before, bias_mantissa=mantissa, bias_exponent=exponent)
 
-    bias, fewest = before.bias.astype(np.float64), judged(stored, layer.post, calibration).moved
+    bias = before.bias.astype(np.float64)
+    fewest = judged(stored, layer.post, calibration).moved
     for share in (sign * nudge for nudge in NUDGES for sign in (1, -1)):
         trial = at(bias + share * unit)
         found = judged(replace(stored, population=trial), layer.post, calibration).moved
         better = lost(found) < lost(fewest)
         better &= loads(trial, stored.projections) <= ONE_STEP_SUM_MAX
-        bias, fewest = np.where(better, bias + share * unit, bias), np.where(better, found, fewest)
+        bias = np.where(better, bias + share * unit, bias)
+        fewest = np.where(better, found, fewest)
     after = at(bias)
     nudged = bool(np.any(after.bias != before.bias))
     return replace(stored, population=after, moved=fewest, compensated=stored.compensated or nudged)
@@ -178,7 +184,8 @@ def assemble(network: Network, layers: Sequence[Rounded]) -> IntegerNetwork:
 
 def explain_choice(layer: FloatLayer, chosen: Rounded) -> Choice:
     """Say what was chosen for a population."""
-    form, scale = chosen.form, chosen.population.scale
+    form = chosen.form
+    scale = chosen.population.scale
     held = reach(form.bits, form.exponents) * step_units(form.bits, form.exponents)
     clipped = zeroed = weights = 0
     for p in layer.projections:
@@ -226,7 +233,9 @@ def choose_storage(
     populations have no usable scale.
     """
     packings = check_packings(packings, len(network.populations), target)
-    layers, chosen, faults = [], [], []
+    layers = []
+    chosen = []
+    faults = []
     known = None if calibration is None else fewer(calibration)
     for post, packing in enumerate(packings):
         layer = layer_of(network, post, known)
@@ -259,7 +268,8 @@ def round_to_forms(
     layers = [layer_of(network, post, calibration) for post in range(len(network.populations))]
     chosen = []
     for layer, form in zip(layers, forms, strict=True):
-        stored, name = rounded(layer, form), layer.population.name
+        stored = rounded(layer, form)
+        name = layer.population.name
         if stored is None or stored.reached > ONE_STEP_SUM_MAX:
             overflow = f"the {_register(layer.population)} may overflow"
             what = "a bias has no register value" if stored is None else overflow

@@ -47,15 +47,20 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
     """
     from spikeloom.compiler.layer_kernel import coincidences
 
-    population, projections, form = layer.population, layer.projections, plain.form
-    scale, step = scales(population, form), step_units(form.bits, form.exponents)
-    limit, times = reach(form.bits, form.exponents), _spike_times(layer, calibration)
+    population = layer.population
+    projections = layer.projections
+    form = plain.form
+    scale = scales(population, form)
+    step = step_units(form.bits, form.exponents)
+    limit = reach(form.bits, form.exponents)
+    times = _spike_times(layer, calibration)
     rate, meant = (
         np.concatenate([source.rate(p.pre, layer.post) for p in projections])
         for source in (calibration, replace(calibration, sent=()))
     )
     nearest = [nearest_steps(population, p, form) for p in projections]
-    steps, errors = [each.copy() for each in nearest], np.zeros(population.size)
+    steps = [each.copy() for each in nearest]
+    errors = np.zeros(population.size)
     for neurons, inputs in _alike(layer):
         shown = np.argsort(-rate[inputs], kind="stable")[:INPUTS]
         shown = shown[rate[inputs[shown]] > 0]
@@ -68,7 +73,8 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
             held = np.clip(weight * (scale[rows] / step)[:, None], -limit, limit)
             found = np.rint(held)
             found[:, shown] = np.clip(_round_in_turn(held[:, shown], share), -limit, limit)
-            less, wanted = (held - found)[:, shown], held @ meant[inputs] - found @ rate[inputs]
+            less = (held - found)[:, shown]
+            wanted = held @ meant[inputs] - found @ rate[inputs]
             most = (np.sum(sign * np.maximum(sign * less, 0), axis=1) for sign in (-1, 1))
             errors[rows] = np.clip(wanted, *most) * step / scale[rows]
             ends = np.cumsum([at.shape[1] for at in places])[:-1]
@@ -78,7 +84,8 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
     stored = rounded(layer, form, steps, population.bias + errors)
     if stored is None:
         return None
-    before, after = plain.moved, judged(stored, layer.post, calibration).moved
+    before = plain.moved
+    after = judged(stored, layer.post, calibration).moved
     back = (lost(after) > lost(before)) | (loads(stored.population, stored.projections) > ONE_STEP_SUM_MAX)
     for p, each, instead in zip(projections, steps, nearest, strict=True):
         np.copyto(each, instead, where=np.repeat(back, np.diff(p.weight.indptr)))
@@ -127,7 +134,8 @@ def _share(together: FloatArray) -> FloatArray:
 
 def _round_in_turn(weight: FloatArray, share: FloatArray) -> FloatArray:
     """Round columns one after the other, each error passed on to the columns that follow."""
-    rounded, errors = np.empty_like(weight), np.empty_like(weight)
+    rounded = np.empty_like(weight)
+    errors = np.empty_like(weight)
     for start in range(0, weight.shape[1], BLOCK):
         block = slice(start, start + BLOCK)
         wanted = weight[:, block] + errors[:, :start] @ share[:start, block]

@@ -154,7 +154,9 @@ def fit(layer: FloatLayer, bits: int, exponents: tuple[int, ...], mantissa_scale
     found, over = tried(high)
     if over <= ONE_STEP_SUM_MAX:
         return found
-    low, under, best = 0, 0.0, None
+    low = 0
+    under = 0.0
+    best = None
     narrowed = True
     while high - low > max(1, low // SCALE_STEPS):
         # in proportion as long as that narrows well, else in the middle: sums of few coarse weights grow in leaps
@@ -163,9 +165,12 @@ def fit(layer: FloatLayer, bits: int, exponents: tuple[int, ...], mantissa_scale
         before = high - low
         found, reached = tried(units)
         if reached <= ONE_STEP_SUM_MAX:
-            low, under, best = units, reached, found
+            low = units
+            under = reached
+            best = found
         else:
-            high, over = units, reached
+            high = units
+            over = reached
         narrowed = not narrowed or 2 * (high - low) <= before
     return best
 
@@ -184,8 +189,11 @@ def candidate(
     just holds the largest weight; the rest is clipped. Also whether registers, not that, limit the scale: a larger
     factor gives the same.
     """
-    bits, peak = packing.bits, float(layer.peaks().max(initial=0))
-    chosen, limited, finest = None, False, 0.0
+    bits = packing.bits
+    peak = float(layer.peaks().max(initial=0))
+    chosen = None
+    limited = False
+    finest = 0.0
     whole = all(np.array_equal(p.weight.data, np.rint(p.weight.data)) for p in layer.projections)
     worthwhile = 1.0 if whole else WORTHWHILE
     for exponent in sorted(exponents):
@@ -198,7 +206,8 @@ def candidate(
             continue  # the threshold is less than a unit, a larger exponent makes it more
         if fitted is None or mantissa_scale(fitted) < worthwhile * finest:
             break
-        chosen, finest = fitted, max(finest, mantissa_scale(fitted))
+        chosen = fitted
+        finest = max(finest, mantissa_scale(fitted))
         limited = finest < WORTHWHILE * held * factor
     return chosen, limited
 

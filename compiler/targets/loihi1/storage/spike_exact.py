@@ -57,9 +57,13 @@ def make_exact(
     steps = (1, 1), (2, 1), (2, slots), (3, slots)
     ladder = [Packing(bits=bits, planes=planes, groups=groups) for planes, groups in steps]
     exponents = target.choices["synapse.exponent"]
-    few, layers, chosen, found = fewer(calibration), [], [], []
+    few = fewer(calibration)
+    layers = []
+    chosen = []
+    found = []
     for post in range(len(network.populations)):
-        layer, best = layer_of(network, post, few), None
+        layer = layer_of(network, post, few)
+        best = None
         tried: list[tuple[int, int, int]] = []
         for packing in ladder:
             if packing.planes > 2 and best is not None and not _full_range(layer, best).any():
@@ -73,7 +77,8 @@ def make_exact(
         assert best is not None, "the ladder has steps"
         if best.flips:
             best = round_with_more(layer, best, calibration)
-        best, layer = judged(best, post, calibration), replace(layer, calibration=calibration)
+        best = judged(best, post, calibration)
+        layer = replace(layer, calibration=calibration)
         layers.append(layer)
         chosen.append(best)
         found.append(
@@ -91,7 +96,8 @@ def make_exact(
 
 def _full_range(layer: FloatLayer, candidate: Rounded) -> BoolArray:
     """Whether the largest weight of each neuron fills the planes; shape (neurons,)."""
-    form, scale = candidate.form, candidate.population.scale
+    form = candidate.form
+    scale = candidate.population.scale
     steps = layer.peaks() * scale / step_units(form.bits, form.exponents)
     return np.asarray(steps >= AT_LIMIT * reach(form.bits, form.exponents))
 

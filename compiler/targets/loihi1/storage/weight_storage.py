@@ -38,7 +38,9 @@ def scales(population: ir.Population, form: ir.Form) -> FloatArray:
 
 def store_steps(projection: ir.Projection, steps: IntArray, form: ir.Form) -> tuple[ir.IntegerProjection, ...]:
     """One integer projection for each plane in use; the finest holds every structural synapse."""
-    pre, post, stored = projection.pre, projection.post, list[ir.IntegerProjection]()
+    pre = projection.pre
+    post = projection.post
+    stored = list[ir.IntegerProjection]()
     for exponent, mantissa in zip(form.exponents, split_planes(steps, form.bits, form.exponents), strict=True):
         weight = ir.with_data(projection.weight, mantissa.astype(ir.MANTISSA))
         if stored:
@@ -51,7 +53,8 @@ def store_steps(projection: ir.Projection, steps: IntArray, form: ir.Form) -> tu
 
 def nearest_steps(population: ir.Population, projection: ir.Projection, form: ir.Form) -> IntArray:
     """Weights of a projection in whole steps of the finest plane, each rounded to the nearest; shape (synapses,)."""
-    weight, scale = projection.weight, scales(population, form)
+    weight = projection.weight
+    scale = scales(population, form)
     steps = np.empty(weight.nnz, np.int32)
     for rows in ir.row_parts(weight):
         held = slice(weight.indptr[rows.start], weight.indptr[rows.stop])
@@ -118,7 +121,8 @@ def fullest(population: ir.IntegerPopulation, up: AnyArray, down: AnyArray) -> F
         return filled
     filled *= current_load(population.decay_u)
     if 2 * population.decay_v >= DECAY_ONE:
-        gather, lost = (1 << MEMBRANE_SHIFT) * DECAY_ONE / (population.decay_u + 1), population.decay_v / DECAY_ONE
+        gather = (1 << MEMBRANE_SHIFT) * DECAY_ONE / (population.decay_u + 1)
+        lost = population.decay_v / DECAY_ONE
         held = (1 - lost) * (population.threshold << MEMBRANE_SHIFT)
         rise = held + gather * up + np.maximum(population.bias, 0)
         fall = (gather * down + np.maximum(-population.bias, 0)) / lost

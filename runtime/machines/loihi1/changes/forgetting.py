@@ -21,7 +21,8 @@ from spikeloom.runtime.machines.loihi1.kernel import kept
 def forgetting(chip: Chip, known: Known, classes: int) -> Forgetting:
     """Bound the runs that are unknown before each step."""
     steps, places = known.fired.shape
-    ends, moved = np.full((2, steps + 1), steps), np.zeros((2, steps + 1, steps, classes), np.int16)
+    ends = np.full((2, steps + 1), steps)
+    moved = np.zeros((2, steps + 1, steps, classes), np.int16)
     _forget(chip, known, *np.zeros((6, places), np.int32), np.zeros(places + 1, np.int64), *ends, *moved)
     return Forgetting(_lag(chip, known), *ends, *moved)
 
@@ -29,7 +30,8 @@ def forgetting(chip: Chip, known: Known, classes: int) -> Forgetting:
 def _lag(chip: Chip, known: Known) -> int:
     """Least number of synapses on a path from an input to a compartment that votes, minus one."""
     begins, target, offset, _ = chip.synapses
-    channels, found = len(known.events), 0
+    channels = len(known.events)
+    found = 0
     reached = np.arange(len(begins) - 1) < channels
     while found < len(known.fired) and not np.any(chip.label[reached[channels:]] >= 0):
         found += 1
@@ -60,7 +62,8 @@ def _after(chip: Chip, c: Any, total: Any, current: Any, membrane: Any) -> Any:
 def _unknown(chip: Chip, start: Any, length: Any, bounds: Any, listed: Any) -> Any:
     """Bounds of registers before a step; lists those that may have fired in the step before."""
     low_u, high_u, low_v, high_v = bounds
-    n, most = 0, np.int32(CURRENT_MAX)
+    n = 0
+    most = np.int32(CURRENT_MAX)
     for c in range(len(chip.bias)):
         depth = chip.depth[c // LANES]
         inside = chip.threshold[c] != NEVER and depth < start <= depth + length  # else all are zero
@@ -77,7 +80,8 @@ def _unknown(chip: Chip, start: Any, length: Any, bounds: Any, listed: Any) -> A
 def _narrow(chip: Chip, known: Known, t: Any, c: Any, bounds: Any, sums: Any) -> Any:
     """Let a compartment integrate between its bounds; says whether its spike is open."""
     low_u, high_u, low_v, high_v = bounds
-    total, threshold = known.sums[t, c], chip.threshold[c]
+    total = known.sums[t, c]
+    threshold = chip.threshold[c]
     low_u[c], v = _after(chip, c, total + sums[0][c], low_u[c], low_v[c])
     high_u[c], top = _after(chip, c, total + sums[1][c], high_u[c], high_v[c])
     is_open = v <= threshold < top
@@ -106,7 +110,8 @@ def _forget(
     channels, length = known.events.shape
     begins, target, offset, weight = chip.synapses
     steps, places = known.fired.shape
-    bounds, sums = (low_u, high_u, low_v, high_v), (low, high)
+    bounds = (low_u, high_u, low_v, high_v)
+    sums = (low, high)
     for start in range(steps - 1, -1, -1):
         n = _unknown(chip, start, length, bounds, listed)
         last = start  # after the last step with an open spike
@@ -120,7 +125,8 @@ def _forget(
                 for r in range(begins[channels + c], begins[channels + c + 1]):
                     size = np.uint64(offset[r + 1] - offset[r])
                     _widen(low, high, weight, sign, np.uint64(target[r]), np.uint64(offset[r]), size)
-            n, apart = 0, False
+            n = 0
+            apart = False
             for c in range(places):
                 depth = chip.depth[c // LANES]
                 if not depth <= t < depth + length:

@@ -116,10 +116,12 @@ def chip_of(netlist: Netlist) -> Chip:
 
 def known_run(chip: Chip, events: AnyArray) -> Known:
     """Run a recording (channels, T) and keep what changed runs need."""
-    places, steps = len(chip.bias), events.shape[1] + int(chip.depth.max())
+    places = len(chip.bias)
+    steps = events.shape[1] + int(chip.depth.max())
     require_below("channels", np.array(len(events)), len(chip.synapses.run) - places)
     registers = np.zeros((2, steps + 1, places), np.int32)
-    sums, fired = np.zeros((steps, places), np.int32), np.zeros((steps, places), np.uint8)
+    sums = np.zeros((steps, places), np.int32)
+    fired = np.zeros((steps, places), np.uint8)
     known = Known(np.ascontiguousarray(events).view(np.uint8), sums, registers[0], registers[1], fired)
     _record(chip, known, _run_of(chip, known))
     return known
@@ -138,7 +140,8 @@ def effects(chip: Chip, known: Known, classes: int, changes: Changes) -> Effects
 
 
 def _run_of(chip: Chip, known: Known) -> _Run:
-    places, blocks = len(chip.bias), len(chip.depth)
+    places = len(chip.bias)
+    blocks = len(chip.depth)
     delta, current, membrane = np.zeros((3, places), np.int32)
     held, looked = np.zeros((2, blocks), np.uint8)
     moved, sign = np.ones((2, places + len(known.events) + 1), np.int64)
@@ -197,9 +200,12 @@ def _arrive(chip: Chip, run: Any, moved: Any) -> None:
     """Let changed sources arrive; marks the blocks that they reach."""
     begins, target, offset, weight = chip.synapses
     for k in range(moved):
-        source, sign = run.moved[k], np.int32(run.sign[k])
+        source = run.moved[k]
+        sign = np.int32(run.sign[k])
         for r in range(begins[source], begins[source + 1]):
-            first, begin, length = target[r], offset[r], offset[r + 1] - offset[r]
+            first = target[r]
+            begin = offset[r]
+            length = offset[r + 1] - offset[r]
             _add(run.delta, weight, sign, np.uint64(first), np.uint64(begin), np.uint64(length))
             for block in range(first // LANES, (first + length - 1) // LANES + 1):
                 run.looked[block] = 1
@@ -224,7 +230,8 @@ def _record(chip: Chip, known: Known, run: Any) -> None:
         copy(run.delta, known.sums[t])
         clear(run.delta)
         for block in range(len(chip.depth)):
-            first, places = np.uint64(block * LANES), np.uint64(LANES)
+            first = np.uint64(block * LANES)
+            places = np.uint64(LANES)
             if chip.depth[block] <= t < chip.depth[block] + length:
                 _step(chip, run, known.sums[t], first, places)
                 _compare(run.other, run.membrane, chip.threshold, known.fired[t], first, places)
@@ -251,7 +258,8 @@ def _span(chip: Chip, known: Known, run: Any, t: Any, begin: Any) -> Any:
 def _part(chip: Chip, known: Known, run: Any, t: Any, moved: Any, span: Any, come: Any, gone: Any) -> tuple[Any, Any]:
     """One step of some blocks; how many sources now differ, and whether a register does."""
     begin, end = span
-    first, places = np.uint64(begin * LANES), np.uint64((end - begin) * LANES)
+    first = np.uint64(begin * LANES)
+    places = np.uint64((end - begin) * LANES)
     channels, length = known.events.shape
     if not chip.depth[begin] <= t < chip.depth[begin] + length:
         clear(run.delta[first : first + places])
@@ -268,7 +276,8 @@ def _part(chip: Chip, known: Known, run: Any, t: Any, moved: Any, span: Any, com
     _reset(run.membrane, chip.threshold, first, places)
     any_held = False
     for block in range(begin, end):
-        at, places = np.uint64(block * LANES), np.uint64(LANES)
+        at = np.uint64(block * LANES)
+        places = np.uint64(LANES)
         differs = _differ(run.membrane, known.membrane[t + 1], at, places)
         run.held[block] = (differs | _differ(run.current, known.current[t + 1], at, places)) != 0
         any_held |= run.held[block] != 0
@@ -279,9 +288,14 @@ def _part(chip: Chip, known: Known, run: Any, t: Any, moved: Any, span: Any, com
 def _run(
     chip: Chip, known: Known, run: Any, channel: Any, step: Any, bounds: Any, come: Any, gone: Any, end: Any
 ) -> None:
-    steps, blocks = len(known.sums), len(chip.depth)
+    steps = len(known.sums)
+    blocks = len(chip.depth)
     for k in range(len(end)):
-        flip, last, moved, any_held, t = bounds[k], bounds[k + 1], 0, False, np.int64(0)
+        flip = bounds[k]
+        last = bounds[k + 1]
+        moved = 0
+        any_held = False
+        t = np.int64(0)
         clear(run.held)
         while True:
             if moved == 0 and not any_held:
@@ -299,7 +313,9 @@ def _run(
                 flip += 1
             copy(run.held, run.looked)
             _arrive(chip, run, moved)
-            moved, any_held, block = 0, False, 0
+            moved = 0
+            any_held = False
+            block = 0
             while block < blocks:
                 after = _span(chip, known, run, t, block)
                 if after > block:

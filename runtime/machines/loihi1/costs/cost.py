@@ -87,7 +87,8 @@ class Meter:
 
 def prepare(netlist: Netlist, target: Target, by: Literal["layer", "core", "whole"] = "layer") -> Meter:
     """Look up what spikes cause on a target with energy tables, by layer, by core or all in one group."""
-    n_inputs, size = netlist.n_inputs, netlist.n_inputs + netlist.n_compartments
+    n_inputs = netlist.n_inputs
+    size = netlist.n_inputs + netlist.n_compartments
     core_of = netlist.core_of_compartment()
     group, groups = {
         "layer": (netlist.layer, len(netlist.layers)),
@@ -107,7 +108,8 @@ def prepare(netlist: Netlist, target: Target, by: Literal["layer", "core", "whol
     sent = np.flatnonzero(netlist.axon_source >= n_inputs)  # a channel is on no core and sends nothing
     source = netlist.axon_source[sent]
     sender = source - n_inputs
-    start, end = netlist.core_tile[core_of[sender]], netlist.core_tile[netlist.core_of_axon()[sent]]
+    start = netlist.core_tile[core_of[sender]]
+    end = netlist.core_tile[netlist.core_of_axon()[sent]]
     leaves = chip_of_core(start, target) != chip_of_core(end, target)
     east_west, north_south = np.where(leaves, 0, hops(start, end, target.limit("mesh.width")))
     compartments = np.arange(n_inputs, size)

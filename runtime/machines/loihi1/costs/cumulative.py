@@ -23,7 +23,8 @@ def least_intervals(netlist: Netlist) -> IntArray:
     gain = current + (netlist.bias_mantissa << netlist.bias_exponent)[voters]
     threshold = netlist.threshold[voters] << MEMBRANE_SHIFT
     keep = 2**DECAY_BITS - netlist.decay_v[voters]
-    membrane, interval = np.zeros_like(gain), np.zeros_like(gain)
+    membrane = np.zeros_like(gain)
+    interval = np.zeros_like(gain)
     open_ = np.ones(len(gain), np.bool_)
     for step in range(1, LONGEST + 1):
         raised = (membrane * keep >> DECAY_BITS) + gain
@@ -40,7 +41,8 @@ def least_intervals(netlist: Netlist) -> IntArray:
 def steady(netlist: Netlist) -> BoolArray:
     """See :attr:`Stoppable.steady`: what nothing lowers, and its own spike alone lifts over the threshold."""
     voters = np.flatnonzero(netlist.readout_class >= 0)
-    sender, receiver = netlist.axon_source[netlist.axon_of_synapse()] - netlist.n_inputs, netlist.synapse_compartment()
+    sender = netlist.axon_source[netlist.axon_of_synapse()] - netlist.n_inputs
+    receiver = netlist.synapse_compartment()
     own = np.bincount(receiver, np.where(sender == receiver, netlist.effective_weight(), 0), netlist.n_compartments)
     lifted = (own > netlist.threshold) & (netlist.bias_mantissa >= 0) & (one_step_bounds(netlist)[1] == 0)
     return np.asarray(lifted[voters])

@@ -59,7 +59,8 @@ def estimate(
     Their events are counted and priced but not timed: links between chips have no public latency.
     """
     prepared = netlist if isinstance(netlist, engine.Engine) else engine.prepare(netlist)
-    netlist, deep = prepared.netlist, detail == "cycle"
+    netlist = prepared.netlist
+    deep = detail == "cycle"
     if deep:
         require_one_chip(netlist.core_tile, target, "--detail cycle")
     latencies = timing.tables_of(netlist, target)
@@ -68,7 +69,8 @@ def estimate(
     chip_steps = steps + netlist.drain
     simple: dict[str, list[SimpleTimes]] = {name: [] for name in latencies}
     detailed: dict[str, list[DetailedTimes]] = {name: [] for name in latencies if deep}
-    counts, updates = [], []
+    counts = []
+    updates = []
     held = 2 * netlist.n_compartments if deep else 8 * max(1, 0 if charges is None else charges.sources.shape[1])
     size = max(1, HELD // (held * (events.shape[2] + netlist.drain)))
     for first in range(0, max(1, len(events)), size):

@@ -25,7 +25,8 @@ AT_INPUT = -1
 
 def core_map(netlist: Netlist, target: Target, fired: FloatArray) -> CoreMap:
     """Where the cores lie, how full each is of everything, and packets if each source id fires so often."""
-    width, chip = target.limit("mesh.width"), chip_of_core(netlist.core_tile, target)
+    width = target.limit("mesh.width")
+    chip = chip_of_core(netlist.core_tile, target)
     fill: dict[int, dict[str, Fill]] = {core: {} for core in range(netlist.n_cores)}
     for use in measure(netlist, target):
         if use.core is not None and use.allowed:
@@ -60,7 +61,8 @@ def _traffic(netlist: Netlist, target: Target, fired: FloatArray) -> tuple[Way, 
     ends = np.stack([home[netlist.axon_source], netlist.core_of_axon()])
     pairs, which, axons = np.unique(ends, axis=1, return_inverse=True, return_counts=True)
     packets = np.bincount(which.ravel(), fired[netlist.axon_source])
-    tile, chip = netlist.core_tile.tolist(), chip_of_core(netlist.core_tile, target)
+    tile = netlist.core_tile.tolist()
+    chip = chip_of_core(netlist.core_tile, target)
     ways = []
     for (pre, post), sent, count in zip(pairs.T.tolist(), packets.tolist(), axons.tolist(), strict=True):
         near = pre != AT_INPUT and chip[pre] == chip[post]
@@ -75,7 +77,8 @@ def figures(found: CostReport) -> list[Block]:
     blocks: list[Block] = []
     if tables:
         layers = {layer.name: list(layer.amounts.energy_j.values()) for layer in found.layers}
-        title, caption = "Dynamic energy of a mean inference by layer", "Synapses belong to the layer that receives."
+        title = "Dynamic energy of a mean inference by layer"
+        caption = "Synapses belong to the layer that receives."
         blocks.append(_bars("energy-layers", title, layers, tables, "J", caption))
         parts = next(iter(found.energy_by_part_j.values()))
         shares = {part: [found.energy_by_part_j[name][part] for name in tables] for part in parts}

@@ -154,7 +154,8 @@ class CostReport:
 
 def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: float) -> CostReport:
     """Sum an estimate up; `bin_s` is the length of a data step in seconds, at the pace of the sensor."""
-    costs, chips = found.costs, chip_count(netlist.core_tile, target)
+    costs = found.costs
+    chips = chip_count(netlist.core_tile, target)
 
     def whole(reduce: Callable[[FloatArray], Any]) -> Amounts:
         return _amounts(costs, chips, lambda amount: float(reduce(amount.sum(axis=1))))

@@ -74,7 +74,8 @@ def core_table(report: CostReport) -> Table:
 
 
 def _lines(report: CostReport) -> list[str]:
-    pace, ends = report.pace, report.energy_range_j
+    pace = report.pace
+    ends = report.energy_range_j
     lines = []
     if ends is not None:
         low, high = (f"{si(ends[end].energy_j, 'J')} ({ends[end].table})" for end in ("low", "high"))

@@ -92,21 +92,26 @@ def _way(start: int, end: int, port: int, width: int, tile_links: int) -> list[i
 def prepare(netlist: Netlist, target: Target, table: TimeTable) -> Tables:
     """Lay a netlist out for the time models; OptionError if it takes several chips."""
     require_one_chip(netlist.core_tile, target, "time")
-    tile, n_inputs, n_cores = netlist.core_tile, netlist.n_inputs, netlist.n_cores
+    tile = netlist.core_tile
+    n_inputs = netlist.n_inputs
+    n_cores = netlist.n_cores
     latency = {event: table.picoseconds(event) for event in table.latencies}
     dense = netlist.format_index_bits[netlist.axon_format] == 0
     synapse = np.where(dense, latency["synaptic_operation_dense"], latency["synaptic_operation_sparse"])
     processing = latency["axon_in"] + np.diff(netlist.axon_synapses) * synapse
     destination = netlist.core_of_axon()
-    width, tile_cores = target.limit("mesh.width"), target.limit("mesh.tile_cores")
+    width = target.limit("mesh.width")
+    tile_cores = target.limit("mesh.tile_cores")
     port = np.array([np.sum(tile[:core] == tile[core]) for core in range(n_cores)])
     # the messages of a spike go out in the order of columns, rows and cores of a tile, as the reference has it
     rank = np.lexsort((port, tile // width, tile % width)).argsort()
     order = np.lexsort((rank[destination], netlist.axon_source))
     from_input = netlist.axon_source[order] < n_inputs
-    injected, sent = order[from_input], order[~from_input]
+    injected = order[from_input]
+    sent = order[~from_input]
 
-    slot, sender = netlist.axon_source[sent] - n_inputs, netlist.core_of_compartment()
+    slot = netlist.axon_source[sent] - n_inputs
+    sender = netlist.core_of_compartment()
     first = np.searchsorted(slot, np.arange(netlist.n_compartments + 1))
     pairs, route = np.unique(sender[slot] * n_cores + destination[sent], return_inverse=True)
     ways = [
@@ -153,8 +158,11 @@ def charges(tables: Tables) -> Charges:
 
     The engine adds them up as it runs, without spike trains.
     """
-    cores, size, channels = tables.start.size - 1, tables.sender.size, tables.channel_first.size - 1
-    sources, updates = np.zeros((channels + size, 2 * cores), np.int64), np.zeros((size, 2 * cores), np.int64)
+    cores = tables.start.size - 1
+    size = tables.sender.size
+    channels = tables.channel_first.size - 1
+    sources = np.zeros((channels + size, 2 * cores), np.int64)
+    updates = np.zeros((size, 2 * cores), np.int64)
     every = np.arange(size)
     sources[channels + every, tables.sender] = tables.sending
     updates[every, tables.sender] = tables.update
@@ -167,7 +175,8 @@ def charges(tables: Tables) -> Charges:
 
 def _ends(spent: AnyArray, steps: IntArray, barrier: int) -> dict[str, AnyArray]:
     """Fields of :class:`StepTimes`, of what cores take to send, then to receive, (samples, chip steps, 2 * cores)."""
-    runs, longest = np.arange(spent.shape[1]) < steps[:, None], spent.argmax(axis=2)
+    runs = np.arange(spent.shape[1]) < steps[:, None]
+    longest = spent.argmax(axis=2)
     receives, core = np.divmod(longest, spent.shape[2] // 2)
     return {
         "duration_ns": np.where(runs, spent.max(axis=2) + barrier, 0) / PICOSECONDS,

@@ -64,8 +64,12 @@ def _list_messages(
     tables: Tables, row: AnyArray, worked: AnyArray, delivery: IntArray, generation: IntArray, queue: IntArray
 ) -> None:
     """List what each core sends in a step: delivery (-1 for work after its last message) and time it takes."""
-    start, first, axon_out = tables.start, tables.first, tables.axon_out
-    access, update, spike = tables.access, tables.update, tables.spike
+    start = tables.start
+    first = tables.first
+    axon_out = tables.axon_out
+    access = tables.access
+    update = tables.update
+    spike = tables.spike
     n = 0
     for core in range(start.size - 1):
         queue[core] = n
@@ -120,18 +124,27 @@ def _send_all(  # noqa: PLR0915 - one loop over local state, which numba passes 
 ) -> tuple[float, float]:
     """Send the messages of a step; return for how long cores were blocked and the highest load of a link."""
     # an array taken out of a tuple costs more than a message: take them out once
-    destination, processing, route = tables.destination, tables.processing, tables.route
-    route_first, route_link, route_share = tables.route_first, tables.route_link, tables.route_share
-    route_hops, unit = tables.route_hops, tables.unit
+    destination = tables.destination
+    processing = tables.processing
+    route = tables.route
+    route_first = tables.route_first
+    route_link = tables.route_link
+    route_share = tables.route_share
+    route_hops = tables.route_hops
+    unit = tables.unit
     cores = done.size
-    due, arrives = np.full(cores, np.inf), np.full(cores, np.inf)
-    cursor, front, back = queue[:cores].copy(), np.full(cores, -1), np.empty(cores, np.int64)
+    due = np.full(cores, np.inf)
+    arrives = np.full(cores, np.inf)
+    cursor = queue[:cores].copy()
+    front = np.full(cores, -1)
+    back = np.empty(cores, np.int64)
     for core in range(cores):
         if queue[core] < queue[core + 1]:
             due[core] = generation[queue[core]]
     under_way = 0
     work_under_way: Any = 0
-    blocked, peak = 0.0, 0
+    blocked = 0.0
+    peak = 0
     while True:
         core = int(np.argmin(due))
         if due[core] == np.inf:
@@ -154,7 +167,8 @@ def _send_all(  # noqa: PLR0915 - one loop over local state, which numba passes 
                 to = int(np.argmin(arrives))
             # what is under way slows or blocks the message
             way = route[a]
-            begin, end = route_first[way], route_first[way + 1]
+            begin = route_first[way]
+            end = route_first[way + 1]
             links = end - begin
             along = _wait(begin, end, route_link, load, unit)
             mean = work_under_way / under_way if under_way else 0.0
@@ -199,13 +213,19 @@ def schedule(
     """
     cores = tables.start.size - 1
     most = tables.destination.size + cores
-    delivery, generation, later = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
-    received, queue = np.empty(most, np.float64), np.empty(cores + 1, np.int64)
+    delivery = np.empty(most, np.int64)
+    generation = np.empty(most, np.int64)
+    later = np.empty(most, np.int64)
+    received = np.empty(most, np.float64)
+    queue = np.empty(cores + 1, np.int64)
     load = np.zeros(tables.route_link.max() + 1 if tables.route_link.size else 0, np.int64)
-    first, destination, cost = tables.channel_first, tables.channel_destination, tables.channel_processing
+    first = tables.channel_first
+    destination = tables.channel_destination
+    cost = tables.channel_processing
     for t in range(steps):
         load[:] = 0
-        done, free = spent[t, :cores], spent[t, cores:]
+        done = spent[t, :cores]
+        free = spent[t, cores:]
         _inject(first, destination, cost, events, t, free)
         _list_messages(tables, fired[t], updated[t], delivery, generation, queue)
         blocked[t], peak[t] = _send_all(tables, delivery, generation, queue, received, later, load, done, free)
