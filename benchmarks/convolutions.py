@@ -50,12 +50,12 @@ def unrolled(form: Any, *_: object) -> Any:
 def figures(file: str, data: Path, options: dict[str, Any]) -> dict[str, Any]:
     """Memory, cores and price of a network."""
     net = spikeloom.compile(file, **options)
-    facts = net.result.value.netlist
+    facts = net.facts.netlist
     polarities = options.get("polarities", 2)
     if not data.exists():
         public_networks.recordings(data, facts.taxels, polarities, facts.classes, public_networks.RATES[0])
-    price = net.estimate(str(data)).value
-    agrees = {} if "calibrate" not in options else {"equal": net.verify(str(data)).value.decision_agreement}
+    price = net.estimate(str(data)).details
+    agrees = {} if "calibrate" not in options else {"equal": net.verify(str(data)).decision_agreement}
     return agrees | {
         "synapse_words": facts.synapse_words,
         "synapse_words_unrolled": facts.synapse_words_unrolled,

@@ -28,7 +28,8 @@ STORAGES: dict[str, dict[str, Any]] = {
 
 def measured(net: spikeloom.Compiled, test: Any, reference: Any = None) -> dict[str, Any]:
     """Decisions of a netlist beside those of its own float model and of the `reference`; and what they cost."""
-    verdict, price = net.verify(test).value, net.estimate(test).value
+    verdict = net.verify(test)
+    price = net.estimate(test).details
     decided = np.array(verdict.chip_predictions)
     own = np.array(verdict.float_predictions)
     return {
@@ -54,7 +55,7 @@ def main() -> None:
         rows: dict[str, Any] = {}
         for name, storage in STORAGES.items():
             rounded = spikeloom.compile(path, calibrate=data.train, **step, **storage)
-            reference = np.array(rounded.verify(data.test).value.float_predictions)
+            reference = np.array(rounded.verify(data.test).float_predictions)
             tuned = Path(folder, f"{place}-{name.split()[0]}.nir")
             if not tuned.exists():
                 asked = {key: int(value) if key == "scale_groups" else value for key, value in storage.items()}

@@ -40,9 +40,9 @@ def measured(name: str, network: str, data: Any) -> dict[str, Any]:
     path, _, target = network.partition("@")
     options = {"target": target} if target else {"calibrate": None if "counters" in name else data.train}
     netlist = spikeloom.compile(path, **options)
-    found = netlist.run(data.test).value
+    found = netlist.run(data.test)
     correct = round(found.accuracy * found.samples)
-    costs = netlist.estimate(data.test).value
+    costs = netlist.estimate(data.test).details
     about = {"name": name, "network": Path(path).name, "correct": correct, "samples": found.samples}
     amounts = {"operations": costs.per_inference.synaptic_operations, "cores": len(costs.cores)}
     return about | amounts | {"energy_j": dict(costs.per_inference.energy_j)}

@@ -1,55 +1,61 @@
-"""The main job in Python: what ``import spikeloom`` offers. Every option of a command is a keyword of its function."""
+"""The library: what ``import spikeloom`` offers. A function asks one question; the command of its name is its client.
+
+Every function takes the options of its command as keywords, builds its request, and returns the dataclass that
+``--json`` prints. Wrong values are an OptionError that names keyword, value and what is allowed.
+"""
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 import tempfile
 import weakref
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.types import JsonObject
+from spikeloom.compiler import DEFAULT_TARGET
+from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.report.sections import Outcome, Section, terminal
+from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.requests.check import CertifyRequest, StressRequest
+from spikeloom.runtime.requests.choices import ComparisonChoice, NetworkChoice
+from spikeloom.runtime.requests.choose import AnytimeRequest, ChartRequest, SmallestRequest
+from spikeloom.runtime.requests.fields import Request, checked, documented
+from spikeloom.runtime.requests.main_job import (
+    ENGINES,
+    CompileRequest,
+    EstimateRequest,
+    InspectRequest,
+    ReportRequest,
+    RunRequest,
+    VerifyRequest,
+)
+from spikeloom.runtime.requests.training import FinetuneRequest, TrainRequest
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from spikeloom.compiler.ir import Network
     from spikeloom.models.recordings.evtouch import Recordings
+    from spikeloom.runtime.commands.main_job.run import Decisions
+    from spikeloom.runtime.commands.training.finetune import Finetuned
+    from spikeloom.runtime.equivalence.verdict import Verdict
+    from spikeloom.runtime.machines.base import Price, Stream
+    from spikeloom.runtime.machines.netlist_check import NetlistCheck
+    from spikeloom.runtime.page.results import Report
+    from spikeloom.runtime.studies.anytime.study import Anytime
+    from spikeloom.runtime.studies.chart.results import Chart
+    from spikeloom.runtime.studies.counting import CountersReport
+    from spikeloom.runtime.studies.smallest.results import Smallest
+    from spikeloom.runtime.studies.stability.results import Stability
+    from spikeloom.runtime.studies.stress.results import Stress
+    from spikeloom.runtime.studies.training import TrainingReport
 
-
-BRIEF = 8
-"""Lines of a result that Python shows by itself."""
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class Result:
-    """What a command found, in `value`: a dataclass whose fields are the keys of ``--json``."""
-
-    value: Any
-    sections: tuple[Section, ...]
-
-    def __str__(self) -> str:
-        """All of it, as on a terminal."""
-        return terminal(self.sections)
-
-    def __repr__(self) -> str:
-        """The first lines; ``print`` shows all."""
-        first = str(self).split("\n\n", 1)[0].splitlines()
-        return "\n".join(first[:BRIEF] + ["…"] * (len(first) > BRIEF))
-
-    def _repr_html_(self) -> str:
-        """What notebooks show."""
-        from spikeloom.runtime.report.html import fragment
-
-        return "".join(map(fragment, self.sections))
+Numbers = int | str | Sequence[int]
+"""One number for all layers, or one for each."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +67,12 @@ class Data:
 
     @cached_property
     def train(self) -> Recordings:
-        """Those that may choose."""
+        """The training split."""
         return self.split("train")
 
     @cached_property
     def test(self) -> Recordings:
-        """Those that report."""
+        """The test split."""
         return self.split("test")
 
     def split(self, name: str) -> Recordings:
@@ -79,199 +85,535 @@ class Data:
         return read(self.source, name, classes=None, taxels=None, bin_s=self.bin)
 
 
-def recordings(source: str, *, bin: float | None = None) -> Data:
+Source = Data | str | os.PathLike[str]
+"""Where recordings are."""
+
+
+def recordings(source: str | os.PathLike[str], *, bin: float | None = None) -> Data:
     """Name recordings: a zip, folder or file of them, ``synthetic``, ``objects`` or ``containers``.
 
     Parameters
     ----------
-    source : str
+    source : str or path
         As of ``--data``.
     bin : float, optional
         Seconds of a time bin, for files of single events; 0.02 where it is not given.
 
-    Raises DataError if there are none.
+    Raises
+    ------
+    DataError
+        If there are none.
     """
     from spikeloom.models.recordings.events import data_splits
     from spikeloom.models.recordings.grasps import SYNTHETIC
 
-    if source != SYNTHETIC:
-        data_splits(source)
-    return Data(source, bin)
+    place = os.fspath(source)
+    if place != SYNTHETIC:
+        data_splits(place)
+    return Data(place, bin)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Compiled:
-    """A netlist, with the network that it was compiled from; made by :func:`compile` or :func:`load`."""
+    """A netlist, with the network that it was compiled from; made by :func:`compile`, :func:`finetune`, :func:`load`.
+
+    path: file of the netlist.
+    network: what it was compiled from, and how that is read; None if that is not known.
+    facts: what the compiler of the chip chose, proved and removed, or what :func:`load` found in the file.
+    """
 
     path: Path
     network: str | Network | None
-    options: JsonObject
-    result: Result
+    reading: NetworkChoice
+    facts: Any
 
-    def verify(self, data: Data | Recordings | str | None = None, **options: Any) -> Result:
-        """Compare chip and float model, without recordings only what they store; options as of ``spikeloom verify``."""
-        return _command("main_job.verify", netlist=str(self.path), data=data, **self._origin("verify"), **options)
+    def check(self) -> NetlistCheck:
+        """Hold what the netlist stores against lowering its network again, level EN; nothing is simulated.
 
-    def estimate(self, data: Data | Recordings | str, **options: Any) -> Result:
-        """Operations, energy and time of recordings; options as of ``spikeloom estimate``."""
-        return _command("main_job.estimate", netlist=str(self.path), data=data, **options)
+        Raises SpikeloomError if they do not belong together.
+        """
+        from spikeloom.runtime.commands.main_job import verify
 
-    def run(self, data: Data | Recordings | str, **options: Any) -> Result:
-        """Decisions of recordings, the chip's; options as of ``spikeloom run``."""
-        return _command("main_job.run", netlist=str(self.path), data=data, **options)
+        result: NetlistCheck = verify.run(self._comparison(VerifyRequest, {"data": None})).result
+        return result
 
-    def report(self, output: str, data: Data | Recordings | str, **options: Any) -> Result:
-        """Write a page with all of it; options as of ``spikeloom report``."""
-        given = self._origin("report") | options
-        return _command("main_job.report", netlist=str(self.path), output=output, data=data, **given)
+    @documented(VerifyRequest)
+    def verify(
+        self,
+        data: Source | Recordings,
+        *,
+        split: str = "test",
+        limit: int | None = None,
+        window: str = "100%",
+        original: str | None = None,
+        engine: str = ENGINES[0],
+        min_agreement: float | None = None,
+        require: str | None = None,
+        spec_samples: int = 3,
+    ) -> Verdict:
+        """Compare chip and float model, spike for spike.
 
-    def save(self, path: str) -> None:
+        Raises SpikeloomError if network, netlist and recordings do not belong together, and ModelError if the netlist
+        is so unlike its network that nothing can be compared: :meth:`check` says how.
+        """
+        from spikeloom.runtime.commands.main_job import verify
+        from spikeloom.runtime.equivalence.verdict import Verdict
+
+        result = verify.run(self._comparison(VerifyRequest, locals())).result
+        if not isinstance(result, Verdict):
+            raise ModelError(f"{self.path.name}: {str(result).splitlines()[0]}; check() lists all")
+        return result
+
+    @documented(EstimateRequest)
+    def estimate(
+        self,
+        data: Source | Recordings,
+        *,
+        split: str = "test",
+        limit: int | None = None,
+        window: str = "100%",
+        detail: str = "counts",
+        table: str | None = None,
+    ) -> Price:
+        """Operations, joules and seconds of an inference, by every table of the chip's prices.
+
+        Raises SpikeloomError if the recordings do not suit the netlist.
+        """
+        from spikeloom.runtime.commands.main_job.estimate import price
+
+        return price(self._question(EstimateRequest, locals()))[2]
+
+    @documented(RunRequest)
+    def run(
+        self,
+        data: Source | Recordings,
+        *,
+        split: str = "test",
+        limit: int | None = None,
+        window: str = "100%",
+        spikes: str | None = None,
+    ) -> Decisions:
+        """Decisions of recordings, bit for bit the chip's.
+
+        Raises SpikeloomError if the recordings do not suit the netlist.
+        """
+        from spikeloom.runtime.commands.main_job import run
+
+        result: Decisions = run.run(self._question(RunRequest, locals())).result
+        return result
+
+    @documented(ReportRequest)
+    def report(
+        self,
+        output: str,
+        data: Source | Recordings,
+        *,
+        split: str = "test",
+        limit: int | None = None,
+        recording: str | None = None,
+        stress: str | None = None,
+        spec_samples: int = 3,
+    ) -> Report:
+        """Write a self-contained page: verdict, accuracy, cores, taxels, spikes, energy, time, provenance.
+
+        Raises SpikeloomError as :meth:`verify` does, or if the page cannot be written.
+        """
+        from spikeloom.runtime.commands.main_job import report
+
+        result: Report = report.run(self._comparison(ReportRequest, locals())).result
+        return result
+
+    @documented(StressRequest)
+    def stress(
+        self,
+        data: Source | Recordings,
+        *,
+        split: str = "test",
+        limit: int | None = None,
+        only: str | Sequence[str] | None = None,
+        seeds: int = 5,
+        require: str | Sequence[str] = (),
+        jobs: int | None = None,
+        picture: str | None = None,
+        output: str | None = None,
+    ) -> Stress:
+        """Find where float model and chip break under a seeded battery of perturbations.
+
+        Raises SpikeloomError as :meth:`verify` does.
+        """
+        from spikeloom.runtime.commands.check import stress
+
+        result: Stress = stress.run(self._comparison(StressRequest, locals())).result
+        return result
+
+    @documented(CertifyRequest)
+    def certify(
+        self,
+        data: Source | Recordings,
+        *,
+        split: str = "test",
+        limit: int | None = None,
+        shift: int = 25,
+        most: int = 16,
+        jobs: int | None = None,
+        picture: str | None = None,
+        output: str | None = None,
+    ) -> Stability:
+        """Decide for every small change of each recording whether it alters the decision; none is sampled.
+
+        Raises SpikeloomError if the recordings do not suit the netlist.
+        """
+        from spikeloom.runtime.commands.check import certify
+
+        result: Stability = certify.run(self._question(CertifyRequest, locals())).result
+        return result
+
+    @documented(AnytimeRequest)
+    def anytime(
+        self,
+        data: Source | Recordings,
+        *,
+        split: str = "test",
+        limit: int | None = None,
+        calibrate: str | None = None,
+        held_out: bool = False,
+        differ: float | None = None,
+        output: str | None = None,
+    ) -> Anytime:
+        """Say how early each decision could be taken, and what that saves.
+
+        Raises SpikeloomError if the recordings do not suit the netlist.
+        """
+        from spikeloom.runtime.commands.choose import anytime
+
+        result: Anytime = anytime.run(self._question(AnytimeRequest, locals())).result
+        return result
+
+    def save(self, path: str | os.PathLike[str]) -> None:
         """Write the netlist, a ``.loom`` file."""
-        require_place(path, "save", kinds=["loom"])
+        require_place(os.fspath(path), "save", kinds=["loom"])
         shutil.copyfile(self.path, path)
 
-    def stream(self) -> Any:
+    def stream(self) -> Stream:
         """Open a live stream: ``step(events)`` takes one bin (taxels, 2), and gives the votes so far."""
         from spikeloom.runtime.machines.backends import machine_for
 
         return machine_for(self.path).stream()
 
-    def _origin(self, what: str) -> JsonObject:
+    def _question(self, kind: type[Request], given: Mapping[str, Any]) -> Any:
+        """The request of a method from its keywords."""
+        return checked(kind, dict(given) | {"data": _data(given), "netlist": str(self.path)})
+
+    def _comparison(self, kind: type[ComparisonChoice], given: Mapping[str, Any]) -> Any:
+        """The same, where the network is compared with."""
         if self.network is None:
-            raise OptionError(f"{what}: of a loaded netlist needs its network; give load(…, network=…)")
-        return {"checkpoint": self.network, **self.options}
+            raise OptionError("of a loaded netlist its network is not known; give load(…, network=…)")
+        reading = {each.name: getattr(self.reading, each.name) for each in NetworkChoice.options()}
+        return self._question(kind, reading | dict(given) | {"checkpoint": self.network})
+
+    def __str__(self) -> str:
+        return str(self.facts)
 
     def __repr__(self) -> str:
-        return repr(self.result)
+        return repr(self.facts)
 
     def _repr_html_(self) -> str:
-        return self.result._repr_html_()
+        return str(self.facts._repr_html_())
 
 
+verify = Compiled.verify
+estimate = Compiled.estimate
+run = Compiled.run
+report = Compiled.report
+stress = Compiled.stress
+certify = Compiled.certify
+
+
+@documented(CompileRequest)
 def compile(
-    network: str | nn.Module,
+    network: str | os.PathLike[str] | nn.Module | Network,
     *,
-    calibrate: Data | Recordings | str | None = None,
     example: Tensor | None = None,
-    **options: Any,
+    calibrate: Source | Recordings | None = None,
+    bin: float | None = None,
+    target: str = DEFAULT_TARGET,
+    weight_bits: Numbers | None = None,
+    planes: Numbers | None = None,
+    scale_groups: Numbers | None = None,
+    spike_exact: bool = False,
+    keep: float | None = None,
+    keep_all: bool = False,
+    prune_unused: bool = False,
+    share_lists: bool = False,
+    cores_for: str | None = None,
+    chips: int = 1,
+    free_running: bool = False,
+    graph: str | None = None,
+    taxels: int | str | None = None,
+    edges: str | None = None,
+    directed: bool = False,
+    run: int = 0,
+    weights: str | None = None,
+    beta: float | None = None,
+    theta: float | None = None,
+    polarities: int | None = None,
+    polarities_first: bool | None = None,
+    dt: float | None = None,
+    convention: str | None = None,
 ) -> Compiled:
     """Lower a network to a netlist that obeys every limit of its chip.
 
     Parameters
     ----------
-    network : str or Module
+    network : str, path or Module
         Checkpoint, ONNX, NIR or netx file, ``pretrained:NAME``, or a torch module of affine stages and
         :class:`spikeloom.LIF` layers.
-    calibrate : Data, Recordings or str, optional
-        Training recordings that choose the scales.
     example : Tensor, optional
         Input of one step, for a module.
-    options
-        As of ``spikeloom compile``: ``graph="manual"``, ``weight_bits=4``, ``target=…``.
 
     Raises
     ------
     SpikeloomError
         If something cannot be used, or the network does not fit; the message says what to do.
     """
-    source = _source("compile", network, example)
+    given = dict(locals())
+    source = _network("compile", network, example)
     folder = tempfile.mkdtemp(prefix="spikeloom-")
     path = Path(folder) / "netlist.loom"
-    words = {"checkpoint": source, "calibrate": calibrate, "output": str(path), **options}
-    result = _command("main_job.compile", **words)
-    kept = {name: value for name, value in options.items() if name in _options("main_job.verify")}
-    made = Compiled(path, source, kept, result)
+    from spikeloom.runtime.commands.main_job import compile as command
+
+    try:
+        seen = {"calibrate": _data({"data": calibrate}, "train")}
+        request = checked(CompileRequest, given | seen | {"checkpoint": source, "output": str(path)})
+        facts: Shown = command.run(request).result
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    made = Compiled(path, source, NetworkChoice.of(vars(request)), facts)
     weakref.finalize(made, shutil.rmtree, folder, ignore_errors=True)
     return made
 
 
+@documented(NetworkChoice)
+def load(
+    path: str | os.PathLike[str],
+    *,
+    network: str | os.PathLike[str] | None = None,
+    graph: str | None = None,
+    taxels: int | str | None = None,
+    edges: str | None = None,
+    directed: bool = False,
+    run: int = 0,
+    weights: str | None = None,
+    beta: float | None = None,
+    theta: float | None = None,
+    polarities: int | None = None,
+    polarities_first: bool | None = None,
+    dt: float | None = None,
+    convention: str | None = None,
+) -> Compiled:
+    """Read a netlist; `network` is what it was compiled from, for questions that compare, with how that is read.
+
+    Raises SpikeloomError if it is none.
+    """
+    given = dict(locals())
+    from spikeloom.runtime.commands.main_job import inspect
+
+    facts: Shown = inspect.run(InspectRequest(path=os.fspath(path))).result
+    origin = None if network is None else os.fspath(network)
+    return Compiled(Path(path), origin, checked(NetworkChoice, given), facts)
+
+
+@documented(FinetuneRequest)
 def finetune(
-    network: str | nn.Module, data: Data | str, output: str, *, example: Tensor | None = None, **options: Any
+    network: str | os.PathLike[str] | nn.Module | Network,
+    data: Source,
+    output: str,
+    *,
+    example: Tensor | None = None,
+    bin: float | None = None,
+    target: str = DEFAULT_TARGET,
+    weight_bits: Numbers | None = None,
+    scale_groups: int | None = None,
+    robust: float | None = None,
+    epochs: int = 40,
+    seed: int = 0,
+    resume: bool = False,
+    graph: str | None = None,
+    taxels: int | str | None = None,
+    edges: str | None = None,
+    directed: bool = False,
+    run: int = 0,
+    weights: str | None = None,
+    beta: float | None = None,
+    theta: float | None = None,
+    polarities: int | None = None,
+    polarities_first: bool | None = None,
+    dt: float | None = None,
+    convention: str | None = None,
 ) -> Compiled:
     """Train a network further on the integers of its chip, and give the netlist of what came of it.
 
-    Parameters
-    ----------
-    network, example
-        As of :func:`compile`, in floats.
-    data : Data or str
-        Recordings, of which the training split trains and the test split reports.
-    output : str
-        File to write: of a checkpoint another one, ``.pt``; of any other network NIR, ``.nir``, its netlist beside it.
-    options
-        As of ``spikeloom finetune``: ``weight_bits=4``, ``epochs=10``.
+    Of a checkpoint `output` is another one, ``.pt``; of any other network NIR, ``.nir``, its netlist beside it.
 
     Raises
     ------
     SpikeloomError
         As of :func:`compile`, and if the recordings are not the network's.
     """
-    words: JsonObject = {"data": data} if isinstance(data, str) else {"data": data.source, "bin": data.bin}
-    words |= {"checkpoint": _source("finetune", network, example), "output": output}
-    result = _command("training.finetune", **words, **options)
-    kept = {name: value for name, value in options.items() if name in ("graph", "taxels", "edges", "polarities")}
-    if result.value.netlist is None:
-        return compile(output, **kept)
-    return Compiled(Path(output).with_name(result.value.netlist), output, kept, result)
+    given = dict(locals())
+    from spikeloom.runtime.commands.training import finetune as command
+
+    given |= _place(data, bin) | {"checkpoint": _network("finetune", network, example)}
+    request = checked(FinetuneRequest, given)
+    tuned: Finetuned = command.run(request).result
+    if tuned.netlist is None:
+        again = {"graph": graph, "taxels": taxels, "edges": edges, "directed": directed}
+        return compile(output, **again)  # type: ignore[arg-type]
+    return Compiled(Path(output).with_name(tuned.netlist), output, NetworkChoice(polarities=polarities), tuned)
 
 
-def _source(what: str, network: str | nn.Module, example: Tensor | None) -> str | Network:
+@documented(TrainRequest)
+def train(
+    data: Source,
+    output: str,
+    *,
+    bin: float | None = None,
+    system: str | None = None,
+    graph: str | None = None,
+    taxels: int | str | None = None,
+    edges: str | None = None,
+    directed: bool = False,
+    join: int = 1,
+    window: str | None = None,
+    padding: str | None = None,
+    recipe: str = "released",
+    current_decay: str | None = None,
+    membrane_decay: str | None = None,
+    clocks: int | None = None,
+    features: int | None = None,
+    hops: int | None = None,
+    hidden: Numbers | None = None,
+    copies: int | None = None,
+    thresholds: Numbers | None = None,
+    parts: int | None = None,
+    ramp: int | None = None,
+    levels: int | None = None,
+    weight_bits: int | None = None,
+    batch: int | None = None,
+    spike_penalty: float | None = None,
+    robust: float | None = None,
+    epochs: int | None = None,
+    decay_epochs: int | None = None,
+    seed: int = 0,
+    seeds: int = 1,
+    resume: bool = False,
+    keep: str | Sequence[str] = (),
+    picture: str | None = None,
+) -> TrainingReport | CountersReport:
+    """Train networks of one system, by the released recipe where nothing else is said, and write them.
+
+    Raises
+    ------
+    SpikeloomError
+        If the recordings cannot be used, or options contradict each other.
+    """
+    given = dict(locals()) | _place(data, bin)
+    from spikeloom.runtime.commands.training import train as command
+
+    result: TrainingReport | CountersReport = command.run(checked(TrainRequest, given)).result
+    return result
+
+
+@documented(SmallestRequest)
+def smallest(
+    data: Source,
+    output: str,
+    *,
+    bin: float | None = None,
+    target: str = DEFAULT_TARGET,
+    budget: str | Sequence[str] = (),
+    levels: int | None = None,
+    store: str | None = None,
+    jobs: int | None = None,
+    html: str | None = None,
+    graph: str | None = None,
+    taxels: int | str | None = None,
+    edges: str | None = None,
+    directed: bool = False,
+) -> Smallest:
+    """Find the cheapest network that does the job, among counting networks and some that are trained; write it.
+
+    Raises
+    ------
+    SpikeloomError
+        If the recordings cannot be used, or a place cannot be written.
+    """
+    given = dict(locals()) | _place(data, bin)
+    from spikeloom.runtime.commands.choose import smallest as command
+
+    result: Smallest = command.run(checked(SmallestRequest, given)).result
+    return result
+
+
+@documented(ChartRequest)
+def chart(
+    checkpoints: str | Sequence[str],
+    data: Source,
+    output: str,
+    *,
+    bin: float | None = None,
+    grid: str | None = None,
+    budget: str | Sequence[str] = (),
+    table: str | None = None,
+    jobs: int | None = None,
+    graph: str | None = None,
+    taxels: int | str | None = None,
+    edges: str | None = None,
+    directed: bool = False,
+    run: int = 0,
+    weights: str | None = None,
+    beta: float | None = None,
+    theta: float | None = None,
+) -> Chart:
+    """Chart accuracy against energy, time and size for a grid of configurations, and say which to deploy.
+
+    Raises
+    ------
+    SpikeloomError
+        If networks and recordings do not belong together, or the folder cannot be written.
+    """
+    given = dict(locals()) | _place(data, bin)
+    from spikeloom.runtime.commands.choose import chart as command
+
+    result: Chart = command.run(checked(ChartRequest, given)).result
+    return result
+
+
+def _data(given: Mapping[str, Any], split: str | None = None) -> Any:
+    """Recordings that a request takes: those of a split of ``Data``, or what was given."""
+    data = given["data"]
+    return data.split(split or given["split"]) if isinstance(data, Data) else data
+
+
+def _place(data: Source, bin: float | None) -> dict[str, Any]:
+    """Where recordings are, and their bins, for questions that read more than one split."""
+    if isinstance(data, Data):
+        return {"data": data.source, "bin": data.bin if bin is None else bin}
+    return {"data": data, "bin": bin}
+
+
+def _network(what: str, network: str | os.PathLike[str] | nn.Module | Network, example: Tensor | None) -> str | Network:
     """File of a network, or what a module means."""
     if isinstance(network, str | os.PathLike):
         return os.fspath(network)
     from torch import Tensor
 
+    from spikeloom.compiler.ir import Network as FloatNetwork
     from spikeloom.models.networks.module import module_network
 
+    if isinstance(network, FloatNetwork):
+        return network
     if not isinstance(example, Tensor):
         raise OptionError(f"{what}: a module needs the input of one step; give example=torch.zeros(1, CHANNELS)")
     return module_network(network, example)
-
-
-def load(path: str, *, network: str | None = None, **options: Any) -> Compiled:
-    """Read a netlist; `network` is what it was compiled from, for `verify` and `report`, with options that name it."""
-    return Compiled(Path(path), network, options, _command("main_job.inspect", path=path))
-
-
-def _options(command: str) -> dict[str, argparse.Action]:
-    """Every option of a command."""
-    parser = argparse.ArgumentParser()
-    module = import_module(f"spikeloom.runtime.commands.{command}")
-    module.add_arguments(parser)
-    return {action.dest: action for action in parser._actions if action.dest != "help"}
-
-
-def _value(option: argparse.Action, given: Any) -> Any:
-    """What a command takes for a value of Python: what its word would mean, or recordings and networks as they are."""
-    from spikeloom.compiler.ir import Network
-    from spikeloom.models.recordings.evtouch import Recordings
-
-    if isinstance(given, Data):
-        return given.train if option.dest == "calibrate" else given.test
-    if given is None or option.nargs == 0 or isinstance(given, Network | Recordings):
-        return given
-    if isinstance(option.default, list):
-        return [given] if isinstance(given, str) else given
-    words = given if isinstance(given, list | tuple) else [given]
-    if not all(isinstance(word, str | int | float | os.PathLike) for word in words):
-        found = type(given).__name__
-        raise OptionError(
-            f"{option.dest}: {found} found; give words as on the command line, or what recordings() gives"
-        )
-    kind: Any = option.type or str
-    try:
-        return kind(",".join(map(str, words)))
-    except ValueError:
-        raise OptionError(f"{option.dest} {given}: not a number of type {kind.__name__}; give one") from None
-
-
-def _command(name: str, **options: Any) -> Result:
-    """Run a command on values in place of words."""
-    known = _options(name)
-    if unknown := sorted(set(options) - set(known)):
-        raise OptionError(f"{unknown[0]}: unknown option; allowed: {', '.join(sorted(known))}")
-    values = {dest: option.default for dest, option in known.items()} | {"json": False, "debug": False}
-    arguments = argparse.Namespace(**values | {dest: _value(known[dest], given) for dest, given in options.items()})
-    found: Outcome = import_module(f"spikeloom.runtime.commands.{name}").run(arguments)
-    value = getattr(found.result, "result", found.result)  # without how it was simulated
-    return Result(value, tuple(found.sections(found.result)))

@@ -118,12 +118,21 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", help=hidden, prog="spikeloom")
     for name in COMMANDS if chosen is None else filter(None, [chosen]):
         sub = commands.add_parser(name, description=COMMANDS[name][1], help=COMMANDS[name][1])
-        module = _module(name)
-        sub.set_defaults(action=getattr(module, "run", None))
-        module.add_arguments(sub)
-        if sub.get_default("action"):  # else it has commands of its own
-            import_module("spikeloom.runtime.commands.options").add_common(sub)
+        _describe(sub, _module(name))
     return parser
+
+
+def _describe(parser: argparse.ArgumentParser, module: Any) -> None:
+    """Add the options of a command; one without a request has commands of its own."""
+    from spikeloom.runtime.commands.options import add_common, add_options
+
+    if not hasattr(module, "REQUEST"):
+        module.add_arguments(parser)
+        return
+    parser.set_defaults(action=module.run, request=module.REQUEST)
+    add_options(parser, module.REQUEST, getattr(module, "OPTIONS", None))
+    add_common(parser)
+    parser.epilog = getattr(module, "NOTES", None)
 
 
 def _parse(words: Sequence[str]) -> Arguments | None:
@@ -174,11 +183,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         from spikeloom.runtime.report.encode import encode  # with numpy, which help need not wait for
 
-        found: Outcome = arguments.action(arguments)
-        text = json.dumps(encode(found.result)) if arguments.json else terminal(found.sections(found.result))
+        outcome: Outcome = arguments.action(arguments.request.of(vars(arguments)))
+        text = json.dumps(encode(outcome.result)) if arguments.json else terminal(outcome.sections(outcome.result))
         progress("")
         show(text)
-        return found.code
+        return outcome.code
     except (SpikeloomError, OSError, MemoryError) as error:
         progress("")
         if "--debug" in words:

@@ -1,8 +1,11 @@
 """The Python interface and one name of ours; the main job on the released checkpoint and the real recordings."""
 
+import inspect
 import json
+import re
 import subprocess
 import sys
+from dataclasses import MISSING
 from pathlib import Path
 
 import pytest
@@ -14,7 +17,17 @@ from torch import nn
 
 import spikeloom as api
 from spikeloom.compiler.errors import CapacityError, DataError, ModelError, OptionError
-from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.requests.check import CertifyRequest, StressRequest
+from spikeloom.runtime.requests.choices import NetworkChoice
+from spikeloom.runtime.requests.choose import AnytimeRequest, ChartRequest, SmallestRequest
+from spikeloom.runtime.requests.main_job import (
+    CompileRequest,
+    EstimateRequest,
+    ReportRequest,
+    RunRequest,
+    VerifyRequest,
+)
+from spikeloom.runtime.requests.training import FinetuneRequest, TrainRequest
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +52,9 @@ def test_results_are_those_of_the_commands(data, net, as_json):
         "estimate": ["net.loom", "--data", "data"],
         "run": ["net.loom", "--data", "data"],
     }
-    found = {name: getattr(net, name)(data.test) for name in ("verify", "estimate", "run")} | {"compile": net.result}
+    found = {name: getattr(net, name)(data.test) for name in ("verify", "estimate", "run")} | {"compile": net.facts}
     for name, options in words.items():
-        assert as_json(name, *options, codes=(0, 1)) == json.loads(json.dumps(encode(found[name].value)))
+        assert as_json(name, *options, codes=(0, 1)) == json.loads(found[name].to_json())
     net.save("copy.loom")
     assert Path("copy.loom").read_bytes() == Path("net.loom").read_bytes()
     again = api.load("copy.loom", network="net.pt")
@@ -62,20 +75,22 @@ def test_modules_come_in_as_they_are(data, tmp_path, monkeypatch):
     module = nn.Sequential(nn.Linear(2 * TAXELS, 5), api.LIF(), nn.Linear(5, 4), api.LIF())
     net = api.compile(module, example=torch.zeros(1, 2 * TAXELS))
     assert "E0  specification = engine" in str(net.verify(data.test, min_agreement=0.0))
-    assert net.report("page.html", data).value.provenance.checkpoint.file == "module"
+    assert net.report("page.html", data).provenance.checkpoint.file == "module"
     refused(OptionError, "example=", api.compile, module)
     tuned = api.finetune(module, data, "tuned.nir", example=torch.zeros(1, 2 * TAXELS), epochs=1)
-    assert tuned.verify(data.test, min_agreement=0.0).value.model_different == 0
+    assert tuned.verify(data.test, min_agreement=0.0).model_different == 0
     assert "written: tuned.nir, tuned.loom" in str(tuned)
 
 
 def test_what_does_not_suit_is_refused(data, net):
-    with pytest.raises(OptionError, match=r"wieght_bits: unknown option; allowed: .*weight_bits"):
+    with pytest.raises(TypeError, match="wieght_bits"):
         api.compile("pretrained:grasps", wieght_bits="4")
-    assert len(net.run(data.test, limit=2).value.files) == 2
+    assert len(net.run(data.test, limit=2).files) == 2
     refused(DataError, "has 39 taxels, the network has 6", net.run, api.recordings("synthetic").test)
-    refused(OptionError, "data: ndarray found", net.run, data.test.events)
-    refused(OptionError, "limit x: not a number of type int", lambda: net.run(data, limit="x"))
+    refused(OptionError, "data |: ndarray found, allowed: text", net.run, data.test.events)
+    refused(OptionError, "limit 'x': str found, allowed: a whole number; give one", lambda: net.run(data, limit="x"))
+    refused(OptionError, "engine 'gpu': allowed: spikeloom, onnx; give one", lambda: net.verify(data, engine="gpu"))
+    refused(OptionError, "spike_exact 1: int found, allowed: True or False", lambda: api.compile("x.pt", spike_exact=1))
     refused(OptionError, "save none/x.loom: the folder does not exist", net.save, "none/x.loom")
     refused(OptionError, "save x.pt: has to end in .loom", net.save, "x.pt")
     module = nn.Sequential(nn.Linear(2 * TAXELS, 4), api.LIF())
@@ -91,7 +106,63 @@ def test_values_of_python_are_those_of_the_words(place, data, net):
     assert api.compile(network, weight_bits=[8, 4, 4, 8]).path.read_bytes() == (
         api.compile(network, weight_bits="8,4,4,8").path.read_bytes()
     )
-    assert str(net.run(data, limit="2")) == str(net.run(data.test, limit=2))
+    assert str(api.run(net, data, limit=2)) == str(net.run(data.test, limit=2))
+
+
+QUESTIONS = {
+    "verify": VerifyRequest,
+    "estimate": EstimateRequest,
+    "run": RunRequest,
+    "report": ReportRequest,
+    "stress": StressRequest,
+    "certify": CertifyRequest,
+    "anytime": AnytimeRequest,
+    "compile": CompileRequest,
+    "finetune": FinetuneRequest,
+    "train": TrainRequest,
+    "smallest": SmallestRequest,
+    "chart": ChartRequest,
+    "load": NetworkChoice,
+}
+BESIDE = {"self", "network", "example", "path", "return"}
+"""Keywords that are no options: what a question is about."""
+COMMAND_ONLY = {
+    "estimate": {"against_processor"},  # gives another result
+    "compile": {"dump_after", "output", "checkpoint"},
+    "finetune": {"checkpoint"},
+}
+OF_NETLISTS = {"netlist", "checkpoint", "bin", *(each.name for each in NetworkChoice.options())}
+"""Options that a netlist in Python knows."""
+
+
+@pytest.mark.parametrize("name", QUESTIONS)
+def test_keywords_are_the_options_of_the_request(name):
+    function = getattr(api, name, None) or getattr(api.Compiled, name)
+    keywords = {key: each for key, each in inspect.signature(function).parameters.items() if key not in BESIDE}
+    options = {each.name: each for each in QUESTIONS[name].options()}
+    assert set(keywords) <= set(options)
+    known = OF_NETLISTS if hasattr(api.Compiled, name) else set()
+    assert set(options) - set(keywords) - known <= COMMAND_ONLY.get(name, set())
+    for key, keyword in keywords.items():
+        option = options[key]
+        if option.default is not MISSING and keyword.default is not keyword.empty:
+            assert keyword.default == option.default, key
+        assert f"\n{key} : {function.__annotations__[key]}\n" in function.__doc__
+
+
+def test_the_readme_and_the_notebook_pass_a_strict_type_checker(tmp_path):
+    root = Path(__file__).parent.parent
+    blocks = re.findall(r"```python\n(.*?)```", (root / "README.md").read_text("utf-8"), re.DOTALL)
+    shown = [line[4:] for block in blocks for line in block.splitlines() if line.startswith((">>> ", "... "))]
+    cells = json.loads((root / "examples" / "touch.ipynb").read_text("utf-8"))["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    (tmp_path / "readme.py").write_text("\n".join(shown), "utf-8")
+    (tmp_path / "notebook.py").write_text(
+        "\n".join(line for each in code for line in each.splitlines() if line[:1] not in "%!"), "utf-8"
+    )
+    words = ["--strict", "--config-file", root / "pyproject.toml", tmp_path / "readme.py", tmp_path / "notebook.py"]
+    done = subprocess.run([sys.executable, "-m", "mypy", *words], capture_output=True, text=True, cwd=root, check=False)
+    assert done.returncode == 0, done.stdout
 
 
 def test_the_module_lists_its_public_names():

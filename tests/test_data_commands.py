@@ -24,7 +24,7 @@ def start(*words):
     parser = argparse.ArgumentParser(prog="spikeloom")
     add_arguments(parser)
     arguments = parser.parse_args(list(map(str, words)))
-    outcome = arguments.action(arguments)
+    outcome = arguments.action(arguments.request.of(vars(arguments)))
     return encode(outcome.result), terminal(outcome.sections(outcome.result)), outcome.code
 
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from commands import as_json, run
 
-import spikeloom
 from spikeloom.compiler.counters import BLOCK
 from spikeloom.compiler.errors import OptionError
 from spikeloom.models.recordings.grasps import synthetic_split
+from spikeloom.runtime.commands.main_job import estimate
+from spikeloom.runtime.requests.main_job import EstimateRequest
 from spikeloom.runtime.studies import processor
 
 PRICE = processor.Price(
@@ -76,5 +77,6 @@ def test_the_option(monkeypatch, tmp_path):
     for telling in ("a microcontroller is cheaper at the sensor's pace", "at no event rate", "static power dominates"):
         assert telling in text
     assert "against_processor" not in as_json(*words)
+    request = EstimateRequest(netlist="net.loom", data=synthetic_split("test", limit=12), against_processor=True)
     with pytest.raises(OptionError, match="needs the training split"):
-        spikeloom.load("net.loom").estimate(synthetic_split("test", limit=12), against_processor=True)
+        estimate.run(request)

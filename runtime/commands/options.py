@@ -1,55 +1,72 @@
-"""Options that several commands share."""
+"""Options of a command, derived from its request."""
 
 import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import Field
+from typing import Any, TypeVar
 
-from spikeloom.compiler.checkpoint import WEIGHTS
-from spikeloom.compiler.formats.nir import CONVENTIONS
-from spikeloom.models.graphs import CHOICES
-from spikeloom.models.recordings.evtouch import BIN_S
+from spikeloom.runtime.requests.fields import Request, has_default, kind_of
 
-MIN_AGREEMENT = 0.95
-"""Share of equal decisions that ``verify`` wants."""
+R = TypeVar("R", bound=Request)
 
-NETWORK_FILES = "CKPT|NET.onnx|NET.nir"
-"""What a float network is read from."""
-
-DATA_HELP = "recordings: released layout, event files (csv, npz), one recording, 'synthetic', 'objects' or 'containers'"
+KINDS = {"int": int, "float": float}
 
 
-def add_netlist(parser: argparse.ArgumentParser) -> None:
-    """Add the compiled network that a command is about."""
-    parser.add_argument("netlist", metavar="NET.loom", help="compiled network")
+def add_options(
+    parser: argparse.ArgumentParser, kind: type[Request], choices: Mapping[str, Sequence[str]] | None = None
+) -> None:
+    """Add the options of a request; `choices` are those of fields that know them only now."""
+    for each in kind.options():
+        _add_option(parser, each, (choices or {}).get(each.name))
 
 
-def add_netlist_and_model(parser: argparse.ArgumentParser) -> None:
-    """Add a netlist, the float network beside it as ``--checkpoint``, and how that is read."""
-    add_netlist(parser)
-    group(parser, "network").add_argument("--checkpoint", metavar=NETWORK_FILES, required=True, help="its float model")
-    add_network(parser)
+def _add_option(parser: argparse.ArgumentParser, each: Field[Any], choices: Sequence[str] | None) -> None:
+    about = each.metadata
+    options = group(parser, about["group"])
+    if about["constants"]:
+        axis = options.add_mutually_exclusive_group()
+        for flag, (value, text) in about["constants"].items():
+            axis.add_argument(flag, dest=each.name, action="store_const", const=value, help=text)
+        return
+    kind = kind_of(each)
+    said: dict[str, Any] = {"help": _help(each)}
+    if not about["positional"]:
+        said |= {"dest": each.name, "default": each.default if has_default(each) else None}
+        said |= {} if has_default(each) else {"required": True}
+    if kind == "bool":
+        said["action"] = "store_true"
+    else:
+        said |= {"metavar": about["metavar"], "choices": choices or about["choices"], "type": KINDS.get(kind, str)}
+    if about["bare"] is not None:
+        said |= {"nargs": "?", "const": about["bare"]}
+    if kind == "tuple":
+        said |= {"nargs": "+"} if about["positional"] else {"action": "append", "default": None}
+    flags = about["flags"] or (f"--{each.name.replace('_', '-')}",)
+    options.add_argument(*([each.name] if about["positional"] else flags), **said)
 
 
-def add_checkpoint(parser: argparse.ArgumentParser, what: str = "trained network, or pretrained:NAME") -> None:
-    """Add the checkpoint that a command is about, and how it is read."""
-    parser.add_argument("checkpoint", metavar="CKPT", help=what)
-    add_model(parser)
+def _help(each: Field[Any]) -> str:
+    """What a field says of itself, and its default where that is a value."""
+    text = str(each.metadata["text"])
+    if has_default(each) and each.default not in (None, False, ()):
+        text += f" (default: {str(each.default).replace('%', '%%')})"
+    return text
 
 
-def add_bin_option(parser: argparse.ArgumentParser) -> None:
-    """Add ``--bin``."""
-    options = group(parser, "recordings")
-    what = f"width of a time bin for event files (default: the one that the network was trained on, else {BIN_S:g} s)"
-    options.add_argument("--bin", type=float, metavar="S", help=what)
+def request_of(kind: type[R], words: Sequence[str]) -> R:
+    """What a request's command line says."""
+    parser = argparse.ArgumentParser()
+    add_options(parser, kind)
+    made: R = kind.of(vars(parser.parse_args(list(words))))
+    return made
 
 
-def group(parser: argparse.ArgumentParser, title: str) -> argparse._ArgumentGroup:
-    """Options of one kind, which a command may add in several places."""
-    found = (each for each in parser._action_groups if each.title == title)
-    return next(found, None) or parser.add_argument_group(title)
-
-
-def add_picture(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add ``--picture``."""
-    parser.add_argument("--picture", metavar="OUT.png|svg|pdf", help=f"draw {what}")
+def group(parser: argparse.ArgumentParser, title: str) -> Any:
+    """Options under one heading."""
+    if title == "options":
+        return parser
+    known = (each for each in parser._action_groups if each.title == title)
+    return next(known, None) or parser.add_argument_group(title)
 
 
 def add_common(parser: argparse.ArgumentParser) -> None:
@@ -57,71 +74,3 @@ def add_common(parser: argparse.ArgumentParser) -> None:
     common = group(parser, "output")
     common.add_argument("--json", action="store_true", help="print the result as JSON")
     common.add_argument("--debug", action="store_true", help="show a traceback on errors")
-
-
-def add_graph_options(parser: argparse.ArgumentParser, purpose: str) -> None:
-    """Add the options that name a taxel graph: the built-in sensor's, or one of the user's own."""
-    options = group(parser, "network")
-    options.add_argument("--graph", help=f"taxel graph {purpose}: {CHOICES}")
-    what = "your own sensor: number of taxels, or their positions x,y[,z] in mm"
-    options.add_argument("--taxels", metavar="N|COORDS.csv", help=what)
-    options.add_argument("--edges", metavar="EDGES.csv", help="your own graph: source,target")
-    options.add_argument("--directed", action="store_true", help="take --edges as they are, one way")
-
-
-def add_data(parser: argparse.ArgumentParser, *, required: bool = True) -> None:
-    """Add the options that name recordings, all splits of them."""
-    group(parser, "recordings").add_argument("--data", required=required, metavar="PATH", help=DATA_HELP)
-    add_bin_option(parser)
-
-
-def add_recordings(parser: argparse.ArgumentParser, *, window: bool = False, required: bool = True) -> None:
-    """Add the options that name recordings to run; with `window` also the one that names a part of each."""
-    add_data(parser, required=required)
-    options = group(parser, "recordings")
-    options.add_argument("--split", default="test", help="split to read (default: test)")
-    options.add_argument("--limit", type=int, metavar="N", help="first N recordings only")
-    if window:
-        what = "first part of every recording, as in 50%% (default: 100%%)"
-        options.add_argument("--window", default="100%", metavar="PERCENT", help=what)
-
-
-def add_prices(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how closely a run is timed, and by which prices."""
-    options = group(parser, "depth and prices")
-    what = "counts: events, energy, simple time model; cycle: the time of every message too (default: counts)"
-    options.add_argument("--detail", choices=("counts", "cycle"), default="counts", help=what)
-    options.add_argument("--table", metavar="NAME|FILE.toml", help="energy or time by this table alone, or by your own")
-
-
-def add_check(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a comparison of chip and float model."""
-    what = "recordings for spec = engine (default: 3)"
-    parser.add_argument("--spec-samples", type=int, default=3, metavar="N", help=what)
-
-
-def add_model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
-    """Add the options that say how to read a checkpoint."""
-    options = group(parser, "network")
-    if graph:
-        add_graph_options(parser, "that it was trained on")
-    options.add_argument("--run", type=int, default=0, metavar="N", help="which run of a released file (default: 0)")
-    what = "epoch, where a checkpoint holds several (default: the first of these that it holds)"
-    options.add_argument("--weights", choices=WEIGHTS, help=what)
-    options.add_argument("--beta", type=float, help="membrane decay, where the file does not say (default: 0.2)")
-    options.add_argument("--theta", type=float, help="threshold, where the file does not say (default: 0.5)")
-
-
-def add_network(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how to read a float network: a checkpoint on its graph, an ONNX or a NIR file."""
-    options = group(parser, "network")
-    add_model(parser)
-    options.add_argument("--polarities", type=int, metavar="N", help="of an ONNX or NIR input, where its shape is flat")
-    axis = options.add_mutually_exclusive_group()
-    for name, first in (("first", True), ("last", False)):
-        what = f"they are the {name} axis, where the shape of an ONNX or NIR input does not say"
-        axis.add_argument(f"--polarities-{name}", dest="polarities_first", action="store_const", const=first, help=what)
-    what = "time step that a NIR file is read in (default: its own)"
-    options.add_argument("--dt", type=float, metavar="SECONDS", help=what)
-    what = f"a step keeps 1 - dt/tau (euler) or exp(-dt/tau) (exponential) of a state (default: {CONVENTIONS[0]})"
-    options.add_argument("--convention", choices=CONVENTIONS, help=what)

@@ -22,6 +22,7 @@ from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.report.shown import Shown
 
 LEVELS = {
     "EN": "every number of the netlist is what lowering its network gives",
@@ -98,8 +99,8 @@ class ModelSpikes:
     different: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Verdict:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Verdict(Shown):
     """Everything that verify finds, on any chip.
 
     Predictions are (samples,) int64 and votes (samples, classes) int64; those of the float model are None where the

@@ -1,6 +1,5 @@
 """What the options of ``compile`` ask for: storage of each layer, cores, and what a netlist remembers of it."""
 
-import argparse
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,28 +9,27 @@ from spikeloom.compiler.ir import Form
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.inputs.recordings import origin_of
+from spikeloom.runtime.requests.main_job import CompileRequest
 
 
-def provenance(
-    arguments: argparse.Namespace, asked: LoadedNetwork, *, calibrated: Recordings | None
-) -> Mapping[str, Any]:
+def provenance(request: CompileRequest, asked: LoadedNetwork, *, calibrated: Recordings | None) -> Mapping[str, Any]:
     """What a netlist remembers of its compilation, whose scales the recordings `calibrated` chose, if any did."""
     seen = {} if calibrated is None else {"data": calibrated.source, "bin_s": calibrated.bin_s}
-    checkpoint, cores_for = asked.checkpoint, parse_cores(arguments.cores_for)
+    checkpoint, cores_for = asked.checkpoint, parse_cores(request.cores_for)
     return {
         "spikeloom": __version__,
         "checkpoint_sha256": asked.sha256,
-        **asked.origin(arguments.run),
+        **asked.origin(request.run),
         **(origin_of(asked.training) or origin_of(seen)),
         **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
-        **storage(parse_packings(arguments), asked.network.forms),
-        "spike_exact": arguments.spike_exact,
-        "keep_all": arguments.keep_all,
-        "prune_unused": arguments.prune_unused,
-        **({"share_lists": True} if arguments.share_lists else {}),
+        **storage(parse_packings(request), asked.network.forms),
+        "spike_exact": request.spike_exact,
+        "keep_all": request.keep_all,
+        "prune_unused": request.prune_unused,
+        **({"share_lists": True} if request.share_lists else {}),
         "calibrated": calibrated is not None,
         **({"cores_for": cores_for} if cores_for else {}),
-        **({"chips": arguments.chips} if arguments.chips != 1 else {}),
+        **({"chips": request.chips} if request.chips != 1 else {}),
     }
 
 
@@ -43,17 +41,17 @@ def whole_numbers(text: str, option: str) -> list[int]:
         raise OptionError(f"{option} {text}: not a number; give one, or several as in 8,4,4,8") from None
 
 
-def parse_packings(arguments: argparse.Namespace) -> tuple[Packing, ...] | None:
+def parse_packings(request: CompileRequest) -> tuple[Packing, ...] | None:
     """Packing that the options of ``compile`` ask for, or None where they do not.
 
     Raises OptionError if they are no numbers, or disagree about the number of layers.
     """
-    if not (arguments.weight_bits or arguments.planes or arguments.scale_groups):
+    if not (request.weight_bits or request.planes or request.scale_groups):
         return None
     asked = {
-        "--weight-bits": whole_numbers(arguments.weight_bits or "8", "--weight-bits"),
-        "--planes": whole_numbers(arguments.planes or "1", "--planes"),
-        "--scale-groups": whole_numbers(arguments.scale_groups or "1", "--scale-groups"),
+        "--weight-bits": whole_numbers(request.weight_bits or "8", "--weight-bits"),
+        "--planes": whole_numbers(request.planes or "1", "--planes"),
+        "--scale-groups": whole_numbers(request.scale_groups or "1", "--scale-groups"),
     }
     layers = max(len(values) for values in asked.values())
     for option, values in asked.items():
@@ -63,16 +61,16 @@ def parse_packings(arguments: argparse.Namespace) -> tuple[Packing, ...] | None:
     return tuple(Packing(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
 
 
-def parse_keep(arguments: argparse.Namespace) -> float | None:
+def parse_keep(request: CompileRequest) -> float | None:
     """Share of decisions that storage has to keep; OptionError if it is none, or nothing can be chosen by it."""
-    keep = arguments.keep
+    keep = request.keep
     if keep is None:
         return KEEP
     if not 0 <= keep <= 1:
         raise OptionError(f"--keep {keep:g}: not a share; give a number from 0 to 1")
-    if arguments.calibrate is None:
+    if request.calibrate is None:
         raise OptionError(f"--keep {keep:g}: no recordings to hold out; give --calibrate")
-    if arguments.spike_exact or parse_packings(arguments) is not None:
+    if request.spike_exact or parse_packings(request) is not None:
         chosen = "--weight-bits, --planes, --scale-groups and --spike-exact"
         raise OptionError(f"--keep {keep:g}: chooses storage; omit it, or {chosen}")
     return float(keep)

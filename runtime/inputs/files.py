@@ -1,10 +1,10 @@
 """Files that a user names: shipped checkpoints, places to write, what can be inspected."""
 
-import argparse
 import zipfile
 from collections.abc import Callable, Iterable
 from importlib import resources
 from pathlib import Path
+from typing import Protocol, cast
 
 from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import OptionError
@@ -12,8 +12,18 @@ from spikeloom.compiler.files import beside, write_atomically
 from spikeloom.compiler.formats import NIR, ONNX
 from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name
 from spikeloom.runtime.report.drawing import PICTURES, Drawing
+from spikeloom.runtime.requests.fields import Request
 
 _RECORDINGS = "recordings are shown by spikeloom data describe"
+
+
+class Pictured(Protocol):
+    """A request that may ask for a picture."""
+
+    @property
+    def picture(self) -> str | None:
+        """File to draw it to."""
+
 
 PRETRAINED = "pretrained:"
 
@@ -48,13 +58,11 @@ INPUTS = (
 """Arguments that may name a file to read."""
 
 
-def require_place(
-    path: str | None, option: str, arguments: argparse.Namespace | None = None, kinds: Iterable[str] = ()
-) -> None:
+def require_place(path: str | None, option: str, request: Request | None = None, kinds: Iterable[str] = ()) -> None:
     """Refuse, before any work is done, a place where a result could not be written; nothing to do without one.
 
     Raises OptionError if there is no such folder, or none that takes a file, the path is a folder or a device, has
-    another suffix than one of the `kinds`, or is one of the `INPUTS` of `arguments`, which must not be overwritten.
+    another suffix than one of the `kinds`, or is one of the `INPUTS` of `request`, which must not be overwritten.
     """
     if path is None:
         return
@@ -71,23 +79,23 @@ def require_place(
     except OSError as error:
         raise OptionError(f"{option} {path}: cannot be written ({error.strerror}); name another") from error
     for name in INPUTS if place.exists() else ():
-        given = getattr(arguments, name, None)
-        for each in given if isinstance(given, list) else [given]:
+        given = getattr(request, name, None)
+        for each in given if isinstance(given, tuple) else [given]:
             if isinstance(each, str) and Path(shipped(each)).exists() and place.samefile(shipped(each)):
                 raise OptionError(f"{option} {path}: is an input of this command ({each}); give another name")
     if kinds and place.suffix not in (allowed := [f".{kind}" for kind in kinds]):
         raise OptionError(f"{option} {path}: has to end in {' or '.join(allowed)}; give another name")
 
 
-def require_picture(arguments: argparse.Namespace, outputs: Iterable[str | Path | None]) -> None:
+def require_picture(request: Pictured, outputs: Iterable[str | Path | None]) -> None:
     """Refuse a ``--picture`` that could not be written, of another kind than is drawn, or that is one of the `outputs`.
 
     Raises OptionError.
     """
-    path = arguments.picture
+    path = request.picture
     if path is None:
         return
-    require_place(path, "--picture", arguments, PICTURES)
+    require_place(path, "--picture", cast(Request, request), PICTURES)
     if Path(path).absolute() in [Path(output).absolute() for output in outputs if output is not None]:
         raise OptionError(f"--picture {path}: is what -o names, too; give another name")
 

@@ -1,6 +1,5 @@
 """The float network that a command is given: a checkpoint on its graph, or an ONNX or NIR file that holds all."""
 
-import argparse
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -26,6 +25,7 @@ from spikeloom.models.systems import NO_GRAPH, propagation_of
 from spikeloom.runtime.inputs.files import is_recordings, shipped
 from spikeloom.runtime.inputs.repeat import NETWORK, refuse
 from spikeloom.runtime.report.console import progress, tell
+from spikeloom.runtime.requests.choices import CheckpointChoice, NetworkChoice, SensorChoice
 
 NETWORKS = {ONNX: "ONNX", NIR: "NIR", COUNTERS: "counting"}
 """Networks that a file holds whole, by its ending, or by what it says of itself."""
@@ -90,7 +90,7 @@ class LoadedNetwork:
         return Factored(self.checkpoint, self.adjacency)
 
 
-def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Netlist | None = None) -> LoadedNetwork:
+def load_network(path: str | Network, request: NetworkChoice, netlist: Netlist | None = None) -> LoadedNetwork:
     """Read what a command is given; beside a `netlist` as that was, where the options say nothing.
 
     That are the epoch and the graph of a checkpoint that does not say which, the time step of a NIR file, and the names
@@ -104,14 +104,14 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
         sha256 = hashlib.sha256(text(path).encode()).hexdigest()
         return LoadedNetwork(network=path, sha256=sha256, format="module")
     kind = network_kind(path)
-    _require_fit(path, kind, arguments)
+    _require_fit(path, kind, request)
     made = {} if netlist is None else netlist.provenance
     if kind is None:
-        checkpoint = load_checkpoint(path, arguments)
+        checkpoint = load_checkpoint(path, request)
         epoch = made.get("weights") if made.get("checkpoint_sha256") == checkpoint.sha256 else None
-        if arguments.weights is None and epoch in checkpoint.sets and epoch != checkpoint.weights:
-            checkpoint = load_checkpoint(path, argparse.Namespace(**vars(arguments) | {"weights": epoch}))
-        graph, adjacency = propagation(checkpoint, _graph_of(checkpoint, arguments, made), path)
+        if request.weights is None and epoch in checkpoint.sets and epoch != checkpoint.weights:
+            checkpoint = load_checkpoint(path, replace(request, weights=epoch))
+        graph, adjacency = propagation(checkpoint, _graph_of(checkpoint, request, made), path)
         return LoadedNetwork(
             network=expand(checkpoint, adjacency),
             sha256=checkpoint.sha256,
@@ -122,7 +122,7 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
         )
     progress("reading the network")
     training = None
-    layout = {"polarities": arguments.polarities, "polarities_first": arguments.polarities_first}
+    layout: dict[str, Any] = {"polarities": request.polarities, "polarities_first": request.polarities_first}
     if kind == COUNTERS:
         from spikeloom.compiler.formats.counters import read_counters, read_network
 
@@ -134,7 +134,7 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
     else:
         from spikeloom.compiler.formats.nir.reader import read_nir
 
-        given = {name: getattr(arguments, name) for name in ("dt", "convention")}
+        given = {name: getattr(request, name) for name in ("dt", "convention")}
         steps = {name: made.get(name) if value is None else value for name, value in given.items()}
         found = read_nir(path, **steps, **layout)
         training = found.training
@@ -148,13 +148,13 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
     )
 
 
-def _graph_of(checkpoint: Checkpoint, arguments: argparse.Namespace, made: Mapping[str, Any]) -> Graph | None:
+def _graph_of(checkpoint: Checkpoint, request: CheckpointChoice, made: Mapping[str, Any]) -> Graph | None:
     """Graph that the options name, or the one that a netlist was compiled for, if it is built in; None for neither."""
-    asked = load_graph(arguments, checkpoint.system)
+    asked = load_graph(request, checkpoint.system)
     if asked is not None or checkpoint.edges is not None or not isinstance(made.get("graph"), str):
         return asked
     try:
-        return load_graph(argparse.Namespace(**vars(arguments) | {"graph": made["graph"]}), checkpoint.system)
+        return load_graph(replace(request, graph=made["graph"]), checkpoint.system)
     except SpikeloomError:
         return None  # one of the user's own
 
@@ -174,33 +174,33 @@ def network_kind(path: str) -> str | None:
     return suffix or (COUNTERS if stated(Path(shipped(path)), "format") == COUNTERS else None)
 
 
-def _require_fit(path: str, kind: str | None, arguments: argparse.Namespace) -> None:
+def _require_fit(path: str, kind: str | None, request: NetworkChoice) -> None:
     """Refuse options that are for another kind of file, and files that hold no float network."""
     if path.endswith(NETX):
         raise OptionError(f"{path}: holds integers, no float network to compare with; compile, inspect and run it")
     if kind not in (ONNX, NIR):
         why = f"is for ONNX and NIR files, {path} is none"
-        refuse(arguments, ("polarities",), why)
-        if arguments.polarities_first is not None:
+        refuse(request, ("polarities",), why)
+        if request.polarities_first is not None:
             raise OptionError(f"--polarities-first or -last: {why}; omit it")
     if kind is not None:
-        refuse(arguments, NETWORK, f"is for checkpoints, the {NETWORKS[kind]} file {path} holds all it needs")
+        refuse(request, NETWORK, f"is for checkpoints, the {NETWORKS[kind]} file {path} holds all it needs")
     if kind != NIR:
-        refuse(arguments, ("dt", "convention"), f"is for NIR files, {path} is none")
+        refuse(request, ("dt", "convention"), f"is for NIR files, {path} is none")
 
 
-def load_graph(arguments: argparse.Namespace, system: str = TACTILESGNET) -> Graph | None:
+def load_graph(request: SensorChoice, system: str = TACTILESGNET) -> Graph | None:
     """Graph that the options name, or None if they name none; a warning goes to stderr.
 
     Raises OptionError or ModelError if there is no such graph, its files are wrong, or the system has no graph at all.
     """
     if system not in GRAPH_SYSTEMS:
-        refuse(arguments, ("graph", "edges", "directed"), f"is for taxel graphs, {TITLES[system]} has none")
+        refuse(request, ("graph", "edges", "directed"), f"is for taxel graphs, {TITLES[system]} has none")
         return None
-    if not (arguments.graph or arguments.taxels or arguments.edges or arguments.directed):
+    if not (request.graph or request.taxels or request.edges or request.directed):
         return None
     graph, warning = sensor_graph(
-        graph=arguments.graph, taxels=arguments.taxels, edges=arguments.edges, directed=arguments.directed
+        graph=request.graph, taxels=request.taxels, edges=request.edges, directed=request.directed
     )
     if warning is not None:
         tell(f"warning: {warning}")
@@ -242,7 +242,7 @@ def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tupl
     return asked.name, found
 
 
-def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
+def load_checkpoint(path: str, request: CheckpointChoice) -> Checkpoint:
     """Read a checkpoint as the options say; OptionError or ModelError if it is not there, or not as they say."""
     progress("reading the checkpoint")
     if (kind := stated(Path(shipped(path)), "format")) in (TRAINED, COUNTERS):
@@ -252,5 +252,5 @@ def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
     if is_recordings(path):
         raise ModelError(f"{path}: holds recordings; give the network here, and these as --calibrate or --data")
     return read_checkpoint(
-        shipped(path), run=arguments.run, weights=arguments.weights, beta=arguments.beta, theta=arguments.theta
+        shipped(path), run=request.run, weights=request.weights, beta=request.beta, theta=request.theta
     )

@@ -1,8 +1,8 @@
 """Recordings that a user names, held against a network."""
 
-import argparse
 from collections.abc import Mapping
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from spikeloom.models.recordings.counts import number, show_counts
 from spikeloom.models.recordings.evtouch import BIN_S, UNLABELLED, Recordings, first_part, other_taxels, parse_window
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
 from spikeloom.runtime.report.console import progress, tell
+from spikeloom.runtime.requests.choices import SplitChoice
 
 
 def recordings(
@@ -128,33 +129,42 @@ def require_bins(bins: int) -> None:
 
 
 def load_recordings(
-    arguments: argparse.Namespace, netlist: Netlist, *, labels_for: str | None = None, joined: bool = True
+    source: str | Recordings,
+    request: SplitChoice,
+    netlist: Netlist,
+    *,
+    labels_for: str | None = None,
+    joined: bool = True,
 ) -> Recordings:
-    """Recordings that the options of a command name, held against a netlist; as `recordings` otherwise.
+    """Recordings of a source that a request names, held against a netlist; as `recordings` otherwise.
 
     In steps of the network if `joined`, as long a part of each as a ``--window`` says, as long as the network needs;
     else whole, in their own bins.
     """
-    window = parse_window(getattr(arguments, "window", "100%"))
+    window = parse_window(getattr(request, "window", "100%"))
     progress("reading the recordings")
     data = recordings(
-        arguments.data,
-        arguments.split,
-        limit=arguments.limit,
+        source,
+        request.split,
+        limit=request.limit,
         classes=netlist.classes,
         taxels=netlist.taxels,
-        bin_s=arguments.bin,
+        bin_s=request.bin,
         bins=netlist.bins if joined else 1,
         labels_for=labels_for,
         trained=origin_of(netlist.provenance),
     )
-    arguments.bin = data.seconds  # what the command goes on with
     if not joined:
         return data
     data, length = first_part(data, window), netlist.clocks.length
     if length is not None and (late := int(data.events[..., length:].sum(dtype=np.int64))):
         tell(f"warning: {data.source}: {number(late, 'event')} after the network's {length} steps: not used")
     return events.of_length(data, length)
+
+
+def name_of(source: str | Recordings) -> str:
+    """Name of recordings without their folder."""
+    return Path(source if isinstance(source, str) else source.source).name
 
 
 def find_recording(data: Recordings, wanted: str, option: str) -> int:

@@ -1,6 +1,5 @@
 """Options as they are typed: to get the same again, or to refuse what does not apply."""
 
-import argparse
 import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,6 +8,7 @@ from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import BIN_S
+from spikeloom.runtime.requests.fields import Request
 
 NETWORK = ("graph", "taxels", "edges", "directed", "run", "weights", "beta", "theta")
 """Options that say how a checkpoint is read."""
@@ -41,7 +41,7 @@ def words(options: Mapping[str, Any]) -> list[str]:
     """
     typed: list[str] = []
     for name, value in options.items():
-        if value is None or value is False or value == USUAL.get(name, []):
+        if value is None or value is False or value in ((), USUAL.get(name, ())):
             continue
         typed.append(f"--{name.replace('_', '-')}")
         if value is not True:
@@ -49,15 +49,15 @@ def words(options: Mapping[str, Any]) -> list[str]:
     return typed
 
 
-def given(arguments: argparse.Namespace, names: Sequence[str]) -> JsonObject:
+def given(request: Request, names: Sequence[str]) -> JsonObject:
     """Some options of a command, by name."""
-    return {name: getattr(arguments, name) for name in names}
+    return {name: getattr(request, name) for name in names}
 
 
-def refuse(arguments: argparse.Namespace, names: Sequence[str], why: str) -> None:
+def refuse(request: Request, names: Sequence[str], why: str) -> None:
     """Refuse options that are given although they do not apply; OptionError naming the first of them."""
     for name in names:
-        if typed := words({name: getattr(arguments, name, None)}):
+        if typed := words({name: getattr(request, name, None)}):
             raise OptionError(f"{' '.join(typed)}: {why}; omit it")
 
 

@@ -3,9 +3,9 @@
 A chip is a :class:`Backend`; all are listed in :mod:`machines.backends`.
 """
 
+import json
 import os
 from abc import ABC, abstractmethod
-from argparse import Namespace
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property
@@ -29,7 +29,11 @@ from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting, by_
 from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.votes import class_counts
-from spikeloom.runtime.report.sections import Block, Outcome
+from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.report.sections import Block, Outcome, Section
+from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.requests.choices import ComparisonChoice
+from spikeloom.runtime.requests.main_job import CompileRequest, InspectRequest
 
 Done = Callable[[int], object] | None
 """Called with the number of recordings done."""
@@ -78,9 +82,9 @@ class Model:
     spikes: Callable[[EventArray], Mapping[str, BoolArray]]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Price:
-    """What recordings cost, in the terms that all chips share."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Price(Shown):
+    """What recordings cost, in the terms that all chips share; arrays have an entry for each recording."""
 
     synaptic_operations: IntArray | FloatArray  # (samples,)
     energy_j: Mapping[str, FloatArray]  # By table, of each recording
@@ -89,6 +93,19 @@ class Price:
     dynamic_j: Mapping[str, FloatArray]  # The same as energy_j, but for power that flows whatever happens
     static_w: Mapping[str, float]  # That power, of all chips, by source
     outcome: Outcome  # All that the chip's own price model knows, with its layout
+
+    @property
+    def details(self) -> Any:
+        """All that the chip's own price model knows: events, energies by part and layer, times."""
+        return self.outcome.result
+
+    def sections(self) -> Iterable[Section]:
+        """What it says, laid out."""
+        return self.outcome.sections(self.outcome.result)
+
+    def to_json(self) -> str:
+        """What ``estimate --json`` prints."""
+        return json.dumps(encode(self.outcome.result))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -475,7 +492,7 @@ class Backend(ABC):
         """Names of the passes that lower a network, in order."""
 
     @abstractmethod
-    def lower(self, arguments: Namespace, after: Callable[[str, Any], object]) -> Lowered:
+    def lower(self, request: CompileRequest, after: Callable[[str, Any], object]) -> Lowered:
         """Read the network that `compile` was given and lower it; `after` as of :func:`pipeline.run`."""
 
     @abstractmethod
@@ -498,16 +515,16 @@ class Backend(ABC):
         """Whether a file holds a network that was trained for the chip alone."""
         return False
 
-    def inspect(self, arguments: Namespace) -> Outcome:
+    def inspect(self, request: InspectRequest) -> Outcome:
         """Describe such a network."""
         raise NotImplementedError(f"no network is trained for {self.name} alone")
 
-    def reference(self, arguments: Namespace, netlist: Any) -> Reference:
+    def reference(self, request: ComparisonChoice, netlist: Any) -> Reference:
         """Read the network that `verify` was given beside a netlist; by default a network of floats."""
-        loaded = load_network(arguments.checkpoint, arguments, netlist)
+        loaded = load_network(request.checkpoint, request, netlist)
         return Reference(
             source=loaded.model,
             network=loaded.network,
             loaded=loaded,
-            difference=loaded.differs_from(netlist, arguments.run),
+            difference=loaded.differs_from(netlist, request.run),
         )

@@ -6,6 +6,7 @@ from typing import Protocol
 
 from spikeloom.runtime.report.encode import HIDDEN
 from spikeloom.runtime.report.sections import Section, Text
+from spikeloom.runtime.report.shown import Shown
 
 
 class LayerCheck(Protocol):
@@ -20,8 +21,8 @@ class LayerCheck(Protocol):
         """Whether it was rounded so that errors cancel, and its numbers need not be the nearest."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NetlistCheck:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class NetlistCheck(Shown):
     """What of a netlist is not as lowering its network gives it.
 
     layers: facts of each layer, where the chip rounds layer by layer.

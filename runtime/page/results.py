@@ -1,6 +1,5 @@
 """All that the page of a network shows, as its JSON has it, and where that is from."""
 
-import argparse
 import hashlib
 import platform
 from collections.abc import Mapping, Sequence
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom import __version__
+from spikeloom.compiler import __version__
 from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import Target
@@ -28,6 +27,8 @@ from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.page.recording import Recording
 from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL, key
 from spikeloom.runtime.report.sections import Block, Outcome
+from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.requests.main_job import ReportRequest
 from spikeloom.runtime.studies.stress.results import Stress
 
 PACKAGES = ("numpy", "scipy", "torch", "numba", "networkx")
@@ -89,8 +90,8 @@ class Provenance:
     commands: Mapping[str, str]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Report:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Report(Shown):
     """All that the page shows."""
 
     verify: Verdict
@@ -139,7 +140,7 @@ def taxels(machine: Machine, loaded: LoadedNetwork, data: Recordings, counts: In
 
 
 def provenance(
-    arguments: argparse.Namespace,
+    request: ReportRequest,
     netlist: Netlist,
     target: Target,
     loaded: LoadedNetwork,
@@ -151,7 +152,7 @@ def provenance(
     File names are those of the files, without their folders; the page is always called ``report.html``.
     """
     checkpoint = loaded.checkpoint
-    file = Path(arguments.checkpoint).name if isinstance(arguments.checkpoint, str) else loaded.format
+    file = Path(request.checkpoint).name if isinstance(request.checkpoint, str) else loaded.format
     digest = hashlib.sha256()
     for name, array in data.identity().items():
         digest.update(f"{name} {array.shape} {array.dtype.str}".encode())
@@ -161,11 +162,11 @@ def provenance(
         facts |= {"system": checkpoint.system, "weights": checkpoint.weights, "training": checkpoint.training}
         facts |= {"dynamics": None if checkpoint.dynamics.is_plain else checkpoint.dynamics.to_json()}
     facts |= {"graph": loaded.graph, "bins": netlist.bins}
-    recorded = {"split": data.split, "samples": len(data), "bin_s": arguments.bin}
+    recorded = {"split": data.split, "samples": len(data), "bin_s": data.seconds}
     return Provenance(
         netlist=Origin(
-            file=Path(arguments.netlist).name,
-            sha256=sha256_of(arguments.netlist),
+            file=Path(request.netlist).name,
+            sha256=sha256_of(request.netlist),
             facts={"compiled": dict(netlist.provenance)},
         ),
         checkpoint=Origin(file=file, sha256=loaded.sha256, facts=facts),
@@ -174,26 +175,26 @@ def provenance(
         | {f"time, {table.name}": table.title for table in target.time},
         versions={"spikeloom": __version__, "python": platform.python_version()}
         | {name: metadata.version(name) for name in PACKAGES},
-        commands=_commands(arguments, recording),
+        commands=_commands(request, recording, data.seconds),
     )
 
 
-def _commands(arguments: argparse.Namespace, recording: str) -> dict[str, str]:
+def _commands(request: ReportRequest, recording: str, bin_s: float) -> dict[str, str]:
     """What to type, and what each is for; how the netlist was compiled is among its facts."""
 
     def name(given: Any) -> str:
         path = "" if given is None else str(getattr(given, "source", given))  # recordings that Python handed over
         return Path(path).name or path
 
-    net, checkpoint, data = name(arguments.netlist), name(arguments.checkpoint), name(arguments.data)
-    options = repeat.given(arguments, repeat.NETWORK)
+    net, checkpoint, data = name(request.netlist), name(request.checkpoint), name(request.data)
+    options = repeat.given(request, repeat.NETWORK)
     options |= {option: name(options[option]) or None for option in ("taxels", "edges")}
-    model = repeat.words(options | {"polarities": arguments.polarities})
-    if arguments.polarities_first is not None:
-        model.append("--polarities-first" if arguments.polarities_first else "--polarities-last")
-    split = None if arguments.split == "test" else arguments.split
-    read = ["--data", data, *repeat.words({"split": split, "limit": arguments.limit, "bin": arguments.bin})]
-    spec = repeat.words({"spec_samples": None if arguments.spec_samples == 3 else arguments.spec_samples})
+    model = repeat.words(options | {"polarities": request.polarities})
+    if request.polarities_first is not None:
+        model.append("--polarities-first" if request.polarities_first else "--polarities-last")
+    split = None if request.split == "test" else request.split
+    read = ["--data", data, *repeat.words({"split": split, "limit": request.limit, "bin": bin_s})]
+    spec = repeat.words({"spec_samples": None if request.spec_samples == 3 else request.spec_samples})
     both = [net, "--checkpoint", checkpoint, *model, *read]
     lines = {
         "verdict and ladder": ["verify", *both, *spec],

@@ -87,6 +87,10 @@ class Section:
 Block = Text | Table | Figure | Facts | Code | Details | Section
 
 
+LAYOUTS: dict[type, Callable[[Any], Iterable[Section]]] = {}
+"""What lays out results of a class, known as soon as there is one, see :mod:`report.shown`."""
+
+
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """What a command has found: a result that :mod:`report.encode` can encode, its layout, and the exit code."""
@@ -94,6 +98,10 @@ class Outcome:
     result: Any
     sections: Callable[[Any], Iterable[Section]]
     code: int = 0
+
+    def __post_init__(self) -> None:
+        """Let the result show itself."""
+        LAYOUTS[type(self.result)] = self.sections
 
 
 def terminal(sections: Iterable[Section]) -> str:

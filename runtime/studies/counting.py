@@ -20,6 +20,7 @@ from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.report.shown import Shown
 
 PART = 64
 """Recordings whose spikes are held at a time."""
@@ -43,8 +44,8 @@ class CountersRecord:
     bin_s: float | None = field(default=None, metadata=OPTIONAL)  # Seconds of a bin, where the recordings were events
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CountersReport:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class CountersReport(Shown):
     """A counting network that was trained and written."""
 
     file: str

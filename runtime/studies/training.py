@@ -22,6 +22,7 @@ from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.drawing import COLOURS, Drawing, sheet, styled
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.studies.jobs import only_one, side_by_side
 
 TITLES = {"last": "last epoch", "best": "best epoch on test", "clean": "clean epoch, chosen on validation"}
@@ -48,8 +49,8 @@ class Accuracies:
     max: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrainingReport:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class TrainingReport(Shown):
     """All seeds, and their accuracies by epoch (JSON calls these protocols)."""
 
     runs: Sequence[Finished]

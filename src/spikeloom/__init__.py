@@ -8,19 +8,51 @@ loihi1: 2,886 neurons (2,517 on the chip), 451,712 synapses (371,854 stored, 355
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from spikeloom.compiler.errors import SpikeloomError
     from spikeloom.models.networks.lif import LIF
-    from spikeloom.runtime.api import Compiled, compile, finetune, load, recordings
+    from spikeloom.runtime.api import (
+        Compiled,
+        Data,
+        certify,
+        chart,
+        compile,
+        estimate,
+        finetune,
+        load,
+        recordings,
+        report,
+        run,
+        smallest,
+        stress,
+        train,
+        verify,
+    )
 
 from spikeloom.compiler import __version__
 
-__all__ = ["LIF", "Compiled", "SpikeloomError", "__version__", "compile", "finetune", "load", "recordings"]
-
-_PLACES = {"SpikeloomError": "compiler.errors", "LIF": "models.networks.lif"}
+__all__ = [
+    "LIF",
+    "Compiled",
+    "Data",
+    "SpikeloomError",
+    "__version__",
+    "certify",
+    "chart",
+    "compile",
+    "estimate",
+    "finetune",
+    "load",
+    "recordings",
+    "report",
+    "run",
+    "smallest",
+    "stress",
+    "train",
+    "verify",
+]
 
 
 def __dir__() -> list[str]:
@@ -30,6 +62,16 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used."""
+    if name == "SpikeloomError":
+        from spikeloom.compiler.errors import SpikeloomError
+
+        return SpikeloomError
+    if name == "LIF":
+        from spikeloom.models.networks.lif import LIF
+
+        return LIF
     if name not in __all__:
         raise AttributeError(f"module 'spikeloom' has no attribute {name!r}")
-    return getattr(import_module(f"spikeloom.{_PLACES.get(name, 'runtime.api')}"), name)
+    from spikeloom.runtime import api
+
+    return getattr(api, name)

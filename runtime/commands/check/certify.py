@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,17 +10,16 @@ from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.errors import require_least
 from spikeloom.compiler.files import sha256_of
 from spikeloom.models.recordings.counts import number
-from spikeloom.runtime.commands.options import add_netlist, add_picture, add_recordings
 from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
-from spikeloom.runtime.inputs.recordings import load_recordings
+from spikeloom.runtime.inputs.recordings import load_recordings, name_of
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
-from spikeloom.runtime.studies.stability.neighbours import KINDS
+from spikeloom.runtime.requests.check import CertifyRequest
 from spikeloom.runtime.studies.stability.results import Provenance
 from spikeloom.runtime.studies.stability.sections import sections, taxel_map
-from spikeloom.runtime.studies.stability.study import MOST, SHIFT, stability
+from spikeloom.runtime.studies.stability.study import stability
 
 NOTES = """\
 On each recording every one of these changes is decided, none is sampled: {kinds}.
@@ -29,41 +27,30 @@ For several changed events it says how many are proven to be harmless and how ma
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Describe the options of the command."""
-    add_netlist(parser)
-    add_recordings(parser)
-    parser.add_argument("--shift", type=int, default=SHIFT, metavar="BINS", help=f"furthest shift (default: {SHIFT})")
-    parser.add_argument(
-        "--most", type=int, default=MOST, metavar="N", help=f"changed events to look for a proof of (default: {MOST})"
-    )
-    parser.add_argument("--jobs", type=int, metavar="N", help="recordings at a time (default: one a core)")
-    add_picture(parser, "how many decisions hang on each taxel")
-    parser.add_argument("-o", "--output", metavar="OUT.json", help="write what --json prints")
-    parser.epilog = NOTES.format(kinds="; ".join(KINDS.values()))
+REQUEST = CertifyRequest
 
 
-def run(arguments: argparse.Namespace) -> Outcome:
+def run(request: CertifyRequest) -> Outcome:
     """Run the command."""
-    require_place(arguments.output, "-o", arguments)
-    require_picture(arguments, [arguments.output])
-    require_least(vars(arguments), shift=0, most=1, jobs=1)
-    machine = machine_for(arguments.netlist)
-    data = load_recordings(arguments, machine.netlist, labels_for="certify", joined=False)
+    require_place(request.output, "-o", request)
+    require_picture(request, [request.output])
+    require_least(vars(request), shift=0, most=1, jobs=1)
+    machine = machine_for(request.netlist)
+    data = load_recordings(request.data, request, machine.netlist, labels_for="certify", joined=False)
     singles = int(data.step_counts.sum()) * data.taxels * data.events.shape[2]
     tell(f"trying {singles:,} single events of {number(len(data), 'recording')}, then taxels, pairs, shifts and cuts")
-    found = stability(machine, data, shift=arguments.shift, most=arguments.most, jobs=arguments.jobs)
+    found = stability(machine, data, shift=request.shift, most=request.most, jobs=request.jobs)
     result = replace(
         found,
         provenance=Provenance(
             spikeloom=__version__,
-            netlist=Path(arguments.netlist).name,
-            netlist_sha256=sha256_of(arguments.netlist),
-            data=Path(arguments.data).name,
+            netlist=Path(request.netlist).name,
+            netlist_sha256=sha256_of(request.netlist),
+            data=name_of(request.data),
             data_sha256=arrays_digest(data.identity()),
-            split=arguments.split,
+            split=request.split,
         ),
     )
-    write_picture(arguments.picture, lambda: taxel_map(result))
-    write_json(arguments.output, result)
+    write_picture(request.picture, lambda: taxel_map(result))
+    write_json(request.output, result)
     return Outcome(result, sections)

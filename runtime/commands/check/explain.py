@@ -4,11 +4,10 @@ The reference is the float model in float64, run from the synapses that the comp
 float32, as the model was trained.
 """
 
-import argparse
+from dataclasses import replace
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.interpret import Activity, channels_last
-from spikeloom.runtime.commands.options import add_netlist_and_model, add_recordings
 from spikeloom.runtime.equivalence.explanation.causes import explain
 from spikeloom.runtime.equivalence.explanation.results import Explained, sections
 from spikeloom.runtime.equivalence.reference import require_match
@@ -17,6 +16,7 @@ from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.capabilities import require_comparable
 from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.requests.check import ExplainRequest
 
 NOTES = """\
 An entry (neuron and step) that differs is a root if no input of the neuron differed since the last step in which both
@@ -28,30 +28,23 @@ LIMIT = 10
 """Recordings that are searched for a difference by default."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Describe the options of the command."""
-    add_netlist_and_model(parser)
-    add_recordings(parser)
-    what = "recording to explain, by name or from 0 (default: the first that differs)"
-    parser.add_argument("--sample", "--recording", metavar="NAME|N", help=what)
-    parser.add_argument("--top", type=int, default=10, metavar="N", help="roots to show (default: 10)")
-    parser.epilog = NOTES
+REQUEST = ExplainRequest
 
 
-def run(arguments: argparse.Namespace) -> Outcome:
+def run(request: ExplainRequest) -> Outcome:
     """Run the command; differences are its subject, not a failure."""
-    if arguments.top < 1:
-        raise OptionError(f"--top {arguments.top}: at least 1 root can be shown; give a positive number")
-    machine = require_comparable(machine_for(arguments.netlist), arguments.netlist, "explain")
+    if request.top < 1:
+        raise OptionError(f"--top {request.top}: at least 1 root can be shown; give a positive number")
+    machine = require_comparable(machine_for(request.netlist), request.netlist, "explain")
     netlist = machine.netlist
-    loaded = load_network(arguments.checkpoint, arguments, netlist)
+    loaded = load_network(request.checkpoint, request, netlist)
     require_match(netlist, loaded.model)
-    loaded.require_same(arguments.netlist, netlist, arguments.run)
-    if arguments.limit is None and arguments.sample is None:
-        arguments.limit = LIMIT
-    data = load_recordings(arguments, netlist)
+    loaded.require_same(request.netlist, netlist, request.run)
+    if request.limit is None and request.sample is None:
+        request = replace(request, limit=LIMIT)
+    data = load_recordings(request.data, request, netlist)
     machine.require_sensor(data.events)
-    chosen = range(len(data)) if arguments.sample is None else [find_recording(data, arguments.sample, "--sample")]
+    chosen = range(len(data)) if request.sample is None else [find_recording(data, request.sample, "--sample")]
 
     machine.require_windows()
     check = machine.check_lowering(loaded.network)
@@ -76,11 +69,11 @@ def run(arguments: argparse.Namespace) -> Outcome:
         sample=data.files[index],
         split=data.split,
         recording=index,
-        searched=1 if arguments.sample is not None else index + 1,
+        searched=1 if request.sample is not None else index + 1,
         steps=data.steps_of(index),
         graph=loaded.graph,
         explanation=explanation,
         faults=check.faults,
-        top=explanation.found[: arguments.top],
+        top=explanation.found[: request.top],
     )
     return Outcome(result, sections)

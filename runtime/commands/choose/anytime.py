@@ -1,10 +1,9 @@
 """The command ``anytime``: how early a decision could have been taken, and what that saves."""
 
-import argparse
+from dataclasses import replace
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.types import FloatArray
-from spikeloom.runtime.commands.options import add_netlist, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
@@ -12,6 +11,7 @@ from spikeloom.runtime.machines.capabilities import Stoppable, require_stoppable
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.requests.choose import AnytimeRequest
 from spikeloom.runtime.studies.anytime import exits
 from spikeloom.runtime.studies.anytime.sections import sections
 from spikeloom.runtime.studies.anytime.study import study
@@ -26,26 +26,17 @@ ALLOWED = (0.0, 0.005, 0.01, 0.02, 0.05)
 """Shares of calibration races that may end otherwise, all of them reported."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Describe the options of the command."""
-    add_netlist(parser)
-    add_recordings(parser)
-    parser.add_argument("--calibrate", metavar="PATH", help="recordings whose train split says when a vote is sure")
-    words = "the network was not trained on --calibrate: its decisions count, not races for second place"
-    parser.add_argument("--held-out", action="store_true", help=words)
-    parser.add_argument("--differ", type=float, metavar="X", help="share of them that may end otherwise (default: 0)")
-    parser.add_argument("-o", "--output", metavar="OUT.json", help="write the result with figures of every recording")
-    parser.epilog = NOTES
+REQUEST = AnytimeRequest
 
 
-def run(arguments: argparse.Namespace) -> Outcome:
+def run(request: AnytimeRequest) -> Outcome:
     """Run the command."""
-    require_place(arguments.output, "-o", arguments)
-    allowed = _allowed(arguments)
-    machine = require_stoppable(machine_for(arguments.netlist), arguments.netlist, "anytime")
-    data = load_recordings(arguments, machine.netlist)
+    require_place(request.output, "-o", request)
+    allowed = _allowed(request)
+    machine = require_stoppable(machine_for(request.netlist), request.netlist, "anytime")
+    data = load_recordings(request.data, request, machine.netlist)
     machine.require_sensor(data.events)
-    points = _races(arguments, machine)
+    points = _races(request, machine)
     progress("running")
     ran = machine.cumulative(data.events, data.step_counts)
     result = study(
@@ -53,32 +44,31 @@ def run(arguments: argparse.Namespace) -> Outcome:
         data,
         ran,
         () if points is None else [exits.calibrate(points, share) for share in sorted(allowed)],
-        calibrated_on=arguments.calibrate,
-        held_out=arguments.held_out,
+        calibrated_on=request.calibrate,
+        held_out=request.held_out,
         chosen=None if points is None else sorted(allowed).index(allowed[0]) + 1,
     )
-    write_json(arguments.output, result)
+    write_json(request.output, result)
     return Outcome(result, sections)
 
 
-def _allowed(arguments: argparse.Namespace) -> list[float]:
+def _allowed(request: AnytimeRequest) -> list[float]:
     """Shares to calibrate for, the chosen one first."""
-    given = "--held-out" if arguments.held_out else "" if arguments.differ is None else f"--differ {arguments.differ:g}"
-    if given and arguments.calibrate is None:
+    given = "--held-out" if request.held_out else "" if request.differ is None else f"--differ {request.differ:g}"
+    if given and request.calibrate is None:
         raise OptionError(f"{given}: nothing to calibrate on; add --calibrate or omit it")
-    chosen = arguments.differ or 0.0
+    chosen = request.differ or 0.0
     if not 0 <= chosen < 1:
         raise OptionError(f"--differ {chosen:g}: not a share; give a number from 0 to below 1")
     return [chosen, *(share for share in ALLOWED if share != chosen)]
 
 
-def _races(arguments: argparse.Namespace, machine: Stoppable) -> FloatArray | None:
+def _races(request: AnytimeRequest, machine: Stoppable) -> FloatArray | None:
     """Turning points of races or decisions of the training split, if there is something to calibrate on."""
-    if arguments.calibrate is None:
+    if request.calibrate is None:
         return None
-    named = {"data": arguments.calibrate, "split": "train", "limit": None}
-    training = load_recordings(argparse.Namespace(**vars(arguments) | named), machine.netlist)
+    training = load_recordings(request.calibrate, replace(request, split="train", limit=None), machine.netlist)
     machine.require_sensor(training.events)
     progress("calibrating")
-    lengths, race = training.step_counts, exits.standing if arguments.held_out else exits.races
+    lengths, race = training.step_counts, exits.standing if request.held_out else exits.races
     return exits.turning_points(race(machine.cumulative(training.events, lengths).votes, lengths))

@@ -1,14 +1,11 @@
 """The command ``smallest``: the cheapest network that does the job, chosen by cross-validation."""
 
-import argparse
+from dataclasses import replace
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.errors import require_least
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
@@ -19,7 +16,9 @@ from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import taxels_alone
 from spikeloom.models.training.counters import require_levels
-from spikeloom.runtime.commands.options import add_data, add_graph_options
+from spikeloom.runtime.commands.main_job import compile, verify
+from spikeloom.runtime.commands.options import request_of
+from spikeloom.runtime.commands.training import train
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_graph, sensor_places
@@ -27,6 +26,10 @@ from spikeloom.runtime.machines.backends import backend_of, machine_for
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.numbers import dominant
 from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.requests.choices import SensorChoice
+from spikeloom.runtime.requests.choose import SmallestRequest
+from spikeloom.runtime.requests.main_job import CompileRequest, VerifyRequest
+from spikeloom.runtime.requests.training import TrainRequest
 from spikeloom.runtime.studies.chart.results import data_of, share
 from spikeloom.runtime.studies.fronts import parse_budgets
 from spikeloom.runtime.studies.smallest.results import Checked
@@ -51,73 +54,61 @@ budgets ask it again; delete it to measure anew. The exit code is 1 if no candid
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Describe the options of the command."""
-    add_data(parser)
-    add_graph_options(parser, f"of the built-in sensor (default: {GRAPH})")
-    parser.add_argument("--target", default=DEFAULT_TARGET, help=f"chip (default: {DEFAULT_TARGET})")
-    parser.add_argument("--levels", type=int, metavar="N", help=LEVELS)
-    what = "energy=5uJ, time=5ms, operations=25000, cores=1, accuracy=88, certified=90; all of them hold"
-    parser.add_argument("--budget", action="append", default=[], metavar="WHAT=LIMIT[,…]", help=what)
-    parser.add_argument("--store", metavar="FILE", help="what is measured (default: NET.sqlite, beside the netlist)")
-    parser.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
-    parser.add_argument("--html", metavar="PAGE.html", help="write a page, too")
-    parser.add_argument("-o", "--output", required=True, metavar="NET.loom", help="netlist; NET.pt is the network")
-    parser.epilog = NOTES
+REQUEST = SmallestRequest
 
 
-def run(arguments: argparse.Namespace) -> Outcome:
+def run(request: SmallestRequest) -> Outcome:
     """Run the command; exit code 1 if no candidate fits a budget."""
-    from spikeloom.runtime.commands.training.train import both_splits
     from spikeloom.runtime.studies.smallest.sections import page, sections
 
-    output = Path(arguments.output)
+    output = Path(request.output)
     network = output.with_suffix(".pt")
-    store = output.with_suffix(".sqlite") if arguments.store is None else Path(arguments.store)
+    store = output.with_suffix(".sqlite") if request.store is None else Path(request.store)
     for place, option, kinds in ((output, "-o", ["loom"]), (network, "-o", ()), (store, "--store", ())):
-        require_place(str(place), option, arguments, kinds)
-    require_place(arguments.html, "--html", arguments, ["html"])
-    require_least(vars(arguments), jobs=1, levels=1)
-    budgets = parse_budgets([words for each in arguments.budget for words in each.split(",")], LIMITS)
-    taxels = None if arguments.taxels is None else len(sensor_places(arguments.taxels))
-    training, test = both_splits(arguments.data, taxels, arguments.bin)
-    require_levels(arguments.levels or 1, int(training.labels.max()) + 1)
-    arguments.bin = training.seconds
-    sensor = _sensor(arguments, training.taxels)
-    data = data_of(arguments.data, arguments.bin, training, test)
-    backend = backend_of(arguments.target)
+        require_place(str(place), option, request, kinds)
+    require_place(request.html, "--html", request, ["html"])
+    require_least(vars(request), jobs=1, levels=1)
+    budgets = parse_budgets([words for each in request.budget for words in each.split(",")], LIMITS)
+    taxels = None if request.taxels is None else len(sensor_places(request.taxels))
+    training, test = train.both_splits(request.data, taxels, request.bin)
+    require_levels(request.levels or 1, int(training.labels.max()) + 1)
+    bin_s = training.seconds
+    request = replace(request, bin=bin_s)
+    sensor = _sensor(request, training.taxels)
+    data = data_of(request.data, bin_s, training, test)
+    backend = backend_of(request.target)
     target = backend.target
     bits = backend.counting_bits
     systems = () if target.cores != COMPARTMENTS else SYSTEMS if len(sensor.graph.edges) else (MLP,)
     found = smallest(
-        [*counting(training.steps, arguments.levels or 1, bits), *networks(training.steps, systems)],
+        [*counting(training.steps, request.levels or 1, bits), *networks(training.steps, systems)],
         data,
         target,
         budgets,
         store,
-        partial(_made, sensor=sensor, splits=(training, test), arguments=arguments),
+        partial(_made, sensor=sensor, splits=(training, test), request=request),
         sensor=sensor,
-        command=_command(arguments),
-        jobs=arguments.jobs,
+        command=_command(request),
+        jobs=request.jobs,
     )
-    if arguments.html is not None:
-        with write_atomically(arguments.html) as file:
+    if request.html is not None:
+        with write_atomically(request.html) as file:
             file.write(page(found).encode())
     return Outcome(found, sections, 0 if found.choice.fits else 1)
 
 
 def _made(
-    candidate: Candidate, *, sensor: Sensor, splits: tuple[Recordings, ...], arguments: argparse.Namespace
+    candidate: Candidate, *, sensor: Sensor, splits: tuple[Recordings, ...], request: SmallestRequest
 ) -> tuple[Checked, tuple[str, ...]]:
     """Train a candidate on the whole training split, compile and verify it, then read the test split; the commands."""
-    netlist, data = arguments.output, arguments.data
+    netlist, data = request.output, request.data
     network, counts = str(Path(netlist).with_suffix(".pt")), candidate.system == COUNTING
-    read = repeat.words({"data": data, "bin": arguments.bin})
+    read = repeat.words({"data": data, "bin": request.bin})
     trained = [*read, *repeat.words(sensor.options_of(candidate.system)), *candidate.words]
     trained += [*([] if counts else ["--keep", "last"]), "-o", network]
-    made = repeat.words({"target": arguments.target})
+    made = repeat.words({"target": request.target})
     made += (
-        [] if counts else repeat.words({"weight_bits": candidate.storage or 8, "calibrate": data, "bin": arguments.bin})
+        [] if counts else repeat.words({"weight_bits": candidate.storage or 8, "calibrate": data, "bin": request.bin})
     )
     words = {"train": trained, "compile": [network, *made, "-o", netlist]}
     words |= {"verify": [netlist, "--checkpoint", network, *read], "estimate": [netlist, *read]}
@@ -125,19 +116,20 @@ def _made(
 
     begun = not counts and any(file.exists() for file in state_files(Path(f"{network}.state")))
     try:
-        _typed("train", [*trained, *(["--resume"] if begun else [])])
+        train.run(request_of(TrainRequest, [*trained, *(["--resume"] if begun else [])]))
     except KeyboardInterrupt:
         raise KeyboardInterrupt("what was found is kept; go on with the same command") from None
-    _typed("compile", words["compile"])
+    compile.run(request_of(CompileRequest, words["compile"]))
     progress("verifying")
-    verdicts = {split: _typed("verify", [*words["verify"], "--split", split]) for split in ("train", "test")}
+    checks = {split: request_of(VerifyRequest, [*words["verify"], "--split", split]) for split in ("train", "test")}
+    verdicts = {split: verify.run(check).result for split, check in checks.items()}
     machine = machine_for(netlist)
     bins, length = machine.netlist.bins, machine.netlist.clocks.length
     seen, held = (of_length(joined_bins(each, bins), length) for each in (some(splits[0]), splits[1]))
     right = int(np.count_nonzero(machine.run(held.events, lengths=held.lengths).decisions == held.labels))
     costs = costs_of(machine.netlist, seen)
-    price = machine.price(seen.events, bin_s=arguments.bin, lengths=seen.lengths)[1]
-    seconds = float(seen.step_counts.mean()) * bins * arguments.bin
+    price = machine.price(seen.events, bin_s=splits[0].seconds, lengths=seen.lengths)[1]
+    seconds = float(seen.step_counts.mean()) * bins * splits[0].seconds
     dynamic = [float(each.mean()) for each in price.dynamic_j.values()]
     words |= {"anytime": [netlist, *read]} if "whole" in costs else {}
     return Checked(
@@ -153,25 +145,17 @@ def _made(
     ), tuple(repeat.command(name, *typed) for name, typed in words.items())
 
 
-def _typed(name: str, words: list[str]) -> Any:
-    """What another command finds, as it is typed."""
-    group = {"train": "training"}.get(name, "main_job")
-    module, parser = import_module(f"spikeloom.runtime.commands.{group}.{name}"), argparse.ArgumentParser()
-    module.add_arguments(parser)
-    return module.run(parser.parse_args(words)).result
-
-
-def _sensor(arguments: argparse.Namespace, taxels: int) -> Sensor:
+def _sensor(request: SmallestRequest, taxels: int) -> Sensor:
     """The sensor that the options name, or the built-in one with its usual graph, if it has as many taxels."""
-    options = repeat.given(arguments, SENSOR)
+    options = repeat.given(request, SENSOR)
     if taxels == len(NEUTOUCH) and not any(options.values()):
         options["graph"] = GRAPH
-    graph = load_graph(argparse.Namespace(**options)) or taxels_alone(np.arange(float(taxels))[:, None])
+    graph = load_graph(SensorChoice(**options)) or taxels_alone(np.arange(float(taxels))[:, None])
     return Sensor(graph=graph, options=options)
 
 
-def _command(arguments: argparse.Namespace) -> str:
+def _command(request: SmallestRequest) -> str:
     """The words that ask for the same search."""
-    words = repeat.words(repeat.given(arguments, ("data", "bin", *SENSOR, "target", "levels", "store")))
-    budgets = [word for budget in arguments.budget for word in ("--budget", budget)]
-    return repeat.command("smallest", *words, *budgets, "-o", arguments.output)
+    words = repeat.words(repeat.given(request, ("data", "bin", *SENSOR, "target", "levels", "store")))
+    budgets = [word for budget in request.budget for word in ("--budget", budget)]
+    return repeat.command("smallest", *words, *budgets, "-o", request.output)

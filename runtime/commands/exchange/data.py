@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,16 +12,16 @@ from spikeloom.compiler.types import FloatArray
 from spikeloom.models.recordings.counts import EventCounts, number, show_notes
 from spikeloom.models.recordings.events import data_splits, joined_bins, load_data, require_events
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings, require_polarities
-from spikeloom.models.recordings.fetch import DATA_SETS, Fetched, fetch_data
+from spikeloom.models.recordings.fetch import Fetched, fetch_data
 from spikeloom.models.recordings.grasps import SPLITS, SYNTHETIC, synthetic_split
 from spikeloom.models.recordings.release import SOURCES, write_event_lines, write_released
 from spikeloom.models.sensors import read_layout
-from spikeloom.runtime.commands.options import add_bin_option, add_common
+from spikeloom.runtime.commands.options import add_common, add_options
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import require_bins
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
-
-Arguments = argparse.Namespace
+from spikeloom.runtime.requests.exchange import ConvertRequest, DescribeRequest, FetchRequest
+from spikeloom.runtime.requests.fields import Request
 
 HOT = 5.0
 """A taxel is hot if its rate is above this many times the median over taxels that are not dead."""
@@ -86,38 +87,15 @@ class Converted:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the commands under ``data``."""
     actions = parser.add_subparsers(dest="data_command", required=True, metavar="COMMAND")
-
-    def command(name: str, action: Callable[[Arguments], Outcome], summary: str) -> argparse.ArgumentParser:
-        sub: argparse.ArgumentParser = actions.add_parser(name, help=summary, description=summary)
-        sub.set_defaults(action=action)
+    for name, kind, action in ACTIONS:
+        sub = actions.add_parser(name, help=kind.__doc__, description=kind.__doc__)
+        sub.set_defaults(action=action, request=kind)
+        add_options(sub, kind)
         add_common(sub)
-        return sub
-
-    sub = command("fetch", _fetch, "download released recordings; --data then takes their name")
-    sub.add_argument("name", choices=tuple(DATA_SETS))
-    sub.add_argument("--url", help="another address of the same file")
-
-    sub = command("describe", _describe, "counts, rates by taxel and polarity, duration, dead and hot taxels")
-    _source(sub)
-    sub.add_argument("--split", default="test", help="split to read (default: test)")
-
-    sub = command("convert", _convert, "write the released layout: SPLIT/sample_N_label_L.npy")
-    _source(sub)
-    sub.add_argument("--split", default="test", help="split of recordings that have none (default: test)")
-    sub.add_argument("--join", type=int, default=1, metavar="N", help="make one bin of N, an event where one has any")
-    what = "new folder, or a zip; or a .csv of event lines, of one recording"
-    sub.add_argument("-o", "--output", required=True, metavar="OUT", help=what)
 
 
-def _source(parser: argparse.ArgumentParser) -> None:
-    what = f"folder, zip, .csv, .npz or .npy with recordings, '{SYNTHETIC}', or {' or '.join(map(repr, DATA_SETS))}"
-    parser.add_argument("source", metavar="SRC", help=what)
-    add_bin_option(parser)
-    parser.add_argument("--taxels", metavar="N|COORDS.csv", help="how many there are, or where: x,y[,z] in mm")
-
-
-def _fetch(arguments: Arguments) -> Outcome:
-    return Outcome(fetch_data(arguments.name, url=arguments.url), _fetch_sections)
+def _fetch(request: FetchRequest) -> Outcome:
+    return Outcome(fetch_data(request.name, url=request.url), _fetch_sections)
 
 
 def _fetch_sections(result: Fetched) -> Iterator[Section]:
@@ -131,9 +109,9 @@ def _fetch_sections(result: Fetched) -> Iterator[Section]:
     )
 
 
-def _describe(arguments: Arguments) -> Outcome:
-    count, _ = _layout(arguments.taxels)
-    recordings = _load(arguments.source, arguments.split, arguments.bin, count)
+def _describe(request: DescribeRequest) -> Outcome:
+    count, _ = _layout(request.taxels)
+    recordings = _load(request.source, request.split, request.bin, count)
     require_polarities(recordings)
     show_notes(recordings.counts)
     return Outcome(describe(recordings), described_sections)
@@ -198,28 +176,28 @@ def described_sections(result: Described) -> Iterator[Section]:
     yield Section("Taxels", [Table(["taxel", "falling/s", "rising/s", "looks"], rows)])
 
 
-def _convert(arguments: Arguments) -> Outcome:
-    lines = arguments.output.lower().endswith(".csv")
-    if lines or arguments.output.lower().endswith(".zip") or not Path(arguments.output).exists():
-        require_place(arguments.output, "-o", arguments)
-    require_bins(bins := arguments.join)
-    count, places = _layout(arguments.taxels)
-    present = tuple(SPLITS) if arguments.source == SYNTHETIC else data_splits(arguments.source)
-    loaded = [_load(arguments.source, split, arguments.bin, count, places) for split in present or (arguments.split,)]
+def _convert(request: ConvertRequest) -> Outcome:
+    lines = request.output.lower().endswith(".csv")
+    if lines or request.output.lower().endswith(".zip") or not Path(request.output).exists():
+        require_place(request.output, "-o", request)
+    require_bins(bins := request.join)
+    count, places = _layout(request.taxels)
+    present = tuple(SPLITS) if request.source == SYNTHETIC else data_splits(request.source)
+    loaded = [_load(request.source, split, request.bin, count, places) for split in present or (request.split,)]
     for recordings in loaded:
         show_notes(recordings.counts)
     loaded = [joined_bins(recordings, bins) for recordings in loaded]
     taxels = max(recordings.taxels for recordings in loaded)
     steps = max(recordings.steps for recordings in loaded)
     if lines:
-        write_event_lines(arguments.output, loaded, bins * loaded[0].seconds)
+        write_event_lines(request.output, loaded, bins * loaded[0].seconds)
     else:
         grown = [_grown(recordings, taxels, steps) for recordings in loaded]
         known = loaded[0].bin_s is not None or bins > 1
-        write_released(arguments.output, grown, round(bins * loaded[0].seconds, 12) if known else None)
+        write_released(request.output, grown, round(bins * loaded[0].seconds, 12) if known else None)
     result = Converted(
-        source=arguments.source,
-        output=arguments.output,
+        source=request.source,
+        output=request.output,
         taxels=taxels,
         steps=steps,
         names=None if lines else SOURCES,
@@ -257,3 +235,10 @@ def _load(
 def _layout(taxels: str | None) -> tuple[int | None, FloatArray | None]:
     """Number of taxels and their positions, as far as ``--taxels`` says them."""
     return (None, None) if taxels is None else read_layout(taxels)
+
+
+ACTIONS: tuple[tuple[str, type[Request], Callable[[Any], Outcome]], ...] = (
+    ("fetch", FetchRequest, _fetch),
+    ("describe", DescribeRequest, _describe),
+    ("convert", ConvertRequest, _convert),
+)

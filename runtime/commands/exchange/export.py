@@ -1,16 +1,13 @@
 """The command ``export``: a netlist in the format of another program."""
 
-import argparse
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 from spikeloom.compiler.files import write_atomically
-from spikeloom.compiler.formats.onnx.writer import FORMS
 from spikeloom.compiler.targets.netlist_file import Netlist
-from spikeloom.models.recordings.evtouch import BIN_S, Recordings
-from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.files import require_netlist, require_place
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.inputs.repeat import refuse
@@ -18,6 +15,9 @@ from spikeloom.runtime.machines.backends import export_formats
 from spikeloom.runtime.machines.base import Request
 from spikeloom.runtime.report.encode import INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
+from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.requests.choices import SplitChoice
+from spikeloom.runtime.requests.exchange import ExportRequest
 
 FORMATS = {each.name: each for each in export_formats()}
 """By the value of ``--to``."""
@@ -25,23 +25,14 @@ FORMATS = {each.name: each for each in export_formats()}
 OF_RECORDINGS = ("split", "bin", "recording")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Describe the options of the command."""
-    parser.add_argument("source", metavar="NET.loom", help="a netlist")
-    what = "; ".join(f"{name}: {each.title}" for name, each in FORMATS.items())
-    parser.add_argument("--to", required=True, choices=tuple(FORMATS), help=what)
-    parser.add_argument("--form", choices=FORMS, help="onnx: a step and its state, or whole recordings (default: scan)")
-    what = f"ranc: a recording to add; {DATA_HELP}"
-    parser.add_argument("--data", metavar="PATH", help=what)
-    parser.add_argument("--split", help="ranc: split to read (default: test)")
-    parser.add_argument("--recording", type=int, metavar="N", help="ranc: which of them (default: 0)")
-    add_bin_option(parser)
-    parser.add_argument("--dt", type=float, metavar="SECONDS", help=f"nir: length of a step (default: {BIN_S:g} a bin)")
-    parser.add_argument("-o", "--output", required=True, metavar="FILE")
+REQUEST = ExportRequest
+
+OPTIONS = {"to": tuple(FORMATS)}
+"""Choices that only the chips know."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Written:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Written(Shown):
     """A file that was written, and what its format says about it."""
 
     path: str
@@ -51,44 +42,42 @@ class Written:
     facts: Any = field(metadata=INLINE)
 
 
-def _require_fit(arguments: argparse.Namespace) -> None:
+def _require_fit(request: ExportRequest) -> None:
     """Refuse options that the format would ignore."""
     for name in {option: None for each in FORMATS.values() for option in each.options}:
-        if name not in FORMATS[arguments.to].options:
+        if name not in FORMATS[request.to].options:
             formats = " and ".join(to for to, each in FORMATS.items() if name in each.options)
-            refuse(arguments, (name,), f"is for {formats}, --to says {arguments.to}")
-        elif name in OF_RECORDINGS and arguments.data is None:
-            refuse(arguments, (name,), "says which recording of --data, which is not given")
+            refuse(request, (name,), f"is for {formats}, --to says {request.to}")
+        elif name in OF_RECORDINGS and request.data is None:
+            refuse(request, (name,), "says which recording of --data, which is not given")
 
 
-def run(arguments: argparse.Namespace) -> Outcome:
+def run(request: ExportRequest) -> Outcome:
     """Write the file."""
-    _require_fit(arguments)
-    require_place(arguments.output, "-o", arguments, [FORMATS[arguments.to].ending or arguments.to])
-    require_netlist(arguments.source)
+    _require_fit(request)
+    require_place(request.output, "-o", request, [FORMATS[request.to].ending or request.to])
+    require_netlist(request.source)
 
     def read(netlist: Netlist) -> Recordings:
-        split = arguments.split or "test"
-        return load_recordings(argparse.Namespace(**vars(arguments) | {"split": split, "limit": None}), netlist)
+        assert request.data is not None, "recordings are read where they are given"
+        return load_recordings(request.data, SplitChoice(split=request.split or "test", bin=request.bin), netlist)
 
-    request = Request(
-        source=arguments.source,
-        output=arguments.output,
-        recordings=None if arguments.data is None else read,
-        recording=arguments.recording,
-        form=arguments.form,
-        dt=arguments.dt,
+    content = Request(
+        source=request.source,
+        output=request.output,
+        recordings=None if request.data is None else read,
+        recording=request.recording,
+        form=request.form,
+        dt=request.dt,
     )
-    export = FORMATS[arguments.to].write(request)
+    export = FORMATS[request.to].write(content)
     digest, size = hashlib.sha256(), 0
-    with write_atomically(arguments.output) as file:
+    with write_atomically(request.output) as file:
         for chunk in export.content:
             digest.update(chunk)
             size += len(chunk)
             file.write(chunk)
-    written = Written(
-        path=arguments.output, format=arguments.to, bytes=size, sha256=digest.hexdigest(), facts=export.facts
-    )
+    written = Written(path=request.output, format=request.to, bytes=size, sha256=digest.hexdigest(), facts=export.facts)
 
     def sections(result: Written) -> Iterator[Section]:
         where = "" if FORMATS[result.format].whole else " on the chip"

@@ -10,10 +10,8 @@ of ``run`` on the same recording. A bin is stepped
 An event whose bin was stepped already is late; what comes after a grasp's decision is counted apart. Neither is used.
 """
 
-import argparse
 import io
 import json
-import math
 import sys
 import time
 import zipfile
@@ -28,11 +26,11 @@ from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.types import EventArray, IntArray, JsonObject
 from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.eventlines import Event, EventLines, Mark
-from spikeloom.runtime.commands.options import add_netlist
 from spikeloom.runtime.machines.base import Step, Stream
 from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Text
+from spikeloom.runtime.requests.exchange import WatchRequest
 
 NOTES = """\
 Lines come in the order of their times: an event whose bin is over, since a later one came, is counted as late, said at
@@ -194,7 +192,7 @@ class Watch:
             sys.stdout.flush()
 
 
-def run(arguments: argparse.Namespace) -> Outcome:
+def run(request: WatchRequest) -> Outcome:
     """Run the command; its result is the summary, everything else was printed before."""
     from spikeloom.models.recordings.evtouch import BIN_S
     from spikeloom.runtime.inputs.recordings import origin_of
@@ -202,20 +200,20 @@ def run(arguments: argparse.Namespace) -> Outcome:
     from spikeloom.runtime.machines.capabilities import require_stoppable
     from spikeloom.runtime.studies.anytime import exits
 
-    bin_s = None if arguments.bin is None else _duration(arguments.bin)
-    if arguments.bins is not None and arguments.bins < 1:
-        raise OptionError(f"--bins {arguments.bins}: not a length; give 1 or more, or leave it out")
-    factor = arguments.until_sure
-    if factor is not None and arguments.bins is None:
+    bin_s = None if request.bin is None else _duration(request.bin)
+    if request.bins is not None and request.bins < 1:
+        raise OptionError(f"--bins {request.bins}: not a length; give 1 or more, or leave it out")
+    factor = request.until_sure
+    if factor is not None and request.bins is None:
         raise OptionError("--until-sure: what can still come is not known; give the length of a grasp with --bins")
     if factor is not None and not factor >= 0:
         raise OptionError(
             f"--until-sure {factor:g}: no votes per root of a bin; give a number from 0, as spikeloom anytime prints "
             "it, or none for the proof alone"
         )
-    machine = machine_for(arguments.netlist)
+    machine = machine_for(request.netlist)
     netlist = machine.netlist
-    bins = arguments.bins or netlist.clocks.length
+    bins = request.bins or netlist.clocks.length
     if bins != (netlist.clocks.length or bins):
         raise OptionError(
             f"--bins {bins}: the network runs every grasp for {netlist.clocks.length} steps, the last of them its "
@@ -227,25 +225,25 @@ def run(arguments: argparse.Namespace) -> Outcome:
     step_s = netlist.bins * (bin_s or Decimal(str(own or BIN_S)))  # a step of the network may join several
     if netlist.polarities != 2:
         raise ModelError(
-            f"{arguments.netlist}: {netlist.polarities} polarities per taxel found, event lines have 2; "
+            f"{request.netlist}: {netlist.polarities} polarities per taxel found, event lines have 2; "
             "watch a network for events of two polarities"
         )
     stream = machine.stream()
-    stdin = arguments.input == "-"
-    name = "standard input" if stdin else arguments.input
-    with _opened(arguments.input) as file:
+    stdin = request.input == "-"
+    name = "standard input" if stdin else request.input
+    with _opened(request.input) as file:
         session = Watch(
             stream=stream,
             lines=EventLines(file, name, netlist.taxels),
-            as_json=arguments.json,
+            as_json=request.json,
             column=np.zeros(netlist.taxels * netlist.polarities, np.uint8),
             bin_s=step_s,
             bins=bins,
-            from_first=arguments.origin == "first",
-            real=arguments.speed == "real",
+            from_first=request.origin == "first",
+            real=request.speed == "real",
             may_end=None
-            if factor is None
-            else exits.live(require_stoppable(machine, arguments.netlist, "--until-sure"), arguments.bins, factor),
+            if factor is None or request.bins is None
+            else exits.live(require_stoppable(machine, request.netlist, "--until-sure"), request.bins, factor),
             found=Summary(early=None if factor is None else 0),
         )
         session.run()
@@ -254,20 +252,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     return Outcome(session.found, sections)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Describe the options of the command."""
-    add_netlist(parser)
-    parser.add_argument("--input", default="-", metavar="FILE", help="event lines (default: -, standard input)")
-    parser.add_argument("--bin", metavar="SECONDS", help="bin of the recordings (default: the network's, else 0.02)")
-    what = "steps of every grasp: shorter ones are filled up, longer ones cut; counters know theirs, read-out included"
-    parser.add_argument("--bins", type=int, metavar="N", help=what)
-    what = "where the first bin of a grasp begins: at time 0 or at the first event (default: zero)"
-    parser.add_argument("--origin", choices=("zero", "first"), default="zero", help=what)
-    what = "keep to the wall clock, or go on as soon as events allow it (default: full)"
-    parser.add_argument("--speed", choices=("real", "full"), default="full", help=what)
-    what = "end a grasp of --bins once nothing can change the vote, or it leads by A*sqrt(bins left) (see anytime)"
-    parser.add_argument("--until-sure", nargs="?", type=float, const=math.inf, metavar="A", help=what)
-    parser.epilog = NOTES
+REQUEST = WatchRequest
 
 
 def _opened(name: str) -> io.FileIO:

@@ -1,16 +1,23 @@
 """The command ``demo``: the main job on what the package ships."""
 
-import argparse
 import tempfile
+from collections.abc import Callable
 from typing import Any
 
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.runtime.commands.main_job import compile, estimate, verify
+from spikeloom.runtime.commands.options import request_of
 from spikeloom.runtime.equivalence.verdict import in_a_sentence
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.report.sections import Code, Outcome, Section, Text
+from spikeloom.runtime.requests.fields import Request
+from spikeloom.runtime.requests.main_job import CompileRequest, EstimateRequest, VerifyRequest
 
-COMMANDS = {"compile": compile, "verify": verify, "estimate": estimate}
+COMMANDS: dict[str, tuple[type[Request], Callable[[Any], Outcome]]] = {
+    "compile": (CompileRequest, compile.run),
+    "verify": (VerifyRequest, verify.run),
+    "estimate": (EstimateRequest, estimate.run),
+}
 
 STEPS = (
     ("compile", "pretrained:grasps", "--calibrate", SYNTHETIC, "-o", "{folder}/grasps.loom"),
@@ -20,20 +27,18 @@ STEPS = (
 """Commands that run in a new folder for temporary files, where the netlist stays."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Take no options of its own."""
+REQUEST = Request
 
 
-def run(_arguments: argparse.Namespace) -> Outcome:
+def run(_request: Request) -> Outcome:
     """Run the commands one after the other; the worst exit code counts."""
     results: dict[str, Any] = {}
     shown: list[Section] = []
     worst = 0
     folder = tempfile.mkdtemp(prefix="spikeloom-")
     for name, *words in STEPS:
-        parser = argparse.ArgumentParser()
-        COMMANDS[name].add_arguments(parser)
-        found = COMMANDS[name].run(parser.parse_args([word.format(folder=folder) for word in words]))
+        kind, run_it = COMMANDS[name]
+        found = run_it(request_of(kind, [word.format(folder=folder) for word in words]))
         typed = " ".join(["spikeloom", name, *words]).replace("{folder}/", "")
         first, *others = found.sections(found.result)
         shown += [Section(first.title, [Code([typed]), *first.blocks]), *others]

@@ -1,23 +1,25 @@
 """The command ``estimate``: synaptic operations, energy and time of an inference."""
 
-import argparse
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.models.recordings.evtouch import Recordings, first_part, parse_window
 from spikeloom.models.training.counters import BITS
-from spikeloom.runtime.commands.options import add_netlist, add_prices, add_recordings
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.base import Machine, Price, Run
 from spikeloom.runtime.report.console import Progress
-from spikeloom.runtime.report.encode import INLINE
-from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.report.encode import HIDDEN, INLINE
+from spikeloom.runtime.report.sections import Outcome, Section
+from spikeloom.runtime.requests.main_job import EstimateRequest
 from spikeloom.runtime.studies import processor
 from spikeloom.runtime.studies.processor import Comparison
 
 AGAINST = "train a linear rule for a small processor on the same recordings, and hold its costs beside these"
+
+
+REQUEST = EstimateRequest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,45 +28,49 @@ class Compared:
 
     costs: Any = field(metadata=INLINE)
     against_processor: Comparison
+    price: Price = field(metadata=HIDDEN)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options."""
-    add_netlist(parser)
-    add_recordings(parser, window=True)
-    add_prices(parser)
-    parser.add_argument("--against-processor", action="store_true", help=AGAINST)
-
-
-def run(arguments: argparse.Namespace) -> Outcome:
+def run(request: EstimateRequest) -> Outcome:
     """Run the command."""
-    machine = machine_for(arguments.netlist)
-    data = load_recordings(arguments, machine.netlist)
-    ran, price = machine.price(
+    machine, ran, priced = price(request)
+    if not request.against_processor:
+        return priced.outcome
+    compared = _against_processor(request, machine, ran, priced)
+    return Outcome(Compared(costs=priced.details, against_processor=compared, price=priced), sections)
+
+
+def price(request: EstimateRequest) -> tuple[Machine, Run, Price]:
+    """Run the recordings of a request on their chip, and price them."""
+    machine = machine_for(request.netlist)
+    data = load_recordings(request.data, request, machine.netlist)
+    ran, priced = machine.price(
         data.events,
-        bin_s=arguments.bin,
+        bin_s=data.seconds,
         lengths=data.lengths,
-        detail=arguments.detail,
-        table=arguments.table,
+        detail=request.detail,
+        table=request.table,
         progress=Progress(len(data)),
     )
-    costs = price.outcome
-    if not arguments.against_processor:
-        return costs
-    compared = _against_processor(arguments, machine, ran, price)
-    shown = [*costs.sections(costs.result), *processor.sections(compared)]
-    return Outcome(Compared(costs=costs.result, against_processor=compared), lambda _: shown)
+    return machine, ran, priced
 
 
-def _against_processor(arguments: argparse.Namespace, machine: Machine, ran: Run, price: Price) -> Comparison:
+def sections(found: Compared) -> list[Section]:
+    """Both for people."""
+    return [*found.price.sections(), *processor.sections(found.against_processor)]
+
+
+def _against_processor(request: EstimateRequest, machine: Machine, ran: Run, priced: Price) -> Comparison:
     """The same recordings in their own bins, and those of the training split, for a rule on a processor."""
-    if isinstance(arguments.data, Recordings):
+    if isinstance(request.data, Recordings):
         raise OptionError("against_processor: needs the training split beside these; give the place of the recordings")
-    window = parse_window(arguments.window)
+    window = parse_window(request.window)
     training, test = (
-        first_part(load_recordings(each, machine.netlist, labels_for="--against-processor", joined=False), window)
-        for each in (argparse.Namespace(**vars(arguments) | {"split": "train", "limit": None}), arguments)
+        load_recordings(request.data, each, machine.netlist, labels_for="--against-processor", joined=False)
+        for each in (replace(request, split="train", limit=None), request)
     )
     right = ran.decisions == test.labels
     bits = min(machine.weight_bits, BITS[-1])
-    return processor.against_processor(training, test, bits, arguments.bin, price, right)
+    return processor.against_processor(
+        first_part(training, window), first_part(test, window), bits, test.seconds, priced, right
+    )

@@ -1,6 +1,5 @@
 """The command ``inspect``: what is in a netlist or a checkpoint."""
 
-import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Self
@@ -12,13 +11,14 @@ from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.dynamics import Dynamics
 from spikeloom.compiler.formats.counters import read_counters
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET
-from spikeloom.runtime.commands.options import add_model
 from spikeloom.runtime.inputs.files import require_inspectable, shipped
 from spikeloom.runtime.inputs.network import load_checkpoint, network_kind
 from spikeloom.runtime.inputs.repeat import NETWORK, refuse
 from spikeloom.runtime.machines.backends import describe, trained_for
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Text
+from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.requests.main_job import InspectRequest
 
 CLOCKING = ("parts", "bins", "steps", "ramp")
 """What a counting network says of time."""
@@ -35,8 +35,8 @@ class LayerSize:
     neurons: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CheckpointFacts:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class CheckpointFacts(Shown):
     """A checkpoint; `given` and `assumed` name the constants that the user gave, or neither user nor file."""
 
     layout: str
@@ -57,8 +57,8 @@ class CheckpointFacts:
     sha256: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CountingFacts:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class CountingFacts(Shown):
     """A counting network."""
 
     taxels: int
@@ -88,27 +88,24 @@ def counting_sections(facts: CountingFacts) -> Iterator[Section]:
     yield Section("", [*map(Text, [*lines, *_values({name: known[name] for name in shown})])])
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options."""
-    parser.add_argument("path", help="netlist or checkpoint")
-    add_model(parser, graph=False)
+REQUEST = InspectRequest
 
 
-def run(arguments: argparse.Namespace) -> Outcome:
+def run(request: InspectRequest) -> Outcome:
     """Run the command."""
-    require_inspectable(arguments.path)
-    backend = trained_for(arguments.path)
+    require_inspectable(request.path)
+    backend = trained_for(request.path)
     if backend is not None:
-        return backend.inspect(arguments)
-    if is_netlist(arguments.path):
-        refuse(arguments, NETWORK, f"is for checkpoints, {arguments.path} is a netlist")
-        return describe(arguments.path)
-    if network_kind(arguments.path) == COUNTERS:
-        refuse(arguments, NETWORK, f"is for checkpoints, {arguments.path} is a counting network")
-        counters, sha256 = read_counters(shipped(arguments.path))
+        return backend.inspect(request)
+    if is_netlist(request.path):
+        refuse(request, NETWORK, f"is for checkpoints, {request.path} is a netlist")
+        return describe(request.path)
+    if network_kind(request.path) == COUNTERS:
+        refuse(request, NETWORK, f"is for checkpoints, {request.path} is a counting network")
+        counters, sha256 = read_counters(shipped(request.path))
         return Outcome(CountingFacts.of(counters, sha256), counting_sections)
-    given = tuple(name for name in ("beta", "theta") if getattr(arguments, name) is not None)
-    checkpoint = load_checkpoint(arguments.path, arguments)
+    given = tuple(name for name in ("beta", "theta") if getattr(request, name) is not None)
+    checkpoint = load_checkpoint(request.path, request)
     same = ("layout", "system", "taxels", "classes", "beta", "theta", "assumed", "graph", "training", "sha256")
     facts = CheckpointFacts(
         **{name: getattr(checkpoint, name) for name in same},

@@ -1,6 +1,5 @@
 """The command ``report``: everything about one netlist on one page, and the same as tables on the terminal."""
 
-import argparse
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,6 @@ import numpy as np
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.options import add_check, add_netlist_and_model, add_recordings
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.files import require_place
@@ -23,6 +21,7 @@ from spikeloom.runtime.page.sections import about, sections
 from spikeloom.runtime.report import html
 from spikeloom.runtime.report.console import Progress, progress
 from spikeloom.runtime.report.sections import Outcome, Section, Text
+from spikeloom.runtime.requests.main_job import ReportRequest
 from spikeloom.runtime.studies.stress.results import Stress
 from spikeloom.runtime.studies.stress.sections import read_stress
 
@@ -33,39 +32,30 @@ and engine differ.
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Describe the options of the command."""
-    add_netlist_and_model(parser)
-    add_recordings(parser)
-    what = "recording to draw, by name or from 0 (default: the first decided differently)"
-    parser.add_argument("--recording", metavar="NAME|N", help=what)
-    parser.add_argument("--stress", metavar="STRESS.json", help="show what stress -o wrote about this netlist")
-    parser.add_argument("-o", "--output", required=True, metavar="OUT.html")
-    add_check(parser)
-    parser.epilog = NOTES
+REQUEST = ReportRequest
 
 
-def run(arguments: argparse.Namespace) -> Outcome:
+def run(request: ReportRequest) -> Outcome:
     """Run the command; nothing is written before everything is known."""
-    require_place(arguments.output, "-o", arguments, ["html"])
-    machine = machine_for(arguments.netlist)
+    require_place(request.output, "-o", request, ["html"])
+    machine = machine_for(request.netlist)
     netlist = machine.netlist
     battery = None
-    if arguments.stress is not None:
-        sha256 = sha256_of(arguments.netlist)
-        battery = read_stress(arguments.stress, arguments.netlist, sha256)
-    reference = backend_of(netlist.target).reference(arguments, netlist)
+    if request.stress is not None:
+        sha256 = sha256_of(request.netlist)
+        battery = read_stress(request.stress, request.netlist, sha256)
+    reference = backend_of(netlist.target).reference(request, netlist)
     if reference.loaded is None:
-        raise OptionError(f"--checkpoint {arguments.checkpoint}: there is no float model to show beside the chip")
+        raise OptionError(f"--checkpoint {request.checkpoint}: there is no float model to show beside the chip")
     if isinstance(machine, Comparable):
         require_match(netlist, reference.loaded.model)
-    reference.loaded.require_same(arguments.netlist, netlist, arguments.run)
-    data = load_recordings(arguments, netlist, labels_for="report")
+    reference.loaded.require_same(request.netlist, netlist, request.run)
+    data = load_recordings(request.data, request, netlist, labels_for="report")
     machine.require_sensor(data.events)
-    report = _report(arguments, machine, reference.source, reference.loaded, data, battery)
+    report = _report(request, machine, reference.source, reference.loaded, data, battery)
     made = report.provenance
     title = f"{made.netlist.file} on {made.data.file}"
-    with write_atomically(arguments.output) as file:
+    with write_atomically(request.output) as file:
         file.write(html.page(title, about(report), sections(report)).encode())
 
     def printed(report: Report) -> list[Section]:
@@ -75,7 +65,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
 
 def _report(
-    arguments: argparse.Namespace,
+    request: ReportRequest,
     machine: Machine,
     source: Any,
     loaded: LoadedNetwork,
@@ -84,14 +74,14 @@ def _report(
 ) -> Report:
     """All that the page shows."""
     netlist = machine.netlist
-    chosen = None if arguments.recording is None else find_recording(data, arguments.recording, "--recording")
+    chosen = None if request.recording is None else find_recording(data, request.recording, "--recording")
     count = Progress(len(data))
     verdict = verify(
         netlist,
         source,
         data,
         original=loaded.model,
-        spec_samples=arguments.spec_samples,
+        spec_samples=request.spec_samples,
         required={"E0": 1.0},
         progress=lambda part, done: count(done, part),
     )
@@ -102,9 +92,9 @@ def _report(
         apart = np.flatnonzero(decided != verdict.chip_predictions)
         chosen = int(apart[0]) if len(apart) else 0 if first is None else data.files.index(first.file)
     progress("pricing")
-    ran, price = machine.price(data.events, lengths=data.lengths, bin_s=arguments.bin)
-    origin = provenance(arguments, netlist, machine.target, loaded, data, data.files[chosen])
-    described = describe(arguments.netlist)
+    ran, price = machine.price(data.events, lengths=data.lengths, bin_s=data.seconds)
+    origin = provenance(request, netlist, machine.target, loaded, data, data.files[chosen])
+    described = describe(request.netlist)
     return Report(
         verify=verdict,
         decisions=Decisions(
@@ -116,11 +106,11 @@ def _report(
         ),
         netlist=described.result,
         cores=machine.core_map(data.events, data.step_counts, ran.counts),
-        taxels=taxels(machine, loaded, data, ran.counts, arguments.taxels),
+        taxels=taxels(machine, loaded, data, ran.counts, request.taxels),
         recording=recording(machine, loaded, data, chosen) if isinstance(machine, Comparable) else None,
         costs=price.outcome.result,
         provenance=origin,
-        output=arguments.output,
+        output=request.output,
         described=described,
         price=price,
         figures=machine.figures(price),

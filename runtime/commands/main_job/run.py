@@ -1,6 +1,5 @@
 """The command ``run``: decisions and spikes, bit for bit the chip's."""
 
-import argparse
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
-from spikeloom.runtime.commands.options import add_netlist, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
@@ -20,10 +18,12 @@ from spikeloom.runtime.machines.base import Machine, Run
 from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
+from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.requests.main_job import RunRequest
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Decisions:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Decisions(Shown):
     """Class (samples,) and votes (samples, classes) of each recording, int64; its label, or ``UNLABELLED``."""
 
     files: tuple[str, ...]
@@ -50,21 +50,17 @@ class Decisions:
         return float(np.mean(self.labels[known] == self.predictions[known])) if known.any() else None
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options."""
-    add_netlist(parser)
-    add_recordings(parser, window=True)
-    parser.add_argument("--spikes", metavar="OUT.npz", help="write the spikes of every layer, aligned with the data")
+REQUEST = RunRequest
 
 
-def run(arguments: argparse.Namespace) -> Outcome:
+def run(request: RunRequest) -> Outcome:
     """Run the command."""
-    require_place(arguments.spikes, "--spikes", arguments, ["npz"])
-    machine = machine_for(arguments.netlist)
-    data = load_recordings(arguments, machine.netlist)
+    require_place(request.spikes, "--spikes", request, ["npz"])
+    machine = machine_for(request.netlist)
+    data = load_recordings(request.data, request, machine.netlist)
     votes = np.concatenate([done.votes for done in _runs("running", machine, data)])
-    if arguments.spikes is not None:
-        _write_spikes(arguments.spikes, machine, data)
+    if request.spikes is not None:
+        _write_spikes(request.spikes, machine, data)
     decisions = Decisions(files=data.files, labels=data.labels, predictions=vote(votes), counts=votes)
     return Outcome(decisions, sections)
 

@@ -1,11 +1,9 @@
 """The command ``verify``: the netlist held against its checkpoint; on recordings their spikes, too."""
 
-import argparse
 from collections.abc import Mapping
 from dataclasses import replace
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_check, add_netlist_and_model, add_recordings
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.verdict import parse_requirements, sections
 from spikeloom.runtime.equivalence.verify import verify
@@ -13,11 +11,11 @@ from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.inputs.repeat import refuse
 from spikeloom.runtime.machines.backends import backend_of, machine_for
-from spikeloom.runtime.machines.base import ENGINES
 from spikeloom.runtime.machines.capabilities import Comparable
 from spikeloom.runtime.machines.netlist_check import sections as check_sections
 from spikeloom.runtime.report.console import Progress, tell
 from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.requests.main_job import MIN_AGREEMENT, VerifyRequest
 
 NOTES = """\
 Without --data nothing is simulated: only the level EN is asked, whether the netlist is its checkpoint, rounded. EN is
@@ -28,49 +26,36 @@ WITH_DATA = ("original", "min_agreement", "require", "limit")
 """Options that only say something about recordings."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options."""
-    add_netlist_and_model(parser)
-    add_recordings(parser, window=True, required=False)
-    what = "float model for E2 and E3 (default: the weights of --checkpoint)"
-    parser.add_argument("--original", metavar="CKPT", help=what)
-    what = f"onnx: onnxruntime runs the integer graph beside our engine (default: {ENGINES[0]})"
-    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0], help=what)
-    what = f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})"
-    parser.add_argument("--min-agreement", type=float, metavar="X", help=what)
-    what = "levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions"
-    parser.add_argument("--require", metavar="E0,E2=X,E3=X", help=what)
-    add_check(parser)
-    parser.epilog = NOTES
+REQUEST = VerifyRequest
 
 
-def run(arguments: argparse.Namespace) -> Outcome:
+def run(request: VerifyRequest) -> Outcome:
     """Run the command."""
-    if arguments.data is None:
-        refuse(arguments, WITH_DATA, "is about recordings, give --data too")
-    required = _required(arguments)
-    machine = machine_for(arguments.netlist)
+    if request.data is None:
+        refuse(request, WITH_DATA, "is about recordings, give --data too")
+    required = _required(request)
+    machine = machine_for(request.netlist)
     netlist = machine.netlist
-    reference = backend_of(netlist.target).reference(arguments, netlist)
+    reference = backend_of(netlist.target).reference(request, netlist)
     if reference.whole:
-        refuse(arguments, ("original", "min_agreement"), "the network is whole numbers, there is no float model")
+        refuse(request, ("original", "min_agreement"), "the network is whole numbers, there is no float model")
     if isinstance(machine, Comparable):
         require_match(machine.netlist, reference.source)
     if reference.difference is not None:
-        tell(f"warning: {arguments.netlist}: {reference.difference}")
+        tell(f"warning: {request.netlist}: {reference.difference}")
     check = machine.check_lowering(reference.network)
-    if arguments.data is None or not check.simulates:
+    if request.data is None or not check.simulates:
         return Outcome(check, check_sections, 0 if check.holds else 1)
-    original = None if arguments.original is None else load_network(arguments.original, arguments).model
-    data = load_recordings(arguments, netlist, labels_for="verify")
+    original = None if request.original is None else load_network(request.original, request).model
+    data = load_recordings(request.data, request, netlist, labels_for="verify")
     count = Progress(len(data))
     verdict = verify(
         netlist,
         reference.source,
         data,
         original=reference.floats if original is None else original,
-        spec_samples=arguments.spec_samples,
-        engine_name=arguments.engine,
+        spec_samples=request.spec_samples,
+        engine_name=request.engine,
         required=required or ({"E0": 1.0, "E1": 1.0} if reference.whole else {"E0": 1.0, "E3": MIN_AGREEMENT}),
         check=check,
         progress=lambda part, done: count(done, part),
@@ -79,14 +64,14 @@ def run(arguments: argparse.Namespace) -> Outcome:
     return Outcome(verdict, sections, 1 if verdict.missed else 0)
 
 
-def _required(arguments: argparse.Namespace) -> Mapping[str, float] | None:
+def _required(request: VerifyRequest) -> Mapping[str, float] | None:
     """Levels and shares that the options require; None where they say nothing."""
-    agreement = arguments.min_agreement
+    agreement = request.min_agreement
     if agreement is not None and not 0 <= agreement <= 1:
         raise OptionError(f"--min-agreement {agreement}: not a share; give a number from 0 to 1")
-    if arguments.require is None:
+    if request.require is None:
         return None if agreement is None else {"E0": 1.0, "E3": agreement}
     if agreement is not None:
         instead = f"write E3={agreement:g} into that instead"
         raise OptionError(f"--min-agreement {agreement:g}: --require replaces it; {instead}")
-    return parse_requirements(arguments.require)
+    return parse_requirements(request.require)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spikeloom.compiler import DEFAULT_TARGET, Packing, check_packings, round_to_forms
+from spikeloom.compiler import Packing, check_packings, round_to_forms
 from spikeloom.compiler.checkpoint import WEIGHTS, layers_of
 from spikeloom.compiler.errors import ModelError, OptionError, require_least
 from spikeloom.compiler.files import remove_leftovers, sha256_of, write_atomically
@@ -23,7 +22,6 @@ from spikeloom.models.recordings.evtouch import BIN_S, data_digest
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.models.training.robust import require_chance
 from spikeloom.runtime.commands.main_job import compile
-from spikeloom.runtime.commands.options import NETWORK_FILES, add_data, add_network
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_place
@@ -33,6 +31,9 @@ from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
+from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.requests.main_job import CompileRequest
+from spikeloom.runtime.requests.training import FinetuneRequest
 from spikeloom.runtime.studies.jobs import only_one
 
 if TYPE_CHECKING:
@@ -83,8 +84,8 @@ class FinetuneRecord:
         return {key: value for key, value in asdict(self).items() if value is not None}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Finetuned:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Finetuned(Shown):
     """A fine-tuning and the file that holds it; `netlist` beside it if that is NIR."""
 
     record: FinetuneRecord = field(metadata=INLINE)
@@ -93,29 +94,7 @@ class Finetuned:
     netlist: str | None = field(default=None, metadata=OPTIONAL)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
-    parser.add_argument("checkpoint", metavar=NETWORK_FILES, help="trained network, or pretrained:NAME")
-    add_network(parser)
-    add_data(parser)
-    parser.add_argument("--target", default=DEFAULT_TARGET, help=f"chip (default: {DEFAULT_TARGET})")
-    parser.add_argument(
-        "--weight-bits",
-        metavar="N[,N]",
-        help="storage width, one or one a layer: 2 to 6 or 8 (default: the storage that compile --calibrate chooses)",
-    )
-    parser.add_argument("--scale-groups", type=int, metavar="N", help="scales in a layer, of that width (default: 8)")
-    parser.add_argument("--robust", type=float, metavar="X", help="chance of an event, and of a taxel, to be lost: 0.1")
-    parser.add_argument("--epochs", type=int, default=40, metavar="N", help="default: 40")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the order of recordings (default: 0)")
-    parser.add_argument("--resume", action="store_true", help="go on with an interrupted one of the same options")
-    parser.add_argument(
-        "-o",
-        "--output",
-        required=True,
-        metavar="OUT.pt|OUT.nir",
-        help="a checkpoint is written back as one; any other network as NIR, with its netlist OUT.loom beside it",
-    )
+REQUEST = FinetuneRequest
 
 
 def _state(output: Path, *, resume: bool) -> Path:
@@ -132,35 +111,35 @@ def _state(output: Path, *, resume: bool) -> Path:
     return state
 
 
-def run(arguments: argparse.Namespace) -> Outcome:
+def run(request: FinetuneRequest) -> Outcome:
     """Fine-tune, write the checkpoint, report; the text of a KeyboardInterrupt says what is kept."""
-    require_place(arguments.output, "-o", arguments, ["pt", "nir"])
-    require_least(vars(arguments), epochs=1, seed=0)
-    require_chance(arguments.robust or 0.0)
-    with only_one(Path(arguments.output)):
-        return Outcome(_finetuned(arguments, Path(arguments.output)), finetune_sections)
+    require_place(request.output, "-o", request, ["pt", "nir"])
+    require_least(vars(request), epochs=1, seed=0)
+    require_chance(request.robust or 0.0)
+    with only_one(Path(request.output)):
+        return Outcome(_finetuned(request, Path(request.output)), finetune_sections)
 
 
-def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
+def _finetuned(request: FinetuneRequest, output: Path) -> Finetuned:
     """Fine-tune and write the network; return the report."""
-    state = _state(output, resume=arguments.resume)
-    target = load_target(arguments.target, COMPARTMENTS)
-    widths = None if arguments.weight_bits is None else whole_numbers(arguments.weight_bits, "--weight-bits")
+    state = _state(output, resume=request.resume)
+    target = load_target(request.target, COMPARTMENTS)
+    widths = None if request.weight_bits is None else whole_numbers(request.weight_bits, "--weight-bits")
     if widths is None:
-        repeat.refuse(arguments, ("scale_groups",), "is for --weight-bits; held-out recordings choose the storage")
-    loaded = load_network(arguments.checkpoint, arguments)
-    _require_trainable(arguments, loaded, output)
+        repeat.refuse(request, ("scale_groups",), "is for --weight-bits; held-out recordings choose the storage")
+    loaded = load_network(request.checkpoint, request)
+    _require_trainable(request, loaded, output)
     if widths is not None:
         check_packings([Packing(bits=width) for width in widths], len(loaded.network.populations), target)
-    require_splits(arguments.data)
+    require_splits(request.data)
     taken = loaded.network.input
     found = [
         recordings(
-            arguments.data,
+            request.data,
             split,
             classes=loaded.network.classes,
             taxels=taken.taxels,
-            bin_s=arguments.bin,
+            bin_s=request.bin,
             labels_for="fine-tuning",
             trained=origin_of(loaded.training),
         )
@@ -178,24 +157,24 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
             test,
             target,
             bits=widths,
-            groups=8 if arguments.scale_groups is None else arguments.scale_groups,
-            epochs=arguments.epochs,
-            seed=arguments.seed,
-            robust=arguments.robust or 0.0,
+            groups=8 if request.scale_groups is None else request.scale_groups,
+            epochs=request.epochs,
+            seed=request.seed,
+            robust=request.robust or 0.0,
             state=state,
-            resume=arguments.resume,
+            resume=request.resume,
         )
     except KeyboardInterrupt:
         kept = f"the epochs so far are kept in {state}; go on with the same command and --resume"
         raise KeyboardInterrupt(kept if state.exists() else "") from None
     epoch = WEIGHTS[0] if loaded.checkpoint is None else loaded.checkpoint.weights
     record = FinetuneRecord(
-        command=" ".join(_words(arguments, SYNTHETIC if arguments.data == SYNTHETIC else training.source)),
+        command=" ".join(_words(request, SYNTHETIC if request.data == SYNTHETIC else training.source)),
         fine_tuned_from=loaded.sha256,
         fine_tuned_weights=epoch,
         weight_bits=widths or [form.bits for form in tuned.net.forms],
-        seed=arguments.seed,
-        epochs=arguments.epochs,
+        seed=request.seed,
+        epochs=request.epochs,
         data=training.source,
         data_sha256=data_digest(*found),
         bin_s=training.bin_s,
@@ -205,14 +184,14 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
         history=[[epoch.loss, epoch.correct] for epoch in tuned.history],
     )
     write = _write_nir if loaded.checkpoint is None else _write_checkpoint
-    netlist = write(arguments, loaded, tuned.net, record)
+    netlist = write(request, loaded, tuned.net, record)
     state.unlink(missing_ok=True)
     return Finetuned(record=record, file=output.name, sha256=sha256_of(output), netlist=netlist)
 
 
-def _require_trainable(arguments: argparse.Namespace, loaded: LoadedNetwork, output: Path) -> None:
+def _require_trainable(request: FinetuneRequest, loaded: LoadedNetwork, output: Path) -> None:
     """Refuse networks that cannot be trained on, and a place whose name says another format."""
-    path, checkpoint = arguments.checkpoint, loaded.checkpoint
+    path, checkpoint = request.checkpoint, loaded.checkpoint
     if loaded.network.forms is not None:
         raise ModelError(f"{path}: was fine-tuned already; give the network that it was made from")
     if loaded.format == "counting":
@@ -226,47 +205,51 @@ def _require_trainable(arguments: argparse.Namespace, loaded: LoadedNetwork, out
         what, ending = ("no checkpoint", NIR) if checkpoint is None else ("a checkpoint", ".pt")
         raise OptionError(f"-o {output}: {path} is {what}, it is written back as {ending}; give OUT{ending}")
     if checkpoint is None:
-        require_place(str(output.with_suffix(".loom")), "-o", arguments)
+        require_place(str(output.with_suffix(".loom")), "-o", request)
 
 
 def _write_checkpoint(
-    arguments: argparse.Namespace, loaded: LoadedNetwork, net: QuantisedNet, record: FinetuneRecord
+    request: FinetuneRequest, loaded: LoadedNetwork, net: QuantisedNet, record: FinetuneRecord
 ) -> None:
     from spikeloom.models.networks.checkpoint import save_again
 
-    output, checkpoint, adjacency = arguments.output, loaded.checkpoint, loaded.adjacency
+    output, checkpoint, adjacency = request.output, loaded.checkpoint, loaded.adjacency
     assert checkpoint is not None
     assert adjacency is not None
-    asked = load_graph(arguments, checkpoint.system)
+    asked = load_graph(request, checkpoint.system)
     edges = asked.edges if checkpoint.edges is None and asked is not None else checkpoint.edges
     changed = replace(checkpoint, graph=loaded.graph, edges=edges, forms=net.forms, **layers_of(net.tensors()))
     save_again(output, changed, training=record.to_json())
     round_to_forms(expand(read_checkpoint(output), adjacency), net.forms)  # it compiles, or says why not
 
 
-def _write_nir(arguments: argparse.Namespace, loaded: LoadedNetwork, net: QuantisedNet, record: FinetuneRecord) -> str:
+def _write_nir(request: FinetuneRequest, loaded: LoadedNetwork, net: QuantisedNet, record: FinetuneRecord) -> str:
     """Write the network, and the netlist that it compiles to; the name of that."""
     from spikeloom.compiler.formats.nir import writer
 
     integer, _ = round_to_forms(net.learned(), net.forms)
     dt = loaded.read_as.get("dt", (record.bin_s or BIN_S) * integer.input.bins)
     content = writer.export(integer, dt, training=json.dumps(record.to_json()))
-    with write_atomically(arguments.output) as file:
+    with write_atomically(request.output) as file:
         file.write(content)
-    netlist = Path(arguments.output).with_suffix(".loom")
-    words = [arguments.output, "--polarities", str(integer.input.polarities), "--target", arguments.target]
-    parser = argparse.ArgumentParser()
-    compile.add_arguments(parser)
-    compile.run(parser.parse_args([*words, "-o", str(netlist)]))
+    netlist = Path(request.output).with_suffix(".loom")
+    compile.run(
+        CompileRequest(
+            checkpoint=request.output,
+            polarities=integer.input.polarities,
+            target=request.target,
+            output=str(netlist),
+        )
+    )
     return netlist.name
 
 
-def _words(arguments: argparse.Namespace, source: str) -> list[str]:
+def _words(request: FinetuneRequest, source: str) -> list[str]:
     """The words that ask for the same fine-tuning, beside the files."""
-    files = {name: getattr(arguments, name) for name in ("taxels", "edges")}
-    options = repeat.given(arguments, (*repeat.NETWORK, "target", "bin", *REPEATED)) | {"data": source}
+    files = {name: getattr(request, name) for name in ("taxels", "edges")}
+    options = repeat.given(request, (*repeat.NETWORK, "target", "bin", *REPEATED)) | {"data": source}
     options |= {name: Path(file).name for name, file in files.items() if file}
-    name = Path(arguments.checkpoint).name if isinstance(arguments.checkpoint, str) else "MODULE"
+    name = Path(request.checkpoint).name if isinstance(request.checkpoint, str) else "MODULE"
     return ["spikeloom", "finetune", name, *repeat.words(options)]
 
 

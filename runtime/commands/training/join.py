@@ -1,13 +1,11 @@
 """The command ``join``: several trained networks as one whose votes add up."""
 
-import argparse
-from argparse import Namespace
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
 from spikeloom.compiler.formats.tensors import join as join_networks
@@ -17,13 +15,16 @@ from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.inputs.network import load_checkpoint
 from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.report.sections import Outcome, Section, Text
+from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.requests.choices import CheckpointChoice
+from spikeloom.runtime.requests.training import JoinRequest
 
 KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "bin_s", "test_samples", "fine_tuned_from")
 """Parts of a network's training record that the joined one keeps, beside what the chosen weights reached."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Joined:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Joined(Shown):
     """Networks that were put side by side; `towers` has of each its file, hash and training record."""
 
     command: str
@@ -36,31 +37,26 @@ class Joined:
     sha256: str
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
-    parser.add_argument("checkpoints", nargs="+", metavar="CKPT", help="networks of one system, graph and timing")
-    what = "epoch to take from each (default: the first of these that it holds)"
-    parser.add_argument("--weights", choices=WEIGHTS, help=what)
-    parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
+REQUEST = JoinRequest
 
 
-def run(arguments: Namespace) -> Outcome:
+def run(request: JoinRequest) -> Outcome:
     """Join, write the checkpoint, report."""
-    require_place(arguments.output, "-o", arguments, ["pt"])
-    found = [_network(name, arguments.weights) for name in arguments.checkpoints]
-    towers = [record for name, checkpoint in zip(arguments.checkpoints, found, strict=True)
+    require_place(request.output, "-o", request, ["pt"])
+    found = [_network(name, request.weights) for name in request.checkpoints]
+    towers = [record for name, checkpoint in zip(request.checkpoints, found, strict=True)
               for record in _records(name, checkpoint)]  # fmt: skip
     if len(towers) < 2:
-        raise OptionError(f"join: {arguments.checkpoints[0]} is one network already; give two or more")
+        raise OptionError(f"join: {request.checkpoints[0]} is one network already; give two or more")
     origins = [origin_of(tower) for tower in towers]
     widths = sorted({origin["bin_s"] for origin in origins if "bin_s" in origin})
     if len(widths) > 1:
         raise ModelError(f"join: networks of bins of {widths[0]:g} s and {widths[-1]:g} s; give those of one width")
-    joined = join_networks(found, arguments.checkpoints)
-    words = [_shown(name) for name in arguments.checkpoints]
-    words += [f"--weights {arguments.weights}"] if arguments.weights else []
+    joined = join_networks(found, request.checkpoints)
+    words = [_shown(name) for name in request.checkpoints]
+    words += [f"--weights {request.weights}"] if request.weights else []
     record: dict[str, Any] = {"command": f"spikeloom join {' '.join(words)}", "towers": towers} | origins[0]
-    output = Path(arguments.output)
+    output = Path(request.output)
     remove_leftovers(output)
     save_again(output, joined, training=record)
     result = Joined(
@@ -77,7 +73,7 @@ def run(arguments: Namespace) -> Outcome:
 
 
 def _network(name: str, weights: str | None) -> Checkpoint:
-    checkpoint = load_checkpoint(name, Namespace(run=0, weights=weights, beta=None, theta=None))
+    checkpoint = load_checkpoint(name, CheckpointChoice(weights=weights))
     if checkpoint.layout != "spikeloom":
         raise ModelError(f"{name}: does not say its graph and constants; give checkpoints that spikeloom train wrote")
     return checkpoint

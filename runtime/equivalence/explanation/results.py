@@ -7,6 +7,7 @@ from textwrap import wrap
 
 from spikeloom.runtime.report.encode import HIDDEN, INLINE
 from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.report.shown import Shown
 
 WEIGHTS, BIAS, BETA = "weight rounding", "bias rounding", "realised beta"
 TRUNCATION, SATURATION, TIE = "round toward zero", "saturation or overflow", "tie (> or >=)"
@@ -117,8 +118,8 @@ class Explanation:
         return self.causes[0].cause if self.found else None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Explained:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Explained(Shown):
     """The explanation of one recording, its number counted from 0.
 
     So many recordings were `searched` for a difference. `faults` says where the netlist is not the rounding of the

@@ -1,7 +1,6 @@
 """Loihi 1 as a :class:`machines.base.Backend`."""
 
 import os
-from argparse import Namespace
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +8,7 @@ from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.runtime.machines.base import Backend, Format, Lowered, Machine
 from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.requests.main_job import CompileRequest
 
 
 class Loihi1(Backend):
@@ -35,11 +35,11 @@ class Loihi1(Backend):
 
         return tuple(step.name for step in PASSES)
 
-    def lower(self, arguments: Namespace, after: Callable[[str, Any], object]) -> Lowered:
+    def lower(self, request: CompileRequest, after: Callable[[str, Any], object]) -> Lowered:
         """Networks of floats are rounded; a netx file brings its integers."""
         from spikeloom.runtime.machines.loihi1.lowering import lower
 
-        return lower(arguments, after)
+        return lower(request, after)
 
     def lower_counters(self, counters: Counters) -> Netlist:
         """As the float network that counts likewise, at 8 bits."""

@@ -16,13 +16,14 @@ from spikeloom.runtime.machines.loihi1 import description
 from spikeloom.runtime.machines.loihi1.description import NetlistFacts
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 from spikeloom.runtime.report.sections import Block, Outcome, Section, Table, Text
+from spikeloom.runtime.report.shown import Shown
 
 ZEROED = 0.25
 """Share of a layer's weights from which on it is said that they round to zero."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CompilationFacts:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class CompilationFacts(Shown):
     """A netlist with the reasons for its scales, the proofs and the placement.
 
     `facts` is what was read from a file of another format; `finetune` the command that helps where no storage keeps

@@ -20,6 +20,7 @@ from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
+from spikeloom.runtime.report.shown import Shown
 
 SHARED = 0.9
 """Shared lists are spoken of when memory is at most this share of what the unrolled network would take."""
@@ -53,8 +54,8 @@ class LayerFacts:
     cores: Sequence[int]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NetlistFacts:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class NetlistFacts(Shown):
     """A netlist; synapses are counted in the network, as stored on cores, and as stored and not zero.
 
     Words of synaptic memory are those of all cores; unrolled are those that it would take if no axons shared a list.

@@ -1,6 +1,5 @@
 """What is compiled for Loihi: networks of floats, which are rounded, and netx files, which bring their integers."""
 
-from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,37 +17,40 @@ from spikeloom.runtime.inputs.recordings import origin_of, recordings
 from spikeloom.runtime.inputs.repeat import LAYOUT, NETWORK, ROUNDING, command, given, refuse, words
 from spikeloom.runtime.machines.base import Lowered, Model
 from spikeloom.runtime.machines.loihi1 import compiled, description
+from spikeloom.runtime.machines.loihi1.description import NetlistFacts
 from spikeloom.runtime.report.console import progress
-from spikeloom.runtime.report.encode import INLINE
+from spikeloom.runtime.report.encode import HIDDEN, INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
+from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.requests.main_job import CompileRequest
 
 
-def lower(arguments: Namespace, after: Callable[[str, Any], object]) -> Lowered:
+def lower(request: CompileRequest, after: Callable[[str, Any], object]) -> Lowered:
     """Read a network and lower it; OptionError, ModelError, DataError or CapacityError if that cannot be."""
-    path = arguments.checkpoint
+    path = request.checkpoint
     if isinstance(path, str) and path.endswith(NETX):
-        return _lower_integers(arguments)
-    packings = parse_packings(arguments)
-    keep = parse_keep(arguments)
-    parse_cores(arguments.cores_for)
-    _options(arguments, packings=packings, keep=keep).require_consistent(calibrated=arguments.calibrate is not None)
-    loaded = load_network(path, arguments)
+        return _lower_integers(path, request)
+    packings = parse_packings(request)
+    keep = parse_keep(request)
+    parse_cores(request.cores_for)
+    _options(request, packings=packings, keep=keep).require_consistent(calibrated=request.calibrate is not None)
+    loaded = load_network(path, request)
     forms = loaded.network.forms
     if forms is not None:
-        refuse(arguments, ("keep",), f"{path} was fine-tuned for its own storage")
-    seen = None if arguments.calibrate is None else _calibration(arguments, loaded)
+        refuse(request, ("keep",), f"{path} was fine-tuned for its own storage")
+    seen = None if request.calibrate is None else _calibration(request.calibrate, request.bin, loaded)
     training = None if seen is None else of_length(seen, loaded.network.input.clocks.length).events
     progress("compiling")
     options = _options(
-        arguments,
+        request,
         packings=packings,
         keep=keep,
         forms=forms,
         training_events=training,
-        provenance=provenance(arguments, loaded, calibrated=seen),
+        provenance=provenance(request, loaded, calibrated=seen),
     )
     done = compile_network(loaded.model, options, after=after)
-    helps = _finetune(arguments, checkpoint=loaded.checkpoint is not None)
+    helps = _finetune(request, checkpoint=loaded.checkpoint is not None)
     return Lowered(
         netlist=done.netlist,
         model=_model(done),
@@ -70,74 +72,74 @@ def _model(done: Compilation) -> Model:
     return Model(first=first, spikes=spikes)
 
 
-def _options(arguments: Namespace, **further: Any) -> Options:
+def _options(request: CompileRequest, **further: Any) -> Options:
     """Options of the passes that a request asks for."""
     return Options(
-        spike_exact=arguments.spike_exact,
-        keep_all=arguments.keep_all,
-        prune_unused=arguments.prune_unused,
-        share_lists=arguments.share_lists,
-        cores_for=parse_cores(arguments.cores_for),
-        chips=arguments.chips,
-        free_running=arguments.free_running,
+        spike_exact=request.spike_exact,
+        keep_all=request.keep_all,
+        prune_unused=request.prune_unused,
+        share_lists=request.share_lists,
+        cores_for=parse_cores(request.cores_for),
+        chips=request.chips,
+        free_running=request.free_running,
         **further,
     )
 
 
-def _calibration(arguments: Namespace, loaded: LoadedNetwork) -> Recordings:
+def _calibration(source: str | Recordings, bin_s: float | None, loaded: LoadedNetwork) -> Recordings:
     """Training recordings that choose storage and scales."""
     progress("reading the recordings")
     return recordings(
-        arguments.calibrate,
+        source,
         "train",
         classes=loaded.network.classes,
         taxels=loaded.network.input.taxels,
-        bin_s=arguments.bin,
+        bin_s=bin_s,
         bins=loaded.network.input.bins,
         trained=origin_of(loaded.training),
     )
 
 
-def _finetune(arguments: Namespace, *, checkpoint: bool) -> str:
+def _finetune(request: CompileRequest, *, checkpoint: bool) -> str:
     """What to type for training on the chip's integers."""
-    read = words(given(arguments, (*NETWORK, *LAYOUT)))
-    data = ("--data", str(arguments.calibrate), "--weight-bits", "8")
-    return command("finetune", str(arguments.checkpoint), *read, *data, "-o", "TUNED.pt" if checkpoint else "TUNED.nir")
+    read = words(given(request, (*NETWORK, *LAYOUT)))
+    data = ("--data", str(request.calibrate), "--weight-bits", "8")
+    return command("finetune", str(request.checkpoint), *read, *data, "-o", "TUNED.pt" if checkpoint else "TUNED.nir")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LaidOut:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class LaidOut(Shown):
     """A netlist of integers as they stood, and what was read from their file."""
 
-    netlist: Any = field(metadata=INLINE)
+    netlist: NetlistFacts = field(metadata=INLINE)
     path: str
     facts: Sequence[str]
+    sha256: str = field(metadata=HIDDEN)
 
 
-def _lower_integers(arguments: Namespace) -> Lowered:
+def _lower_integers(path: str, request: CompileRequest) -> Lowered:
     """Lay out a file that brings its integers: nothing is rounded."""
-    path = arguments.checkpoint
     floats = ("dt", "convention", *ROUNDING, "dump_after", "calibrate")
-    refuse(arguments, floats, f"is for float networks, {path} holds integers")
-    refuse(arguments, NETWORK, f"is for checkpoints, the netx file {path} holds all it needs")
+    refuse(request, floats, f"is for float networks, {path} holds integers")
+    refuse(request, NETWORK, f"is for checkpoints, the netx file {path} holds all it needs")
     progress("reading the network")
-    read = read_netx(path, polarities=arguments.polarities, polarities_first=arguments.polarities_first)
+    read = read_netx(path, polarities=request.polarities, polarities_first=request.polarities_first)
     invariants.verify(read.network)
     progress("compiling")
-    cores_for = parse_cores(arguments.cores_for)
+    cores_for = parse_cores(request.cores_for)
     origin = {
         "spikeloom": __version__,
         "checkpoint_sha256": read.sha256,
         "format": "netx",
-        "keep_all": arguments.keep_all,
+        "keep_all": request.keep_all,
         **({"cores_for": cores_for} if cores_for else {}),
-        **({"chips": arguments.chips} if arguments.chips != 1 else {}),
+        **({"chips": request.chips} if request.chips != 1 else {}),
     }
     options = Options(
-        keep_all=arguments.keep_all,
+        keep_all=request.keep_all,
         cores_for=cores_for,
-        free_running=arguments.free_running,
-        chips=arguments.chips,
+        free_running=request.free_running,
+        chips=request.chips,
         provenance=origin,
     )
     done = compile_network(read.network, options)
@@ -146,18 +148,19 @@ def _lower_integers(arguments: Namespace) -> Lowered:
         netlist=netlist,
         model=_model(done),
         write=lambda output: write_netlist(netlist, output),
-        report=lambda sha256: _laid_out(arguments.output, sha256, read.facts),
+        report=lambda sha256: _laid_out(request.output, sha256, read.facts),
     )
 
 
 def _laid_out(path: str, sha256: str, facts: Sequence[str]) -> Outcome:
     """The netlist of a file, what was read, and the hash."""
-    described = description.inspect(path)
+    described: NetlistFacts = description.inspect(path).result
+    return Outcome(LaidOut(netlist=described, path=path, facts=facts, sha256=sha256), sections)
 
-    def sections(made: LaidOut) -> Iterator[Section]:
-        yield Section("", [*map(Text, made.facts)])
-        *first, last = described.sections(made.netlist)
-        yield from first
-        yield Section("", [*last.blocks, Text(f"sha256 {sha256}")])
 
-    return Outcome(LaidOut(netlist=described.result, path=path, facts=facts), sections)
+def sections(made: LaidOut) -> Iterator[Section]:
+    """The same for people."""
+    yield Section("", [*map(Text, made.facts)])
+    *first, last = description.sections(made.netlist)
+    yield from first
+    yield Section("", [*last.blocks, Text(f"sha256 {made.sha256}")])

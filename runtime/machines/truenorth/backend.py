@@ -1,7 +1,6 @@
 """TrueNorth as a :class:`machines.base.Backend`."""
 
 import os
-from argparse import Namespace
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +9,8 @@ from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.machines.base import Backend, Format, Lowered, Machine, Reference
 from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.requests.choices import ComparisonChoice
+from spikeloom.runtime.requests.main_job import CompileRequest, InspectRequest
 
 
 class TrueNorth(Backend):
@@ -38,11 +39,11 @@ class TrueNorth(Backend):
 
         return tuple(step.name for step in PASSES)
 
-    def lower(self, arguments: Namespace, after: Callable[[str, Any], object]) -> Lowered:
+    def lower(self, request: CompileRequest, after: Callable[[str, Any], object]) -> Lowered:
         """Networks that were trained for the chip, and counting ones."""
         from spikeloom.runtime.machines.truenorth.lowering import lower
 
-        return lower(arguments, after)
+        return lower(request, after)
 
     def lower_counters(self, counters: Counters) -> Netlist:
         """Whole numbers already."""
@@ -74,15 +75,15 @@ class TrueNorth(Backend):
 
         return is_trained(shipped(path))
 
-    def inspect(self, arguments: Namespace) -> Outcome:
+    def inspect(self, request: InspectRequest) -> Outcome:
         """Stages and levels."""
         from spikeloom.runtime.machines.truenorth.description import describe_trained
         from spikeloom.runtime.machines.truenorth.lowering import read
 
-        return describe_trained(read(arguments.path, arguments))
+        return describe_trained(read(request.path, request))
 
-    def reference(self, arguments: Namespace, netlist: Any) -> Reference:
+    def reference(self, request: ComparisonChoice, netlist: Any) -> Reference:
         """Whole numbers, whose every spike must be the chip's."""
         from spikeloom.runtime.machines.truenorth.lowering import reference
 
-        return reference(arguments, netlist)
+        return reference(request, netlist)

@@ -17,6 +17,7 @@ from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_c
 from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
+from spikeloom.runtime.report.shown import Shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +40,8 @@ class LimitFill:
     allowed: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Description:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Description(Shown):
     """Sizes, layers and the fullest core by each limit."""
 
     target: str

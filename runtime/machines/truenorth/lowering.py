@@ -1,6 +1,5 @@
 """What is compiled for TrueNorth: networks that were trained for it, and counting ones."""
 
-from argparse import Namespace
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -23,6 +22,8 @@ from spikeloom.runtime.machines.base import Lowered, Reference
 from spikeloom.runtime.machines.truenorth.description import describe
 from spikeloom.runtime.machines.truenorth.model import model_of
 from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.requests.choices import CheckpointChoice, ComparisonChoice
+from spikeloom.runtime.requests.main_job import CompileRequest
 
 TITLE = "TrueNorth"
 
@@ -30,35 +31,34 @@ COUNTING = NETWORKS[COUNTERS].lower()
 """What a netlist says of the format that it was compiled from, if that was a counting network."""
 
 
-def read(path: str, arguments: Namespace) -> Trained:
+def read(path: str, request: CheckpointChoice) -> Trained:
     """Read a trained network as the options say; OptionError or ModelError if it is not as they say."""
     others = [name for name in NETWORK if name != "weights"]
-    refuse(arguments, others, f"{path} is a network for {TITLE} and says that itself")
-    return read_trained(shipped(path), weights=arguments.weights)
+    refuse(request, others, f"{path} is a network for {TITLE} and says that itself")
+    return read_trained(shipped(path), weights=request.weights)
 
 
-def lower(arguments: Namespace, after: Callable[[str, Any], object]) -> Lowered:
+def lower(request: CompileRequest, after: Callable[[str, Any], object]) -> Lowered:
     """Place a network on cores; OptionError, ModelError or CapacityError if that cannot be."""
-    path = arguments.checkpoint
-    named = isinstance(path, str)
-    if named and path.endswith(NETX):
-        raise OptionError(f"--target {arguments.target}: {path} holds integers of another chip; omit it")
-    refuse(arguments, ("calibrate", *ROUNDING, *PLACING), "is not for truenorth")
+    path = request.checkpoint
+    if isinstance(path, str) and path.endswith(NETX):
+        raise OptionError(f"--target {request.target}: {path} holds integers of another chip; omit it")
+    refuse(request, ("calibrate", *ROUNDING, *PLACING), "is not for truenorth")
     source: Source | Factored | Network
-    if named and is_trained(shipped(path)):
-        trained = read(path, arguments)
+    if isinstance(path, str) and is_trained(shipped(path)):
+        trained = read(path, request)
         source = trained.network
         provenance = provenance_of(trained)
     else:
-        loaded = load_network(path, arguments)
-        source = read_counters(shipped(path))[0] if loaded.format == COUNTING else loaded.model
+        loaded = load_network(path, request)
+        source = read_counters(shipped(str(path)))[0] if loaded.format == COUNTING else loaded.model
         provenance = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256}
-        provenance |= loaded.origin(arguments.run) | origin_of(loaded.training)
+        provenance |= loaded.origin(request.run) | origin_of(loaded.training)
     progress("compiling")
     try:
         done = compile_crossbars(source, Options(provenance=provenance), after=after)
     except ModelError as error:
-        raise ModelError(f"{path if named else 'module'}: {error}") from error
+        raise ModelError(f"{path if isinstance(path, str) else 'module'}: {error}") from error
     netlist = done.netlist
     return Lowered(
         netlist=netlist,
@@ -81,25 +81,25 @@ def provenance_of(trained: Trained) -> JsonObject:
     }
 
 
-def reference(arguments: Namespace, netlist: CrossbarNetlist) -> Reference:
+def reference(request: ComparisonChoice, netlist: CrossbarNetlist) -> Reference:
     """The network that a netlist was compiled from; OptionError if the file is another one."""
-    path = arguments.checkpoint
+    path = request.checkpoint
     made = netlist.provenance
     if made.get("format") == COUNTING:
-        loaded = load_network(path, arguments)
-        _require_file(arguments, made, loaded.sha256)
-        counters = read_counters(shipped(path))[0]
+        loaded = load_network(path, request)
+        _require_file(request, made, loaded.sha256)
+        counters = read_counters(shipped(str(path)))[0]
         return Reference(source=counters, network=counters, loaded=loaded, whole=True)
-    trained = read(path, arguments)
-    _require_file(arguments, made, trained.sha256)
+    trained = read(str(path), request)
+    _require_file(request, made, trained.sha256)
     if made.get("weights") != trained.weights:
-        compiled = f"{arguments.netlist} was compiled from {made.get('weights')}"
+        compiled = f"{request.netlist} was compiled from {made.get('weights')}"
         raise OptionError(f"--weights {trained.weights}: {compiled}; give the same")
     return Reference(source=trained.network, network=trained.network, loaded=None, whole=True)
 
 
-def _require_file(arguments: Namespace, made: Mapping[str, Any], sha256: str) -> None:
+def _require_file(request: ComparisonChoice, made: Mapping[str, Any], sha256: str) -> None:
     """Refuse another file than a netlist was compiled from."""
     if made.get("checkpoint_sha256") != sha256:
-        path = f"--checkpoint {arguments.checkpoint}"
-        raise OptionError(f"{path}: {arguments.netlist} was compiled from another file; give that one")
+        path = f"--checkpoint {request.checkpoint}"
+        raise OptionError(f"{path}: {request.netlist} was compiled from another file; give that one")

@@ -10,6 +10,7 @@ from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
 from spikeloom.runtime.machines.capabilities import Cumulative, Stoppable
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 from spikeloom.runtime.report.numbers import wilson
+from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.studies.anytime import exits
 
 WINDOWS = tuple(range(5, 101, 5))
@@ -78,8 +79,8 @@ class Window:
     chip: Right
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Anytime:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Anytime(Shown):
     """How early decisions could be taken.
 
     `bins` are those of the longest recording, `least_interval` the least steps from one spike of an output neuron to

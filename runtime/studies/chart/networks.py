@@ -1,8 +1,7 @@
 """The networks of a chart, and the storages that a grid asks for."""
 
-import argparse
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar
@@ -20,6 +19,8 @@ from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import PRETRAINED, shipped
 from spikeloom.runtime.inputs.network import NETWORKS, load_checkpoint, load_graph, network_kind, propagation
 from spikeloom.runtime.report.encode import HIDDEN, key
+from spikeloom.runtime.requests.choices import NetworkChoice
+from spikeloom.runtime.requests.choose import ChartRequest
 from spikeloom.runtime.studies.chart.grid import Grid
 
 
@@ -88,10 +89,9 @@ class NetworkFile:
         about = {"checkpoint": self.sha256, "weights": self.weights, "sees": self.sees}
         return about | {"options": dict(self.options)}
 
-    def arguments(self) -> argparse.Namespace:
-        """Its options as a command would have parsed them."""
-        others = dict.fromkeys(("polarities", "polarities_first", "dt", "convention"))
-        return argparse.Namespace(**others, **dict(self.options))
+    def choice(self) -> NetworkChoice:
+        """How it is read."""
+        return NetworkChoice(**dict(self.options))
 
     def storages(self, grid: Grid) -> Iterator[Storage]:
         """Every storage that a grid asks for; of a network that was fine-tuned for one its own and no other."""
@@ -109,18 +109,18 @@ class NetworkFile:
                 yield Storage(bits=bits, planes=planes, groups=groups, prune=bool(prune))
 
 
-def read_networks(arguments: argparse.Namespace) -> tuple[NetworkFile, ...]:
+def read_networks(request: ChartRequest) -> tuple[NetworkFile, ...]:
     """Networks of ``checkpoints``; refused if one cannot be used, or is given twice."""
-    paths: list[str] = arguments.checkpoints
+    paths = request.checkpoints
     for path in paths:
         if paths.count(path) > 1:
             raise OptionError(f"{path}: is given twice; give each checkpoint once")
     stems = [Path(path.removeprefix(PRETRAINED)).stem for path in paths]
     names = [stem if stems.count(stem) == 1 else f"{stem}-{number}" for number, stem in enumerate(stems, 1)]
-    return tuple(_read(path, name, arguments) for path, name in zip(paths, names, strict=True))
+    return tuple(_read(path, name, request) for path, name in zip(paths, names, strict=True))
 
 
-def _read(path: str, name: str, arguments: argparse.Namespace) -> NetworkFile:
+def _read(path: str, name: str, request: ChartRequest) -> NetworkFile:
     kind = network_kind(path)
     if kind == COUNTERS:
         return _counting(path, name)
@@ -128,11 +128,11 @@ def _read(path: str, name: str, arguments: argparse.Namespace) -> NetworkFile:
         raise ModelError(
             f"{path}: is an {NETWORKS[kind]} file, a chart takes checkpoints; give the checkpoint that it was made of"
         )
-    checkpoint = load_checkpoint(path, arguments)
-    typed = repeat.given(arguments, repeat.NETWORK)
+    checkpoint = load_checkpoint(path, request)
+    typed = repeat.given(request, repeat.NETWORK)
     if checkpoint.edges is not None:  # one that knows its graph needs no option; others of the same call may
         typed |= {"graph": None, "edges": None, "directed": False}
-    known_graph = load_graph(argparse.Namespace(**(vars(arguments) | typed)), checkpoint.system)
+    known_graph = load_graph(replace(request, **typed), checkpoint.system)
     graph, sees = propagation(checkpoint, known_graph, path)
     if checkpoint.edges is not None:
         typed["taxels"] = None

@@ -7,6 +7,7 @@ from typing import ClassVar
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.runtime.report.encode import INLINE, key
 from spikeloom.runtime.report.numbers import wilson
+from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.studies.chart.grid import FEWEST, Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
 
@@ -139,8 +140,8 @@ class ChosenBy:
         return found
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Chart:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Chart(Shown):
     """Every configuration of a grid, and which one to deploy."""
 
     spikeloom: str

@@ -4,7 +4,6 @@ Everything here is a function of files and of a request, so that a netlist is th
 ``compile`` would write. A network is rounded once for any number of layouts.
 """
 
-import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
@@ -14,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler import (
-    DEFAULT_TARGET,
     Compilation,
     Options,
     __version__,
@@ -36,6 +34,7 @@ from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_s
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.base import Machine, Price
 from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.requests.main_job import CompileRequest
 from spikeloom.runtime.studies.chart.grid import FEWEST, Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
 from spikeloom.runtime.studies.chart.results import FORMAT, SPLITS, Data, Figures, Share, share
@@ -125,7 +124,7 @@ def _in_steps(data: Data, network: NetworkFile) -> dict[str, Recordings]:
 
 @lru_cache(maxsize=2)
 def _loaded(network: NetworkFile) -> LoadedNetwork:
-    loaded = load_network(network.path, network.arguments())
+    loaded = load_network(network.path, network.choice())
     if loaded.sha256 != network.sha256:
         raise ModelError(f"{network.path}: was written anew since the chart began; begin it again")
     return loaded
@@ -168,7 +167,7 @@ def _share(decisions: IntArray, wanted: IntArray) -> Share:
 
 def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
     """Write the netlist of a layout and measure it."""
-    asked = _compile_options(work, layout)
+    asked = _compile_request(work, layout)
     placing = Options(
         cores_for=parse_cores(asked.cores_for),
         provenance=provenance(asked, _loaded(work.network), calibrated=_in_steps(work.data, work.network)["train"]),
@@ -199,7 +198,7 @@ def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
 
 def _rounded(work: Measurement, loaded: LoadedNetwork) -> Compilation:
     """A network in its storage; how it is laid out is yet to be said."""
-    asked = _compile_options(work, FEWEST)
+    asked = _compile_request(work, FEWEST)
     options = Options(
         forms=work.network.forms,
         packings=parse_packings(asked),
@@ -209,15 +208,11 @@ def _rounded(work: Measurement, loaded: LoadedNetwork) -> Compilation:
     return to_integers(loaded.model, options, load_target(asked.target))
 
 
-def _compile_options(work: Measurement, layout: str) -> argparse.Namespace:
-    """What the command ``compile`` would have parsed."""
-    return argparse.Namespace(
-        **vars(work.network.arguments())
-        | {"target": DEFAULT_TARGET}
-        | {name: repeat.USUAL.get(name) for name in (*repeat.ROUNDING, *repeat.PLACING)}
-        | {name: value for name, value in work.storage.options().items() if value is not None}
-        | _layout_options(layout)
-    )
+def _compile_request(work: Measurement, layout: str) -> CompileRequest:
+    """What is compiled for a layout; it is written by :func:`_built`."""
+    stored = {name: value for name, value in work.storage.options().items() if value is not None}
+    options = dict(work.network.options) | stored | _layout_options(layout)
+    return CompileRequest(checkpoint=work.network.path, output="", **options)
 
 
 def _figures(machine: Machine, data: Recordings, bin_s: float, decided: IntArray) -> Figures:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.report.shown import Shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,8 +74,8 @@ class TaxelUse:
     training_differ: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Lean:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Lean(Shown):
     """What a network can do without; the first row is the whole one.
 
     `samples` counts recordings of ``training`` and ``test``. `taken` is the row of least energy in training among those

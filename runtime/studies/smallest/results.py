@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from spikeloom.runtime.report.encode import HIDDEN, INLINE
+from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.studies.chart.results import ChosenBy, Data, Share
 from spikeloom.runtime.studies.pruning.results import Costs
 from spikeloom.runtime.studies.smallest.space import Candidate
@@ -66,8 +67,8 @@ class Checked:
     pace: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Smallest:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Smallest(Shown):
     """A search, its choice and what that reaches."""
 
     spikeloom: str

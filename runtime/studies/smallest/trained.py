@@ -1,6 +1,5 @@
 """Networks that are trained by gradients, as candidates: a part left out at a time, decided by the compiled network."""
 
-import argparse
 import io
 import tempfile
 from collections.abc import Mapping
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import Options
+from spikeloom.compiler import Options, Packing
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.passes import compile_network
@@ -22,9 +21,9 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import taxels_alone
 from spikeloom.models.training.kinds import Plan, kind_of, seen_by
 from spikeloom.models.training.recipes import RECIPES
-from spikeloom.runtime.inputs import repeat
-from spikeloom.runtime.inputs.compilation import parse_packings, whole_numbers
+from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.network import load_network
+from spikeloom.runtime.requests.choices import NetworkChoice
 from spikeloom.runtime.studies.smallest.space import Candidate
 
 
@@ -68,14 +67,7 @@ def without(plan: Plan, training: Recordings, held: IntArray, epochs: int, targe
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "network.pt")
         kind.save(file, {"last": made.last}, plan, {})
-        asked = arguments(target)
-        asked.weight_bits = str(storage or 8)
-        loaded, events = load_network(str(file), asked), np.ascontiguousarray(seen.events)
-        options = Options(training_events=events, packings=parse_packings(asked))
+        loaded = load_network(str(file), NetworkChoice())
+        events = np.ascontiguousarray(seen.events)
+        options = Options(training_events=events, packings=(Packing(bits=storage or 8),))
         return compile_network(loaded.model, options, target=target).netlist
-
-
-def arguments(target: Target) -> argparse.Namespace:
-    """What the command ``compile`` would have parsed, without options."""
-    names = (*repeat.NETWORK, *repeat.ROUNDING, *repeat.PLACING, "polarities", "polarities_first", "dt", "convention")
-    return argparse.Namespace(**{name: repeat.USUAL.get(name) for name in names}, target=target.name)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from spikeloom.runtime.report.shown import Shown
+
 PHASES = 10
 """Parts of a recording in which altering events are counted."""
 
@@ -59,8 +61,8 @@ class Provenance:
     split: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Stability:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Stability(Shown):
     """Verdicts of recordings; `most` is the largest number of events that was looked for, `shift` that of bins."""
 
     target: str

@@ -1,6 +1,5 @@
 """What ``stress`` works on: netlist and float network, sensor and recordings; and how recordings become inputs."""
 
-import argparse
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from spikeloom.runtime.inputs.network import LoadedNetwork, load_graph, load_net
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.capabilities import require_threaded
+from spikeloom.runtime.requests.check import StressRequest
 from spikeloom.runtime.studies.stress import damages, disturbances
 from spikeloom.runtime.studies.stress.pair import Events, Inputs, Pair, Perturbation, perturbation
 
@@ -110,19 +110,19 @@ NAMES = {each.name: each for each in _ALL if isinstance(each, Perturbation)}
 """Every perturbation: of recordings, of the state that is left over, of the network."""
 
 
-def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
+def bench_of(request: StressRequest) -> tuple[Bench, LoadedNetwork, str]:
     """Everything that is stressed, the float network, and a hash of the recordings."""
-    netlist = require_threaded(machine_for(arguments.netlist), arguments.netlist, "stress").netlist
-    loaded = load_network(arguments.checkpoint, arguments, netlist)
+    netlist = require_threaded(machine_for(request.netlist), request.netlist, "stress").netlist
+    loaded = load_network(request.checkpoint, request, netlist)
     require_match(netlist, loaded.model)
-    loaded.require_same(arguments.netlist, netlist, arguments.run)
-    data = load_recordings(arguments, netlist, labels_for="stress", joined=False)
+    loaded.require_same(request.netlist, netlist, request.run)
+    data = load_recordings(request.data, request, netlist, labels_for="stress", joined=False)
     digest = hashlib.sha256()
     for array in data.identity().values():
         digest.update(np.ascontiguousarray(array).tobytes())
     bench = Bench(
         pair=Pair(netlist=netlist, network=loaded.network),
-        distance=_distances(arguments, loaded.checkpoint, netlist.taxels),
+        distance=_distances(request, loaded.checkpoint, netlist.taxels),
         events=data.events,
         labels=data.labels,
         files=data.files,
@@ -131,14 +131,14 @@ def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
     return bench, loaded, digest.hexdigest()
 
 
-def _distances(arguments: argparse.Namespace, checkpoint: Checkpoint | None, taxels: int) -> FloatArray:
+def _distances(request: StressRequest, checkpoint: Checkpoint | None, taxels: int) -> FloatArray:
     """Distances between taxels, as far as anything is known of their places."""
-    if arguments.taxels is not None:
-        return distances(taxels, read_layout(arguments.taxels)[1], None)
-    if taxels == len(NEUTOUCH) and not arguments.edges:
+    if request.taxels is not None:
+        return distances(taxels, read_layout(request.taxels)[1], None)
+    if taxels == len(NEUTOUCH) and not request.edges:
         return distances(taxels, NEUTOUCH, None)
     graph = None if checkpoint is None else checkpoint.edges
-    if graph is None and checkpoint is not None and (given := load_graph(arguments, checkpoint.system)) is not None:
+    if graph is None and checkpoint is not None and (given := load_graph(request, checkpoint.system)) is not None:
         graph = given.edges
     return distances(taxels, None, graph)
 

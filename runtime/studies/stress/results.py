@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from spikeloom.runtime.report.encode import OPTIONAL, key
+from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.studies.stress.pair import Level
 
 
@@ -91,8 +92,8 @@ class Provenance:
     split: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Stress:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Stress(Shown):
     """Where float network and chip break: curves by perturbation, and why others were not measured."""
 
     recordings: int

@@ -1,6 +1,5 @@
 """The study: every perturbation at every level, once for each seed, on both sides at once."""
 
-import argparse
 import os
 import zlib
 from collections.abc import Sequence
@@ -13,16 +12,18 @@ from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import sha256_of
 from spikeloom.runtime.equivalence.breakdowns import undecided
+from spikeloom.runtime.inputs.recordings import name_of
 from spikeloom.runtime.report.console import Progress, progress
+from spikeloom.runtime.requests.check import StressRequest
 from spikeloom.runtime.studies.stress.bench import NAMES, Bench, bench_of, by_length, whole
 from spikeloom.runtime.studies.stress.pair import SIDES, TAXELS, Inputs, Level, Outcome, evaluate
 from spikeloom.runtime.studies.stress.results import Provenance, Run, Stress
 from spikeloom.runtime.studies.stress.verdicts import Requirement, curve, unmet
 
 
-def study(arguments: argparse.Namespace, names: Sequence[str], requirements: Sequence[Requirement]) -> Stress:
+def study(request: StressRequest, names: Sequence[str], requirements: Sequence[Requirement]) -> Stress:
     """Measure perturbations on the files that a command's options name, and judge them."""
-    bench, loaded, data = bench_of(arguments)
+    bench, loaded, data = bench_of(request)
     recordings, classes, taxels = len(bench.labels), bench.pair.netlist.classes, bench.events.shape[1]
     reasons = {name: NAMES[name].why_not(bench.pair) for name in names}
     for wanted in requirements:
@@ -37,16 +38,16 @@ def study(arguments: argparse.Namespace, names: Sequence[str], requirements: Seq
         for name in names
         if reasons[name] is None
         for level in NAMES[name].levels_of(taxels, [each.level for each in requirements if each.name == name])
-        for seed in range(arguments.seeds if NAMES[name].seeded else 1)
+        for seed in range(request.seeds if NAMES[name].seeded else 1)
     ]
     measured: dict[str, dict[Level, list[Run]]] = {}
-    for (name, level, _), run in zip(points, _runs(points, bench, reference, arguments.jobs), strict=True):
+    for (name, level, _), run in zip(points, _runs(points, bench, reference, request.jobs), strict=True):
         measured.setdefault(name, {}).setdefault(level, []).append(run)
     curves = {name: curve(name, each, undisturbed, recordings, classes) for name, each in measured.items()}
     return Stress(
         recordings=recordings,
         classes=classes,
-        seeds=arguments.seeds,
+        seeds=request.seeds,
         clean=undisturbed,
         perturbations=curves,
         not_applicable={name: reason for name, reason in reasons.items() if reason is not None},
@@ -54,15 +55,15 @@ def study(arguments: argparse.Namespace, names: Sequence[str], requirements: Seq
         missed=unmet(requirements, curves),
         provenance=Provenance(
             spikeloom=__version__,
-            netlist_sha256=sha256_of(arguments.netlist),
+            netlist_sha256=sha256_of(request.netlist),
             checkpoint_sha256=loaded.sha256,
             **loaded.read_as,
             graph=loaded.graph,
             data_sha256=data,
-            netlist=Path(arguments.netlist).name,
-            checkpoint=Path(arguments.checkpoint).name,
-            data=Path(arguments.data).name,
-            split=arguments.split,
+            netlist=Path(request.netlist).name,
+            checkpoint=Path(str(request.checkpoint)).name,
+            data=name_of(request.data),
+            split=request.split,
         ),
     )
 

@@ -1,0 +1,76 @@
+"""Requests about where a network breaks and why: explain, stress, certify."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from spikeloom.runtime.requests.choices import (
+    CheckpointChoice,
+    ComparisonChoice,
+    NetlistChoice,
+    RecordingsChoice,
+)
+from spikeloom.runtime.requests.fields import option
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplainRequest(ComparisonChoice, RecordingsChoice):
+    """Why chip and float model differ on one recording: roots, their causes, and what removes them."""
+
+    sample: str | None = option(
+        "recording to explain, by name or from 0 (default: the first that differs)",
+        metavar="NAME|N",
+        flags=("--sample", "--recording"),
+    )
+    top: int = option("roots to show", default=10, metavar="N")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StressRequest(ComparisonChoice, RecordingsChoice):
+    """Where float network and chip break: a seeded battery of perturbations, with verdicts and reasons."""
+
+    only: str | None = option("some perturbations (default: all)", metavar="NAME[,…]")
+    seeds: int = option("draws of each", default=5, metavar="N")
+    require: tuple[str, ...] = option(
+        "accuracy that the chip must keep, as in taxels_dead:3>=0.85; else exit code 1; may be repeated",
+        default=(),
+        metavar="NAME:LEVEL>=SHARE",
+    )
+    jobs: int | None = option("measurements at a time (default: one a core)", metavar="N")
+    picture: str | None = option("draw the curves", metavar="OUT.png|svg|pdf")
+    output: str | None = option(
+        "write what --json prints; report --stress shows it", metavar="OUT.json", flags=("-o", "--output")
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CertifyRequest(NetlistChoice, RecordingsChoice):
+    """Which decisions no small change of a recording alters: proven, not sampled."""
+
+    shift: int = option("furthest shift", default=25, metavar="BINS")
+    most: int = option("changed events to look for a proof of", default=16, metavar="N")
+    jobs: int | None = option("recordings at a time (default: one a core)", metavar="N")
+    picture: str | None = option("draw how many decisions hang on each taxel", metavar="OUT.png|svg|pdf")
+    output: str | None = option("write what --json prints", metavar="OUT.json", flags=("-o", "--output"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CosimulateRequest(NetlistChoice, RecordingsChoice):
+    """Run a netlist in a hardware description that others wrote, and compare every spike and membrane."""
+
+    rtl: str = option(
+        "a clone of github.com/UA-RCL/RANC (TrueNorth)", required=True, metavar="FOLDER", group="hardware"
+    )
+    simulator: str | None = option(
+        "default: verilator, if it is there", choices=("verilator", "iverilog"), group="hardware"
+    )
+    work: str | None = option(
+        "keep what is built and finished, and go on from it (a minute a recording)", metavar="FOLDER", group="hardware"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class YardsticksRequest(CheckpointChoice, RecordingsChoice):
+    """NeuroBench's metrics of a checkpoint, and arithmetic energy on a processor."""
+
+    checkpoint: str = option("trained network, or pretrained:NAME", positional=True, metavar="CKPT")

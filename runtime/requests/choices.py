@@ -1,0 +1,116 @@
+"""Choices that several requests share: which network, which recordings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from spikeloom.compiler.checkpoint import WEIGHTS
+from spikeloom.compiler.formats.nir import CONVENTIONS
+from spikeloom.models.graphs import CHOICES
+from spikeloom.models.recordings.evtouch import BIN_S
+from spikeloom.runtime.requests.fields import Request, option
+
+if TYPE_CHECKING:
+    from spikeloom.compiler.ir import Network
+    from spikeloom.models.recordings.evtouch import Recordings
+
+NETWORK_FILES = "CKPT|NET.onnx|NET.nir"
+"""What a float network is read from."""
+
+BIN_HELP = f"width of a time bin for event files (default: the one that the network was trained on, else {BIN_S:g} s)"
+
+DATA_HELP = "recordings: released layout, event files (csv, npz), one recording, 'synthetic', 'objects' or 'containers'"
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetlistChoice(Request):
+    """Which compiled network."""
+
+    netlist: str = option("compiled network", positional=True, metavar="NET.loom")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorChoice(Request):
+    """Which taxels, and which graph over them."""
+
+    graph: str | None = option(f"taxel graph: {CHOICES}", group="network")
+    taxels: str | None = option(
+        "your own sensor: number of taxels, or their positions x,y[,z] in mm", metavar="N|COORDS.csv", group="network"
+    )
+    edges: str | None = option("your own graph: source,target", metavar="EDGES.csv", group="network")
+    directed: bool = option("take --edges as they are, one way", default=False, group="network")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckpointChoice(SensorChoice):
+    """How a checkpoint is read."""
+
+    run: int = option("which run of a released file", default=0, metavar="N", group="network")
+    weights: str | None = option(
+        "epoch, where a checkpoint holds several (default: the first of these that it holds)",
+        choices=WEIGHTS,
+        group="network",
+    )
+    beta: float | None = option("membrane decay, where the file does not say (default: 0.2)", group="network")
+    theta: float | None = option("threshold, where the file does not say (default: 0.5)", group="network")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkChoice(CheckpointChoice):
+    """How a network of any format is read."""
+
+    polarities: int | None = option("of an ONNX or NIR input, where its shape is flat", metavar="N", group="network")
+    polarities_first: bool | None = option(
+        "whether they are the first axis, where the shape of an ONNX or NIR input does not say",
+        group="network",
+        constants={
+            "--polarities-first": (
+                True,
+                "they are the first axis, where the shape of an ONNX or NIR input does not say",
+            ),
+            "--polarities-last": (
+                False,
+                "they are the last axis, where the shape of an ONNX or NIR input does not say",
+            ),
+        },
+    )
+    dt: float | None = option(
+        "time step that a NIR file is read in (default: its own)", metavar="SECONDS", group="network"
+    )
+    convention: str | None = option(
+        f"a step keeps 1 - dt/tau (euler) or exp(-dt/tau) (exponential) of a state (default: {CONVENTIONS[0]})",
+        choices=CONVENTIONS,
+        group="network",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonChoice(NetlistChoice, NetworkChoice):
+    """Which compiled network, beside which float model."""
+
+    checkpoint: str | Network = option("its float model", required=True, metavar=NETWORK_FILES, group="network")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataChoice(Request):
+    """Where recordings are, all splits of them."""
+
+    data: str = option(DATA_HELP, required=True, metavar="PATH", group="recordings")
+    bin: float | None = option(BIN_HELP, metavar="S", group="recordings")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitChoice(Request):
+    """Which recordings of a source."""
+
+    bin: float | None = option(BIN_HELP, metavar="S", group="recordings")
+    split: str = option("split to read", default="test", group="recordings")
+    limit: int | None = option("first N recordings only", metavar="N", group="recordings")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingsChoice(SplitChoice):
+    """Which recordings."""
+
+    data: str | Recordings = option(DATA_HELP, required=True, metavar="PATH", group="recordings")

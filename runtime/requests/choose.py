@@ -1,0 +1,79 @@
+"""Requests about what to deploy: smallest, chart, lean, anytime."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from spikeloom.compiler import DEFAULT_TARGET
+from spikeloom.runtime.requests.choices import (
+    NETWORK_FILES,
+    CheckpointChoice,
+    DataChoice,
+    NetlistChoice,
+    NetworkChoice,
+    RecordingsChoice,
+    SensorChoice,
+)
+from spikeloom.runtime.requests.fields import option
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmallestRequest(SensorChoice, DataChoice):
+    """The cheapest network that does the job: many are tried, one is chosen, compiled and verified."""
+
+    target: str = option("chip", default=DEFAULT_TARGET)
+    levels: int | None = option(
+        "so many classes in a row are levels of one thing, for counting networks (default: 1)", metavar="N"
+    )
+    budget: tuple[str, ...] = option(
+        "energy=5uJ, time=5ms, operations=25000, cores=1, accuracy=88, certified=90; all of them hold",
+        default=(),
+        metavar="WHAT=LIMIT[,…]",
+    )
+    store: str | None = option("what is measured (default: NET.sqlite, beside the netlist)", metavar="FILE")
+    jobs: int | None = option("processes at a time (default: one a core)", metavar="N")
+    html: str | None = option("write a page, too", metavar="PAGE.html")
+    output: str = option("netlist; NET.pt is the network", required=True, metavar="NET.loom", flags=("-o", "--output"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChartRequest(CheckpointChoice, DataChoice):
+    """Accuracy against energy, time and size for a grid of configurations, and which one to deploy."""
+
+    checkpoints: tuple[str, ...] = option("trained networks of one data set", positional=True, metavar="CKPT")
+    grid: str | None = option(
+        "configurations, as in bits=2-6,8,planes=1-2,window=25-100%% (default: bits=2-6,8,window=25-100%%)",
+        metavar="AXIS=V,V,…",
+    )
+    budget: tuple[str, ...] = option(
+        "of the point to deploy: energy=0.1mJ, latency=5ms or accuracy=88; may be repeated, all of them hold",
+        default=(),
+        metavar="WHAT=LIMIT",
+    )
+    table: str | None = option("energy table to choose and draw by (default: the first)", metavar="NAME")
+    jobs: int | None = option("processes at a time (default: one a core)", metavar="N")
+    output: str = option("what to write", required=True, metavar="FOLDER", flags=("-o", "--output"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeanRequest(NetworkChoice, RecordingsChoice):
+    """What of a network its recordings do not need, and a netlist without it."""
+
+    checkpoint: str = option("trained network", positional=True, metavar=NETWORK_FILES)
+    differ: float = option("share of training decisions that the netlist may change", default=0.01, metavar="X")
+    output: str | None = option("write the netlist without what may go", metavar="OUT.loom", flags=("-o", "--output"))
+    network: str | None = option("write the float network without dense neurons that may go", metavar="OUT.pt")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnytimeRequest(NetlistChoice, RecordingsChoice):
+    """How early decisions could be taken, and what that saves."""
+
+    calibrate: str | None = option("recordings whose train split says when a vote is sure", metavar="PATH")
+    held_out: bool = option(
+        "the network was not trained on --calibrate: its decisions count, not races for second place", default=False
+    )
+    differ: float | None = option("share of them that may end otherwise (default: 0)", metavar="X")
+    output: str | None = option(
+        "write the result with figures of every recording", metavar="OUT.json", flags=("-o", "--output")
+    )
