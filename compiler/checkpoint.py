@@ -91,13 +91,15 @@ class Checkpoint:
 
 def layers_of(arrays: Mapping[str, AnyArray]) -> dict[str, Any]:
     """Fields of a :class:`Checkpoint` that hold its weights, from tensors by name; read-only copies."""
-    held = {name: frozen(np.array(array, np.float32, order="C")) for name, array in arrays.items()}
+    layers_read = {name: frozen(np.array(array, np.float32, order="C")) for name, array in arrays.items()}
     stages = sorted(
-        (name.removesuffix(".weight") for name in held if name.startswith("fc") and name.endswith(".weight")),
+        (name.removesuffix(".weight") for name in layers_read if name.startswith("fc") and name.endswith(".weight")),
         key=lambda name: int(name[2:]),
     )
-    dense = tuple(Dense(name=name, weight=held[f"{name}.weight"], bias=held[f"{name}.bias"]) for name in stages)
-    return {"hops": held["conv1.hops"], "conv_bias": held["conv1.bias"], "dense": dense}
+    dense = tuple(
+        Dense(name=name, weight=layers_read[f"{name}.weight"], bias=layers_read[f"{name}.bias"]) for name in stages
+    )
+    return {"hops": layers_read["conv1.hops"], "conv_bias": layers_read["conv1.bias"], "dense": dense}
 
 
 def constant_faults(beta: float | None, theta: float | None) -> list[str]:

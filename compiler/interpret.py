@@ -137,8 +137,8 @@ def synapses_of(
     from spikeloom.compiler.layer_kernel import by_source, no_synapses
 
     merged = ir.added_up((projection.pre, weight) for projection, weight in weights)
-    own = merged.pop(weights[0][0].post, None) if loops and weights else None
-    itself = no_synapses(dtype) if own is None else by_source([own], dtype)
+    recurrent = merged.pop(weights[0][0].post, None) if loops and weights else None
+    itself = no_synapses(dtype) if recurrent is None else by_source([recurrent], dtype)
     return tuple(merged), (by_source(list(merged.values()), dtype), itself)
 
 

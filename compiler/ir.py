@@ -187,11 +187,11 @@ class IntegerNetwork:
 
 def depths(network: Network | IntegerNetwork) -> tuple[int, ...]:
     """Steps that each population lags behind the data: the longest path from the input, loops aside, minus one."""
-    found = [0] * len(network.populations)
+    depth = [0] * len(network.populations)
     for post in range(len(network.populations)):
         sources = [projection.pre for projection in network.projections if projection.post == post]
-        found[post] = max((found[pre] + 1 for pre in sources if pre not in (INPUT, post)), default=0)
-    return tuple(found)
+        depth[post] = max((depth[pre] + 1 for pre in sources if pre not in (INPUT, post)), default=0)
+    return tuple(depth)
 
 
 def recurrent(network: Network | IntegerNetwork) -> tuple[str, ...]:
@@ -210,10 +210,10 @@ def fan_in(network: Network | IntegerNetwork, post: int) -> IntArray:
 
 def added_up(weights: Iterable[tuple[int, Sparse]]) -> dict[int, Sparse]:
     """Weights from each source, those of several planes together."""
-    found: dict[int, Sparse] = {}
+    total: dict[int, Sparse] = {}
     for pre, weight in weights:
-        found[pre] = found[pre] + weight if pre in found else weight
-    return found
+        total[pre] = total[pre] + weight if pre in total else weight
+    return total
 
 
 def with_data(weight: Sparse, data: AnyArray) -> Sparse:
@@ -231,12 +231,12 @@ def one_sided(projections: Iterable[IntegerProjection], neurons: int) -> tuple[I
         for rows in row_parts(projection.weight):
             ends = projection.weight.indptr[rows.start : rows.stop + 1]
             units = in_units(projection.weight.data[ends[0] : ends[-1]], projection.exponent)
-            held = np.flatnonzero(np.diff(ends))
-            if len(held):
-                begins = ends[held] - ends[0]
+            filled = np.flatnonzero(np.diff(ends))
+            if len(filled):
+                begins = ends[filled] - ends[0]
                 up = np.add.reduceat(np.maximum(units, 0), begins, dtype=np.int64)
-                positive[rows.start + held] += up
-                negative[rows.start + held] += up - np.add.reduceat(units, begins, dtype=np.int64)
+                positive[rows.start + filled] += up
+                negative[rows.start + filled] += up - np.add.reduceat(units, begins, dtype=np.int64)
     return positive, negative
 
 

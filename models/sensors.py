@@ -102,8 +102,8 @@ def sensor_graph(
     used.
     """
     if (graph is None) == (edges is None):
-        found = "neither was given" if graph is None else "both were given"
-        raise OptionError(f"--graph and --edges: {found}, allowed is one of them; --graph takes {CHOICES}")
+        given = "neither was given" if graph is None else "both were given"
+        raise OptionError(f"--graph and --edges: {given}, allowed is one of them; --graph takes {CHOICES}")
     if directed and edges is None:
         raise OptionError("--directed: only edges from a file have directions; give --edges or omit it")
     count, places = (None, None) if taxels is None else read_layout(taxels)

@@ -22,9 +22,9 @@ def digests(network: IntegerNetwork, gone: Sequence[BoolArray]) -> dict[str, dic
 
     Weights are sums of planes in weight units, so that neither the order of synapses nor zeros count.
     """
-    found = {}
+    by_layer = {}
     for post, population in enumerate(network.populations):
-        held = np.flatnonzero(~gone[post])
+        kept = np.flatnonzero(~gone[post])
         synapses = []
         into = added_up((p.pre, p.effective()) for p in network.projections if p.post == post)
         for pre, weight in sorted(into.items()):
@@ -33,13 +33,13 @@ def digests(network: IntegerNetwork, gone: Sequence[BoolArray]) -> dict[str, dic
             part.sort_indices()
             synapses += [np.array(pre), part.indptr, part.indices, part.data] if part.nnz else []
         parts = {
-            "neurons": [held],
-            "thresholds": [population.threshold[held]],
+            "neurons": [kept],
+            "thresholds": [population.threshold[kept]],
             "weights": synapses,
-            "biases": [population.bias[held]],
+            "biases": [population.bias[kept]],
         }
-        found[population.name] = {
+        by_layer[population.name] = {
             what: hashlib.sha256(b"".join(a.astype("<i4").tobytes() for a in arrays)).hexdigest()[:DIGITS]
             for what, arrays in parts.items()
         }
-    return found
+    return by_layer

@@ -212,15 +212,15 @@ def compact(network: IntegerNetwork, gone: Masks) -> tuple[IntegerNetwork, tuple
 def removals(network: Network, silent: Masks, unread: Masks, quiet: Masks) -> tuple[Removal, ...]:
     """Count what was left out of `network`, layer by layer; `quiet` are those that go by evidence, not by proof."""
     gone = either(silent, unread)
-    found = []
+    removed = []
     for post, population in enumerate(network.populations):
         by_evidence = quiet[post] & gone[post]
         synapses = 0
         for p in network.projections:
             if p.post == post:
-                lost = _touched(p.weight, gone[post], of_source(gone, p.pre, p.weight.shape[1]))
-                synapses += int((lost & (p.weight.data != 0)).sum())
-        found.append(
+                zeroed = _touched(p.weight, gone[post], of_source(gone, p.pre, p.weight.shape[1]))
+                synapses += int((zeroed & (p.weight.data != 0)).sum())
+        removed.append(
             Removal(
                 layer=population.name,
                 silent=int((silent[post] & ~by_evidence).sum()),
@@ -229,7 +229,7 @@ def removals(network: Network, silent: Masks, unread: Masks, quiet: Masks) -> tu
                 synapses=synapses,
             )
         )
-    return tuple(found)
+    return tuple(removed)
 
 
 def _without_voters(network: Network, masks: Masks) -> Masks:

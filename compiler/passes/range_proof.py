@@ -66,13 +66,13 @@ def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:
         kept_v = population.realised_beta
         up = settled(positive * unit, kept_u)
         down = settled(negative * unit, kept_u)
-        own = np.zeros(population.size)
+        itself = np.zeros(population.size)
         others = np.zeros(population.size)
         for p in into:
             inhibition = -p.effective().minimum(0)
             inhibition.eliminate_zeros()  # a zero of what has no end is none
             if p.pre == post and inhibition.nnz == np.count_nonzero(diagonal := inhibition.diagonal()):
-                own += diagonal
+                itself += diagonal
             else:
                 others += inhibition @ spikes.get(p.pre, np.full(inhibition.shape[1], length))
         rise = kept_v * population.threshold * unit + up + np.maximum(population.bias, 0)
@@ -81,8 +81,8 @@ def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:
             fall = settled(down + sinking, kept_v)
         else:
             sinking = np.multiply(sinking, length, out=np.zeros(population.size), where=sinking > 0)
-            fall = settled((own + others) * unit, kept_u) + sinking
-        pause = np.floor((own + population.threshold) * unit / np.maximum(up + np.maximum(population.bias, 0), 1))
+            fall = settled((itself + others) * unit, kept_u) + sinking
+        pause = np.floor((itself + population.threshold) * unit / np.maximum(up + np.maximum(population.bias, 0), 1))
         rests = kept_v == 1 and kept_u == 0
         spikes[post] = 1 + np.floor((length - 1) / (pause + 1)) if rests else np.full(population.size, length)
         proofs.append(

@@ -176,12 +176,12 @@ def load_target(name: str, cores: str | None = None) -> Target:
 
     OptionError if there is no such target, or its cores are of the other kind.
     """
-    found = shipped().get(name)
-    if found is None or cores not in (None, found.cores):
+    target = shipped().get(name)
+    if target is None or cores not in (None, target.cores):
         why = _NOT_MODELLED.get(name, "unknown")
-        why = why if found is None else f"its cores are {found.cores}, this is for {cores}"
+        why = why if target is None else f"its cores are {target.cores}, this is for {cores}"
         raise OptionError(f"--target {name}: {why}; allowed: {', '.join(known_targets(cores))}")
-    return found
+    return target
 
 
 def _entries(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -196,24 +196,24 @@ def _entries(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 def _quantity(where: str, entry: Any, unit: str = "") -> Quantity:
     """A number with its unit, which must be `unit` if one is given, and its source."""
     try:
-        found = Quantity(**entry)
+        quantity = Quantity(**entry)
     except TypeError:
         raise FileFault(f"{where}: is {entry!r}, not an entry of value, unit and source") from None
-    if type(found.value) not in (int, float) or not 0 <= found.value < math.inf:
-        raise FileFault(f"{where}: value is {found.value!r}, a finite number from 0 is needed")
-    if unit and found.unit != unit:
-        raise FileFault(f"{where}: unit is {found.unit!r}, allowed is {unit!r}")
-    return found
+    if type(quantity.value) not in (int, float) or not 0 <= quantity.value < math.inf:
+        raise FileFault(f"{where}: value is {quantity.value!r}, a finite number from 0 is needed")
+    if unit and quantity.unit != unit:
+        raise FileFault(f"{where}: unit is {quantity.unit!r}, allowed is {unit!r}")
+    return quantity
 
 
 def _quantities(where: str, table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> dict[str, Quantity]:
     """Numbers of a section by their dotted names; `units` are those that it may have, all by default."""
-    found = {}
+    quantities = {}
     for name, entry in _entries(table):
         if units is not None and name not in units:
             raise FileFault(f"{where}.{name}: unknown, allowed are {', '.join(units)}")
-        found[name] = _quantity(f"{where}.{name}", entry, units[name] if units else "")
-    return found
+        quantities[name] = _quantity(f"{where}.{name}", entry, units[name] if units else "")
+    return quantities
 
 
 def _cost_tables(raw: Mapping[str, Any], cores: str) -> tuple[tuple[EnergyTable, ...], tuple[TimeTable, ...]]:

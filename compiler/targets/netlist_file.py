@@ -167,20 +167,20 @@ def column_faults(
     Range `bounds` must divide so many entries in so many parts (parts, entries); `lengths` are those of the other
     arrays; `ranges` of values do not hold their upper end.
     """
-    found = []
+    wrong = []
     for name, (parts, total) in bounds.items():
         ends = getattr(netlist, name)
         if len(ends) != parts + 1 or ends[0] != 0 or ends[-1] != total or np.any(np.diff(ends) < 0):
-            found.append(f"{name} does not divide {total} entries in {parts} parts")
+            wrong.append(f"{name} does not divide {total} entries in {parts} parts")
     for name, length in lengths.items():
         if (held := len(getattr(netlist, name))) != length:
-            found.append(f"{name} has {held} entries, {length} are needed")
+            wrong.append(f"{name} has {held} entries, {length} are needed")
     outside = (
         f"{name} has values outside {low} … {high - 1}"
         for name, (low, high) in ranges.items()
         if is_outside(getattr(netlist, name), low, high)
     )
-    return found or list(outside)
+    return wrong or list(outside)
 
 
 def is_outside(array: archive.Array, low: int, high: int) -> bool:

@@ -156,9 +156,9 @@ class _LastingCurrent(torch.autograd.Function):
 
 
 def _accumulated(steps: Tensor, alpha: float, *, backwards: bool) -> Tensor:
-    found = steps.clone(memory_format=torch.contiguous_format)
-    accumulate(rows_of(found), kind_of(found)(alpha), backwards)
-    return found
+    sums = steps.clone(memory_format=torch.contiguous_format)
+    accumulate(rows_of(sums), kind_of(sums)(alpha), backwards)
+    return sums
 
 
 def spike_linear(spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -312,13 +312,13 @@ def events_of(spikes: Any) -> Any:
     rows, inputs = spikes.shape
     source = np.empty(spikes.size, np.int32)
     bounds = np.zeros(rows + 1, np.int64)
-    found = 0
+    count = 0
     for row in range(rows):
         for i in range(inputs):
-            source[found] = i
-            found += spikes[row, i] != 0
-        bounds[row + 1] = found
-    return source[:found].copy(), bounds
+            source[count] = i
+            count += spikes[row, i] != 0
+        bounds[row + 1] = count
+    return source[:count].copy(), bounds
 
 
 @numba.njit(cache=True)

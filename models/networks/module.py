@@ -97,8 +97,8 @@ def _weights(stages: _Stages) -> tuple[list[list[Sparse]], list[FloatArray]]:
         rows: list[list[Sparse]] = [[] for _ in sources]
         for start in range(0, len(flat), ROWS):
             units = torch.from_numpy(np.eye(min(ROWS, len(flat) - start), len(flat), start))
-            found = torch.autograd.grad(flat, sources, units, retain_graph=True, is_grads_batched=True)
-            for part, gradient in zip(rows, found, strict=True):
+            gradients = torch.autograd.grad(flat, sources, units, retain_graph=True, is_grads_batched=True)
+            for part, gradient in zip(rows, gradients, strict=True):
                 block = gradient.reshape(len(units), -1).numpy()
                 least = NOTHING * np.abs(block).max(axis=1, keepdims=True, initial=0)
                 part.append(sparse.csr_array(np.where(np.abs(block) > least, block, 0)))
@@ -113,8 +113,8 @@ def _require_affine(stages: _Stages, weights: list[list[Sparse]], biases: list[F
     named = [f"the stage before {name}" for name in stages.names] + ["the output"]
     for size in 10.0 ** np.arange(-2, 6):
         given = [rng.normal(size=shape) * size for shape in stages.shapes]
-        found = stages.respond([torch.from_numpy(values) for values in given])
-        for what, response, parts, bias in zip(named, found, weights, biases, strict=True):
+        responses = stages.respond([torch.from_numpy(values) for values in given])
+        for what, response, parts, bias in zip(named, responses, weights, biases, strict=True):
             expected = sum((part @ values.ravel() for part, values in zip(parts, given, strict=True)), start=bias)
             off = np.abs(response.numpy().ravel() - expected).max(initial=0) / max(
                 np.abs(expected).max(initial=0), 1e-300

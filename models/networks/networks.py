@@ -219,8 +219,8 @@ class SpikingNet(TrainedModule):
         """Neuron of ours that is the first, second … one in the order of the system."""
         features = self.architecture.features
         clocks = self.architecture.dynamics.clocks.channels
-        own = np.arange(self.places * features).reshape(self.places, features)
-        return np.append(in_order(self.architecture.system, own), np.arange(own.size, own.size + clocks))
+        order = np.arange(self.places * features).reshape(self.places, features)
+        return np.append(in_order(self.architecture.system, order), np.arange(order.size, order.size + clocks))
 
 
 def relayed(clocks: Clocks, like: Tensor) -> Tensor:

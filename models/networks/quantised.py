@@ -174,10 +174,10 @@ class QuantisedNet(nn.Module):
 
     def tensors(self) -> Weights:
         """Weights and biases as a checkpoint holds them."""
-        found = {"conv1.hops": self.hops, "conv1.bias": self.conv_bias}
+        weights = {"conv1.hops": self.hops, "conv1.bias": self.conv_bias}
         for name, weight, bias in zip(self.names[1:], self.weights, self.biases, strict=True):
-            found |= {f"{name}.weight": weight.view(len(bias), -1), f"{name}.bias": bias}
-        return {name: parameter.detach().numpy().copy() for name, parameter in found.items()}
+            weights |= {f"{name}.weight": weight.view(len(bias), -1), f"{name}.bias": bias}
+        return {name: parameter.detach().numpy().copy() for name, parameter in weights.items()}
 
     def round(self) -> None:
         """Round all weights, after every change of them; `make_legal` sees that every bias has a register value."""

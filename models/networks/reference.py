@@ -52,7 +52,7 @@ def _run(
         return side_by_side(checkpoint, every)
     shape = (len(events), events.shape[3])
     kind = dtype if membranes else np.bool_
-    found = {name: np.empty((*shape, neurons), kind) for name, neurons in checkpoint.neurons.items()}
+    kept = {name: np.empty((*shape, neurons), kind) for name, neurons in checkpoint.neurons.items()}
 
     def batch(start: int) -> None:
         rows = slice(start, start + BATCH)
@@ -64,10 +64,10 @@ def _run(
                 spikes, compared = layer(spikes)
                 if layer is layers[0]:
                     spikes, compared = _with_relays(checkpoint, spikes, compared, first)
-                found[name][rows, steps] = (compared if membranes else spikes).transpose(1, 0, 2)
+                kept[name][rows, steps] = (compared if membranes else spikes).transpose(1, 0, 2)
 
     list(threads().map(batch, range(0, len(events), BATCH)))
-    return found
+    return kept
 
 
 def _layers(

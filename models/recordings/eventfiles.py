@@ -117,9 +117,9 @@ def _read_npz(path: Path, where: str) -> tuple[Mapping[str, FloatArray], Callabl
             if member := members.get(f"{name}.npy"):
                 columns[name] = parse_npy(f"{where}: {name}", member).astype(np.float64)
         if missing := [name for name in _REQUIRED if name not in columns]:
-            found = ", ".join(sorted(member.removesuffix(".npy") for member in members)) or "nothing"
+            names = ", ".join(sorted(member.removesuffix(".npy") for member in members)) or "nothing"
             raise DataError(
-                f"{where}: holds {found}, without {', '.join(missing)}; name the arrays {', '.join(_REQUIRED)}[, label]"
+                f"{where}: holds {names}, without {', '.join(missing)}; name the arrays {', '.join(_REQUIRED)}[, label]"
             )
     shapes = {name: columns[name].shape for name in _REQUIRED}
     if len(set(shapes.values())) > 1 or columns["time_s"].ndim != 1:

@@ -143,17 +143,17 @@ def opened(path: Path) -> Iterator[Members]:
 
 def splits_of(source: str, members: Members, splits: set[str]) -> dict[str, dict[str, str]]:
     """Map split to file name to member name, for the one data set among `members`; DataError if there are several."""
-    found: dict[str, dict[str, str]] = {}
+    by_split: dict[str, dict[str, str]] = {}
     roots: set[str] = set()
     for member in members:
         *top, split, name = ("", *member.split("/"))
         if len(top) > 2 or split not in splits or "__MACOSX" in top or name.startswith("."):
             continue
         roots.add("/".join(filter(None, top)) or ".")
-        found.setdefault(split, {})[name] = member
+        by_split.setdefault(split, {})[name] = member
     if len(roots) > 1:
         raise DataError(f"{source}: several data sets ({', '.join(sorted(roots))}); give one of them")
-    return found
+    return by_split
 
 
 def label_in_name(name: str) -> int:
@@ -237,8 +237,10 @@ def require_class(where: str, label: int, classes: int | None) -> None:
 def require_polarities(recordings: Recordings) -> None:
     """Refuse events that are neither falling nor rising: of another number of polarities than two; a DataError."""
     if recordings.events.shape[2] != 2:
-        found = recordings.events.shape[2]
-        raise DataError(f"{recordings.source}: has {found} polarities, allowed are falling and rising; choose another")
+        polarities = recordings.events.shape[2]
+        raise DataError(
+            f"{recordings.source}: has {polarities} polarities, allowed are falling and rising; choose another"
+        )
 
 
 def data_digest(training: Recordings, test: Recordings) -> str:
@@ -262,10 +264,10 @@ def parse_window(words: str) -> int:
     >>> parse_window("25%"), parse_window("100")
     (25, 100)
     """
-    found = re.fullmatch(r"([0-9]{1,3})%?", words.strip(), re.ASCII)
-    if found is None or not 1 <= int(found[1]) <= WHOLE:
+    match = re.fullmatch(r"([0-9]{1,3})%?", words.strip(), re.ASCII)
+    if match is None or not 1 <= int(match[1]) <= WHOLE:
         raise OptionError(f"--window {words}: not a part of a recording; give whole per cent from 1% to 100%")
-    return int(found[1])
+    return int(match[1])
 
 
 def steps_of(lengths: IntArray, percent: int) -> IntArray:
@@ -283,8 +285,8 @@ def first_part(recordings: Recordings, percent: int) -> Recordings:
     """The first steps of every recording, so many per cent of its own length; labels, names and order stay."""
     if percent == WHOLE:
         return recordings
-    own = recordings.step_counts
-    kept = steps_of(own, percent)
+    lengths = recordings.step_counts
+    kept = steps_of(lengths, percent)
     longest = int(kept.max(initial=0))
     return replace(
         recordings, events=recordings.events[..., :longest], lengths=None if recordings.lengths is None else kept

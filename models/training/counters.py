@@ -183,15 +183,15 @@ def linear_rules(data: Counted, classes: int, strengths: Iterable[float]) -> dic
     sign = np.where(here & (label >= each), 1.0, np.where(here | (each % levels == 0), -1.0, 0.0))
     ordered = sorted(strengths)  # so that each starts at what the one before has found
     share = _least_squares(alike, sign, ordered[0])
-    found = {}
+    rules = {}
     for strength in ordered:
         starts = zip(sign.T, share.T, strict=True)
         share = np.stack([_newton(alike, one, start, strength) for one, start in starts], axis=1)
         weight = (share.T @ spikes).reshape(-1, levels, len(used))
         if levels > 1:
             weight[:, 0] *= THING
-        found[strength] = Rule(used=used, weight=weight.cumsum(axis=1).reshape(classes, -1))
-    return found
+        rules[strength] = Rule(used=used, weight=weight.cumsum(axis=1).reshape(classes, -1))
+    return rules
 
 
 def _least_squares(alike: FloatArray, sign: FloatArray, strength: float) -> FloatArray:
@@ -231,13 +231,13 @@ def _newton(alike: FloatArray, sign: FloatArray, share: FloatArray, strength: fl
 
 def folds(labels: IntArray, parts: int, rng: np.random.Generator) -> IntArray:
     """Part of each recording, so that all parts have the same share of every class; (samples,)."""
-    found = np.empty(len(labels), np.int64)
+    fold = np.empty(len(labels), np.int64)
     first = 0
     for each in np.unique(labels):
-        own = rng.permutation(np.flatnonzero(labels == each))
-        found[own] = (np.arange(len(own)) + first) % parts
-        first += len(own)
-    return found
+        members = rng.permutation(np.flatnonzero(labels == each))
+        fold[members] = (np.arange(len(members)) + first) % parts
+        first += len(members)
+    return fold
 
 
 def held_out(data: Counted, classes: int, *, seed: int = 0) -> dict[float, FloatArray]:

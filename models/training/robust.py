@@ -21,8 +21,8 @@ def worn(events: EventArray, chance: float, draw: np.random.Generator) -> EventA
     """
     if not chance:
         return events
-    lost = draw.random(events.shape) < chance
+    dropped = draw.random(events.shape) < chance
     come = draw.random(events.shape) < chance * events.mean(axis=(1, 2, 3), keepdims=True)
     alive = draw.random(events.shape[:2]) >= chance
-    found: EventArray = ((events & ~lost) | come) & alive[:, :, None, None]
+    found: EventArray = ((events & ~dropped) | come) & alive[:, :, None, None]
     return found

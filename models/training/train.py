@@ -234,11 +234,11 @@ def _require_options(epochs: int, decay_epochs: int, seed: int) -> None:
 def _require_suited(recordings: Recordings, architecture: Sizes) -> None:
     """Refuse recordings of another sensor, or of more classes than a network has."""
     where = f"{recordings.source}: split {recordings.split!r}"
-    found = recordings.events.shape[1:3]
+    shape = recordings.events.shape[1:3]
     wanted = (architecture.taxels, architecture.channels)
-    if found != wanted:
+    if shape != wanted:
         raise DataError(
-            f"{where}: {found[0]} taxels and {found[1]} polarities, the network has {wanted[0]} and {wanted[1]}; "
+            f"{where}: {shape[0]} taxels and {shape[1]} polarities, the network has {wanted[0]} and {wanted[1]}; "
             "use the graph of this sensor"
         )
     highest = int(recordings.labels.max())
@@ -263,7 +263,7 @@ def validation_split(training: Recordings) -> tuple[Recordings, Recordings]:
 
     Both parts keep the order of `training`.
     """
-    held = np.zeros(len(training.labels), np.bool_)
+    chosen = np.zeros(len(training.labels), np.bool_)
     draw = np.random.default_rng(0)
     for label in np.unique(training.labels):
         members = np.flatnonzero(training.labels == label)
@@ -272,8 +272,8 @@ def validation_split(training: Recordings) -> tuple[Recordings, Recordings]:
                 f"{training.source}: class {label} has one training recording, the clean epoch needs 2 of each; "
                 "record more or drop the class"
             )
-        held[draw.permutation(members)[: max(1, int(len(members) * VALIDATION_SHARE))]] = True
-    return training.part(~held, "fitted"), training.part(held, "validation")
+        chosen[draw.permutation(members)[: max(1, int(len(members) * VALIDATION_SHARE))]] = True
+    return training.part(~chosen, "fitted"), training.part(chosen, "validation")
 
 
 def train_both(

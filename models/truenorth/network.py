@@ -232,7 +232,7 @@ def run_layers(
     steps, samples = events.shape[:2]
     ticks = torch.from_numpy(clocks.events(steps).T.astype(np.float32))
     spikes = _spikes(layers[0], block_sums(events.reshape(steps, samples, -1), layers[0].weight), surrogate)
-    found = [spikes]
+    layers_spikes = [spikes]
     for layer, received in zip(layers[1:], inputs, strict=True):
         width = received.shape[1]
         sums = block_sums(spikes.index_select(2, torch.tensor(received.reshape(-1))), layer.weight[:, :width])
@@ -240,8 +240,8 @@ def run_layers(
             timed = torch.matmul(ticks, layer.weight[:, width:])
             sums = sums + timed.transpose(0, 1).reshape(steps, 1, -1)
         spikes = _spikes(layer, sums, surrogate)
-        found.append(spikes)
-    return found
+        layers_spikes.append(spikes)
+    return layers_spikes
 
 
 def _spikes(layer: Rounded, sums: Tensor, surrogate: Surrogate) -> Tensor:

@@ -65,10 +65,10 @@ def _run_step(current: Any, held: Any, threshold: Any, floor: Any, spikes: Any, 
 @numba.njit(cache=True)
 def _run(current: Any, threshold: Any, floor: Any, spikes: Any, membrane: Any) -> None:
     steps, samples, neurons = current.shape
-    held = np.zeros((samples, neurons), np.float32)
+    membranes = np.zeros((samples, neurons), np.float32)
     for t in range(steps):
         for s in range(samples):
-            _run_step(current[t, s], held[s], threshold, floor, spikes[t, s], membrane[t, s])
+            _run_step(current[t, s], membranes[s], threshold, floor, spikes[t, s], membrane[t, s])
 
 
 @numba.njit(cache=True)

@@ -47,10 +47,10 @@ def breakdowns(
     `reference` and `chip` are the spikes of each layer, (compared,), of those neurons that `neurons` numbers; `votes`
     are those of float model and chip, (samples, classes), of recordings that `files` names.
     """
-    found: list[Breakdown] = []
+    failures: list[Breakdown] = []
     for name, ours, theirs, ids in zip(names, reference, chip, neurons, strict=True):
-        found += _fallen(name, ours, theirs, ids)
-    return (*found, *undecided(*votes, files))
+        failures += _fallen(name, ours, theirs, ids)
+    return (*failures, *undecided(*votes, files))
 
 
 def _fallen(name: str, before: IntArray, after: IntArray, ids: IntArray) -> list[Breakdown]:
@@ -59,29 +59,29 @@ def _fallen(name: str, before: IntArray, after: IntArray, ids: IntArray) -> list
     if total >= OFTEN and not after.any():
         text = f"{name} never fires on the chip; it fires {total:,} times in the float model"
         return [Breakdown(kind="silent layer", layer=name, count=total, text=text)]
-    found = []
+    failures = []
     for kind, one, other, where, beside in (
         ("silenced neurons", before, after, "in the float model", "never on the chip"),
         ("woken neurons", after, before, "on the chip", "never in the float model"),
     ):
-        lost = np.flatnonzero((one >= OFTEN) & (other == 0))
-        lost = lost[np.argsort(-one[lost], kind="stable")]
-        if len(lost):
-            worst = ", ".join(f"{ids[i]} ({one[i]:,} times)" for i in lost[:LISTED])
-            more = f" and {len(lost) - LISTED} more" if len(lost) > LISTED else ""
+        silent = np.flatnonzero((one >= OFTEN) & (other == 0))
+        silent = silent[np.argsort(-one[silent], kind="stable")]
+        if len(silent):
+            worst = ", ".join(f"{ids[i]} ({one[i]:,} times)" for i in silent[:LISTED])
+            more = f" and {len(silent) - LISTED} more" if len(silent) > LISTED else ""
             text = f"{name} neurons that fire {where} and {beside}: {worst}{more}"
-            found.append(Breakdown(kind=kind, layer=name, count=len(lost), text=text))
-    return found
+            failures.append(Breakdown(kind=kind, layer=name, count=len(silent), text=text))
+    return failures
 
 
 def undecided(before: IntArray, after: IntArray, files: Sequence[str]) -> list[Breakdown]:
     """Decisions that say nothing about the recording; votes (samples, classes) of the reference and of the chip."""
-    found = []
+    failures = []
     decided = vote(after)
     wanted = vote(before)
     if len(set(decided)) == 1 and len(set(wanted)) > 1:
         text = f"the chip decides class {decided[0]} for every recording, the float model {len(set(wanted))} classes"
-        found.append(Breakdown(kind="one class", layer=None, count=len(decided), text=text))
+        failures.append(Breakdown(kind="one class", layer=None, count=len(decided), text=text))
     most = after.max(axis=1, initial=0)
     tied = (most > 0) & (np.count_nonzero(after == most[:, None], axis=1) > 1)
     for kind, what, where in (
@@ -92,5 +92,5 @@ def undecided(before: IntArray, after: IntArray, files: Sequence[str]) -> list[B
             named = ", ".join(files[i] for i in np.flatnonzero(where)[:LISTED])
             more = f" and {count - LISTED} more" if count > LISTED else ""
             text = f"{what}: {count} of {len(files)} recordings ({named}{more})"
-            found.append(Breakdown(kind=kind, layer=None, count=count, text=text))
-    return found
+            failures.append(Breakdown(kind=kind, layer=None, count=count, text=text))
+    return failures

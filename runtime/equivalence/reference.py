@@ -53,8 +53,8 @@ def require_match(netlist: Netlist, model: Factored | Network) -> None:
 
 
 def _timing(clocks: Clocks, bins: int) -> dict[str, int]:
-    found = {"clocks": clocks.channels, "steps of a clock": clocks.steps} if clocks.channels else {}
-    return found | ({"bins of a step": bins} if bins > 1 else {})
+    clocked = {"clocks": clocks.channels, "steps of a clock": clocks.steps} if clocks.channels else {}
+    return clocked | ({"bins of a step": bins} if bins > 1 else {})
 
 
 def reference_of(model: Factored | Network) -> Callable[[EventArray], list[BoolArray]]:

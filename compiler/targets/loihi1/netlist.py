@@ -165,13 +165,13 @@ class Netlist(netlist_file.Netlist):
         """Synapses of one core: source, compartment and effective weight of each; all (synapses of the core,) int64."""
         axons = slice(*self.core_axons[core : core + 2].tolist())
         ends = self.axon_synapses[axons.start : axons.stop + 1]
-        held = slice(*ends[[0, -1]].tolist())
+        stored = slice(*ends[[0, -1]].tolist())
         length = np.diff(ends)
         exponent = np.repeat(self.format_exponent[self.axon_format[axons]], length)
         return (
             np.repeat(self.axon_source[axons], length),
-            self.synapse_target[held] + self.core_compartments[core],
-            in_units(self.synapse_weight[held], exponent),
+            self.synapse_target[stored] + self.core_compartments[core],
+            in_units(self.synapse_weight[stored], exponent),
         )
 
     def effective_weight(self) -> IntArray:
@@ -214,14 +214,14 @@ def reach(netlist: Netlist) -> Reach:
     bias = netlist.bias_mantissa << netlist.bias_exponent
     # a membrane is left at the threshold at most; below zero it loses as much as it can gain at the far end
     above = np.maximum(netlist.threshold << MEMBRANE_SHIFT, 0)
-    lost = netlist.decay_v
+    decay = netlist.decay_v
     gained = down + np.maximum(-bias, 0)
     endless = np.where(gained > 0, MEMBRANE_MAX + 1, 0)
-    below = np.where(lost > 0, (gained << DECAY_BITS) // np.maximum(lost, 1), endless)
+    below = np.where(decay > 0, (gained << DECAY_BITS) // np.maximum(decay, 1), endless)
     return Reach(
         sums=np.maximum(*bounds) << MEMBRANE_SHIFT,
         current=np.maximum(up, down),
-        highest=(above * (2**DECAY_BITS - lost) >> DECAY_BITS) + up + np.maximum(bias, 0),
+        highest=(above * (2**DECAY_BITS - decay) >> DECAY_BITS) + up + np.maximum(bias, 0),
         stored=np.maximum(above, below),
     )
 

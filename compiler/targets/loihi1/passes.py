@@ -95,8 +95,8 @@ def _calibrate(done: Compilation) -> Compilation:
         several = any(packing.planes > 1 for packing in options.packings or ())
         few = calibration.evenly_spaced(np.arange(len(events)), calibration.MANY if several else calibration.FEW)
         events = events[held_out.split(len(events))[0] if options.chooses else few]
-    found = calibration.calibrate(done.network, channels_last(events, done.network.input.clocks))
-    return replace(done, calibration=found, rates=found.rates)
+    calibrated = calibration.calibrate(done.network, channels_last(events, done.network.input.clocks))
+    return replace(done, calibration=calibrated, rates=calibrated.rates)
 
 
 @step(
@@ -149,8 +149,8 @@ def _cheapest(done: Compilation) -> Compilation:
     keep = options.keep
     if events is None or keep is None or few is None or len(events) < 2:
         return _quantize.apply(replace(done, options=replace(options, keep=None)))
-    _, several, held = held_out.split(len(events))
-    judge = HeldOut(network, events[held])
+    _, several, left_out = held_out.split(len(events))
+    judge = HeldOut(network, events[left_out])
     many = None
     best = done
     most = -1
@@ -159,10 +159,10 @@ def _cheapest(done: Compilation) -> Compilation:
         if many is None and (packing.planes > 1 or options.prune_unused):
             chosen = events[calibration.evenly_spaced(several, calibration.MANY)]
             many = calibration.calibrate(network, channels_last(chosen, network.input.clocks))
-        asked = replace(options, packings=(packing,))
+        chosen_options = replace(options, packings=(packing,))
         trial = Trial(planes=packing.planes, groups=packing.groups)
         try:
-            tried = run((_quantize, *INTEGERS, *LAYOUT), replace(done, options=asked, calibration=many or few))
+            tried = run((_quantize, *INTEGERS, *LAYOUT), replace(done, options=chosen_options, calibration=many or few))
         except (CapacityError, ModelError) as error:
             if not trials:
                 raise  # nor does what is larger fit
@@ -211,8 +211,8 @@ def _remove(done: Compilation) -> Compilation:
     silent, unread = (none, none) if done.options.keep_all else prune.removable(integer)
     silent = prune.either(silent, done.gone or none)
     removals = () if network is LATER else prune.removals(network, silent, unread, done.quiet)
-    held, identity = prune.compact(integer, prune.either(silent, unread))
-    return replace(done, held=held, identity=identity, silent=silent, unread=unread, removals=removals)
+    kept, identity = prune.compact(integer, prune.either(silent, unread))
+    return replace(done, held=kept, identity=identity, silent=silent, unread=unread, removals=removals)
 
 
 @step(

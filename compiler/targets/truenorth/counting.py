@@ -132,8 +132,8 @@ def _votes(draft: Draft, plan: Plan, chip: Target) -> dict[Place, Place]:
     core = draft.core()
     lowest = (1 << chip.limit("neuron.threshold_bits")) - 1
     for label in range(counters.classes):
-        own = np.argwhere(used[:, 2 * label : 2 * label + 2]).tolist()
-        if len(draft.cores[core].axons) + len(own) > chip.limit("core.axons"):
+        lines = np.argwhere(used[:, 2 * label : 2 * label + 2]).tolist()
+        if len(draft.cores[core].axons) + len(lines) > chip.limit("core.axons"):
             core = draft.core()
         vote = Neuron(
             weights=(1, -1),
@@ -146,7 +146,7 @@ def _votes(draft: Draft, plan: Plan, chip: Target) -> dict[Place, Place]:
         )
         number = draft.neuron(core, vote, layer="votes", number=label)
         draft.vote((core, number), label, first=first)
-        for group, sign in own:
+        for group, sign in lines:
             ends[group, 2 * label + sign] = core, draft.axon(core, sign, [number])
     return ends
 
@@ -158,8 +158,8 @@ def _sums(draft: Draft, plan: Plan, ends: Mapping[Place, Place]) -> list[list[Pl
         core = draft.core()
         rows = sorted(row for each, row in ends if each == number)
         for row in rows:
-            held = Neuron(weights=MAGNITUDES, reset_mode=RESET_LINEAR)
-            added = draft.neuron(core, held, layer="sums", number=number * plan.magnitude.shape[1] + row)
+            adder = Neuron(weights=MAGNITUDES, reset_mode=RESET_LINEAR)
+            added = draft.neuron(core, adder, layer="sums", number=number * plan.magnitude.shape[1] + row)
             draft.wire((core, added), *ends[number, row])
         points = plan.magnitude[number, rows, group].T[:, :, None] & np.array(MAGNITUDES)
         for n, line in draft.inputs(core, points):
@@ -213,11 +213,11 @@ def run_counters(plan: Plan, events: EventArray) -> dict[str, BoolArray]:
     arriving = np.zeros((steps + late, plan.magnitude.shape[0] * plan.magnitude.shape[1]), np.int64)
     arriving[:steps] = spikes["counters"].astype(np.int64) @ plan.magnitude.reshape(arriving.shape[1], -1).T
     sent = np.zeros(arriving.shape, np.bool_)
-    held = np.zeros(arriving.shape[1], np.int64)
+    membrane = np.zeros(arriving.shape[1], np.int64)
     for tick, more in enumerate(arriving):
-        held += more
-        sent[tick] = held > 0
-        held -= sent[tick]
+        membrane += more
+        sent[tick] = membrane > 0
+        membrane -= sent[tick]
     spikes["sums"] = sent[:steps]
     above, below = np.moveaxis(sent.reshape(steps + late, -1, counters.classes, 2).sum(axis=1), -1, 0)
     sums = np.cumsum(above - below, axis=0)[late - 1 : -1]

@@ -28,7 +28,7 @@ def faults(netlist: CrossbarNetlist, chip: Target) -> tuple[Violation, ...]:
     core_of = netlist.core_of_neuron()
     number = np.arange(netlist.n_neurons) - netlist.core_neurons[core_of]
     wire = netlist.wire_neuron
-    found = []
+    violations = []
     tables: tuple[tuple[IntArray, Words, Iterator[Broken]], ...] = (
         (np.arange(netlist.n_cores), lambda _: "", _cores(netlist, chip)),
         (netlist.core_of_axon(), lambda row: f", axon {netlist.axon_line[row]}", _axons(netlist, chip)),
@@ -42,10 +42,10 @@ def faults(netlist: CrossbarNetlist, chip: Target) -> tuple[Violation, ...]:
                 first, *others = rows[core[rows] == place].tolist()
                 owner = f"core {place}{who(first)}" + f" (and {len(others)} more on this core)" * bool(others)
                 name = f"{chip.name}.{rule}"
-                found.append(Violation(owner=owner, used=used(first), allowed=allowed, rule=name, remedy=remedy))
+                violations.append(Violation(owner=owner, used=used(first), allowed=allowed, rule=name, remedy=remedy))
     if netlist.n_cores > chip.limit("chip.cores"):
-        found.append(chip.exceeded("chip", "chip.cores", netlist.n_cores, "fewer neurons, inputs or copies"))
-    return tuple(found)
+        violations.append(chip.exceeded("chip", "chip.cores", netlist.n_cores, "fewer neurons, inputs or copies"))
+    return tuple(violations)
 
 
 def require_legal(netlist: CrossbarNetlist, chip: Target) -> None:
@@ -174,10 +174,10 @@ def _needs_of(network: Network, layer: int, chip: Target) -> Iterator[tuple[str,
     allowed = 2**copies - 1
     if distinct.max(initial=0) > allowed:
         where = _worst(name, distinct, allowed)
-        found = f"{distinct.max():,} different weights"
+        what = f"{distinct.max():,} different weights"
         beside = f"{allowed} with {copies} axon{'s' * (copies > 1)} an input"
         remedy = "fewer weights, or each input on several axons of different types"
-        yield where, found, beside, "neuron.weight_bits", remedy
+        yield where, what, beside, "neuron.weight_bits", remedy
     # spikes go to every core that holds neurons which receive them, and there to two axons of different types: with one
     # each, all neurons of a core would have to divide their inputs into the same four groups of equal weights
     receivers = [network.populations[each.post].size for each in network.projections if each.pre == layer]
@@ -190,11 +190,11 @@ def _needs_of(network: Network, layer: int, chip: Target) -> Iterator[tuple[str,
 def _distinct_weights(network: Network, layer: int) -> IntArray:
     """Number of different weights, zero left out, of each neuron of a layer; (neurons,) int64."""
     size = network.populations[layer].size
-    found = np.zeros(size, np.int64)
+    most = np.zeros(size, np.int64)
     for weight in (projection.weight.tocoo() for projection in network.projections if projection.post == layer):
         pairs = np.unique(np.stack([weight.coords[0], weight.data])[:, weight.data != 0], axis=1)
-        found = np.maximum(found, np.bincount(pairs[0].astype(np.int64), minlength=size))
-    return found
+        most = np.maximum(most, np.bincount(pairs[0].astype(np.int64), minlength=size))
+    return most
 
 
 def _worst(name: str, amounts: IntArray, allowed: int) -> str:

@@ -126,14 +126,14 @@ def faults(network: NativeNetwork) -> list[str]:
     """What in a network contradicts itself or the rules above; empty if it can be placed."""
     if network.copies not in BASES:
         return [f"{network.copies} copies of an input, allowed are {', '.join(map(str, BASES))}"]
-    found = []
+    wrong = []
     fan_in = network.taxels * network.polarities
     for depth, stage in enumerate(network.stages):
-        found += [f"{stage.name}: {fault}" for fault in _stage_faults(network, stage, depth, fan_in)]
+        wrong += [f"{stage.name}: {fault}" for fault in _stage_faults(network, stage, depth, fan_in)]
         fan_in = stage.neurons
     if not network.stages or fan_in % network.classes:
-        found.append(f"{fan_in} voting neurons for {network.classes} classes")
-    return found
+        wrong.append(f"{fan_in} voting neurons for {network.classes} classes")
+    return wrong
 
 
 def _stage_faults(network: NativeNetwork, stage: Stage, depth: int, fan_in: int) -> Iterator[str]:

@@ -228,22 +228,22 @@ def inconsistencies(netlist: CrossbarNetlist) -> list[str]:
 
 def unlike(netlist: CrossbarNetlist, due: CrossbarNetlist) -> list[str]:
     """Say what in a netlist is not as it is due, an entry for each field; what it remembers aside."""
-    found = []
+    differing = []
     for name in (*COMMON, *FILE.entries, *FILE.arrays):
         ours = getattr(netlist, name)
         theirs = getattr(due, name)
         if name not in FILE.arrays:
             if name != "provenance" and ours != theirs:
-                found.append(f"{name} is {ours} instead of {theirs}")
+                differing.append(f"{name} is {ours} instead of {theirs}")
         elif ours.shape != theirs.shape:
-            found.append(f"{name} has {len(ours):,} entries instead of {len(theirs):,}")
+            differing.append(f"{name} has {len(ours):,} entries instead of {len(theirs):,}")
         elif len(other := np.argwhere(ours != theirs)):
             first = tuple(other[0].tolist())
             more = f", and {len(other) - 1:,} more" if len(other) > 1 else ""
             of = (name in PER_NEURON or name == "weight") and int(netlist.layer[first[0]])
             owner = "" if of is False else f" of {netlist.layers[of]} neuron {netlist.neuron[first[0]]}"
-            found.append(f"{name}{list(first)}{owner} is {ours[first]} instead of {theirs[first]}{more}")
-    return found
+            differing.append(f"{name}{list(first)}{owner} is {ours[first]} instead of {theirs[first]}{more}")
+    return differing
 
 
 FILE = NetlistFile(

@@ -88,11 +88,11 @@ def find_roots(differs: Sequence[BoolArray], resets: Sequence[BoolArray], source
                 begin[post][neuron] = step + 1
         before = arisen
     dragged, alone = _count(sets, len(places))
-    found = [
+    roots = [
         Root(layer=post, neuron=neuron, step=step, begin=first, dragged=dragged[i] - 1, alone=alone[i] - 1)
         for i, (step, post, neuron, first) in enumerate(places)
     ]
-    return tuple(sorted(found, key=lambda root: (-root.dragged, root.step, root.layer, root.neuron)))
+    return tuple(sorted(roots, key=lambda root: (-root.dragged, root.step, root.layer, root.neuron)))
 
 
 def _inherit(known: list[int], arisen: dict[int, int], connected: BoolArray) -> None:
@@ -114,13 +114,13 @@ def _inherit(known: list[int], arisen: dict[int, int], connected: BoolArray) -> 
 
 def _count(sets: list[int], roots: int) -> tuple[list[int], list[int]]:
     """How many sets hold each root, and how many hold nothing else."""
-    held = np.zeros(roots, np.int64)
+    counts = np.zeros(roots, np.int64)
     alone = np.zeros(roots, np.int64)
     width = -(-roots // 8)
     for start in range(0, len(sets), 1024):
         part = sets[start : start + 1024]
         packed = np.frombuffer(b"".join(bits.to_bytes(width, "little") for bits in part), np.uint8)
         bits = np.unpackbits(packed.reshape(len(part), width), axis=1, bitorder="little", count=roots)
-        held += bits.sum(axis=0, dtype=np.int64)
+        counts += bits.sum(axis=0, dtype=np.int64)
         alone += bits[bits.sum(axis=1, dtype=np.int64) == 1].sum(axis=0, dtype=np.int64)
-    return held.tolist(), alone.tolist()
+    return counts.tolist(), alone.tolist()

@@ -119,13 +119,13 @@ class Loihi(Threaded, Stoppable):
 
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """On a free-running chip also in a row."""
-        found = super().check(events, lengths=lengths)
+        different = super().check(events, lengths=lengths)
         if self.free_running:
             pause = np.zeros((self.netlist.n_inputs, self.netlist.blank), events.dtype)
             each = one_by_one(with_clocks(events, self.netlist.clocks), lengths)
             row = np.concatenate([part for channels in each for part in (channels, pause)], axis=1)
-            found += differences(*self.twice(row))
-        return found
+            different += differences(*self.twice(row))
+        return different
 
     @property
     def free_running(self) -> bool:
@@ -258,14 +258,14 @@ class Loihi(Threaded, Stoppable):
         from spikeloom.runtime.machines.loihi1.costs.result import cost_report
         from spikeloom.runtime.machines.loihi1.costs.sections import sections
 
-        trace, found = estimate(self._engine, chip, channels, lengths=lengths, detail=detail, progress=progress)
-        report = cost_report(self.netlist, chip, found, bin_s=bin_s * self.netlist.bins)
-        energy = {name: each.sum(axis=1) for name, each in found.costs.energy.items()}
+        trace, estimated = estimate(self._engine, chip, channels, lengths=lengths, detail=detail, progress=progress)
+        report = cost_report(self.netlist, chip, estimated, bin_s=bin_s * self.netlist.bins)
+        energy = {name: each.sum(axis=1) for name, each in estimated.costs.energy.items()}
         return trace, Price(
-            synaptic_operations=found.costs.synaptic_operations.sum(axis=1),
+            synaptic_operations=estimated.costs.synaptic_operations.sum(axis=1),
             energy_j=energy,
-            time_s={name: times.seconds for name, times in found.simple.items()},
-            step_s={name: float(times.duration_ns.max() * 1e-9) for name, times in found.simple.items()},
+            time_s={name: times.seconds for name, times in estimated.simple.items()},
+            step_s={name: float(times.duration_ns.max() * 1e-9) for name, times in estimated.simple.items()},
             dynamic_j=energy,
             static_w={each.source: each.chips * each.chip_w for each in report.static},
             outcome=Outcome(report, sections),
@@ -273,8 +273,8 @@ class Loihi(Threaded, Stoppable):
 
     def batch(self, steps: int) -> int:
         """As many recordings as keep the sums of the time model small."""
-        held = (steps + self.netlist.drain) * 2 * self.netlist.n_cores * max(1, len(self.target.time))
-        return max(1, SUMS // held)
+        sums = (steps + self.netlist.drain) * 2 * self.netlist.n_cores * max(1, len(self.target.time))
+        return max(1, SUMS // sums)
 
     def stream(self) -> Stream:
         """One grasp, bin after bin."""

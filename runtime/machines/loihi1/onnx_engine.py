@@ -65,22 +65,22 @@ def simulate(
     for end in np.unique(ends[ends > 0]).tolist():
         which = np.flatnonzero(ends == end)
         given = np.ascontiguousarray((events[which, :, :end] != 0).transpose(2, 0, 1)).view(np.uint8)
-        found = dict(zip(names, prepared.session.run(names, {"events": given}), strict=True))
+        outputs = dict(zip(names, prepared.session.run(names, {"events": given}), strict=True))
         for layer in prepared.layers:
             window = np.arange(layer.depth, layer.depth + end)
-            spikes[np.ix_(which, window, layer.ids)] = found[f"{layer.name}.spikes"].transpose(1, 0, 2)
-        votes[which] = found.get("votes", 0)
+            spikes[np.ix_(which, window, layer.ids)] = outputs[f"{layer.name}.spikes"].transpose(1, 0, 2)
+        votes[which] = outputs.get("votes", 0)
     return spikes, votes
 
 
 def differences(onnx: OnnxEngine, ours: Engine, events: EventArray, lengths: IntArray | None) -> int:
     """Spikes (recording, chip step, compartment) and votes in which onnxruntime and our engine differ."""
-    found = 0
+    different = 0
     for start in range(0, len(events), PART):
         part = events[start : start + PART]
         ends = None if lengths is None else lengths[start : start + PART]
         expected = engine.simulate(ours, part, lengths=ends, spikes=True)
         spikes, votes = simulate(onnx, part, lengths=ends)
-        found += int(np.count_nonzero(spikes != expected.spikes))
-        found += int(np.count_nonzero(votes != class_counts(onnx.netlist, expected.counts.spikes)))
-    return found
+        different += int(np.count_nonzero(spikes != expected.spikes))
+        different += int(np.count_nonzero(votes != class_counts(onnx.netlist, expected.counts.spikes)))
+    return different

@@ -225,13 +225,13 @@ def _may_be_zero(integer: IntegerNetwork, post: int, silent: BoolArray, pruned: 
 def summed(stage: Network | IntegerNetwork, pre: int, post: int) -> Sparse:
     """Weights from one population to another, mantissas of planes added up; float64."""
     size = stage.input.size if pre == INPUT else stage.populations[pre].size
-    found = sparse.csr_array((stage.populations[post].size, size), dtype=np.float64)
+    total = sparse.csr_array((stage.populations[post].size, size), dtype=np.float64)
     projections: tuple[Projection | IntegerProjection, ...] = stage.projections
     for projection in projections:
         if (projection.pre, projection.post) == (pre, post):
             weight = projection.effective() if isinstance(projection, IntegerProjection) else projection.weight
-            found = found + weight.astype(np.float64)
-    return found
+            total = total + weight.astype(np.float64)
+    return total
 
 
 def _compare_weights(

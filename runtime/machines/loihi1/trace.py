@@ -90,11 +90,11 @@ def aligned(netlist: Netlist, array: AnyArray, layer: int) -> AnyArray:
     depth = netlist.layers[layer].depth
     length = array.shape[-2] - netlist.drain
     ids = netlist.compartments_of(layer)
-    held = array[..., depth : depth + length, ids]
+    part = array[..., depth : depth + length, ids]
     if len(ids) == netlist.layers[layer].neurons:
-        return held
-    whole = np.zeros((*held.shape[:-1], netlist.layers[layer].neurons), held.dtype)
-    whole[..., netlist.neuron[ids]] = held
+        return part
+    whole = np.zeros((*part.shape[:-1], netlist.layers[layer].neurons), part.dtype)
+    whole[..., netlist.neuron[ids]] = part
     return whole
 
 

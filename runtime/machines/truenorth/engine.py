@@ -116,13 +116,13 @@ def _steady_first(
     )
     leak, threshold, reset, lowest, under, linear = (column[first] for column in _registers(netlist))
     initial = netlist.initial[first]
-    held = netlist.negative_saturates[first] == 1
+    saturates = netlist.negative_saturates[first] == 1
     simple = (netlist.leak_reversal == 0)[first]
     cap = high - positive - np.maximum(leak, 0)
     most = np.maximum.reduce([threshold - 1, reset, under, initial])
     least = np.minimum.reduce([lowest, reset, under, initial]) - negative + np.minimum(leak, 0)
     to_value = (netlist.reset_mode[first] == RESET_TO) & (most <= cap)
-    by_threshold = (linear == 1) & held & (initial <= cap) & (not careful)
+    by_threshold = (linear == 1) & saturates & (initial <= cap) & (not careful)
     steady = simple & (least >= low) & (to_value | by_threshold)
     order = np.argsort(~steady, kind="stable")
     rank = np.argsort(order)
@@ -193,12 +193,12 @@ def simulate(
     axons = np.zeros((samples, len(twins.first_axon)), np.int64)
     spiked, votes, overflows = np.zeros((3, samples, neurons), np.int64)
     raster = np.zeros((samples, most if spikes else 0, neurons), np.bool_)
-    held = np.zeros((samples, most if membranes else 0, neurons), np.int32)
+    membranes_kept = np.zeros((samples, most if membranes else 0, neurons), np.int32)
     merged = np.zeros(samples, np.int64)
 
     def one(sample: int) -> None:
         arriving = np.ascontiguousarray(events[sample, :, : steps[sample]].T).astype(np.uint8)
-        arrays = (axons, spiked, votes, overflows, raster, held)
+        arrays = (axons, spiked, votes, overflows, raster, membranes_kept)
         merged[sample] = kernel.run(
             arriving,
             netlist.bin_ticks,
@@ -226,5 +226,5 @@ def simulate(
     return Trace(
         counts=counts,
         spikes=raster[:, :, twins.neuron] if spikes else None,
-        membranes=held[:, :, twins.neuron] if membranes else None,
+        membranes=membranes_kept[:, :, twins.neuron] if membranes else None,
     )

@@ -209,8 +209,8 @@ def _send(n: Any, tick: Any, ticks: Any, window: Any, slots: Any, wiring: Any, s
     if wiring.parameters[n, AXON] < 0:
         return 0
     later = tick + wiring.parameters[n, DELAY]
-    twice = _queue(state, later & (slots - 1), wiring.parameters[n, AXON])
-    return twice * (later < ticks)
+    merged = _queue(state, later & (slots - 1), wiring.parameters[n, AXON])
+    return merged * (later < ticks)
 
 
 @compiled

@@ -55,10 +55,10 @@ def find_twins(netlist: CrossbarNetlist, half: int) -> Twins:
         known[wired, 1] = kind[sources[wired, 1]]
         axon_kind = np.unique(known, axis=0, return_inverse=True)[1].reshape(-1)
         pairs, weights = _pairs(axon_kind, neuron, axon, halves)
-        found = _neuron_kinds(registers, pairs, weights)
-        if found.max(initial=-1) == kind.max(initial=-1):
+        neuron_kinds = _neuron_kinds(registers, pairs, weights)
+        if neuron_kinds.max(initial=-1) == kind.max(initial=-1):
             break
-        kind = found
+        kind = neuron_kinds
     first_neuron, first_axon = (np.unique(kinds, return_index=True)[1] for kinds in (kind, axon_kind))
     # pairs are by neuron; those of the first of each kind stand for all
     stays = np.zeros(netlist.n_neurons, np.bool_)
@@ -119,8 +119,8 @@ def _neuron_kinds(registers: IntArray, pairs: IntArray, sums: IntArray) -> IntAr
     bounds = np.searchsorted(pairs[0], np.arange(len(registers) + 1)).tolist()
     rows = np.ascontiguousarray(np.stack([pairs[1], sums], axis=1))
     known: dict[tuple[int, bytes], int] = {}
-    found = [
+    neuron_kinds = [
         known.setdefault((register, rows[bounds[n] : bounds[n + 1]].tobytes()), len(known))
         for n, register in enumerate(registers.tolist())
     ]
-    return np.array(found, np.int64)
+    return np.array(neuron_kinds, np.int64)

@@ -44,10 +44,10 @@ def cut_layer(needs: Needs, population: int, least: int | None = None) -> list[C
         while True:
             needs.out_axons[population] = others + charged
             chunks = once()
-            own = needs.source_axons(chunks).get(population, charged)
-            if np.all(own <= charged):
+            incoming = needs.source_axons(chunks).get(population, charged)
+            if np.all(incoming <= charged):
                 return chunks
-            charged = np.maximum(charged, own)
+            charged = np.maximum(charged, incoming)
     finally:
         needs.out_axons[population] = others
 
@@ -77,13 +77,13 @@ def _fill(needs: Needs, population: int) -> list[Chunk]:
 
 def _worst(needs: Needs, population: int) -> tuple[Violation, ...]:
     """For each limit that single neurons of a population break: the one that breaks it most."""
-    found: dict[str, tuple[int, int]] = {}
+    worst: dict[str, tuple[int, int]] = {}
     for neuron in range(needs.network.populations[population].size):
         for rule, used in needs.excess((Chunk(population=population, first=neuron, last=neuron + 1),)).items():
-            if rule not in found or used > found[rule][0]:
-                found[rule] = used, neuron
+            if rule not in worst or used > worst[rule][0]:
+                worst[rule] = used, neuron
     name = needs.network.populations[population].name
-    return tuple(violation(needs.target, f"{name} neuron {n}", rule, used) for rule, (used, n) in found.items())
+    return tuple(violation(needs.target, f"{name} neuron {n}", rule, used) for rule, (used, n) in worst.items())
 
 
 def order_on_core(needs: Needs, chunks: Core) -> Core:
@@ -182,12 +182,12 @@ def cut(needs: Needs, least: Mapping[int, int]) -> list[Chunk]:
     needs.forget()
     for population in reversed(range(len(needs.network.populations))):
         try:
-            found = cut_layer(needs, population, least.get(population))
+            pieces = cut_layer(needs, population, least.get(population))
         except CapacityError as error:
             violations = error.violations + violations
         else:
-            chunks += found
-            needs.charge(needs.source_axons(found))
+            chunks += pieces
+            needs.charge(needs.source_axons(pieces))
     if violations:
         raise CapacityError(violations)
     return sorted(chunks)

@@ -183,9 +183,9 @@ def place_on_chips(traffic: FloatArray, target: Target) -> Placement:
     tiles = np.zeros(len(chip), np.int64)
     placed = []
     for number in range(int(chip.max()) + 1):
-        own = np.flatnonzero(chip == number)
-        placed.append(place(traffic[np.ix_(own, own)], target))
-        tiles[own] = number * chip_tiles(target) + np.array(placed[-1].tiles)
+        members = np.flatnonzero(chip == number)
+        placed.append(place(traffic[np.ix_(members, members)], target))
+        tiles[members] = number * chip_tiles(target) + np.array(placed[-1].tiles)
     return Placement(
         tiles=tuple(tiles.tolist()),
         spike_hops=sum(placement.spike_hops for placement in placed),

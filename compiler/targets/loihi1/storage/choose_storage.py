@@ -112,8 +112,8 @@ def best_scale(
             scales[stored.form.exponents, int(stored.form.threshold[0])] = stored
         if limited:
             break
-    found = list(scales.values())
-    if not found:
+    candidates = list(scales.values())
+    if not candidates:
         register = _register(population)
         lasting = f" and its current, of which a step keeps {population.alpha:g}, within its register"
         raise ModelError(
@@ -121,10 +121,10 @@ def best_scale(
             f"accumulator ({ONE_STEP_SUM_MAX} units a step){lasting if register == 'current' else ''}; use more bits "
             "or smaller weights"
         )
-    tried = len(found)
+    tried = len(candidates)
     if calibration is not None and tried > FINALISTS:
-        found = sorted(found, key=lambda c: judged(c, post, calibration, 1).cost)[:FINALISTS]
-    best = min((judged(stored, post, calibration) for stored in found), key=attrgetter("cost"))
+        candidates = sorted(candidates, key=lambda c: judged(c, post, calibration, 1).cost)[:FINALISTS]
+    best = min((judged(stored, post, calibration) for stored in candidates), key=attrgetter("cost"))
     if packing.groups > 1:
         several = grouped(layer, best, packing.groups)
         if several is not None:
@@ -186,7 +186,7 @@ def explain_choice(layer: FloatLayer, chosen: Rounded) -> Choice:
     """Say what was chosen for a population."""
     form = chosen.form
     scale = chosen.population.scale
-    held = reach(form.bits, form.exponents) * step_units(form.bits, form.exponents)
+    limit = reach(form.bits, form.exponents) * step_units(form.bits, form.exponents)
     clipped = zeroed = weights = 0
     for p in layer.projections:
         planes = [plane for plane in chosen.projections if plane.pre == p.pre]
@@ -197,7 +197,7 @@ def explain_choice(layer: FloatLayer, chosen: Rounded) -> Choice:
             weights += int(weight.count_nonzero())
             zeroed += int(weight.count_nonzero() - kept.multiply(weight != 0).count_nonzero())
             units = np.abs(weight.data) * np.repeat(scale[rows], np.diff(weight.indptr))
-            clipped += int(np.count_nonzero(units > held * (1 + 1e-12)))
+            clipped += int(np.count_nonzero(units > limit * (1 + 1e-12)))
     return Choice(
         layer=layer.population.name,
         bits=form.bits,

@@ -70,11 +70,11 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
         for rows in np.array_split(neurons, -(-len(neurons) * len(inputs) // PART) or 1):
             places = [_places(p, rows) for p in projections]
             weight = np.concatenate([p.weight.data[at] for p, at in zip(projections, places, strict=True)], axis=1)
-            held = np.clip(weight * (scale[rows] / step)[:, None], -limit, limit)
-            found = np.rint(held)
-            found[:, shown] = np.clip(_round_in_turn(held[:, shown], share), -limit, limit)
-            less = (held - found)[:, shown]
-            wanted = held @ meant[inputs] - found @ rate[inputs]
+            exact = np.clip(weight * (scale[rows] / step)[:, None], -limit, limit)
+            found = np.rint(exact)
+            found[:, shown] = np.clip(_round_in_turn(exact[:, shown], share), -limit, limit)
+            less = (exact - found)[:, shown]
+            wanted = exact @ meant[inputs] - found @ rate[inputs]
             most = (np.sum(sign * np.maximum(sign * less, 0), axis=1) for sign in (-1, 1))
             errors[rows] = np.clip(wanted, *most) * step / scale[rows]
             ends = np.cumsum([at.shape[1] for at in places])[:-1]

@@ -55,8 +55,8 @@ def split(count: int) -> tuple[IntArray, IntArray, IntArray]:
     """
     every = np.arange(count)
     few = evenly_spaced(every, min(FEW, -(-count // 2)))
-    held = evenly_spaced(np.setdiff1d(every, few), HELD) if count > 1 else every[:0]
-    return few, np.setdiff1d(every, held), held
+    left_out = evenly_spaced(np.setdiff1d(every, few), HELD) if count > 1 else every[:0]
+    return few, np.setdiff1d(every, left_out), left_out
 
 
 def thinned(events: AnyArray) -> AnyArray:

@@ -119,10 +119,10 @@ def planes_from(exponent: int, bits: int, planes: int, largest: int) -> tuple[in
     >>> planes_from(-1, 8, 2, 7), planes_from(3, 8, 3, 7)
     ((-1, 6), (3, 7))
     """
-    found = [exponent]
-    while len(found) < planes and found[-1] < largest:
-        found.append(min(found[-1] + plane_distance(bits), largest))
-    return tuple(found)
+    exponents = [exponent]
+    while len(exponents) < planes and exponents[-1] < largest:
+        exponents.append(min(exponents[-1] + plane_distance(bits), largest))
+    return tuple(exponents)
 
 
 def _largest_threshold(population: Population) -> float:
@@ -198,17 +198,17 @@ def candidate(
     worthwhile = 1.0 if whole else WORTHWHILE
     for exponent in sorted(exponents):
         stored = planes_from(exponent, bits, packing.planes, max(exponents))
-        held = reach(bits, stored) * weight_step(bits) / peak if peak else 1.0 / layer.population.theta
-        if whole and held >= weight_step(bits):  # at a multiple of the step no weight is rounded
-            held -= held % weight_step(bits)
-        fitted = fit(layer, bits, stored, held * factor)
+        scale = reach(bits, stored) * weight_step(bits) / peak if peak else 1.0 / layer.population.theta
+        if whole and scale >= weight_step(bits):  # at a multiple of the step no weight is rounded
+            scale -= scale % weight_step(bits)
+        fitted = fit(layer, bits, stored, scale * factor)
         if fitted is None and chosen is None:
             continue  # the threshold is less than a unit, a larger exponent makes it more
         if fitted is None or mantissa_scale(fitted) < worthwhile * finest:
             break
         chosen = fitted
         finest = max(finest, mantissa_scale(fitted))
-        limited = finest < WORTHWHILE * held * factor
+        limited = finest < WORTHWHILE * scale * factor
     return chosen, limited
 
 
@@ -216,8 +216,8 @@ def finest_thresholds(layer: FloatLayer, bits: int, exponents: tuple[int, ...]) 
     """Largest threshold of each neuron that registers and its largest weight allow; 0 if none."""
     population = layer.population
     with np.errstate(divide="ignore"):
-        held = population.theta * reach(bits, exponents) * step_units(bits, exponents) / layer.peaks()
-    high = np.minimum(held, _largest_threshold(population)).astype(np.int64) + 1  # one more than allowed
+        largest = population.theta * reach(bits, exponents) * step_units(bits, exponents) / layer.peaks()
+    high = np.minimum(largest, _largest_threshold(population)).astype(np.int64) + 1  # one more than allowed
     low = np.zeros(population.size, np.int64)
     while np.any(high - low > np.maximum(1, low // SCALE_STEPS)):
         middle = (low + high + 1) // 2

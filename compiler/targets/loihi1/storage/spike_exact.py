@@ -60,7 +60,7 @@ def make_exact(
     few = fewer(calibration)
     layers = []
     chosen = []
-    found = []
+    reports = []
     for post in range(len(network.populations)):
         layer = layer_of(network, post, few)
         best = None
@@ -81,7 +81,7 @@ def make_exact(
         layer = replace(layer, calibration=calibration)
         layers.append(layer)
         chosen.append(best)
-        found.append(
+        reports.append(
             Exactness(
                 layer=layer.population.name,
                 tried=tuple(tried),
@@ -91,7 +91,7 @@ def make_exact(
                 decay=_decay_flips(layer, calibration) if best.flips else 0,
             )
         )
-    return assemble(network, chosen), tuple(map(explain_choice, layers, chosen)), tuple(found)
+    return assemble(network, chosen), tuple(map(explain_choice, layers, chosen)), tuple(reports)
 
 
 def _full_range(layer: FloatLayer, candidate: Rounded) -> BoolArray:

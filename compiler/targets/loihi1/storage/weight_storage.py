@@ -57,9 +57,9 @@ def nearest_steps(population: ir.Population, projection: ir.Projection, form: ir
     scale = scales(population, form)
     steps = np.empty(weight.nnz, np.int32)
     for rows in ir.row_parts(weight):
-        held = slice(weight.indptr[rows.start], weight.indptr[rows.stop])
+        entries = slice(weight.indptr[rows.start], weight.indptr[rows.stop])
         each = np.repeat(scale[rows], np.diff(weight.indptr[rows.start : rows.stop + 1]))
-        steps[held] = round_steps(weight.data[held], each, form.bits, form.exponents)
+        steps[entries] = round_steps(weight.data[entries], each, form.bits, form.exponents)
     return steps
 
 
@@ -122,9 +122,9 @@ def fullest(population: ir.IntegerPopulation, up: AnyArray, down: AnyArray) -> F
     filled *= current_load(population.decay_u)
     if 2 * population.decay_v >= DECAY_ONE:
         gather = (1 << MEMBRANE_SHIFT) * DECAY_ONE / (population.decay_u + 1)
-        lost = population.decay_v / DECAY_ONE
-        held = (1 - lost) * (population.threshold << MEMBRANE_SHIFT)
-        rise = held + gather * up + np.maximum(population.bias, 0)
-        fall = (gather * down + np.maximum(-population.bias, 0)) / lost
+        decay = population.decay_v / DECAY_ONE
+        kept = (1 - decay) * (population.threshold << MEMBRANE_SHIFT)
+        rise = kept + gather * up + np.maximum(population.bias, 0)
+        fall = (gather * down + np.maximum(-population.bias, 0)) / decay
         filled = np.maximum(filled, np.maximum(rise, fall) * (ONE_STEP_SUM_MAX / MEMBRANE_MAX))
     return filled

@@ -31,14 +31,14 @@ def _lag(chip: Chip, known: Known) -> int:
     """Least number of synapses on a path from an input to a compartment that votes, minus one."""
     begins, target, offset, _ = chip.synapses
     channels = len(known.events)
-    found = 0
+    lag = 0
     reached = np.arange(len(begins) - 1) < channels
-    while found < len(known.fired) and not np.any(chip.label[reached[channels:]] >= 0):
-        found += 1
+    while lag < len(known.fired) and not np.any(chip.label[reached[channels:]] >= 0):
+        lag += 1
         for source in np.flatnonzero(reached):
             for r in range(begins[source], begins[source + 1]):
                 reached[channels + target[r] : channels + target[r] + offset[r + 1] - offset[r]] = True
-    return max(found - 1, 0)
+    return max(lag - 1, 0)
 
 
 @compiled

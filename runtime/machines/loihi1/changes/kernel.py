@@ -167,12 +167,12 @@ def _integrate(membrane: Any, keep: Any, current: Any, bias: Any, first: Any, pl
 
 @compiled
 def _compare(other: Any, membrane: Any, threshold: Any, fired: Any, first: Any, places: Any) -> Any:
-    found = np.uint8(0)
+    different = np.uint8(0)
     for i in range(first, first + places):
         differs = np.uint8(np.uint8(membrane[i] > threshold[i]) ^ fired[i])
         other[i] = differs
-        found |= differs
-    return found
+        different |= differs
+    return different
 
 
 @compiled
@@ -183,10 +183,10 @@ def _reset(membrane: Any, threshold: Any, first: Any, places: Any) -> None:
 
 @compiled
 def _differ(ours: Any, theirs: Any, first: Any, places: Any) -> Any:
-    found = np.int32(0)
+    different = np.int32(0)
     for i in range(first, first + places):
-        found |= ours[i] ^ theirs[i]
-    return found
+        different |= ours[i] ^ theirs[i]
+    return different
 
 
 @compiled

@@ -43,8 +43,8 @@ def steady(netlist: Netlist) -> BoolArray:
     voters = np.flatnonzero(netlist.readout_class >= 0)
     sender = netlist.axon_source[netlist.axon_of_synapse()] - netlist.n_inputs
     receiver = netlist.synapse_compartment()
-    own = np.bincount(receiver, np.where(sender == receiver, netlist.effective_weight(), 0), netlist.n_compartments)
-    lifted = (own > netlist.threshold) & (netlist.bias_mantissa >= 0) & (one_step_bounds(netlist)[1] == 0)
+    itself = np.bincount(receiver, np.where(sender == receiver, netlist.effective_weight(), 0), netlist.n_compartments)
+    lifted = (itself > netlist.threshold) & (netlist.bias_mantissa >= 0) & (one_step_bounds(netlist)[1] == 0)
     return np.asarray(lifted[voters])
 
 

@@ -71,8 +71,8 @@ def estimate(
     detailed: dict[str, list[DetailedTimes]] = {name: [] for name in latencies if deep}
     counts = []
     updates = []
-    held = 2 * netlist.n_compartments if deep else 8 * max(1, 0 if charges is None else charges.sources.shape[1])
-    size = max(1, HELD // (held * (events.shape[2] + netlist.drain)))
+    entries = 2 * netlist.n_compartments if deep else 8 * max(1, 0 if charges is None else charges.sources.shape[1])
+    size = max(1, HELD // (entries * (events.shape[2] + netlist.drain)))
     for first in range(0, max(1, len(events)), size):
         part = slice(first, first + size)
         trace = engine.simulate(prepared, events[part], lengths=steps[part], spikes=deep, updated=deep, charges=charges)

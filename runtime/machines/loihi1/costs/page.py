@@ -34,7 +34,7 @@ def core_map(netlist: Netlist, target: Target, fired: FloatArray) -> CoreMap:
     placed = []
     for core, tile in enumerate(netlist.core_tile.tolist()):
         y, x = divmod(tile % chip_tiles(target), width)
-        held = netlist.layer[slice(*netlist.core_compartments[core : core + 2])]
+        members = netlist.layer[slice(*netlist.core_compartments[core : core + 2])]
         placed.append(
             Core(
                 core=core,
@@ -42,8 +42,8 @@ def core_map(netlist: Netlist, target: Target, fired: FloatArray) -> CoreMap:
                 tile=tile,
                 x=x,
                 y=y,
-                layers=tuple(netlist.layers[i].name for i in np.unique(held)),
-                compartments=len(held),
+                layers=tuple(netlist.layers[i].name for i in np.unique(members)),
+                compartments=len(members),
                 fullest=max(FILLS, key=lambda name: fill[core][name].share),
                 fill=fill[core],
             )

@@ -295,12 +295,12 @@ def _pace(found: Estimate, bin_s: float) -> Pace:
 
 
 def _core(netlist: Netlist, found: Estimate, core: int) -> CoreCosts:
-    held = np.unique(netlist.layer[slice(*netlist.core_compartments[core : core + 2])])
+    layers = np.unique(netlist.layer[slice(*netlist.core_compartments[core : core + 2])])
     simple = found.simple.items()
     return CoreCosts(
         core=core,
         tile=int(netlist.core_tile[core]),
-        layers=tuple(netlist.layers[i].name for i in held),
+        layers=tuple(netlist.layers[i].name for i in layers),
         sweep_s={name: float(times.generation_ns[:, core].mean() * 1e-9) for name, times in simple},
         receive_s={name: float(times.processing_ns[:, core].mean() * 1e-9) for name, times in simple},
         energy_j={name: float(each[:, core].mean()) for name, each in found.cores.items()},

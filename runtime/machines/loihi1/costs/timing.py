@@ -210,16 +210,16 @@ def detailed(
     """
     fired, worked, seen = (np.ascontiguousarray(bits).view(np.uint8) for bits in (spikes, updated, events != 0))
     cores, (samples, length) = tables.start.size - 1, spikes.shape[:2]
-    own = np.full(samples, length) if steps is None else steps
+    lengths = np.full(samples, length) if steps is None else steps
     require_below("compartments", np.array(fired.shape[2]), tables.sender.size + 1)
     require_below("channels", np.array(seen.shape[1]), tables.channel_first.size)
-    require_below("chip steps", own, length + 1)
+    require_below("chip steps", lengths, length + 1)
     blocked, peak = np.zeros((2, samples, length))
     spent = np.zeros((samples, length, 2 * cores))
     for i in range(samples):
-        schedule(tables, fired[i], worked[i], seen[i], int(own[i]), spent[i], blocked[i], peak[i])
+        schedule(tables, fired[i], worked[i], seen[i], int(lengths[i]), spent[i], blocked[i], peak[i])
     return DetailedTimes(
-        **_ends(spent, own, tables.barrier),
+        **_ends(spent, lengths, tables.barrier),
         sent_ns=spent[:, :, :cores].max(axis=2) / PICOSECONDS,
         processed_ns=spent[:, :, cores:].max(axis=2) / PICOSECONDS,
         blocked_ns=blocked / PICOSECONDS,
