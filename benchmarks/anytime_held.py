@@ -21,8 +21,9 @@ from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.graphs import NEUTOUCH
+from spikeloom.models.network_kinds import kind_of
 from spikeloom.models.recordings.evtouch import BIN_S, Recordings
-from spikeloom.models.training.kinds import kind_of, seen_by
+from spikeloom.models.training.kinds import seen_by
 from spikeloom.models.training.train import train, validation_split
 from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.commands.choose.anytime import ALLOWED

@@ -15,8 +15,9 @@ from made import made
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, TACTILESGNET
 from spikeloom.models.graphs import NEUTOUCH
+from spikeloom.models.network_kinds import kind_of
 from spikeloom.models.recordings.evtouch import BIN_S
-from spikeloom.models.training.kinds import kind_of, seen_by
+from spikeloom.models.training.kinds import seen_by
 from spikeloom.models.training.train import train
 from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.commands.training.train import both_splits, plan_jobs

@@ -23,8 +23,9 @@ from made import made
 
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, MLP
 from spikeloom.models.graphs import NEUTOUCH
+from spikeloom.models.network_kinds import kind_of
 from spikeloom.models.recordings.evtouch import BIN_S, Recordings
-from spikeloom.models.training.kinds import kind_of, seen_by
+from spikeloom.models.training.kinds import seen_by
 from spikeloom.models.training.train import train
 from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.commands.training.train import both_splits, plan_jobs

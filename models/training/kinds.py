@@ -1,19 +1,15 @@
 """The kinds of network that are trained: what sizes each has, how it is stored and read back.
 
-The usual kind is :mod:`training.usual`; a chip that needs its own has a module ``models/CHIP/kind.py``.
+All kinds are listed in :mod:`models.network_kinds`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from pkgutil import iter_modules
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol
 
-from spikeloom import models
 from spikeloom.compiler.systems import SYSTEMS, TACTILESGNET, Grid
 from spikeloom.compiler.types import FloatArray
 from spikeloom.models.graphs import Graph
@@ -71,18 +67,6 @@ class Kind(Protocol):
 
     def differing(self, found: Any, plan: Plan) -> list[str]:
         """In what a checkpoint is of another plan."""
-
-
-def kinds() -> list[Kind]:
-    """All kinds, the usual one first."""
-    names = [f"{models.__name__}.{each.name}.kind" for each in iter_modules(models.__path__) if each.ispkg]
-    found = [f"{models.__name__}.training.usual", *filter(find_spec, names)]
-    return [cast(Kind, import_module(name)) for name in found]
-
-
-def kind_of(system: str) -> Kind:
-    """The kind of network that a system is."""
-    return next(kind for kind in kinds() if system in kind.SYSTEMS)
 
 
 def seen_by(plan: Plan) -> FloatArray:

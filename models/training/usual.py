@@ -14,7 +14,7 @@ from spikeloom.models.networks.networks import Architecture
 from spikeloom.models.training.kinds import Plan, same_graph
 from spikeloom.models.training.recipes import RECIPES, Recipe
 
-SYSTEMS = systems.SYSTEMS
+SYSTEMS: tuple[str, ...] = systems.SYSTEMS
 COPIES: tuple[int, ...] = ()
 
 read = read_checkpoint

@@ -13,7 +13,7 @@ from spikeloom.models.training.kinds import Plan, same_graph
 from spikeloom.models.training.recipes import ADAMW, COSINE, CROSS_ENTROPY, Recipe
 from spikeloom.models.truenorth import network
 
-SYSTEMS = (SYSTEM,)
+SYSTEMS: tuple[str, ...] = (SYSTEM,)
 COPIES = tuple(BASES)
 
 read = read_trained

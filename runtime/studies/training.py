@@ -13,9 +13,10 @@ import numpy as np
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import OptionError, UnfinishedError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
+from spikeloom.models.network_kinds import kind_of
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
-from spikeloom.models.training.kinds import Plan, kind_of, seen_by
+from spikeloom.models.training.kinds import Plan, seen_by
 from spikeloom.models.training.recipes import MSE, RELEASED
 from spikeloom.models.training.record import Reached, TrainingRecord
 from spikeloom.runtime.report.console import tell

@@ -185,7 +185,7 @@ def _recipe(request: TrainRequest) -> Recipe:
 
 def _named_recipe(request: TrainRequest) -> Recipe:
     """What was named, or the only one of a system that has its own."""
-    from spikeloom.models.training.kinds import kind_of
+    from spikeloom.models.network_kinds import kind_of
 
     names = ("recipe", "current_decay", "membrane_decay", "join", "spike_penalty", "copies", "hidden", "hops")
     usual = {"recipe": RELEASED.name, "join": 1}

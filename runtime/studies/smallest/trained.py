@@ -16,10 +16,11 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.graphs import Graph
+from spikeloom.models.network_kinds import kind_of
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import taxels_alone
-from spikeloom.models.training.kinds import Plan, kind_of, seen_by
+from spikeloom.models.training.kinds import Plan, seen_by
 from spikeloom.models.training.recipes import RECIPES
 from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.network import load_network
