@@ -13,7 +13,6 @@ import numpy as np
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import OptionError, UnfinishedError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
-from spikeloom.models.network_kinds import kind_of
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.models.training.kinds import Plan, seen_by
@@ -98,6 +97,7 @@ def state_of(job: Job) -> tuple[Path, Path]:
 
 def run_job(job: Job) -> Finished:
     """Train one seed, read at its last, best and clean epoch, and write its checkpoint."""
+    from spikeloom.models.network_kinds import kind_of  # torch, so only here
     from spikeloom.models.training.record import training_record
     from spikeloom.models.training.train import train_both
 
@@ -134,6 +134,7 @@ def run_job(job: Job) -> Finished:
 
 def recall(job: Job) -> Finished:
     """What `run_job` returned when it wrote the checkpoint that is there; refused if that is of another training."""
+    from spikeloom.models.network_kinds import kind_of  # torch, so only here
     from spikeloom.models.training.record import read_record
 
     kind = kind_of(job.plan.system)

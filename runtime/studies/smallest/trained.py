@@ -16,7 +16,6 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.graphs import Graph
-from spikeloom.models.network_kinds import kind_of
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import taxels_alone
@@ -59,6 +58,7 @@ def plan_of(candidate: Candidate, sensor: Sensor, training: Recordings) -> Plan:
 
 def without(plan: Plan, training: Recordings, held: IntArray, epochs: int, target: Target, storage: int | None) -> Any:
     """The netlist of a network that some recordings are left out of."""
+    from spikeloom.models.network_kinds import kind_of  # torch, so only here
     from spikeloom.models.training.train import train
 
     kind, steps = kind_of(plan.system), joined_bins(training, plan.bins)
