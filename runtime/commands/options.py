@@ -12,15 +12,23 @@ R = TypeVar("R", bound=Request)
 KINDS = {"int": int, "float": float}
 
 
+GROUPS = ("options", "network", "storage", "layout", "recordings", "depth and prices", "counters", "hardware", "output")
+"""Headings in the order of the help."""
+
+SUBJECTS = ("checkpoint", "data")
+"""What a question is about, which stands first under its heading."""
+
+
 def add_options(
-    parser: argparse.ArgumentParser, kind: type[Request], choices: Mapping[str, Sequence[str]] | None = None
+    parser: argparse.ArgumentParser, kind: type[Request], choices: Mapping[str, Mapping[str, str]] | None = None
 ) -> None:
-    """Add the options of a request; `choices` are those of fields that know them only now."""
-    for each in kind.options():
+    """Add the options of a request; `choices`, with what each means, are of fields that know them only now."""
+    options = sorted(kind.options(), key=lambda each: each.name not in SUBJECTS)
+    for each in sorted(options, key=lambda each: GROUPS.index(each.metadata["group"])):
         _add_option(parser, each, (choices or {}).get(each.name))
 
 
-def _add_option(parser: argparse.ArgumentParser, each: Field[Any], choices: Sequence[str] | None) -> None:
+def _add_option(parser: argparse.ArgumentParser, each: Field[Any], meanings: Mapping[str, str] | None) -> None:
     about = each.metadata
     options = group(parser, about["group"])
     if about["constants"]:
@@ -29,14 +37,17 @@ def _add_option(parser: argparse.ArgumentParser, each: Field[Any], choices: Sequ
             axis.add_argument(flag, dest=each.name, action="store_const", const=value, help=text)
         return
     kind = kind_of(each)
+    choices = about["choices"] if meanings is None else tuple(meanings)
     said: dict[str, Any] = {"help": _help(each)}
+    if meanings is not None:
+        said["help"] = "; ".join(f"{name}: {meaning}" for name, meaning in meanings.items())
     if not about["positional"]:
         said |= {"dest": each.name, "default": each.default if has_default(each) else None}
         said |= {} if has_default(each) else {"required": True}
     if kind == "bool":
         said["action"] = "store_true"
     else:
-        said |= {"metavar": about["metavar"], "choices": choices or about["choices"], "type": KINDS.get(kind, str)}
+        said |= {"metavar": about["metavar"], "choices": choices, "type": KINDS.get(kind, str)}
     if about["bare"] is not None:
         said |= {"nargs": "?", "const": about["bare"]}
     if kind == "tuple":
@@ -48,7 +59,7 @@ def _add_option(parser: argparse.ArgumentParser, each: Field[Any], choices: Sequ
 def _help(each: Field[Any]) -> str:
     """What a field says of itself, and its default where that is a value."""
     text = str(each.metadata["text"])
-    if has_default(each) and each.default not in (None, False, ()):
+    if has_default(each) and not any(each.default is nothing for nothing in (None, False, ())):
         text += f" (default: {str(each.default).replace('%', '%%')})"
     return text
 

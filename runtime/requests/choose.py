@@ -52,7 +52,7 @@ class ChartRequest(CheckpointChoice, DataChoice):
     )
     table: str | None = option("energy table to choose and draw by (default: the first)", metavar="NAME")
     jobs: int | None = option("processes at a time (default: one a core)", metavar="N")
-    output: str = option("what to write", required=True, metavar="FOLDER", flags=("-o", "--output"))
+    output: str = option("folder of the chart", required=True, metavar="FOLDER", flags=("-o", "--output"))
 
 
 @dataclass(frozen=True, kw_only=True)

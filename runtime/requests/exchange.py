@@ -28,7 +28,7 @@ class ExportRequest(Request):
     split: str | None = option("ranc: split to read (default: test)")
     recording: int | None = option("ranc: which of them (default: 0)", metavar="N")
     dt: float | None = option("nir: length of a step (default: 0.02 a bin)", metavar="SECONDS")
-    output: str = option("what to write", required=True, metavar="FILE", flags=("-o", "--output"))
+    output: str = option("file to write", required=True, metavar="FILE", flags=("-o", "--output"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class WatchRequest(NetlistChoice):
 
     json: bool = field(default=False)  # Whether each decision is printed as JSON
 
-    input: str = option("event lines", default="-", metavar="FILE")
+    input: str = option("event lines; - is standard input", default="-", metavar="FILE")
     bin: str | None = option("bin of the recordings (default: the network's, else 0.02)", metavar="SECONDS")
     bins: int | None = option(
         "steps of every grasp: shorter ones are filled up, longer ones cut; counters know theirs, read-out included",

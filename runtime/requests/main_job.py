@@ -148,5 +148,5 @@ class ReportRequest(ComparisonChoice, RecordingsChoice):
         "recording to draw, by name or from 0 (default: the first decided differently)", metavar="NAME|N"
     )
     stress: str | None = option("show what stress -o wrote about this netlist", metavar="STRESS.json")
-    output: str = option("what to write", required=True, metavar="OUT.html", flags=("-o", "--output"))
+    output: str = option("page to write", required=True, metavar="OUT.html", flags=("-o", "--output"))
     spec_samples: int = option("recordings for spec = engine", default=3, metavar="N")

@@ -19,6 +19,8 @@ from spikeloom.runtime.requests.fields import Request, option
 if TYPE_CHECKING:
     from spikeloom.compiler.ir import Network
 
+EPOCHS = ", ".join(f"{recipe.epochs} ({name})" for name, recipe in RECIPES.items())
+
 ALL_SYSTEMS = (*SYSTEMS, NATIVE, COUNTING)
 
 
@@ -65,11 +67,11 @@ class TrainRequest(SensorChoice, DataChoice):
     batch: int | None = option("recordings to a step of the optimizer", metavar="N")
     spike_penalty: float | None = option("loss of a spike on every synapse in every step: fewer spikes", metavar="X")
     robust: float | None = option("chance of an event, and of a taxel, to be lost while training: 0.1", metavar="X")
-    epochs: int | None = option("passes over the training recordings (default: the recipe's)", metavar="N")
+    epochs: int | None = option(f"passes over the training recordings (default: {EPOCHS})", metavar="N")
     decay_epochs: int | None = option(
         "the learning rate falls to a tenth every N epochs, after epoch N + 1 first (default: 40)", metavar="N"
     )
-    seed: int = option("of weights and order", default=0, metavar="N")
+    seed: int = option("of initial weights and the order of recordings", default=0, metavar="N")
     seeds: int = option("train N seeds side by side", default=1, metavar="N")
     resume: bool = option("go on with an interrupted training of the same options", default=False)
     keep: tuple[str, ...] = option(
@@ -78,7 +80,7 @@ class TrainRequest(SensorChoice, DataChoice):
         choices=WEIGHTS,
     )
     picture: str | None = option("draw learning curves", metavar="OUT.png|svg|pdf")
-    output: str = option("what to write", required=True, metavar="OUT.pt", flags=("-o", "--output"))
+    output: str = option("checkpoint to write", required=True, metavar="OUT.pt", flags=("-o", "--output"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,4 +112,4 @@ class JoinRequest(Request):
 
     checkpoints: tuple[str, ...] = option("networks of one system, graph and timing", positional=True, metavar="CKPT")
     weights: str | None = option("epoch to take from each (default: the first of these that it holds)", choices=WEIGHTS)
-    output: str = option("what to write", required=True, metavar="OUT.pt", flags=("-o", "--output"))
+    output: str = option("checkpoint to write", required=True, metavar="OUT.pt", flags=("-o", "--output"))

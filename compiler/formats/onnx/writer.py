@@ -48,8 +48,6 @@ from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, Reach, netlist_bytes, reach
 from spikeloom.compiler.types import IntArray
 
-FORMS = ("step", "scan")
-
 SIZE_LIMIT = 2**31 - 2**20
 """Bytes of weights that a file of this format can hold, a little below protobuf's 2 GiB."""
 

@@ -16,9 +16,6 @@ Accuracies are means over the seeds with a 95 % interval; a level leaves where t
 clean accuracy.
 """
 
-SEEDS = 5
-"""Draws of each random perturbation."""
-
 
 REQUEST = StressRequest
 

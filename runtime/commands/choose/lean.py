@@ -26,8 +26,6 @@ operations, energy and time. What -o writes is what takes least energy on the tr
 taxels or without hops.
 """
 
-DIFFER = 0.01
-
 
 REQUEST = LeanRequest
 

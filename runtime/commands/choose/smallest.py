@@ -43,8 +43,6 @@ SENSOR = ("graph", "taxels", "edges", "directed")
 GRAPH = "manual"
 """Of the built-in sensor, unless another is named."""
 
-LEVELS = "so many classes in a row are levels of one thing, for counting networks (default: 1)"
-
 NOTES = """\
 Candidates are counting networks of many sizes and a few that are trained by gradients. They are cross-validated inside
 the training split, in three rungs: what a cheaper one beats is dropped early. Taken is the cheapest whose accuracy is

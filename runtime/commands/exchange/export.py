@@ -27,7 +27,7 @@ OF_RECORDINGS = ("split", "bin", "recording")
 
 REQUEST = ExportRequest
 
-OPTIONS = {"to": tuple(FORMATS)}
+OPTIONS = {"to": {name: each.title for name, each in FORMATS.items()}}
 """Choices that only the chips know."""
 
 

@@ -16,9 +16,6 @@ from spikeloom.runtime.requests.main_job import EstimateRequest
 from spikeloom.runtime.studies import processor
 from spikeloom.runtime.studies.processor import Comparison
 
-AGAINST = "train a linear rule for a small processor on the same recordings, and hold its costs beside these"
-
-
 REQUEST = EstimateRequest
 
 
