@@ -108,10 +108,11 @@ class Session:
         for file in sources.resolve().iterdir():
             (folder / file.name).symlink_to(file)
 
-    def run(self, words: str, output: str = "") -> Json:
-        """What a command says in JSON, or writes."""
-        self.commands.append(f"spikeloom {words}")
-        run = [sys.executable, "-m", "spikeloom", *words.split(), "--json"]
+    def run(self, words: str, output: str = "", program: str = "") -> Json:
+        """What a command, or a `program` of this folder, says in JSON, or writes."""
+        self.commands.append(f"python benchmarks/{program} {words}" if program else f"spikeloom {words}")
+        file = [str(Path(__file__).with_name(program))] if program else ["-m", "spikeloom"]
+        run = [sys.executable, *file, *words.split(), "--json"]
         done = subprocess.run(run, cwd=self.folder, stdout=subprocess.PIPE, text=True, check=False)
         if done.returncode not in (0, 1):
             raise SystemExit(f"spikeloom {words}: exit code {done.returncode}")
@@ -314,7 +315,8 @@ def hardware(session: Session, kind: str) -> Json:
             session.run(f"train --data {data} --system counters --weight-bits 5 -o net.pt")
         session.run(f"compile {network} --target truenorth -o net.loom")
         work = f"work/{name if kind == 'counters' else kind}"
-        result = session.run(f"cosimulate net.loom --data {data} --rtl RANC --limit {IN_HARDWARE[kind]} --work {work}")
+        words = f"net.loom {data} --rtl RANC --limit {IN_HARDWARE[kind]} --work {work}"
+        result = session.run(words, program="cosimulate.py")
         found[name] = result | {"recordings": len(result["recordings"])}
     return found
 

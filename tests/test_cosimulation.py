@@ -2,13 +2,15 @@
 where ``SPIKELOOM_RANC`` names a clone of its repository.
 """
 
+import json
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import as_json, refusal, run
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from made_files import recordings_folder
@@ -22,6 +24,7 @@ from spikeloom.compiler.targets.truenorth.netlist import RESET_NONE, write_cross
 from spikeloom.runtime.machines.truenorth import cosimulation
 from spikeloom.runtime.machines.truenorth.machine import TrueNorth
 
+SCRIPT = Path(__file__).parent.parent / "benchmarks" / "cosimulate.py"
 OURS = Path(__file__).with_name("rtl")
 STEPS = 6
 
@@ -70,9 +73,14 @@ def wrong(found) -> int:
     return sum(count for name, count in found.items() if name.endswith(("different", "lost", "error_cycles")))
 
 
-def test_the_command(place, rtl):
-    words = ["cosimulate", place / "net.loom", "--data", place / "data", "--rtl", rtl, "--simulator", "iverilog"]
-    found = as_json(*words, "--work", place / "work")
+def cosimulated(*words):
+    command = [sys.executable, SCRIPT, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_the_script(place, rtl):
+    words = [place / "net.loom", place / "data", "--rtl", rtl, "--simulator", "iverilog", "--work", place / "work"]
+    found = json.loads(cosimulated(*words, "--json").stdout)
     assert wrong(found) == 0
     assert found["spikes"] > 10
     assert found["membranes"] == 2 * 4 * (STEPS + 17)
@@ -81,9 +89,9 @@ def test_the_command(place, rtl):
     # finished recordings are read, not run again
     kept = next((place / "work").glob("*.json"))
     kept.write_text(kept.read_text("utf-8").replace('"packets_lost": 0', '"packets_lost": 3'), "utf-8")
-    code, out, _ = run(*words, "--work", place / "work")
-    assert code == 1
-    assert "lost in cores: 3" in out
+    again = cosimulated(*words)
+    assert again.returncode == 1
+    assert "lost in cores: 3" in again.stdout
 
 
 @pytest.mark.parametrize(
@@ -98,19 +106,28 @@ def test_the_command(place, rtl):
 )
 def test_what_hardware_does_wrong_is_counted(place, right, wrong, what):
     defective(place, right, wrong)
-    words = ["cosimulate", place / "net.loom", "--data", place / "data", "--rtl", place, "--simulator", "iverilog"]
-    found = as_json(*words, codes=(1,))
+    words = [place / "net.loom", place / "data", "--rtl", place, "--simulator", "iverilog", "--json"]
+    done = cosimulated(*words)
+    assert done.returncode == 1
+    found = json.loads(done.stdout)
     assert found[what] == sum(each[what] for each in found["recordings"].values()) > 0
 
 
 def test_mistakes_in_one_line(place, monkeypatch):
-    words = ["cosimulate", place / "net.loom", "--data", place / "data", "--rtl", place]
+    words = [place / "net.loom", place / "data", "--rtl", place]
+
+    def refusal(*words):
+        done = cosimulated(*words)
+        assert done.returncode == 1
+        assert "Traceback" not in done.stderr
+        return done.stderr
+
     assert "no Core.v in it; give a clone of github.com/UA-RCL/RANC" in refusal(*words)
     defective(place, "scheduler_wen = here.size() > 0", "scheduler_wen = 0")
     assert "tick 0 does not end" in refusal(*words, "--simulator", "iverilog")
     defective(place, "module Core", "module Score")
     assert "iverilog fails" in refusal(*words, "--simulator", "iverilog")
-    assert "net.loom: File exists" in refusal(*words, "--work", place / "net.loom")
+    assert "File exists" in refusal(*words, "--work", place / "net.loom")
     monkeypatch.setenv("PATH", str(place))
     assert "verilator or iverilog: not found" in refusal(*words)
     write_netlist(lively(), place / "net.loom")

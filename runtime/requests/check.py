@@ -55,21 +55,6 @@ class CertifyRequest(NetlistChoice, RecordingsChoice):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CosimulateRequest(NetlistChoice, RecordingsChoice):
-    """Run a netlist in a hardware description that others wrote, and compare every spike and membrane."""
-
-    rtl: str = option(
-        "a clone of github.com/UA-RCL/RANC (TrueNorth)", required=True, metavar="FOLDER", group="hardware"
-    )
-    simulator: str | None = option(
-        "default: verilator, if it is there", choices=("verilator", "iverilog"), group="hardware"
-    )
-    work: str | None = option(
-        "keep what is built and finished, and go on from it (a minute a recording)", metavar="FOLDER", group="hardware"
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
 class YardsticksRequest(CheckpointChoice, RecordingsChoice):
     """NeuroBench's metrics of a checkpoint, and arithmetic energy on a processor."""
 

@@ -221,7 +221,7 @@ def cosimulate(
         done = folder / f"{key[:16]}.json"
         if not done.is_file():
             write_json(str(done), built.run(events))
-        found[name] = read_json(Compared, done, "--work", "spikeloom cosimulate")
+        found[name] = read_json(Compared, done, "--work", "benchmarks/cosimulate.py")
     total = sum(found.values(), Compared())
     result = Cosimulation(
         simulator=program,
