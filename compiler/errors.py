@@ -12,7 +12,7 @@ from typing import Any
 
 
 class SpikeloomError(Exception):
-    """Base of everything that a user can cause and mend."""
+    """Base of everything that a user can cause and fix."""
 
 
 class ModelError(SpikeloomError):

@@ -366,7 +366,7 @@ def test_a_table_above_the_splits(write):
 @pytest.mark.parametrize(
     ("rows", "line"),
     [
-        ("b_label_2.csv,3\n", "own: b_label_2.csv: label 2, and 3 in labels.csv; mend one of them"),
+        ("b_label_2.csv,3\n", "own: b_label_2.csv: label 2, and 3 in labels.csv; fix one of them"),
         ("a.csv,x\n", "own: labels.csv: row 2: 'a.csv', label 'x'; give a file and a number from 0"),
         ("a.csv,1\na.csv,2\n", "own: labels.csv: row 3: a.csv has labels 1 and 2; keep one"),
     ],

@@ -155,7 +155,7 @@ REFUSED = {
     "module: has no LIF layer, so nothing spikes": lambda: nn.Linear(4, 2),
     "module 1: is called 2 times in a step": twice,
     "module: its output is no count of the spikes": lambda: nn.Sequential(nn.Linear(4, 3), LIF(), nn.Linear(3, 2)),
-    "layer lif_c: receives the input and lif_a and lif_b, which lie differently deep": lambda: TwoWays(skip=True),
+    "layer lif_c: receives the input and lif_a and lif_b, which are at different depths": lambda: TwoWays(skip=True),
     "layer 1: keeps 1.5 of its membrane in a step": lambda: nn.Sequential(nn.Linear(4, 2), LIF(beta=1.5)),
     "layer 1: has the threshold 0, allowed are numbers above 0": lambda: nn.Sequential(nn.Linear(4, 2), LIF(theta=0)),
 }

@@ -113,7 +113,7 @@ GRAPHS = [
     ("has no spiking neurons", lambda: chain(affine(RNG, 5, 4))),
     ("filters a current that is filtered", lambda: chain(affine(RNG, 5, 4), leaky(5, 0.1), leaky(5, 0.2), lif(5))),
     (
-        "the input and b, which lie differently deep",
+        "the input and b, which are at different depths",
         lambda: graph_with(SKIP, [("a", "b"), ("b", "c"), ("c", "e"), ("input", "d"), ("d", "e")], (4,), (3,)),
     ),
 ]

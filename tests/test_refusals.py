@@ -255,7 +255,7 @@ TABLE = [
             "certify net.loom --data data",
         )
     ),
-    ("certify net.loom --data data -o x.svg --picture x.svg", "--picture x.svg: is what -o names, too"),
+    ("certify net.loom --data data -o x.svg --picture x.svg", "--picture x.svg: is also the -o file"),
     *(
         (f"{command} x.txt", f"{command.split()[-1]} x.txt: has to end in {kind}; give another name")
         for command, kind in (

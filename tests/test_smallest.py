@@ -105,7 +105,7 @@ def test_decisions_that_no_event_alters_are_a_budget():
     for share, chosen, fits in ((85, 3, True), (95, 1, True), (97, 1, False)):
         found = study.choose(pool, budgets(f"certified={share}"))
         assert (found.cheapest["one"], found.fits) == (chosen, fits)
-    assert study.going_on(pool, 1, budgets("certified=99")) == study.going_on(pool, 1)  # it is known on the last rung
+    assert study.promote(pool, 1, budgets("certified=99")) == study.promote(pool, 1)  # it is known on the last rung
 
 
 def test_budgets_that_are_none():
@@ -120,13 +120,13 @@ def test_budgets_that_are_none():
 
 
 def test_who_goes_on():
-    assert [each.number for each in study.going_on(POOL[:4], 1)] == [1, 2, 3, 4]
+    assert [each.number for each in study.promote(POOL[:4], 1)] == [1, 2, 3, 4]
     dominated = tried(6, 20, 20 * UJ)
-    assert study.going_on([dominated, *POOL], 1)[-1] == dominated
-    assert study.going_on([replace(dominated, costs=None)], 2) == []
-    assert len(study.going_on([dominated] * 30, 2)) == study.KEPT[2]
+    assert study.promote([dominated, *POOL], 1)[-1] == dominated
+    assert study.promote([replace(dominated, costs=None)], 2) == []
+    assert len(study.promote([dominated] * 30, 2)) == study.KEPT[2]
     for words, on in (("energy=8.5uJ", [2, 4]), ("cores=1", [2, 3, 4]), ("energy=1nJ", [1, 2, 3, 4])):
-        assert sorted(each.number for each in study.going_on(POOL[:4], 1, budgets(words))) == on
+        assert sorted(each.number for each in study.promote(POOL[:4], 1, budgets(words))) == on
 
 
 @pytest.mark.parametrize(

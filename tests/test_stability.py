@@ -31,7 +31,7 @@ from spikeloom.runtime.studies.stability.counting import least, tally_of
 from spikeloom.runtime.studies.stability.neighbours import KINDS, cells_of, channels_of
 from spikeloom.runtime.studies.stability.results import Stability
 from spikeloom.runtime.studies.stability.sections import hanging_on
-from spikeloom.runtime.studies.stability.study import bearing, stability
+from spikeloom.runtime.studies.stability.study import share_robust_to_one_event, stability
 
 REPEATABLE = settings(max_examples=40, derandomize=True)
 
@@ -209,7 +209,10 @@ def test_counters_bear_exactly_so_many_events(plan):
             assert found.at_most == (broken if broken < 3 else None)
             exact.add(broken)
     assert {1, 2} <= exact
-    assert bearing(machine, data.part(slice(5))) == stability(machine, data.part(slice(5)), jobs=1).certified(1) / 5
+    assert (
+        share_robust_to_one_event(machine, data.part(slice(5)))
+        == stability(machine, data.part(slice(5)), jobs=1).certified(1) / 5
+    )
 
 
 @pytest.mark.parametrize(("bins", "clocks"), [(1, Clocks()), (3, Clocks(length=12))])

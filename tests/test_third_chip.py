@@ -182,7 +182,7 @@ class Machinery(Machine):
 
         return Model(first=dict.fromkeys(again.layers, 0), spikes=spikes)
 
-    def twice(self, channels):
+    def spec_and_engine(self, channels):
         return specification(self.netlist, channels), simulate(self.netlist, channels[None])
 
     def priced(self, channels, lengths, chip, bin_s, detail, progress):
@@ -282,7 +282,7 @@ def test_what_is_wrong_is_found(made, monkeypatch):
     assert code == 1
     assert "missed: EN: NOT what this network is lowered to: another threshold" in out
     assert "missed: E1" not in out, "nobody required it"
-    monkeypatch.setattr(Machinery, "twice", wrongly)
+    monkeypatch.setattr(Machinery, "spec_and_engine", wrongly)
     assert "missed: E0" in run("verify", *words)[1]
 
 

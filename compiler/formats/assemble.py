@@ -123,6 +123,6 @@ def _require_reach(network: Network) -> None:
         if len({depth[source] for source in sources}) > 1:
             received = " and ".join("the input" if source == INPUT else names[source] for source in sources)
             raise ModelError(
-                f"layer {name}: receives {received}, which lie differently deep; a spike takes one step on the chip "
-                "and would arrive too early, so put a spiking layer into the shorter way"
+                f"layer {name}: receives {received}, which are at different depths; a spike takes one step on the chip "
+                "and would arrive too early, so add a spiking layer to the shorter path"
             )

@@ -18,7 +18,7 @@ from spikeloom.compiler.errors import OptionError, Violation
 from spikeloom.compiler.files import FileFault, read_whole, reading
 from spikeloom.compiler.types import JsonObject
 
-MEND = "mend it"
+REMEDY = "fix it"
 
 COMPARTMENTS, CROSSBARS = "compartments", "crossbars"
 """What cores are made of: lists of weighted synapses onto compartments (Loihi), or a binary crossbar (TrueNorth)."""
@@ -121,7 +121,7 @@ class Target:
 
 def read_target(path: str | os.PathLike[str]) -> Target:
     """Read a target file; OptionError if it cannot be read or an entry is wrong."""
-    with reading(path, OptionError, MEND):
+    with reading(path, OptionError, REMEDY):
         raw = tomllib.loads(read_whole(Path(path), "target file").decode())
         if missing := {"name", "title", "limits", "energy"} - raw.keys():
             raise FileFault(f"{', '.join(sorted(missing))}: missing")
@@ -151,7 +151,7 @@ def with_tables(target: Target, name: str) -> Target:
         if not name.endswith(".toml"):
             names = sorted({table.name for table in target.energy} | {table.name for table in target.time})
             raise OptionError(f"--table {name}: unknown; allowed: {', '.join(names)}, or a file that ends in .toml")
-        with reading(name, OptionError, MEND):
+        with reading(name, OptionError, REMEDY):
             raw = tomllib.loads(read_whole(Path(name), "file of tables").decode())
             if not raw or raw.keys() - {"energy", "time"}:
                 raise FileFault(f"holds {', '.join(raw) or 'nothing'}, wanted is [energy.NAME] or [time.NAME] alone")

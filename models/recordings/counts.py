@@ -1,4 +1,4 @@
-"""What was odd about recordings while their events were put into bins: counted, said on stderr, kept as JSON."""
+"""Anomalies that were found while events were put into bins: counted, said on stderr, kept as JSON."""
 
 import sys
 from dataclasses import dataclass, field

@@ -62,9 +62,9 @@ def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, wher
     if wrong.any():
         row = int(np.argmax(wrong))
         from_one = taxel.min() == 1 and taxel.max() == taxels  # false for NaN
-        mend = "they seem to count from 1" if from_one else "use recordings of this sensor"
+        remedy = "they seem to count from 1" if from_one else "use recordings of this sensor"
         plain = f"{at(row)}: taxel {taxel[row]:g}, allowed are whole numbers 0..{most - 1}; count from 0"
-        raise DataError(f"{plain}, {mend}" if from_one else f"{plain} and {mend}")
+        raise DataError(f"{plain}, {remedy}" if from_one else f"{plain} and {remedy}")
     return EventStream(
         name=path.name,
         time_s=time_s,
@@ -105,7 +105,7 @@ def _label(where: str, name: str, column: FloatArray | None) -> int:
             "write one file for each recording"
         )
     if named not in (UNLABELLED, first):
-        raise DataError(f"{where}: label {first:g} in the file and {named} in its name; mend one of them")
+        raise DataError(f"{where}: label {first:g} in the file and {named} in its name; fix one of them")
     return int(first)
 
 

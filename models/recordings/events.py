@@ -1,6 +1,6 @@
 """Recordings in any form that we read: the released layout, files of events, single recordings, or a name.
 
-Events are put into time bins of one width. Nothing is mended in silence: what came out of order, what fell on an
+Events are put into time bins of one width. Nothing is corrected silently: what came out of order, what fell on an
 event of the same taxel, polarity and bin, and long silences are counted. Each recording counts for its own length.
 """
 
@@ -181,10 +181,10 @@ def bin_events(
     # A sensor that is touched sends several events a second: fewer than one, for a minute, are in a smaller unit.
     odd = last > UNIT_SPAN_S and len(np.unique(stream.time_s)) < last - stream.time_s.min()
     if last / bin_s >= MAX_STEPS:
-        mend = "write seconds" if odd else "count from the start of the recording or use wider bins"
+        remedy = "write seconds" if odd else "count from the start of the recording or use wider bins"
         raise DataError(
             f"{stream.at(latest)}: time {last:g} s is past {MAX_STEPS} bins of {bin_s:g} s, the limit of a recording; "
-            f"{mend}"
+            f"{remedy}"
         )
     step = np.floor(stream.time_s / bin_s + _EDGE).astype(np.int64)
     steps = int(step.max()) + 1
@@ -313,5 +313,5 @@ def _read(
         grid, counts = bin_events(stream, bin_s, taxels=taxels)
         label = stream.label
     if listed is not None and label not in (evtouch.UNLABELLED, listed):
-        raise DataError(f"{where}: label {label}, and {listed} in {LABELS}; mend one of them")
+        raise DataError(f"{where}: label {label}, and {listed} in {LABELS}; fix one of them")
     return _Recording(where, grid, label if listed is None else listed, counts)

@@ -59,7 +59,7 @@ class Recordings:
     # (samples,) int64, or None; steps of each recording; read-only. None where all have as many as the array, as in the
     # released layout.
     lengths: IntArray | None = None
-    counts: EventCounts | None = None  # What was odd about their events; None where they had bins already
+    counts: EventCounts | None = None  # Anomalies of their events; None where they had bins already
     bin_s: float | None = None  # Seconds of a bin, where somebody said so; of those before any were joined
 
     def __post_init__(self) -> None:

@@ -43,7 +43,7 @@ MOST = 64
 """Thresholds at most."""
 
 THING = 3
-"""How much more a thing weighs than a boundary between its levels."""
+"""Gain of the rules for objects over those for boundaries between their levels."""
 
 NEWTON_STEPS, LEAST_STEP = 100, 1e-6
 """Steps at most, of which a class takes three to ten, and the least part of one that is tried."""

@@ -1,4 +1,4 @@
-"""By how much a network misses, a few recordings at a time."""
+"""Loss and accuracy of a network, in small batches."""
 
 import math
 from collections.abc import Iterator

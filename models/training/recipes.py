@@ -17,7 +17,7 @@ from spikeloom.models.systems import HOPS
 from spikeloom.models.training.robust import require_chance
 
 DECAY_EPOCHS = 40
-"""There the learning rate falls to a tenth after so many epochs; the first of each such block still has the old one."""
+"""Epochs after which the learning rate is multiplied by 0.1; it takes effect one epoch late."""
 
 HIDDEN = (128, 256)
 """Dense layers of the released networks."""

@@ -97,7 +97,7 @@ def require_picture(request: Pictured, outputs: Iterable[str | Path | None]) -> 
         return
     require_place(path, "--picture", cast(Request, request), PICTURES)
     if Path(path).absolute() in [Path(output).absolute() for output in outputs if output is not None]:
-        raise OptionError(f"--picture {path}: is what -o names, too; give another name")
+        raise OptionError(f"--picture {path}: is also the -o file; give another name")
 
 
 def write_picture(path: str | None, draw: Callable[[], Drawing]) -> None:

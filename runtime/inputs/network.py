@@ -93,8 +93,8 @@ class LoadedNetwork:
 def load_network(path: str | Network, request: NetworkChoice, netlist: Netlist | None = None) -> LoadedNetwork:
     """Read what a command is given; beside a `netlist` as that was, where the options say nothing.
 
-    That are the epoch and the graph of a checkpoint that does not say which, the time step of a NIR file, and the names
-    of the layers of a network.
+    These are the epoch and the graph of a checkpoint that does not say which, the time step of a NIR file, and the
+    names of the layers of a network.
 
     Raises OptionError or ModelError if it is not there, not as the options say, or an option is for the other kind of
     file.

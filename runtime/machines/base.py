@@ -254,7 +254,7 @@ class Machine(ABC):
         """Trace of recordings (samples, channels, steps), clocks among the channels; the rest is as for :meth:`run`."""
 
     @abstractmethod
-    def twice(self, channels: EventArray) -> tuple[Any, Any]:
+    def spec_and_engine(self, channels: EventArray) -> tuple[Any, Any]:
         """All that the specification keeps of one recording (channels, steps), and a batch of it by the simulator."""
 
     @abstractmethod
@@ -326,7 +326,7 @@ class Machine(ABC):
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Spikes, membranes and counts in which simulator and specification differ; events and lengths as for `run`."""
         channels = with_clocks(events, self.netlist.clocks)
-        return sum(differences(*self.twice(sample)) for sample in one_by_one(channels, lengths))
+        return sum(differences(*self.spec_and_engine(sample)) for sample in one_by_one(channels, lengths))
 
     def beside(self, engine: str) -> Callable[[EventArray, IntArray | None], int] | None:
         """Make one of ``ENGINES`` ready to run recordings of some lengths; None for our own.

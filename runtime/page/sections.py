@@ -56,7 +56,7 @@ def sections(report: Report) -> list[Section]:
         Section("Taxels", _taxels(report.taxels)),
         Section("One recording", [] if report.recording is None else _recording(report.recording)),
         Section("Energy and time", [*_of_chip(report.price.outcome), Section("", report.figures)]),
-        Section("Stability", [] if report.stress is None else stability(report.stress)),
+        Section("Stress", [] if report.stress is None else stability(report.stress)),
         Section("Provenance", _provenance(report.provenance)),
         Section("Words", [Table(["word", "meaning"], list(map(list, WORDS.items())), words=True, most=0)]),
     ]

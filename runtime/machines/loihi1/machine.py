@@ -110,7 +110,7 @@ class Loihi(Threaded, Stoppable):
             found.args = (f"{self.file}: {found}",)
             raise
 
-    def twice(self, channels: EventArray) -> tuple[Trace, Trace]:
+    def spec_and_engine(self, channels: EventArray) -> tuple[Trace, Trace]:
         """Every spike, membrane, update and count."""
         from spikeloom.runtime.machines.loihi1 import spec
 
@@ -124,7 +124,7 @@ class Loihi(Threaded, Stoppable):
             pause = np.zeros((self.netlist.n_inputs, self.netlist.blank), events.dtype)
             each = one_by_one(with_clocks(events, self.netlist.clocks), lengths)
             row = np.concatenate([part for channels in each for part in (channels, pause)], axis=1)
-            different += differences(*self.twice(row))
+            different += differences(*self.spec_and_engine(row))
         return different
 
     @property

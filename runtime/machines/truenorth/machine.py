@@ -82,7 +82,7 @@ class TrueNorth(Machine):
         """Spikes and membranes by tick."""
         return engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
 
-    def twice(self, channels: EventArray) -> tuple[Trace, Trace]:
+    def spec_and_engine(self, channels: EventArray) -> tuple[Trace, Trace]:
         """Every spike, membrane, vote and spike on an axon."""
         fast = engine.simulate(self._engine, channels[None], spikes=True, membranes=True)
         return spec.simulate(self.netlist, channels), fast

@@ -70,7 +70,7 @@ def smallest(
     """
     certify = any(budget.what == "certified" for budget in budgets)
     trial = partial(work.trial, data=data, sensor=sensor, target=target.name, certify=certify)
-    on = partial(going_on, budgets=budgets)
+    on = partial(promote, budgets=budgets)
     beside = search(baselines(), most_accurate, trial, store, jobs=jobs)
     tried = search(candidates, on, trial, store, jobs=jobs)
     taken = choose(tried, budgets)
@@ -96,13 +96,13 @@ def smallest(
 
 def search(
     candidates: Iterable[Candidate],
-    going_on: Callable[[Sequence[Tried], int], Sequence[Tried]],
+    promote: Callable[[Sequence[Tried], int], Sequence[Tried]],
     trial: Callable[[Candidate, int, float | None], work.Trial],
     store: Path,
     *,
     jobs: int | None,
 ) -> list[Tried]:
-    """All candidates, as far as each came; `going_on` chooses those that go on from a rung."""
+    """All candidates, as far as each came; `promote` chooses those that go on from a rung."""
     known: dict[str, Tried] = {}
     # By name, with the setting that the rung before has chosen
     alive: dict[str, tuple[Candidate, float | None]] = {each.name: (each, None) for each in candidates}
@@ -113,7 +113,7 @@ def search(
             number = known[job.label].number if job.label in known else len(known) + 1
             known[job.label] = _tried(number, job, found[job.key])
         if rung < RUNGS:
-            on = going_on([known[name] for name in alive], rung)
+            on = promote([known[name] for name in alive], rung)
             alive = {each.candidate.name: (each.candidate, each.setting) for each in on}
             for each in on[: VARIED[rung]]:
                 alive |= {other.name: (other, each.setting) for other in variants(each.candidate, rung)}
@@ -167,7 +167,7 @@ def gap(best: Measured, other: Measured) -> tuple[float, float]:
     return float(ahead.mean()), float(error)
 
 
-def going_on(tried: Iterable[Tried], rung: int, budgets: Sequence[Budget] = ()) -> list[Tried]:
+def promote(tried: Iterable[Tried], rung: int, budgets: Sequence[Budget] = ()) -> list[Tried]:
     """Those that may still be chosen: least behind a cheaper one, or, which weighs less, behind the best.
 
     Where budgets are nearly met by any, those alone go on.

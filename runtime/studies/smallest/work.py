@@ -42,7 +42,7 @@ from spikeloom.runtime.studies.smallest import baselines
 from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF
 from spikeloom.runtime.studies.smallest.space import Candidate
 from spikeloom.runtime.studies.smallest.trained import Sensor, plan_of, without
-from spikeloom.runtime.studies.stability.study import bearing
+from spikeloom.runtime.studies.stability.study import share_robust_to_one_event
 
 FORMAT = 3
 """Of what is measured; goes up when a figure means something else."""
@@ -137,7 +137,7 @@ def _counting(work: Trial, training: Recordings) -> Measured:
     try:
         made, netlist = compiled(data)
         if work.certify:
-            certified = bearing(machine_of(compiled(data.part(~held))[1]), some(training.part(held)))
+            certified = share_robust_to_one_event(machine_of(compiled(data.part(~held))[1]), some(training.part(held)))
     except (CapacityError, ModelError, DataError) as error:
         costs = {"refused": str(error).splitlines()[0]}
     else:
@@ -164,7 +164,7 @@ def _network(work: Trial, training: Recordings) -> Measured:
             break
         costs = costs or costs_of(netlist, some(steps))
         if work.certify and not part:
-            certified = bearing(machine_of(netlist), some(training.part(held)))
+            certified = share_robust_to_one_event(machine_of(netlist), some(training.part(held)))
         right[held], tried[held] = decisions_on_chip(netlist, steps.part(held)) == training.labels[held], 1
     decided, rounds = tuple(right.tolist()), tuple(tried.tolist())
     return Measured(right=decided, tried=rounds, setting=epochs, certified=certified, **costs)

@@ -21,8 +21,8 @@ SHOWN = 20
 PANELS = {"dead": "dies", "stuck": "is stuck", "event": "sends one event more or less"}
 
 KEY = (
-    "at least: no change of so many events alters the decision, proven; at most: one of so many does; taxels: on which "
-    "a decision hangs"
+    "at least: no change of so many events alters the decision, proven; at most: smallest change known to alter it; "
+    "taxels: on which a decision hangs"
 )
 
 

@@ -122,7 +122,7 @@ def _singly(machine: Machine, events: Events, most: int, tally: Tally | None) ->
     return channels, votes, cells, counted, effects, (effects.votes + votes).argmax(axis=1)[those]
 
 
-def bearing(machine: Machine, data: Recordings) -> float:
+def share_robust_to_one_event(machine: Machine, data: Recordings) -> float:
     """Share of recordings, in their own bins, whose decision no single event alters."""
     found, tally = 0, tally_of(machine)
     for events, length in zip(data.events, data.step_counts.tolist(), strict=True):

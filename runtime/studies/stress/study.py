@@ -84,7 +84,7 @@ def generator(name: str, seed: int) -> np.random.Generator:
 
 
 def clean(bench: Bench) -> tuple[Outcome, Run]:
-    """Nothing is wrong."""
+    """Run the unperturbed recordings."""
     inputs = whole(bench.events, bench.pair.netlist, bench.lengths)
     outcome = evaluate(bench.pair, inputs)
     return outcome, _run(bench, outcome, None, inputs, outcome)

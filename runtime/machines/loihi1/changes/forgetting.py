@@ -115,7 +115,7 @@ def _forget(
     for start in range(steps - 1, -1, -1):
         n = _unknown(chip, start, length, bounds, listed)
         last = start  # after the last step with an open spike
-        # who knew less, since a later step, has no open spike after it is quiet: nor has this one
+        # a run that starts later has no open spikes here, so this one has none
         for t in range(start, steps if quiet[start + 1] == steps else quiet[start + 1] + 1):
             clear(low)
             clear(high)
