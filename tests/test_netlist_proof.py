@@ -93,6 +93,7 @@ DAMAGES = {
     "bias at its end": (changed("bias_exponent", of_layer(1, FIRST), lambda _: 7), f"{BIASES} that are not"),
     "neurons": (changed("neuron", of_layer(1, PAIR), np.flip), WEIGHTS),
     "votes": (changed("readout_class", of_layer(3, PAIR), np.flip), "fc3 has 2 of 4 neurons that vote for another"),
+    "classes": (lambda netlist: dataclasses.replace(netlist, classes=5), "it has 5 classes, the network 4"),
     "window": (layer_with(depth=1), "conv1 has a window from step 1 instead of 0"),
     "theta": (layer_with(theta=0.6), "conv1 has theta 0.6 instead of 0.5"),
     "limit": (changed("threshold", slice(9), plus(np.arange(9))), "12 used, 8 allowed .loihi1.core.threshold_slots"),

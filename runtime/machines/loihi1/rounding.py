@@ -157,6 +157,8 @@ def check_rounding(netlist: Netlist, integer: IntegerNetwork, target: Target, ne
             faults=tuple(faults),
         )
     whole = [*_broken_limits(netlist, target)]
+    if netlist.classes != network.classes:
+        whole.append(f"it has {netlist.classes} classes, the network {network.classes}")
     if recorded is None and provenance.get("calibrated") and any(layer.faults for layer in layers.values()):
         whole.append("it does not record how it was rounded on recordings: compile it again")
     return NetlistCheck(layers=layers, whole=tuple(whole), claim=_claim(layers))
