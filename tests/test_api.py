@@ -90,6 +90,8 @@ def test_what_does_not_suit_is_refused(data, net):
     refused(OptionError, "data |: ndarray found, allowed: text", net.run, data.test.events)
     refused(OptionError, "limit 'x': str found, allowed: a whole number; give one", lambda: net.run(data, limit="x"))
     refused(OptionError, "engine 'gpu': allowed: spikeloom, onnx; give one", lambda: net.verify(data, engine="gpu"))
+    refused(OptionError, "data None: NoneType found, allowed: text", net.run, None)
+    refused(OptionError, "keep 'first': allowed: last, best, clean", lambda: api.train(data, "x.pt", keep="first"))
     refused(OptionError, "spike_exact 1: int found, allowed: True or False", lambda: api.compile("x.pt", spike_exact=1))
     refused(OptionError, "save none/x.loom: the folder does not exist", net.save, "none/x.loom")
     refused(OptionError, "save x.pt: has to end in .loom", net.save, "x.pt")

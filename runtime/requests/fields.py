@@ -99,7 +99,7 @@ def checked(kind: type[Request], given: Mapping[str, Any]) -> Any:
 
 def _value(each: Field[Any], value: Any) -> Any:
     """What a field holds for a value of Python."""
-    if value is None or (has_default(each) and value is each.default):
+    if has_default(each) and (value is None or value is each.default):
         return value
     kind = kind_of(each)
     taken = _taken(kind, value)
@@ -107,7 +107,7 @@ def _value(each: Field[Any], value: Any) -> Any:
     if taken is None and not hasattr(value, "populations") and not hasattr(value, "events"):
         found = f"{each.name} {reprlib.repr(value)}: {type(value).__name__} found"
         raise OptionError(f"{found}, allowed: {ALLOWED.get(kind, kind)}; give one")
-    if choices and taken not in choices:
+    if choices and not set(taken if kind == "tuple" else [taken]) <= set(choices):
         raise OptionError(f"{each.name} {value!r}: allowed: {', '.join(map(str, choices))}; give one of these")
     return value if taken is None else taken  # networks and recordings stay what they are
 
