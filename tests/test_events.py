@@ -14,7 +14,7 @@ from spikeloom.models.recordings.events import MAX_STEPS, bin_events, data_split
 from spikeloom.models.recordings.evtouch import BIN_S, UNLABELLED, Recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_event_lines, write_released
-from spikeloom.runtime.commands.exchange.data import describe
+from spikeloom.runtime.studies.datasets import describe
 
 HEADER = "time_s,taxel,polarity\n"
 

@@ -18,7 +18,8 @@ from spikeloom.runtime.equivalence.reference import float_network
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.repeat import PLACING, ROUNDING, refuse
 from spikeloom.runtime.machines import backends
-from spikeloom.runtime.machines.base import Backend, Lowered, Machine, Model, Price
+from spikeloom.runtime.machines.backend import Backend, Lowered
+from spikeloom.runtime.machines.base import Machine, Model, Price
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 

@@ -7,7 +7,9 @@ from spikeloom.compiler.archive import TRAINED, stated
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.runtime.inputs.files import require_netlist, shipped
-from spikeloom.runtime.machines.base import Backend, Format, Machine
+from spikeloom.runtime.machines.backend import Backend
+from spikeloom.runtime.machines.base import Machine
+from spikeloom.runtime.machines.exports import Format
 from spikeloom.runtime.machines.loihi1.backend import Loihi1
 from spikeloom.runtime.machines.truenorth.backend import TrueNorth
 from spikeloom.runtime.report.sections import Outcome

@@ -1,10 +1,6 @@
-"""What every chip offers to those who run, price, show and stream netlists.
-
-A chip is a :class:`Backend`; all are listed in :mod:`machines.backends`.
-"""
+"""A netlist on its chip: what those who run, price, show and stream netlists ask of every machine."""
 
 import json
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
@@ -14,17 +10,12 @@ from typing import Any, ClassVar, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.interpret import cut, vote
-from spikeloom.compiler.ir import Network
-from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.base import Target, load_target, with_tables
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
-from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting, by_running
 from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
@@ -32,8 +23,6 @@ from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import Block, Outcome, Section
 from spikeloom.runtime.report.shown import Shown
-from spikeloom.runtime.requests.choices import ComparisonChoice
-from spikeloom.runtime.requests.main_job import CompileRequest, InspectRequest
 
 Done = Callable[[int], object] | None
 """Called with the number of recordings done."""
@@ -365,166 +354,3 @@ class Machine(ABC):
     def stream(self) -> Stream:
         """State of one grasp that runs bin after bin; OptionError if the simulator runs whole recordings only."""
         raise OptionError(f"{self.target.title}: runs whole recordings, not bin after bin; give one for another chip")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Request:
-    """What a format is written from; options that were not given are None.
-
-    source, output: file of the network, and the one to be written.
-    recordings: reads recordings for a netlist, where a format has a use for them.
-    recording: which of them.
-    form: which form of the format.
-    dt: seconds of a step.
-    """
-
-    source: str
-    output: str
-    recordings: Callable[[Any], Recordings] | None = None
-    recording: int | None = None
-    form: str | None = None
-    dt: float | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Facts:
-    """What a file of any format holds."""
-
-    neurons: int
-    synapses: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Export:
-    """Content of a file, facts about it, and lines for people.
-
-    `form` is which of several forms of the format it has.
-    """
-
-    content: Iterable[bytes]
-    facts: Facts
-    form: str | None = None
-    lines: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Format:
-    """A format by its name on the command line.
-
-    name, title: value of ``--to``, and what it is.
-    write: raises OptionError and ModelError where the format cannot hold the network.
-    options: options that it takes beside the network.
-    whole: whether it also holds the neurons that the compiler left out.
-    ending: of its files, where that is not its name.
-    """
-
-    name: str
-    title: str
-    write: Callable[[Request], Export]
-    options: tuple[str, ...] = ()
-    whole: bool = False
-    ending: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Lowered:
-    """A network as a chip holds it.
-
-    netlist: the placed network.
-    model: its whole numbers, run without the chip.
-    write: write the netlist to a file and give its sha256.
-    report: what was chosen, proved and removed, of the netlist in a file with that sha256.
-    """
-
-    netlist: Any
-    model: Model
-    write: Callable[[str], str]
-    report: Callable[[str], Outcome]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reference:
-    """What a netlist is held against.
-
-    source: the network as `compile` was given it.
-    network: the same, written out.
-    loaded: the float network beside the chip, and where it is from; None where there is none.
-    whole: whether the network is whole numbers, so that the chip must have their every spike.
-    difference: how the file is not what the netlist was compiled from.
-    """
-
-    source: Any
-    network: Any
-    loaded: LoadedNetwork | None
-    whole: bool = False
-    difference: str | None = None
-
-    @property
-    def floats(self) -> Factored | Network | None:
-        """The float model that decides and spikes beside the chip."""
-        return None if self.loaded is None else self.loaded.model
-
-
-class Backend(ABC):
-    """What a chip offers; its methods import what is heavy, so that naming a chip loads no simulator."""
-
-    name: ClassVar[str]
-    """Value of ``--target``."""
-
-    @property
-    @abstractmethod
-    def counting_bits(self) -> int:
-        """Widest weights of a counting network."""
-
-    @property
-    def target(self) -> Target:
-        """Its numbers."""
-        return load_target(self.name)
-
-    @property
-    def formats(self) -> tuple[Format, ...]:
-        """Formats of other programs that its netlists can be written in."""
-        return ()
-
-    @property
-    @abstractmethod
-    def passes(self) -> tuple[str, ...]:
-        """Names of the passes that lower a network, in order."""
-
-    @abstractmethod
-    def lower(self, request: CompileRequest, after: Callable[[str, Any], object]) -> Lowered:
-        """Read the network that `compile` was given and lower it; `after` as of :func:`pipeline.run`."""
-
-    @abstractmethod
-    def lower_counters(self, counters: Counters) -> Netlist:
-        """Lower a counting network."""
-
-    @abstractmethod
-    def machine(self, netlist: Any) -> Machine:
-        """The machine of a netlist in memory."""
-
-    @abstractmethod
-    def load(self, path: str | os.PathLike[str]) -> Machine:
-        """Read a netlist file; SpikeloomError if it is none."""
-
-    @abstractmethod
-    def describe(self, path: str | os.PathLike[str]) -> Outcome:
-        """Layers and cores of a netlist file, and how full each limit is; loads no simulator."""
-
-    def is_trained_for(self, path: str) -> bool:  # noqa: ARG002 -- no network is, unless the chip says so
-        """Whether a file holds a network that was trained for the chip alone."""
-        return False
-
-    def inspect(self, request: InspectRequest) -> Outcome:
-        """Describe such a network."""
-        raise NotImplementedError(f"no network is trained for {self.name} alone")
-
-    def reference(self, request: ComparisonChoice, netlist: Any) -> Reference:
-        """Read the network that `verify` was given beside a netlist; by default a network of floats."""
-        loaded = load_network(request.checkpoint, request, netlist)
-        return Reference(
-            source=loaded.model,
-            network=loaded.network,
-            loaded=loaded,
-            difference=loaded.differs_from(netlist, request.run),
-        )

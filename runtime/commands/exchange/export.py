@@ -12,7 +12,7 @@ from spikeloom.runtime.inputs.files import require_netlist, require_place
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.inputs.repeat import refuse
 from spikeloom.runtime.machines.backends import export_formats
-from spikeloom.runtime.machines.base import Request
+from spikeloom.runtime.machines.exports import ExportSource
 from spikeloom.runtime.report.encode import INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 from spikeloom.runtime.report.shown import Shown
@@ -62,7 +62,7 @@ def run(request: ExportRequest) -> Outcome:
         assert request.data is not None, "recordings are read where they are given"
         return load_recordings(request.data, SplitChoice(split=request.split or "test", bin=request.bin), netlist)
 
-    content = Request(
+    content = ExportSource(
         source=request.source,
         output=request.output,
         recordings=None if request.data is None else read,

@@ -1,36 +1,21 @@
-"""The command ``watch``: event lines in, the running decision out.
-
-A line is ``time_s,taxel,polarity``. Bins are stepped in order, empty ones included, so that the final counts are those
-of ``run`` on the same recording. A bin is stepped
-
-* at full speed, as soon as a line of a later bin arrives;
-* in real time, not before its end by the wall clock, which the first event of a grasp sets; and at the latest one bin
-  after its end, so that decisions go on while nothing touches the sensor.
-
-An event whose bin was stepped already is late; what comes after a grasp's decision is counted apart. Neither is used.
-"""
+"""The command ``watch``: event lines in, the running decision out; :mod:`studies.watching` follows them."""
 
 import io
-import json
-import sys
-import time
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
-from spikeloom.compiler.types import EventArray, IntArray, JsonObject
-from spikeloom.models.recordings.counts import number
-from spikeloom.models.recordings.eventlines import Event, EventLines, Mark
-from spikeloom.runtime.machines.base import Step, Stream
-from spikeloom.runtime.report.console import tell
-from spikeloom.runtime.report.encode import OPTIONAL
-from spikeloom.runtime.report.sections import Outcome, Section, Text
+from spikeloom.compiler.targets.netlist_file import Netlist
+from spikeloom.compiler.types import IntArray
+from spikeloom.models.recordings.eventlines import EventLines
+from spikeloom.runtime.machines.base import Machine
+from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.exchange import WatchRequest
+from spikeloom.runtime.studies.watching import Summary, Watch, sections
 
 NOTES = """\
 Lines come in the order of their times: an event whose bin is over, since a later one came, is counted as late, said at
@@ -40,211 +25,36 @@ begin with a header that names the columns, in any order. An empty line or the l
 last. TrueNorth runs whole recordings only.
 """
 
-MAX_GAP = 100_000
-"""Empty bins in a row; more of them means that the times are not seconds, or not of this grasp."""
-
-EDGE = Decimal("1e-9")
-"""Share of a bin by which a time may miss an edge and yet count as on it; the same as where recordings are read."""
-
-
-@dataclass(slots=True, kw_only=True)
-class Summary:
-    """All grasps together; `early` counts those that ended before their length, where they may."""
-
-    kind: str = "end"
-    grasps: int = 0
-    bins: int = 0
-    events: int = 0
-    repeated: int = 0
-    late: int = 0
-    after_decision: int = 0
-    interrupted: bool = False
-    early: int | None = field(default=None, metadata=OPTIONAL)
-
-
-@dataclass(kw_only=True, eq=False)
-class Watch:
-    """Bins events and steps a stream; one pass over the lines, any number of grasps."""
-
-    stream: Stream  # At rest
-    lines: EventLines
-    as_json: bool  # Whether decisions are printed as objects, or as lines for people
-    bin_s: Decimal  # Length of a bin
-    bins: int | None  # Length of every grasp in bins; without it the last event or the wall clock ends it
-    from_first: bool  # Whether the bins of a grasp begin at its first event instead of at time 0
-    real: bool  # Whether to keep to the wall clock
-    # Says from a chip step and the votes after it whether the grasp is decided, see :func:`exits.live`
-    may_end: Callable[[int, IntArray], bool] | None
-    column: EventArray  # Inputs of the open bin, (channels,)
-    origin: Decimal | None = None  # Of the grasp; None between two grasps
-    epoch: float = 0.0  # Wall clock at the origin
-    decided: bool = False
-    last: tuple[Step, ...] = ()
-    shown: int | None = None  # Decision that was printed last
-    found: Summary = field(default_factory=Summary)
-
-    def run(self) -> None:
-        """Follow the lines to their end, or until the user, or the reader of our output, ends it before."""
-        try:
-            while True:
-                waits = self.real and self._is_open()
-                entry = self.lines.read(self._wall(self.stream.index + 2) if waits else None)
-                if entry is None:
-                    self._close_bin()
-                elif isinstance(entry, Event):
-                    self._take(entry)
-                else:
-                    self._end_grasp()
-                    if entry is Mark.END_OF_STREAM:
-                        return
-        except KeyboardInterrupt:
-            if self._is_open() and self.stream.index:  # what the open bin holds is not all of it
-                self._decide()
-        except BrokenPipeError:
-            pass
-        self.found.interrupted = True
-
-    def _is_open(self) -> bool:
-        """Whether a grasp has begun and is not decided."""
-        return self.origin is not None and not self.decided
-
-    def _wall(self, bins: int) -> float:
-        """Where the wall clock is after so many bins of the grasp."""
-        return self.epoch + float(self.bin_s) * bins
-
-    def _take(self, event: Event) -> None:
-        """Put an event into its bin; step the bins before it."""
-        self.found.events += 1
-        if self.origin is None:
-            self.origin = event.time_s if self.from_first else Decimal(0)
-            self.epoch = time.monotonic() - float(event.time_s - self.origin)
-        place = (event.time_s - self.origin) / self.bin_s + EDGE
-        index = int(place) if place >= 0 else -1
-        if self._is_open() and index - self.stream.index > MAX_GAP:
-            gap = index - self.stream.index
-            raise self.lines.complain(
-                f"time {event.time_s} s leaves {gap} bins without an event, allowed are {MAX_GAP}",
-                "give seconds, end a grasp with an empty line, or let it begin at its first event (--origin first)",
-            )
-        while self._is_open() and self.stream.index < index:
-            self._close_bin()
-        if self.decided:
-            self.found.after_decision += 1
-            return
-        if index < self.stream.index:
-            self.found.late += 1
-            if str(self.found.late).strip("0") == "1":  # 1, 10, 100, …
-                many = number(self.found.late, "event")
-                tell(f"{many} so far after the end of a bin, this one of {event.time_s} s: late, not used")
-            return
-        self.found.repeated += int(self.column[event.channel])
-        self.column[event.channel] = 1
-
-    def _close_bin(self, *, wait: bool = True) -> None:
-        """Step the open bin, not before its end by the wall clock if that counts."""
-        if self.real and wait:
-            time.sleep(max(0.0, self._wall(self.stream.index + 1) - time.monotonic()))
-        step = self.stream.step(self.column)
-        self.last = (step,)
-        self.column[:] = 0
-        line = ""
-        if step.counts.any() and step.decision != self.shown:
-            self.shown = step.decision
-            elapsed = f"{self.bin_s * (step.index + 1):f} s"
-            line = f"{elapsed:>10}  {_standing(step)}"
-        self._show(line, "bin", self.found.grasps + 1, step.index + 1, step)
-        if step.index + 1 == self.bins:
-            self._decide()
-        elif self.may_end is not None and self.may_end(step.index, step.counts):
-            self._decide(early=True)
-
-    def _end_grasp(self) -> None:
-        """Step the bins that are left, decide, and get ready for the next grasp."""
-        while self._is_open() and (self.column.any() or self.stream.index < (self.bins or 0)):
-            self._close_bin(wait=False)
-        if self._is_open():
-            self._decide()
-        self.stream.reset()
-        self.origin, self.decided = None, False
-
-    def _decide(self, *, early: bool = False) -> None:
-        """Run the steps by which the read-out lags, unless they change nothing, and show the decision."""
-        bins = self.stream.index
-        self.decided = True
-        last = self.last[-1] if early else (*self.last, *self.stream.finish())[-1]
-        self.found.grasps += 1
-        self.found.bins += bins
-        if self.found.early is not None:
-            self.found.early += early
-        self.shown = None
-        after = f"after {number(bins, 'bin')} ({self.bin_s * bins:f} s)"
-        line = f"grasp {self.found.grasps}: {_standing(last)}{', sure' if early else ''}, {after}"
-        self._show(line, "grasp", self.found.grasps, bins, last, {} if self.may_end is None else {"early": early})
-
-    def _show(self, line: str, kind: str, grasp: int, bins: int, step: Step, more: JsonObject | None = None) -> None:
-        """Print a line, if there is one, or what it says as an object."""
-        if self.as_json:
-            found = {"kind": kind, "grasp": grasp, "bins": bins, "time_s": float(self.bin_s * bins)}
-            found |= {"decision": step.decision, "margin": step.margin, "counts": step.counts.tolist()}
-            line = json.dumps(found | (more or {}))
-        if line:
-            sys.stdout.write(f"{line}\n")
-            sys.stdout.flush()
+REQUEST = WatchRequest
 
 
 def run(request: WatchRequest) -> Outcome:
     """Run the command; its result is the summary, everything else was printed before."""
-    from spikeloom.models.recordings.evtouch import BIN_S
-    from spikeloom.runtime.inputs.recordings import origin_of
     from spikeloom.runtime.machines.backends import machine_for
-    from spikeloom.runtime.machines.capabilities import require_stoppable
-    from spikeloom.runtime.studies.anytime import exits
 
-    bin_s = None if request.bin is None else _duration(request.bin)
-    if request.bins is not None and request.bins < 1:
-        raise OptionError(f"--bins {request.bins}: not a length; give 1 or more, or leave it out")
-    factor = request.until_sure
-    if factor is not None and request.bins is None:
-        raise OptionError("--until-sure: what can still come is not known; give the length of a grasp with --bins")
-    if factor is not None and not factor >= 0:
-        raise OptionError(
-            f"--until-sure {factor:g}: no votes per root of a bin; give a number from 0, as spikeloom anytime prints "
-            "it, or none for the proof alone"
-        )
+    _require_length(request)
     machine = machine_for(request.netlist)
     netlist = machine.netlist
-    bins = request.bins or netlist.clocks.length
-    if bins != (netlist.clocks.length or bins):
-        raise OptionError(
-            f"--bins {bins}: the network runs every grasp for {netlist.clocks.length} steps, the last of them its "
-            f"read-out; give --bins {netlist.clocks.length} or leave it out"
-        )
-    own = origin_of(netlist.provenance).get("bin_s")
-    if own is not None and bin_s not in (None, Decimal(str(own))):
-        raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {own:g} s; omit --bin")
-    step_s = netlist.bins * (bin_s or Decimal(str(own or BIN_S)))  # a step of the network may join several
     if netlist.polarities != 2:
         raise ModelError(
             f"{request.netlist}: {netlist.polarities} polarities per taxel found, event lines have 2; "
             "watch a network for events of two polarities"
         )
-    stream = machine.stream()
-    stdin = request.input == "-"
-    name = "standard input" if stdin else request.input
+    name = "standard input" if request.input == "-" else request.input
+    early = None if request.until_sure is None else 0
+    step_s = _step_seconds(request, netlist)
     with _opened(request.input) as file:
         session = Watch(
-            stream=stream,
+            stream=machine.stream(),
             lines=EventLines(file, name, netlist.taxels),
             as_json=request.json,
             column=np.zeros(netlist.taxels * netlist.polarities, np.uint8),
             bin_s=step_s,
-            bins=bins,
+            bins=_bins(request, netlist),
             from_first=request.origin == "first",
             real=request.speed == "real",
-            may_end=None
-            if factor is None or request.bins is None
-            else exits.live(require_stoppable(machine, request.netlist, "--until-sure"), request.bins, factor),
-            found=Summary(early=None if factor is None else 0),
+            may_end=_ending(request, machine),
+            found=Summary(early=early),
         )
         session.run()
     if not session.found.events and not session.found.interrupted:
@@ -252,7 +62,54 @@ def run(request: WatchRequest) -> Outcome:
     return Outcome(session.found, sections)
 
 
-REQUEST = WatchRequest
+def _require_length(request: WatchRequest) -> None:
+    """Refuse a length of a grasp that is none, and an early end without one."""
+    if request.bins is not None and request.bins < 1:
+        raise OptionError(f"--bins {request.bins}: not a length; give 1 or more, or omit it")
+    factor = request.until_sure
+    if factor is None:
+        return
+    if request.bins is None:
+        raise OptionError("--until-sure: what can still come is not known; give the length of a grasp with --bins")
+    if not factor >= 0:
+        raise OptionError(
+            f"--until-sure {factor:g}: no votes per root of a bin; give a number from 0, as spikeloom anytime prints "
+            "it, or none for the proof alone"
+        )
+
+
+def _bins(request: WatchRequest, netlist: Netlist) -> int | None:
+    """Bins of every grasp, where their number is fixed."""
+    length = netlist.clocks.length
+    bins = request.bins or length
+    if length and bins != length:
+        raise OptionError(
+            f"--bins {bins}: the network runs every grasp for {length} steps, the last of them its read-out; "
+            f"give --bins {length} or omit it"
+        )
+    return bins
+
+
+def _step_seconds(request: WatchRequest, netlist: Netlist) -> Decimal:
+    """Length of a step, which may join several bins of the recordings."""
+    from spikeloom.models.recordings.evtouch import BIN_S
+    from spikeloom.runtime.inputs.recordings import origin_of
+
+    bin_s = None if request.bin is None else _duration(request.bin)
+    trained = origin_of(netlist.provenance).get("bin_s")
+    if trained is not None and bin_s not in (None, Decimal(str(trained))):
+        raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {trained:g} s; omit --bin")
+    return netlist.bins * (bin_s or Decimal(str(trained or BIN_S)))
+
+
+def _ending(request: WatchRequest, machine: Machine) -> Callable[[int, IntArray], bool] | None:
+    """Says whether a grasp is decided before its end, where that is wanted."""
+    from spikeloom.runtime.machines.capabilities import require_stoppable
+    from spikeloom.runtime.studies.anytime import exits
+
+    if request.until_sure is None or request.bins is None:
+        return None
+    return exits.live(require_stoppable(machine, request.netlist, "--until-sure"), request.bins, request.until_sure)
 
 
 def _opened(name: str) -> io.FileIO:
@@ -276,20 +133,3 @@ def _duration(text: str) -> Decimal:
     if not seconds.is_finite() or not Decimal("1e-6") <= seconds <= 1000:
         raise OptionError(f"--bin {text}: not a duration; give seconds from 0.000001 to 1000, such as 0.02")
     return seconds
-
-
-def _standing(step: Step) -> str:
-    """The decision and what it rests on, for people."""
-    if not step.counts.any():
-        return f"class {step.decision}, no votes"
-    ahead = f"{step.margin} ahead" if step.margin else "a tie"
-    return f"class {step.decision}, {number(int(step.counts.max()), 'vote')}, {ahead}"
-
-
-def sections(found: Summary) -> list[Section]:
-    """The summary for people."""
-    parts = [number(found.grasps, "grasp"), number(found.bins, "bin"), number(found.events, "event")]
-    parts += [f"{found.repeated} repeated within a bin", f"{found.late} late"]
-    parts += [f"{found.after_decision} after the decision"] if found.after_decision else []
-    text = ", ".join([*parts, *([] if found.early is None else [f"{found.early} ended early"])])
-    return [Section("Watched", [Text(text + ("\ninterrupted" if found.interrupted else ""))])]

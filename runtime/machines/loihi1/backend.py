@@ -6,7 +6,9 @@ from typing import Any
 
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.targets.netlist_file import Netlist
-from spikeloom.runtime.machines.base import Backend, Format, Lowered, Machine
+from spikeloom.runtime.machines.backend import Backend, Lowered
+from spikeloom.runtime.machines.base import Machine
+from spikeloom.runtime.machines.exports import Format
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.main_job import CompileRequest
 

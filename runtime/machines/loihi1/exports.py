@@ -14,7 +14,7 @@ from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.models.recordings.evtouch import BIN_S
 from spikeloom.runtime.inputs.recordings import origin_of
-from spikeloom.runtime.machines.base import Export, Facts, Format, Request
+from spikeloom.runtime.machines.exports import Export, ExportSource, Facts, Format
 from spikeloom.runtime.report.encode import OPTIONAL
 
 
@@ -45,7 +45,7 @@ class NirFacts(Facts):
     convention: str
 
 
-def _sanafe(request: Request) -> Export:
+def _sanafe(request: ExportSource) -> Export:
     netlist = read_netlist(request.source)
     target = load_target(netlist.target)
     places = sanafe.cores(netlist, target)
@@ -68,7 +68,7 @@ def _sanafe(request: Request) -> Export:
     return Export(content=content, facts=facts, lines=tuple(lines))
 
 
-def _onnx(request: Request) -> Export:
+def _onnx(request: ExportSource) -> Export:
     netlist, form = read_netlist(request.source), request.form or "scan"
     content, *ports = onnx.export(netlist, form)
     inputs, outputs = ([str(port) for port in side] for side in ports)
@@ -79,7 +79,7 @@ def _onnx(request: Request) -> Export:
     return Export(content=[content], facts=facts, form=form, lines=lines)
 
 
-def _nir(request: Request) -> Export:
+def _nir(request: ExportSource) -> Export:
     netlist = read_netlist(request.source)
     width = origin_of(netlist.provenance).get("bin_s")
     dt = (width or BIN_S) * netlist.bins if request.dt is None else request.dt

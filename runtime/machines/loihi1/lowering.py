@@ -15,7 +15,8 @@ from spikeloom.runtime.inputs.compilation import parse_cores, parse_keep, parse_
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings
 from spikeloom.runtime.inputs.repeat import LAYOUT, NETWORK, ROUNDING, command, given, refuse, words
-from spikeloom.runtime.machines.base import Lowered, Model
+from spikeloom.runtime.machines.backend import Lowered
+from spikeloom.runtime.machines.base import Model
 from spikeloom.runtime.machines.loihi1 import compiled, description
 from spikeloom.runtime.machines.loihi1.description import NetlistFacts
 from spikeloom.runtime.report.console import progress

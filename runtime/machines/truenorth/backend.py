@@ -7,7 +7,9 @@ from typing import Any
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.runtime.inputs.files import shipped
-from spikeloom.runtime.machines.base import Backend, Format, Lowered, Machine, Reference
+from spikeloom.runtime.machines.backend import Backend, Lowered, Reference
+from spikeloom.runtime.machines.base import Machine
+from spikeloom.runtime.machines.exports import Format
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.choices import ComparisonChoice
 from spikeloom.runtime.requests.main_job import CompileRequest, InspectRequest

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import ranc
-from spikeloom.runtime.machines.base import Export, Facts, Format, Request
+from spikeloom.runtime.machines.exports import Export, ExportSource, Facts, Format
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -15,7 +15,7 @@ class RancFacts(Facts):
     ticks: int | None
 
 
-def _ranc(request: Request) -> Export:
+def _ranc(request: ExportSource) -> Export:
     from spikeloom.runtime.machines.truenorth.machine import load  # numba, so only here
 
     netlist = load(request.source).netlist

@@ -18,7 +18,7 @@ from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import NETWORKS, load_network
 from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
-from spikeloom.runtime.machines.base import Lowered, Reference
+from spikeloom.runtime.machines.backend import Lowered, Reference
 from spikeloom.runtime.machines.truenorth.description import describe
 from spikeloom.runtime.machines.truenorth.model import model_of
 from spikeloom.runtime.report.console import progress
