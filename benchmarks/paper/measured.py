@@ -19,7 +19,7 @@ from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.inputs.network import propagation
+from spikeloom.runtime.inputs.checkpoint import propagation
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.votes import predictions, readout_counts

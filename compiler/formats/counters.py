@@ -127,4 +127,4 @@ def read_network(path: str | os.PathLike[str]) -> ReadNetwork[Network]:
         f"{len(counters.counter)} counters of {thresholds} events{parts}; {counters.steps} steps count, then "
         f"{counters.ramp} to read out"
     )
-    return ReadNetwork(network=counting_network(counters), facts=(fact,), sha256=sha256)
+    return ReadNetwork(network=counting_network(counters), facts=(fact,), sha256=sha256, training=counters.training)

@@ -1,34 +1,26 @@
 """The float network that a command is given: a checkpoint on its graph, or an ONNX or NIR file that holds all."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from spikeloom.compiler.archive import COUNTERS, FORMATS, TRAINED, is_netlist, stated
+from spikeloom.compiler.archive import COUNTERS, stated
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.errors import ModelError, OptionError, SpikeloomError
+from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import NETX, NIR, ONNX
-from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.formats.assemble import ReadNetwork
 from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored, expand
-from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
 from spikeloom.compiler.targets.netlist_file import Netlist
-from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
-from spikeloom.models.graphs import CHOICES, NEUTOUCH, Graph
-from spikeloom.models.sensors import read_layout, sensor_graph
-from spikeloom.models.systems import NO_GRAPH, propagation_of
-from spikeloom.runtime.inputs.files import is_recordings, shipped
-from spikeloom.runtime.inputs.repeat import NETWORK, refuse
-from spikeloom.runtime.report.console import progress, tell
-from spikeloom.runtime.requests.choices import CheckpointChoice, NetworkChoice, SensorChoice
-
-NETWORKS = {ONNX: "ONNX", NIR: "NIR", COUNTERS: "counting"}
-"""Networks that a file holds whole, by its ending, or by what it says of itself."""
+from spikeloom.compiler.types import FloatArray, JsonObject
+from spikeloom.runtime.inputs.checkpoint import graph_of, load_checkpoint, propagation
+from spikeloom.runtime.inputs.files import shipped
+from spikeloom.runtime.inputs.repeat import INPUT_LAYOUT, LAYOUT, NETWORK, refuse
+from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.requests.choices import NetworkChoice
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,73 +82,133 @@ class LoadedNetwork:
         return Factored(self.checkpoint, self.adjacency)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reader:
+    """A format that float networks are read from.
+
+    name, title: what :attr:`LoadedNetwork.format` says, and what one of its files is, in a sentence.
+    ending: how their names end; empty where the file itself says what it is, by the format `states` of its manifest.
+    options: those of a request that it takes; others are refused.
+    read: reads a file as a request says, beside the provenance of a netlist where there is one.
+    """
+
+    name: str
+    title: str
+    ending: str = ""
+    states: str | None = None
+    options: tuple[str, ...] = ()
+    read: Callable[[str, NetworkChoice, Mapping[str, Any]], LoadedNetwork]
+
+    def takes(self, path: str) -> bool:
+        """Whether a file is of this format."""
+        if self.ending:
+            return path.endswith(self.ending)
+        return self.states is None or stated(Path(shipped(path)), "format") == self.states
+
+
+def _read_onnx(path: str, request: NetworkChoice, made: Mapping[str, Any]) -> LoadedNetwork:  # noqa: ARG001
+    from spikeloom.compiler.formats.onnx.reader import read_onnx
+
+    read = read_onnx(path, polarities=request.polarities, polarities_first=request.polarities_first)
+    return _loaded("onnx", read)
+
+
+def _read_nir(path: str, request: NetworkChoice, made: Mapping[str, Any]) -> LoadedNetwork:
+    from spikeloom.compiler.formats.nir.reader import read_nir
+
+    read = read_nir(
+        path,
+        dt=made.get("dt") if request.dt is None else request.dt,
+        convention=made.get("convention") if request.convention is None else request.convention,
+        polarities=request.polarities,
+        polarities_first=request.polarities_first,
+    )
+    return _loaded("nir", read)
+
+
+def _read_counters(path: str, request: NetworkChoice, made: Mapping[str, Any]) -> LoadedNetwork:  # noqa: ARG001
+    from spikeloom.compiler.formats.counters import read_network
+
+    read = read_network(shipped(path))
+    return _loaded("counting", read)
+
+
+def _loaded(name: str, read: ReadNetwork[Network]) -> LoadedNetwork:
+    """What was read from a file that holds the whole network."""
+    return LoadedNetwork(
+        network=read.network,
+        sha256=read.sha256,
+        facts=read.facts,
+        format=name,
+        read_as=read.read_as,
+        training=read.training,
+    )
+
+
+def _read_checkpoint(path: str, request: NetworkChoice, made: Mapping[str, Any]) -> LoadedNetwork:
+    """On the graph and of the epoch of a netlist, where the options say nothing."""
+    checkpoint = load_checkpoint(path, request)
+    epoch = made.get("weights") if made.get("checkpoint_sha256") == checkpoint.sha256 else None
+    if request.weights is None and epoch in checkpoint.sets and epoch != checkpoint.weights:
+        checkpoint = load_checkpoint(path, replace(request, weights=epoch))
+    graph, adjacency = propagation(checkpoint, graph_of(checkpoint, request, made), path)
+    return LoadedNetwork(
+        network=expand(checkpoint, adjacency),
+        sha256=checkpoint.sha256,
+        checkpoint=checkpoint,
+        adjacency=adjacency,
+        graph=graph,
+        training=checkpoint.training,
+    )
+
+
+COUNTING = Reader(name="counting", title="a counting network", states=COUNTERS, read=_read_counters)
+CHECKPOINT = Reader(name="checkpoint", title="a checkpoint", options=NETWORK, read=_read_checkpoint)
+
+READERS = (
+    Reader(name="onnx", title="an ONNX file", ending=ONNX, options=INPUT_LAYOUT, read=_read_onnx),
+    Reader(name="nir", title="a NIR file", ending=NIR, options=LAYOUT, read=_read_nir),
+    COUNTING,
+    CHECKPOINT,
+)
+"""All of them; the first that takes a file reads it, the last takes any."""
+
+
+def reader_of(path: str) -> Reader:
+    """The format of a file."""
+    return next(reader for reader in READERS if reader.takes(path))
+
+
 def load_network(path: str | Network, request: NetworkChoice, netlist: Netlist | None = None) -> LoadedNetwork:
     """Read what a command is given; beside a `netlist` as that was, where the options say nothing.
 
     These are the epoch and the graph of a checkpoint that does not say which, the time step of a NIR file, and the
     names of the layers of a network.
 
-    Raises OptionError or ModelError if it is not there, not as the options say, or an option is for the other kind of
-    file.
+    Raises OptionError or ModelError if it is not there, not as the options say, or an option is for another format.
     """
     if isinstance(path, Network):
         # a network that Python made, as if it came from a file
         sha256 = hashlib.sha256(text(path).encode()).hexdigest()
         return LoadedNetwork(network=path, sha256=sha256, format="module")
-    kind = network_kind(path)
-    _require_fit(path, kind, request)
-    made = {} if netlist is None else netlist.provenance
-    if kind is None:
-        checkpoint = load_checkpoint(path, request)
-        epoch = made.get("weights") if made.get("checkpoint_sha256") == checkpoint.sha256 else None
-        if request.weights is None and epoch in checkpoint.sets and epoch != checkpoint.weights:
-            checkpoint = load_checkpoint(path, replace(request, weights=epoch))
-        graph, adjacency = propagation(checkpoint, _graph_of(checkpoint, request, made), path)
-        return LoadedNetwork(
-            network=expand(checkpoint, adjacency),
-            sha256=checkpoint.sha256,
-            checkpoint=checkpoint,
-            adjacency=adjacency,
-            graph=graph,
-            training=checkpoint.training,
-        )
-    progress("reading the network")
-    training = None
-    layout: dict[str, Any] = {"polarities": request.polarities, "polarities_first": request.polarities_first}
-    if kind == COUNTERS:
-        from spikeloom.compiler.formats.counters import read_counters, read_network
-
-        found, training = read_network(shipped(path)), read_counters(shipped(path))[0].training
-    elif kind == ONNX:
-        from spikeloom.compiler.formats.onnx.reader import read_onnx
-
-        found = read_onnx(path, **layout)
-    else:
-        from spikeloom.compiler.formats.nir.reader import read_nir
-
-        given = {name: getattr(request, name) for name in ("dt", "convention")}
-        steps = {name: made.get(name) if value is None else value for name, value in given.items()}
-        found = read_nir(path, **steps, **layout)
-        training = found.training
-    return LoadedNetwork(
-        network=found.network if netlist is None else _named_alike(found.network, netlist),
-        sha256=found.sha256,
-        facts=found.facts,
-        format=NETWORKS[kind].lower(),
-        read_as=found.read_as,
-        training=training,
-    )
+    reader = reader_of(path)
+    _require_fit(path, reader, request)
+    if reader is not CHECKPOINT:
+        progress("reading the network")
+    loaded = reader.read(path, request, {} if netlist is None else netlist.provenance)
+    if netlist is None or loaded.checkpoint is not None:
+        return loaded
+    return replace(loaded, network=_named_alike(loaded.network, netlist))
 
 
-def _graph_of(checkpoint: Checkpoint, request: CheckpointChoice, made: Mapping[str, Any]) -> Graph | None:
-    """Graph that the options name, or the one that a netlist was compiled for, if it is built in; None for neither."""
-    asked = load_graph(request, checkpoint.system)
-    if asked is not None or checkpoint.edges is not None or not isinstance(made.get("graph"), str):
-        return asked
-    try:
-        return load_graph(replace(request, graph=made["graph"]), checkpoint.system)
-    except SpikeloomError:
-        return None  # one of the user's own
+def _require_fit(path: str, reader: Reader, request: NetworkChoice) -> None:
+    """Refuse options that are for another format, and files that hold no float network."""
+    if path.endswith(NETX):
+        raise OptionError(f"{path}: holds integers, no float network to compare with; compile, inspect and run it")
+    for name in (*NETWORK, *LAYOUT):
+        if name not in reader.options:
+            titles = " or ".join(other.title for other in READERS if name in other.options)
+            refuse(request, (name,), f"is for {titles}, {path} is none")
 
 
 def _named_alike(network: Network, netlist: Any) -> Network:
@@ -166,91 +218,3 @@ def _named_alike(network: Network, netlist: Any) -> Network:
         return network
     pairs = zip(network.populations, layers, strict=True)
     return replace(network, populations=tuple(replace(population, name=name) for population, (name, _) in pairs))
-
-
-def network_kind(path: str) -> str | None:
-    """Which of ``NETWORKS`` a file holds; None for a checkpoint, or nothing of ours."""
-    suffix = next((suffix for suffix in (ONNX, NIR) if path.endswith(suffix)), None)
-    return suffix or (COUNTERS if stated(Path(shipped(path)), "format") == COUNTERS else None)
-
-
-def _require_fit(path: str, kind: str | None, request: NetworkChoice) -> None:
-    """Refuse options that are for another kind of file, and files that hold no float network."""
-    if path.endswith(NETX):
-        raise OptionError(f"{path}: holds integers, no float network to compare with; compile, inspect and run it")
-    if kind not in (ONNX, NIR):
-        why = f"is for ONNX and NIR files, {path} is none"
-        refuse(request, ("polarities",), why)
-        if request.polarities_first is not None:
-            raise OptionError(f"--polarities-first or -last: {why}; omit it")
-    if kind is not None:
-        refuse(request, NETWORK, f"is for checkpoints, the {NETWORKS[kind]} file {path} holds all it needs")
-    if kind != NIR:
-        refuse(request, ("dt", "convention"), f"is for NIR files, {path} is none")
-
-
-def load_graph(request: SensorChoice, system: str = TACTILESGNET) -> Graph | None:
-    """Graph that the options name, or None if they name none; a warning goes to stderr.
-
-    Raises OptionError or ModelError if there is no such graph, its files are wrong, or the system has no graph at all.
-    """
-    if system not in GRAPH_SYSTEMS:
-        refuse(request, ("graph", "edges", "directed"), f"is for taxel graphs, {TITLES[system]} has none")
-        return None
-    if not (request.graph or request.taxels or request.edges or request.directed):
-        return None
-    graph, warning = sensor_graph(
-        graph=request.graph, taxels=request.taxels, edges=request.edges, directed=request.directed
-    )
-    if warning is not None:
-        tell(f"warning: {warning}")
-    return graph
-
-
-def sensor_places(taxels: str | None) -> FloatArray:
-    """Positions of the taxels in millimetres: of ``--taxels``, where a number lines them up, or of the built-in sensor.
-
-    Raises OptionError or DataError if there is no such sensor.
-    """
-    if taxels is None:
-        return NEUTOUCH
-    count, places = read_layout(taxels)
-    return np.arange(float(count))[:, None] if places is None else places
-
-
-def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tuple[str, FloatArray]:
-    """Name of the graph that was asked for, or of the one in the checkpoint, and what the first layer sees.
-
-    Raises ModelError if no graph is known, or another one than the checkpoint was trained on is asked for.
-    """
-
-    def seen(edges: IntArray, taxels: int) -> FloatArray:
-        return propagation_of(checkpoint.system, edges, taxels, checkpoint.grid, len(checkpoint.hops))
-
-    if checkpoint.system not in GRAPH_SYSTEMS:
-        return NO_GRAPH, seen(np.zeros((0, 2), np.int64), checkpoint.taxels)
-    if asked is None:
-        if checkpoint.edges is None:
-            raise ModelError(f"{where}: the graph is not in this file; name it with --graph: {CHOICES}")
-        return str(checkpoint.graph), seen(checkpoint.edges, checkpoint.taxels)
-    found = seen(asked.edges, asked.n_taxels)
-    if checkpoint.edges is not None and not np.array_equal(seen(checkpoint.edges, checkpoint.taxels), found):
-        raise ModelError(
-            f"{where}: graph and weights disagree: it was trained on {checkpoint.graph}, --graph says "
-            f"{asked.name}; omit --graph"
-        )
-    return asked.name, found
-
-
-def load_checkpoint(path: str, request: CheckpointChoice) -> Checkpoint:
-    """Read a checkpoint as the options say; OptionError or ModelError if it is not there, or not as they say."""
-    progress("reading the checkpoint")
-    if (kind := stated(Path(shipped(path)), "format")) in (TRAINED, COUNTERS):
-        raise ModelError(f"{path}: is {FORMATS[kind]}; only compile, verify and inspect take one")
-    if Path(shipped(path)).is_file() and is_netlist(shipped(path)):
-        raise ModelError(f"{path}: is a netlist, its weights are rounded; give the checkpoint that it was made from")
-    if is_recordings(path):
-        raise ModelError(f"{path}: holds recordings; give the network here, and these as --calibrate or --data")
-    return read_checkpoint(
-        shipped(path), run=request.run, weights=request.weights, beta=request.beta, theta=request.theta
-    )

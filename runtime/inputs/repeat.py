@@ -13,8 +13,11 @@ from spikeloom.runtime.requests.fields import Request
 NETWORK = ("graph", "taxels", "edges", "directed", "run", "weights", "beta", "theta")
 """Options that say how a checkpoint is read."""
 
-LAYOUT = ("polarities", "dt", "convention")
-"""Options that say how a NIR or ONNX file is read."""
+INPUT_LAYOUT = ("polarities", "polarities_first")
+"""Options that say how the input of a NIR or ONNX file is read."""
+
+LAYOUT = (*INPUT_LAYOUT, "dt", "convention")
+"""Those, and options of NIR files."""
 
 ROUNDING = ("weight_bits", "planes", "scale_groups", "spike_exact", "prune_unused", "keep", "share_lists")
 """Options of ``compile`` that say how a float network is stored."""
@@ -54,11 +57,23 @@ def given(request: Request, names: Sequence[str]) -> JsonObject:
     return {name: getattr(request, name) for name in names}
 
 
+def typed(request: Request, names: Sequence[str]) -> list[str]:
+    """Options of a request as they are typed, those that are not as usual."""
+    known = {each.name: each.metadata["constants"] for each in request.options()}
+    line: list[str] = []
+    for name in names:
+        value = getattr(request, name, None)
+        constants = known.get(name) or {}
+        flags = [flag for flag, (meaning, _) in constants.items() if value is meaning]
+        line += flags or words({name: value})
+    return line
+
+
 def refuse(request: Request, names: Sequence[str], why: str) -> None:
     """Refuse options that are given although they do not apply; OptionError naming the first of them."""
     for name in names:
-        if typed := words({name: getattr(request, name, None)}):
-            raise OptionError(f"{' '.join(typed)}: {why}; omit it")
+        if line := typed(request, [name]):
+            raise OptionError(f"{' '.join(line)}: {why}; omit it")
 
 
 def command(*typed: str) -> str:

@@ -20,7 +20,8 @@ from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.verdict import Verdict
 from spikeloom.runtime.inputs import repeat
-from spikeloom.runtime.inputs.network import LoadedNetwork, sensor_places
+from spikeloom.runtime.inputs.checkpoint import sensor_places
+from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.base import Machine, Price
 from spikeloom.runtime.machines.capabilities import Comparable
 from spikeloom.runtime.machines.core_map import CoreMap

@@ -130,6 +130,7 @@ def described_sections(result: Described) -> Iterator[Section]:
 
 
 def converted_sections(result: Converted) -> Iterator[Section]:
+    """What was written, for people."""
     lines = [f"{result.output}: {number(result.taxels, 'taxel')}, {number(result.steps, 'bin')}"]
     for split, made in result.splits.items():
         lines.append(f"  {split}: {number(made.recordings, 'recording')}")

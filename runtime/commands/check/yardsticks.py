@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
+from spikeloom.runtime.inputs.checkpoint import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import origin_of, recordings
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.check import YardsticksRequest

@@ -8,9 +8,10 @@ from spikeloom.compiler import __version__, write_netlist
 from spikeloom.compiler.errors import OptionError
 from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.inputs.checkpoint import load_graph
 from spikeloom.runtime.inputs.compilation import storage
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.network import load_graph, load_network
+from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import encode

@@ -20,8 +20,8 @@ from spikeloom.runtime.commands.main_job import compile, verify
 from spikeloom.runtime.commands.options import request_of
 from spikeloom.runtime.commands.training import train
 from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.inputs.checkpoint import load_graph, sensor_places
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.network import load_graph, sensor_places
 from spikeloom.runtime.machines.backends import backend_of, machine_for
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.numbers import dominant

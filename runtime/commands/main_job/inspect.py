@@ -6,13 +6,14 @@ from typing import Any, Self
 
 import numpy as np
 
-from spikeloom.compiler.archive import COUNTERS, is_netlist
+from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.dynamics import Dynamics
 from spikeloom.compiler.formats.counters import read_counters
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET
+from spikeloom.runtime.inputs.checkpoint import load_checkpoint
 from spikeloom.runtime.inputs.files import require_inspectable, shipped
-from spikeloom.runtime.inputs.network import load_checkpoint, network_kind
+from spikeloom.runtime.inputs.network import COUNTING
 from spikeloom.runtime.inputs.repeat import NETWORK, refuse
 from spikeloom.runtime.machines.backends import describe, trained_for
 from spikeloom.runtime.report.encode import OPTIONAL
@@ -100,7 +101,7 @@ def run(request: InspectRequest) -> Outcome:
     if is_netlist(request.path):
         refuse(request, NETWORK, f"is for checkpoints, {request.path} is a netlist")
         return describe(request.path)
-    if network_kind(request.path) == COUNTERS:
+    if COUNTING.takes(request.path):
         refuse(request, NETWORK, f"is for checkpoints, {request.path} is a counting network")
         counters, sha256 = read_counters(shipped(request.path))
         return Outcome(CountingFacts.of(counters, sha256), counting_sections)

@@ -23,9 +23,10 @@ from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.models.training.robust import require_chance
 from spikeloom.runtime.commands.main_job import compile
 from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.inputs.checkpoint import load_graph
 from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.network import LoadedNetwork, load_graph, load_network
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL

@@ -11,8 +11,8 @@ from spikeloom.compiler.files import remove_leftovers, sha256_of
 from spikeloom.compiler.formats.tensors import join as join_networks
 from spikeloom.models.networks.checkpoint import save_again
 from spikeloom.runtime.commands.main_job.inspect import LayerSize, tower_line
+from spikeloom.runtime.inputs.checkpoint import load_checkpoint
 from spikeloom.runtime.inputs.files import require_place, shipped
-from spikeloom.runtime.inputs.network import load_checkpoint
 from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 from spikeloom.runtime.report.shown import Shown

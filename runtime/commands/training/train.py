@@ -17,9 +17,9 @@ from spikeloom.models.systems import sensor_grid, taxels_alone
 from spikeloom.models.training.kinds import Plan
 from spikeloom.models.training.recipes import RELEASED, STEPS, Recipe, check_recipe, decays_asked
 from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.inputs.checkpoint import load_graph, sensor_places
 from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
-from spikeloom.runtime.inputs.network import load_graph, sensor_places
 from spikeloom.runtime.inputs.recordings import recordings, require_bins, require_splits
 from spikeloom.runtime.report.console import progress, tell
 from spikeloom.runtime.report.sections import Outcome

@@ -14,7 +14,7 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.compilation import parse_cores, parse_keep, parse_packings, provenance
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings
-from spikeloom.runtime.inputs.repeat import LAYOUT, NETWORK, ROUNDING, command, given, refuse, words
+from spikeloom.runtime.inputs.repeat import LAYOUT, NETWORK, ROUNDING, command, refuse, typed
 from spikeloom.runtime.machines.backend import Lowered
 from spikeloom.runtime.machines.base import Model
 from spikeloom.runtime.machines.loihi1 import compiled, description
@@ -103,7 +103,7 @@ def _calibration(source: str | Recordings, bin_s: float | None, loaded: LoadedNe
 
 def _finetune(request: CompileRequest, *, checkpoint: bool) -> str:
     """What to type for training on the chip's integers."""
-    read = words(given(request, (*NETWORK, *LAYOUT)))
+    read = typed(request, (*NETWORK, *LAYOUT))
     data = ("--data", str(request.calibrate), "--weight-bits", "8")
     return command("finetune", str(request.checkpoint), *read, *data, "-o", "TUNED.pt" if checkpoint else "TUNED.nir")
 

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from spikeloom.compiler import __version__
-from spikeloom.compiler.archive import COUNTERS
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.counters import read_counters
@@ -15,7 +14,7 @@ from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_
 from spikeloom.compiler.targets.truenorth.passes import Options, Source, compile_crossbars
 from spikeloom.compiler.types import JsonObject
 from spikeloom.runtime.inputs.files import shipped
-from spikeloom.runtime.inputs.network import NETWORKS, load_network
+from spikeloom.runtime.inputs.network import COUNTING, load_network
 from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
 from spikeloom.runtime.machines.backend import Lowered, Reference
@@ -26,9 +25,6 @@ from spikeloom.runtime.requests.choices import CheckpointChoice, ComparisonChoic
 from spikeloom.runtime.requests.main_job import CompileRequest
 
 TITLE = "TrueNorth"
-
-COUNTING = NETWORKS[COUNTERS].lower()
-"""What a netlist says of the format that it was compiled from, if that was a counting network."""
 
 
 def read(path: str, request: CheckpointChoice) -> Trained:
@@ -51,7 +47,7 @@ def lower(request: CompileRequest, after: Callable[[str, Any], object]) -> Lower
         provenance = provenance_of(trained)
     else:
         loaded = load_network(path, request)
-        source = read_counters(shipped(str(path)))[0] if loaded.format == COUNTING else loaded.model
+        source = read_counters(shipped(str(path)))[0] if loaded.format == COUNTING.name else loaded.model
         provenance = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256}
         provenance |= loaded.origin(request.run) | origin_of(loaded.training)
     progress("compiling")
@@ -85,7 +81,7 @@ def reference(request: ComparisonChoice, netlist: CrossbarNetlist) -> Reference:
     """The network that a netlist was compiled from; OptionError if the file is another one."""
     path = request.checkpoint
     made = netlist.provenance
-    if made.get("format") == COUNTING:
+    if made.get("format") == COUNTING.name:
         loaded = load_network(path, request)
         _require_file(request, made, loaded.sha256)
         counters = read_counters(shipped(str(path)))[0]

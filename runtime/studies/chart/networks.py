@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from spikeloom.compiler import Packing, check_packings
-from spikeloom.compiler.archive import COUNTERS, arrays_digest
+from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.counters import SYSTEM, counting_network, read_counters
 from spikeloom.compiler.ir import Form
@@ -16,8 +16,9 @@ from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import NO_GRAPH
 from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.inputs.checkpoint import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.files import PRETRAINED, shipped
-from spikeloom.runtime.inputs.network import NETWORKS, load_checkpoint, load_graph, network_kind, propagation
+from spikeloom.runtime.inputs.network import CHECKPOINT, COUNTING, reader_of
 from spikeloom.runtime.report.encode import HIDDEN, key
 from spikeloom.runtime.requests.choices import NetworkChoice
 from spikeloom.runtime.requests.choose import ChartRequest
@@ -121,12 +122,12 @@ def read_networks(request: ChartRequest) -> tuple[NetworkFile, ...]:
 
 
 def _read(path: str, name: str, request: ChartRequest) -> NetworkFile:
-    kind = network_kind(path)
-    if kind == COUNTERS:
+    reader = reader_of(path)
+    if reader is COUNTING:
         return _counting(path, name)
-    if kind is not None:
+    if reader is not CHECKPOINT:
         raise ModelError(
-            f"{path}: is an {NETWORKS[kind]} file, a chart takes checkpoints; give the checkpoint that it was made of"
+            f"{path}: is {reader.title}, a chart takes checkpoints; give the checkpoint that it was made of"
         )
     checkpoint = load_checkpoint(path, request)
     typed = repeat.given(request, repeat.NETWORK)

@@ -14,7 +14,8 @@ from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import fitted, join_bins
 from spikeloom.models.sensors import read_layout
 from spikeloom.runtime.equivalence.reference import require_match
-from spikeloom.runtime.inputs.network import LoadedNetwork, load_graph, load_network
+from spikeloom.runtime.inputs.checkpoint import load_graph
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.capabilities import require_threaded
