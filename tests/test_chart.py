@@ -203,7 +203,7 @@ def test_the_front_is_what_no_other_point_beats(pairs):
 
 def test_fronts_are_of_test_accuracy_and_each_cost(points):
     assert [each.front["energy"] for each in points] == [False, True, False, True, False]
-    assert [each.front["latency"] for each in points] == [False, True, True, True, True]
+    assert [each.front["time"] for each in points] == [False, True, True, True, True]
 
 
 def test_expected_is_validation_times_what_is_kept_on_training_recordings():
@@ -233,8 +233,8 @@ def test_the_choice_does_not_look_at_the_test_split(points):
         (["accuracy=50"], 4, 5),
         (["accuracy=89.2"], 2, 3),
         (["accuracy=90"], 1, 2),
-        (["energy=150uJ", "latency=2.2ms"], 3, 1),
-        (["accuracy=88", "latency=1.5ms"], 5, 1),
+        (["energy=150uJ", "time=2.2ms"], 3, 1),
+        (["accuracy=88", "time=1.5ms"], 5, 1),
     ],
 )
 def test_the_point_that_fits_all_budgets(points, budgets, number, fitting):
@@ -244,21 +244,21 @@ def test_the_point_that_fits_all_budgets(points, budgets, number, fitting):
 
 
 @pytest.mark.parametrize(
-    ("budgets", "number"), [(["energy=20uJ"], 4), (["energy=50uJ", "latency=2ms"], 3), (["accuracy=95"], 1)]
+    ("budgets", "number"), [(["energy=20uJ"], 4), (["energy=50uJ", "time=2ms"], 3), (["accuracy=95"], 1)]
 )
 def test_the_nearest_point_of_budgets_that_nothing_fits(points, budgets, number):
     found = study.pick(points, fronts.parse_budgets(budgets), BY)
     assert (found.fits, found.fitting, found.point) == (False, 0, number)
-    with pytest.raises(OptionError, match=r"--budget latency: .*no time table"):
-        study.pick(points, fronts.parse_budgets(["latency=1ms"]), replace(BY, time=None))
+    with pytest.raises(OptionError, match=r"--budget time: .*no time table"):
+        study.pick(points, fronts.parse_budgets(["time=1ms"]), replace(BY, time=None))
 
 
 @pytest.mark.parametrize(
     ("words", "limit"),
     [
         *((f"energy={value}", 1e-4) for value in ("0.1mJ", "100uJ", "100 µJ", "100μJ", "1e-4J")),
-        ("latency=5ms", 5e-3),
-        ("latency= .5us", 5e-7),
+        ("time=5ms", 5e-3),
+        ("time= .5us", 5e-7),
         ("accuracy=88", 0.88),
         ("accuracy=88.5%", 0.885),
     ],
@@ -273,14 +273,14 @@ def test_a_budget_in_units(words, limit):
     [
         "power=1W",
         *(f"energy{value}" for value in ("", "=0.1", "=1ms", "=0mJ")),
-        *(f"latency={value}" for value in ("", "-1ms")),
+        *(f"time={value}" for value in ("", "-1ms")),
         *(f"accuracy={value}" for value in ("101", "x")),
     ],
 )
 def test_a_budget_that_is_none(words):
     refused(OptionError, f"--budget {words}: ", fronts.parse_budgets, [words])
-    twice = ["latency=1ms", "latency=2ms"]
-    refused(OptionError, "--budget latency=2ms: latency is limited twice; give it once", fronts.parse_budgets, twice)
+    twice = ["time=1ms", "time=2ms"]
+    refused(OptionError, "--budget time=2ms: time is limited twice; give it once", fronts.parse_budgets, twice)
 
 
 def parsed(text):

@@ -109,7 +109,7 @@ def test_decisions_that_no_event_alters_are_a_budget():
 
 
 def test_budgets_that_are_none():
-    for words in ("energy=5", "latency=5ms", "cores=none", "operations=0", "certified=101"):
+    for words in ("energy=5", "power=1W", "cores=none", "operations=0", "certified=101"):
         with pytest.raises(OptionError, match="--budget"):
             budgets(words)
     timeless = replace(POOL[0], costs=replace(POOL[0].costs, time_s={}))

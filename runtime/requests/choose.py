@@ -46,7 +46,7 @@ class ChartRequest(CheckpointChoice, DataChoice):
         metavar="AXIS=V,V,…",
     )
     budget: tuple[str, ...] = option(
-        "of the point to deploy: energy=0.1mJ, latency=5ms or accuracy=88; may be repeated, all of them hold",
+        "of the point to deploy: energy=0.1mJ, time=5ms or accuracy=88; may be repeated, all of them hold",
         default=(),
         metavar="WHAT=LIMIT",
     )

@@ -26,7 +26,6 @@ _NUMBER = {"": 1.0}
 
 LIMITED = {
     "energy": ({"J": 1.0, "mJ": 1e-3, "uJ": 1e-6, "µJ": 1e-6, "μJ": 1e-6, "nJ": 1e-9, "pJ": 1e-12}, "as in 0.1mJ"),
-    "latency": (_SECONDS, "as in 5ms"),
     "time": (_SECONDS, "as in 5ms"),
     "accuracy": (_SHARE, "in per cent, as in 88"),
     "certified": (_SHARE, "in per cent, as in 90"),
@@ -48,9 +47,7 @@ class Budget:
     words: str
 
 
-def parse_budgets(
-    given: Sequence[str], limits: Collection[str] = ("energy", "latency", "accuracy")
-) -> tuple[Budget, ...]:
+def parse_budgets(given: Sequence[str], limits: Collection[str] = ("energy", "time", "accuracy")) -> tuple[Budget, ...]:
     """Read the words of every ``--budget``; an OptionError says which is none of what has `limits`."""
     budgets: dict[str, Budget] = {}
     for words in given:

@@ -92,7 +92,7 @@ class Point(Configuration):
 
     @property
     def label(self) -> str:
-        """Short name: ``objects 4b 2p, latency, 50 %``."""
+        """Short name: ``objects 4b 2p, fc1:6, 50 %``."""
         layout = "" if self.cores == FEWEST else f", {self.cores}"
         return f"{self.network} {self.storage}{layout}, {self.window} %"
 
@@ -136,7 +136,7 @@ class ChosenBy:
         """Costs that accuracy is held against, by name: what gives them of figures."""
         found: dict[str, Callable[[Figures], float]] = {"energy": lambda figures: figures.energy_j[self.energy]}
         if (time := self.time) is not None:
-            found["latency"] = lambda figures: figures.time_s[time]
+            found["time"] = lambda figures: figures.time_s[time]
         return found
 
 

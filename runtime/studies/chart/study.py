@@ -134,7 +134,7 @@ def pick(points: Sequence[Point], budgets: Sequence[Budget], by: ChosenBy) -> Pi
     """
     costs = by.costs()
     if any(budget.what not in (*costs, "accuracy") for budget in budgets):
-        raise OptionError("--budget latency: the chip has no time table, nothing is timed; omit it")
+        raise OptionError("--budget time: the chip has no time table, nothing is timed; omit it")
 
     def energy(point: Point) -> float:
         return costs["energy"](point.train)
