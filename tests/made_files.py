@@ -12,8 +12,8 @@ import torch
 from spikeloom.compiler.archive import ZIP_DATE
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.models.graphs import Graph, normalised_adjacency
-from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.recordings.evtouch import Recordings
 
 TAXELS, FEATURES, CLASSES, STEPS = 6, 5, 4, 24

@@ -35,12 +35,13 @@ from zoo import specimen
 
 from spikeloom.compiler import archive
 from spikeloom.compiler.errors import CapacityError, SpikeloomError
-from spikeloom.compiler.formats.checkpoint_reader import content_digest, read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.counters import read_network
 from spikeloom.compiler.formats.hdf5 import hdf5_bytes, tree_of
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.formats.nir.reader import read_nir
 from spikeloom.compiler.formats.onnx.reader import read_onnx
+from spikeloom.compiler.formats.own_checkpoint import content_digest
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.targets.base import with_tables
 from spikeloom.compiler.targets.truenorth.native_file import read_trained

@@ -19,10 +19,10 @@ from zoo import STORAGE, tuned
 
 from spikeloom.compiler.errors import CapacityError, OptionError, Violation
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.truenorth.native_file import write_trained
-from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import data_digest
 from spikeloom.runtime.studies import fronts

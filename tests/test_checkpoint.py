@@ -18,9 +18,9 @@ from oracles import refused
 from spikeloom.compiler.archive import npy_bytes, read_npy
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import SIZE_LIMIT
-from spikeloom.compiler.formats.checkpoint_reader import content_digest, read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.formats.own_checkpoint import content_digest, save_checkpoint
 from spikeloom.models.graphs import Graph
-from spikeloom.models.networks.checkpoint import save_checkpoint
 
 TAXELS, FEATURES, HOPS, SIZES, CLASSES = 6, 4, 3, (5, 7), 3
 NOT_A_CHECKPOINT = "is not a checkpoint; give"

@@ -452,7 +452,7 @@ def full(*_words, **_options):
 )
 def test_of_two_files_the_first_is_named(refusal, tmp_path, monkeypatch, trouble, line):
     netlist = tmp_path / "lean.loom"
-    monkeypatch.setattr("spikeloom.models.networks.checkpoint.save_again", trouble)
+    monkeypatch.setattr("spikeloom.compiler.formats.own_checkpoint.save_again", trouble)
     words = ["lean", "net.pt", "--data", "data", "-o", netlist, "--network", tmp_path / "lean.pt"]
     assert refusal(*words) == line.format(netlist)
     assert netlist.exists()

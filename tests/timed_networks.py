@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from spikeloom.compiler.dynamics import Clocks, Dynamics
+from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.models.graphs import NEUTOUCH, build_graph
-from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.systems import filters_of, propagation_of, sensor_grid
 

@@ -26,10 +26,10 @@ from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.dynamics import PLAIN, with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.counters import write_counters
+from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.compiler.formats.tensors import arrays_of, join
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.truenorth.native_file import write_trained
-from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.recordings.events import joined_bins, load_data, of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.cli import main

@@ -9,7 +9,7 @@ from spikeloom.compiler import systems
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.models.networks.checkpoint import save_checkpoint
+from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.models.networks.networks import Architecture
 from spikeloom.models.training.kinds import Plan, same_graph
 from spikeloom.models.training.recipes import RECIPES, Recipe

@@ -60,7 +60,7 @@ def run(request: LeanRequest) -> Outcome:
         made |= {"keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True, "lean": lean}
         write_netlist(replace(netlist, provenance={**netlist.provenance, **made}), request.output)
     if request.network is not None and loaded.checkpoint is not None:
-        from spikeloom.models.networks.checkpoint import save_again
+        from spikeloom.compiler.formats.own_checkpoint import save_again
 
         asked, given = load_graph(request, loaded.checkpoint.system), loaded.checkpoint
         edges = asked.edges if given.edges is None and asked is not None else given.edges

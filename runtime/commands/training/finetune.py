@@ -212,7 +212,7 @@ def _require_trainable(request: FinetuneRequest, loaded: LoadedNetwork, output: 
 def _write_checkpoint(
     request: FinetuneRequest, loaded: LoadedNetwork, net: QuantisedNet, record: FinetuneRecord
 ) -> None:
-    from spikeloom.models.networks.checkpoint import save_again
+    from spikeloom.compiler.formats.own_checkpoint import save_again
 
     output, checkpoint, adjacency = request.output, loaded.checkpoint, loaded.adjacency
     assert checkpoint is not None

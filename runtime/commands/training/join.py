@@ -8,8 +8,8 @@ from typing import Any
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
+from spikeloom.compiler.formats.own_checkpoint import save_again
 from spikeloom.compiler.formats.tensors import join as join_networks
-from spikeloom.models.networks.checkpoint import save_again
 from spikeloom.runtime.commands.main_job.inspect import LayerSize, tower_line
 from spikeloom.runtime.inputs.checkpoint import load_checkpoint
 from spikeloom.runtime.inputs.files import require_place, shipped
