@@ -5,16 +5,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_files import CLASSES, STEPS, TAXELS, events, recorded, small_checkpoint
+from commands import as_json as answer
+from made_files import CLASSES, STEPS, TAXELS, events, recorded, recordings_folder, ring, small_checkpoint, weights
 from numpy.testing import assert_array_equal
 from timed_networks import events_of, written
 
 from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.models.networks.reference import float_spikes
+from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.trace import unpack
@@ -334,3 +337,18 @@ def test_the_page_of_a_network_shows_it_if_it_is_a_result_about_its_netlist(as_j
         line = refusal(*words, "wrong.json")
         assert line.startswith("--stress wrong.json: ")
         assert all(part in line for part in telling.split("|"))
+
+
+def test_recordings_have_one_hash_whatever_is_asked_of_them(tmp_path):
+    """Also where a step of the network joins several of their bins."""
+    data, model, chip = (tmp_path / name for name in ("data", "net.pt", "net.loom"))
+    recordings_folder(data)
+    save_checkpoint(model, {"last": weights()}, ring(), beta=0.2, theta=0.5, training={"seed": 0}, bins=2)
+    answer("compile", model, "-o", chip)
+    known = ("--data", data, "--checkpoint", model)
+    hashes = {
+        answer("stress", chip, *known, "--only", "faster", "--seeds", 1)["provenance"]["data_sha256"],
+        answer("certify", chip, *known[:2], "--most", 1)["provenance"]["data_sha256"],
+        answer("report", chip, *known, "-o", tmp_path / "net.html")["provenance"]["data"]["sha256"],
+    }
+    assert hashes == {load_data(str(data), "test").sha256}

@@ -119,6 +119,11 @@ class Recordings:
         arrays: dict[str, AnyArray] = {"events": self.events, "labels": self.labels}
         return arrays if self.lengths is None else arrays | {"lengths": self.lengths}
 
+    @property
+    def sha256(self) -> str:
+        """Hash over them, whatever their names."""
+        return arrays_digest(self.identity())
+
 
 @contextmanager
 def opened(path: Path) -> Iterator[Members]:

@@ -109,8 +109,8 @@ def train(
     options = {
         "architecture": repr(architecture),
         "graph": arrays_digest({"adjacency": propagation}),
-        "training data": arrays_digest(training.identity()),
-        "test data": arrays_digest(test.identity()),
+        "training data": training.sha256,
+        "test data": test.sha256,
         "epochs": epochs,
         "seed": seed,
         "recipe": recipe.to_json(),

@@ -12,7 +12,15 @@ from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings import events
 from spikeloom.models.recordings.counts import number, show_counts
-from spikeloom.models.recordings.evtouch import BIN_S, UNLABELLED, Recordings, first_part, other_taxels, parse_window
+from spikeloom.models.recordings.evtouch import (
+    BIN_S,
+    UNLABELLED,
+    WHOLE,
+    Recordings,
+    first_part,
+    other_taxels,
+    parse_window,
+)
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
 from spikeloom.runtime.report.console import progress, tell
 from spikeloom.runtime.requests.choices import SplitChoice
@@ -150,13 +158,16 @@ def load_recordings(
         classes=netlist.classes,
         taxels=netlist.taxels,
         bin_s=request.bin,
-        bins=netlist.bins if joined else 1,
         labels_for=labels_for,
         trained=origin_of(netlist.provenance),
     )
-    if not joined:
-        return data
-    data, length = first_part(data, window), netlist.clocks.length
+    return in_steps(data, netlist, window) if joined else data
+
+
+def in_steps(data: Recordings, netlist: Netlist, window: int = WHOLE) -> Recordings:
+    """Recordings in steps of a network: the first `window` per cent of each, as long as the network needs."""
+    data = first_part(events.joined_bins(data, netlist.bins), window)
+    length = netlist.clocks.length
     if length is not None and (late := int(data.events[..., length:].sum(dtype=np.int64))):
         tell(f"warning: {data.source}: {number(late, 'event')} after the network's {length} steps: not used")
     return events.of_length(data, length)

@@ -1,6 +1,5 @@
 """All that the page of a network shows, as its JSON has it, and where that is from."""
 
-import hashlib
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -148,16 +147,12 @@ def provenance(
     data: Recordings,
     recording: str,
 ) -> Provenance:
-    """Where everything is from; `recording` is the one that is drawn.
+    """Where everything is from; `data` are in their own bins, `recording` is the one that is drawn.
 
     File names are those of the files, without their folders; the page is always called ``report.html``.
     """
     checkpoint = loaded.checkpoint
     file = Path(request.checkpoint).name if isinstance(request.checkpoint, str) else loaded.format
-    digest = hashlib.sha256()
-    for name, array in data.identity().items():
-        digest.update(f"{name} {array.shape} {array.dtype.str}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
     facts: JsonObject = dict.fromkeys(("system", "weights", "dynamics", "training"))
     if checkpoint is not None:
         facts |= {"system": checkpoint.system, "weights": checkpoint.weights, "training": checkpoint.training}
@@ -171,7 +166,7 @@ def provenance(
             facts={"compiled": dict(netlist.provenance)},
         ),
         checkpoint=Origin(file=file, sha256=loaded.sha256, facts=facts),
-        data=Origin(file=Path(data.source).name, sha256=digest.hexdigest(), facts=recorded),
+        data=Origin(file=Path(data.source).name, sha256=data.sha256, facts=recorded),
         tables={f"energy, {table.name}": table.title for table in target.energy}
         | {f"time, {table.name}": table.title for table in target.time},
         versions={"spikeloom": __version__, "python": platform.python_version()}

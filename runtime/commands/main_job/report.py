@@ -11,7 +11,7 @@ from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork
-from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
+from spikeloom.runtime.inputs.recordings import find_recording, in_steps, load_recordings
 from spikeloom.runtime.machines.backends import backend_of, describe, machine_for
 from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.machines.capabilities import Comparable
@@ -50,7 +50,7 @@ def run(request: ReportRequest) -> Outcome:
     if isinstance(machine, Comparable):
         require_match(netlist, reference.loaded.model)
     reference.loaded.require_same(request.netlist, netlist, request.run)
-    data = load_recordings(request.data, request, netlist, labels_for="report")
+    data = load_recordings(request.data, request, netlist, labels_for="report", joined=False)
     machine.require_sensor(data.events)
     report = _report(request, machine, reference.source, reference.loaded, data, battery)
     made = report.provenance
@@ -69,11 +69,12 @@ def _report(
     machine: Machine,
     source: Any,
     loaded: LoadedNetwork,
-    data: Recordings,
+    recorded: Recordings,
     stress: Stress | None,
 ) -> Report:
     """All that the page shows."""
     netlist = machine.netlist
+    data = in_steps(recorded, netlist)
     chosen = None if request.recording is None else find_recording(data, request.recording, "--recording")
     count = Progress(len(data))
     verdict = verify(
@@ -93,7 +94,7 @@ def _report(
         chosen = int(apart[0]) if len(apart) else 0 if first is None else data.files.index(first.file)
     progress("pricing")
     ran, price = machine.price(data.events, lengths=data.lengths, bin_s=data.seconds)
-    origin = provenance(request, netlist, machine.target, loaded, data, data.files[chosen])
+    origin = provenance(request, netlist, machine.target, loaded, recorded, data.files[chosen])
     described = describe(request.netlist)
     return Report(
         verify=verdict,
