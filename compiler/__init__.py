@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from spikeloom.compiler.ir import IntegerNetwork, Network
-    from spikeloom.compiler.passes.expand import Factored
     from spikeloom.compiler.targets.loihi1.lift import lift
     from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist, write_netlist
     from spikeloom.compiler.targets.loihi1.options import KEEP, MAX_PLANES, Options, Packing, check_packings
@@ -43,7 +42,7 @@ def __getattr__(name: str) -> Any:
 
 
 def compile_network(
-    source: Factored | Network | IntegerNetwork,
+    source: Network | IntegerNetwork,
     options: Options | None = None,
     *,
     after: Callable[[str, Compilation], object] | None = None,

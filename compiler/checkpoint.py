@@ -4,20 +4,17 @@ Files are read and written by :mod:`compiler.formats`; :mod:`passes.expand` writ
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
 from spikeloom.compiler.fixedpoint import frozen
 from spikeloom.compiler.ir import Form, Readout
 from spikeloom.compiler.systems import MLP, TACTILESGNET, Grid, in_order
-from spikeloom.compiler.types import AnyArray, IntArray
-
-Float32Array = npt.NDArray[np.float32]
+from spikeloom.compiler.types import AnyArray, BoolArray, Float32Array, IntArray
 
 WEIGHTS = ("last", "best", "clean")
 """Sets that our own format can hold."""
@@ -113,7 +110,7 @@ def constant_faults(beta: float | None, theta: float | None) -> list[str]:
 
 
 SHARED = -1
-"""Tower of the relays of clocks."""
+"""Tower of the relays of clocks, which all receive."""
 
 
 def towers_of(checkpoint: Checkpoint) -> tuple[IntArray, ...]:
@@ -124,3 +121,24 @@ def towers_of(checkpoint: Checkpoint) -> tuple[IntArray, ...]:
     relays = np.full(checkpoint.dynamics.clocks.channels, SHARED)
     dense = (np.repeat(towers, len(stage.bias) // checkpoint.towers) for stage in checkpoint.dense)
     return (np.concatenate([first, relays]), *dense)
+
+
+def neurons_of(tower: int, owner: IntArray) -> BoolArray:
+    """Which neurons of a layer a tower has, the shared ones among them."""
+    return np.asarray((owner == tower) | (owner == SHARED))
+
+
+def merge(owners: Sequence[IntArray], parts: Sequence[Sequence[AnyArray]]) -> list[AnyArray]:
+    """Values of all neurons by layer, (..., neurons), from those of each tower.
+
+    >>> merge([np.array([0, 1, SHARED])], [[np.array([5, 9])], [np.array([7, 9])]])
+    [array([5, 7, 9])]
+    """
+    merged = []
+    for layer, owner in enumerate(owners):
+        first = parts[0][layer]
+        values = np.empty((*first.shape[:-1], len(owner)), first.dtype)
+        for tower, part in enumerate(parts):
+            values[..., neurons_of(tower, owner)] = part[layer]
+        merged.append(values)
+    return merged

@@ -7,7 +7,7 @@ object can know is checked on construction, everything else in :mod:`compiler.in
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from scipy import sparse
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
 from spikeloom.compiler.fixedpoint import in_units, kept_shares
-from spikeloom.compiler.types import AnyArray, FloatArray, IntArray
+from spikeloom.compiler.types import AnyArray, Float32Array, FloatArray, IntArray
 
 INPUT = -1
 """Source id of a projection that starts at the input."""
@@ -95,6 +95,22 @@ class Form:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Convolution:
+    """The first layer as it was trained: filters that all its places share, see :mod:`compiler.systems`.
+
+    Sums of float32 depend on their order. With the filters a network can be run in the order in which it was trained,
+    and trained further, while its projections hold the same weights, written out synapse by synapse in float64.
+    """
+
+    system: str  # One of ``SYSTEMS``
+    filters: Float32Array  # (filters, features, channels)
+    bias: Float32Array  # (features,)
+    # Of a TactileSGNet the normalised adjacency A, (taxels, taxels); else the stack (filters, places, taxels)
+    propagation: FloatArray
+    towers: tuple[IntArray, ...] = ()  # Of a joined network, by layer: see :func:`checkpoint.towers_of`
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Network:
     """A spiking network in real numbers."""
 
@@ -104,6 +120,8 @@ class Network:
     readout: Readout
     classes: int
     forms: tuple[Form, ...] | None = None  # How the chip stores each population, where it was fine-tuned for it
+    # Where it comes from a checkpoint; whatever changes weights leaves it out. Not printed: it says nothing new
+    convolution: Convolution | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -11,6 +11,8 @@ BoolArray = npt.NDArray[np.bool_]
 
 EventArray = npt.NDArray[np.uint8 | np.bool_]
 
+Float32Array = npt.NDArray[np.float32]
+
 FloatArray = npt.NDArray[np.float64]
 
 IntArray = npt.NDArray[np.int64]

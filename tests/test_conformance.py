@@ -240,7 +240,7 @@ def test_the_expanded_network_is_the_float_model(name):
     made = specimen(name)
     loaded = float_side(made)
     for dtype in ("float64", "float32"):
-        wanted = float_spikes(loaded.checkpoint, loaded.adjacency, made.events, dtype=dtype)
+        wanted = float_spikes(loaded.network, made.events, dtype=dtype)
         inputs = channels_last(made.events, loaded.network.input.clocks)
         found = run_float(loaded.network, inputs, dtype=dtype).spikes
         for ours, (layer, theirs) in zip(found, wanted.items(), strict=True):

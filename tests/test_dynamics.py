@@ -14,6 +14,7 @@ from timed_networks import GRAPH, SMALL, TIMING, louder, written
 from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, clocks_over
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.networks.reference import float_membranes, float_spikes
@@ -127,7 +128,10 @@ def test_a_checkpoint_holds_the_dynamics_and_its_float_model_is_the_network(tmp_
     assert checkpoint.dense[0].weight.shape == (8, checkpoint.places * 3 + 3)
     events = (np.random.default_rng(4).random((2, 39, 2, 15)) < 0.2).astype(np.uint8)
     time_first = torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32))
-    spikes, membranes = float_spikes(checkpoint, seen, events), float_membranes(checkpoint, seen, events)
+    spikes, membranes = (
+        float_spikes(expand(checkpoint, seen), events),
+        float_membranes(expand(checkpoint, seen), events),
+    )
     for name, (ours, values) in network.layers(time_first).items():
         if (system, name) == ("grid-cnn", "conv1"):
             continue  # these neurons lie in another order

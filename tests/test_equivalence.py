@@ -12,7 +12,7 @@ from random_netlists import Neuron, build
 from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.interpret import channels_last, run_float
-from spikeloom.compiler.passes.expand import Factored, expand
+from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.runtime.equivalence.reference import LADDER, realised
 from spikeloom.runtime.equivalence.verify import verify
@@ -40,7 +40,7 @@ def small(tmp_path_factory):
 @pytest.fixture(scope="module")
 def verdict(small):
     checkpoint, adjacency, netlist = small
-    return verify(netlist, Factored(checkpoint, adjacency), GIVEN)
+    return verify(netlist, expand(checkpoint, adjacency), GIVEN)
 
 
 def by_specification(netlist, recordings):
@@ -58,8 +58,8 @@ def by_specification(netlist, recordings):
 
 def test_spikes_and_decisions(small, verdict):
     checkpoint, adjacency, netlist = small
-    narrow = list(float_spikes(checkpoint, adjacency, events(2)).values())
-    wide = list(float_spikes(checkpoint, adjacency, events(2), dtype="float64").values())
+    narrow = list(float_spikes(expand(checkpoint, adjacency), events(2)).values())
+    wide = list(float_spikes(expand(checkpoint, adjacency), events(2), dtype="float64").values())
     chip, _ = by_specification(netlist, events(2))
     assert list(verdict.spikes) == LAYERS
     for name, a, b, c in zip(LAYERS, narrow, chip, wide, strict=True):
@@ -83,8 +83,8 @@ def test_the_first_divergence_is_the_first(tmp_path, seed, bits):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
     options = Options(packings=(Packing(bits=bits),), keep_all=bits == 6)
     netlist, recordings = compile_network(expand(checkpoint, adjacency), options).netlist, events(2 + seed, samples=3)
-    found = verify(netlist, Factored(checkpoint, adjacency), recorded(recordings), spec_samples=1).first_divergence
-    reference = list(float_spikes(checkpoint, adjacency, recordings).values())
+    found = verify(netlist, expand(checkpoint, adjacency), recorded(recordings), spec_samples=1).first_divergence
+    reference = list(float_spikes(expand(checkpoint, adjacency), recordings).values())
     chip, registers = by_specification(netlist, recordings)
     sample, step, layer, neuron = next(
         (sample, step, layer, neuron)
@@ -97,7 +97,7 @@ def test_the_first_divergence_is_the_first(tmp_path, seed, bits):
     compartment = netlist.compartments_of(layer)[neuron]
     assert (found.file, found.step, found.layer, found.neuron) == (f"{sample}.npy", step, LAYERS[layer], neuron)
     assert (found.taxel, found.feature) == ((neuron // 5, neuron % 5) if layer == 0 else (None, None))
-    membranes = list(float_membranes(checkpoint, adjacency, recordings).values())
+    membranes = list(float_membranes(expand(checkpoint, adjacency), recordings).values())
     assert found.float_membrane == membranes[layer][sample, step, neuron]
     assert found.chip_register == registers[layer][sample, step, neuron]
     assert found.chip_membrane == found.chip_register / (64 * netlist.scale[compartment])
@@ -147,7 +147,7 @@ def test_saturation_is_a_rung_of_its_own(tmp_path):
     recordings = np.zeros((1, 6, 2, 80), np.uint8)
     recordings[:, :, :, 30:] = 1
     netlist = compile_network(expand(checkpoint, adjacency)).netlist
-    found = verify(netlist, Factored(checkpoint, adjacency), recorded(recordings))
+    found = verify(netlist, expand(checkpoint, adjacency), recorded(recordings))
     ladder = rungs(found)
     assert ladder["rounding"]["fc1"] < ladder["saturation"]["fc1"] == found.spikes["fc1"].different
     assert found.first_divergence.layer == "fc1"
@@ -162,14 +162,14 @@ def test_ill_posed_spikes_are_told_from_faults(tmp_path):
     arrays["fc2.weight"][:, :2] = [1.0, 2.0**-25]
     checkpoint, adjacency = small_checkpoint(tmp_path, last=arrays, beta=0.0, theta=1.0)
     netlist = compile_network(expand(checkpoint, adjacency), Options(keep_all=True)).netlist
-    found = verify(netlist, Factored(checkpoint, adjacency), recorded(events(0)))
+    found = verify(netlist, expand(checkpoint, adjacency), recorded(events(0)))
     assert found.spikes["fc2"].float == 0
     assert found.spikes["fc2"].ill_posed == 6 * STEPS * 8
     assert found.spikes["fc1"].ill_posed == 0
     assert rungs(found)["float64"] == {"conv1": 0, "fc1": 0, "fc2": 6 * STEPS * 8, "fc3": 0}
     # a finer chip would have sided with float64; this one stands for it
     finer = dataclasses.replace(netlist, threshold=read_only(netlist.threshold - (netlist.layer == 2)))
-    first = verify(finer, Factored(checkpoint, adjacency), recorded(events(0))).first_divergence
+    first = verify(finer, expand(checkpoint, adjacency), recorded(events(0))).first_divergence
     assert (first.layer, first.step, first.neuron, first.ill_posed) == ("fc2", 0, 0, True)
 
 
@@ -187,9 +187,9 @@ def test_a_single_wrong_bit_is_found_out(small, monkeypatch, field):
                 getattr(trace.counts, field.removeprefix("counted "))[0, -1] += 1
         return trace
 
-    assert verify(netlist, Factored(checkpoint, adjacency), GIVEN, spec_samples=1).spec_equals_engine
+    assert verify(netlist, expand(checkpoint, adjacency), GIVEN, spec_samples=1).spec_equals_engine
     monkeypatch.setattr(engine, "simulate", wrong)
-    assert not verify(netlist, Factored(checkpoint, adjacency), GIVEN, spec_samples=1).spec_equals_engine
+    assert not verify(netlist, expand(checkpoint, adjacency), GIVEN, spec_samples=1).spec_equals_engine
 
 
 def test_the_ladder_carries_thresholds_that_differ(small):

@@ -116,8 +116,8 @@ def test_towers_spike_as_the_single_networks_bit_for_bit(tmp_path, system, dynam
     singles, wide, seen = joined(tmp_path, system, dynamics)
     dtype = "float32" if system == "grid-cnn" else "float64"
     events = events_of(5, samples=4, steps=30)
-    alone = [float_spikes(single, seen, events, dtype=dtype) for single in singles]
-    found = float_spikes(wide, seen, events, dtype=dtype)
+    alone = [float_spikes(expand(single, seen), events, dtype=dtype) for single in singles]
+    found = float_spikes(expand(wide, seen), events, dtype=dtype)
     assert list(found) == ["conv1", "fc1", "fc2", "fc3"]
     for name, spikes in found.items():
         assert_array_equal(spikes, one_by_one(alone, wide, name), err_msg=name)
@@ -125,8 +125,8 @@ def test_towers_spike_as_the_single_networks_bit_for_bit(tmp_path, system, dynam
     summed = sum(run["fc3"].sum(axis=1, dtype=np.int64) for run in alone)
     assert_array_equal(readout_counts(wide.readout, wide.classes, found["fc3"]), summed)
     assert summed.any()
-    still = float_membranes(wide, seen, events, dtype=dtype)
-    single_membranes = [float_membranes(single, seen, events, dtype=dtype) for single in singles]
+    still = float_membranes(expand(wide, seen), events, dtype=dtype)
+    single_membranes = [float_membranes(expand(single, seen), events, dtype=dtype) for single in singles]
     for name, membranes in still.items():
         assert_array_equal(membranes, one_by_one(single_membranes, wide, name, membranes.dtype), err_msg=name)
 
@@ -155,7 +155,7 @@ def test_yardsticks_count_no_weights_between_towers(tmp_path):
     events = events_of(3, samples=4)
 
     def bench(checkpoint):
-        return yardsticks.measure(checkpoint, seen, events, float_spikes(checkpoint, seen, events)).neurobench
+        return yardsticks.measure(checkpoint, seen, events, float_spikes(expand(checkpoint, seen), events)).neurobench
 
     alone, found = [bench(single) for single in singles], bench(wide)
     assert found.footprint == sum(each.footprint for each in alone)

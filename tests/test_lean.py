@@ -38,7 +38,7 @@ def compiled(tmp_path_factory):
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"), last=weights(3, gain=2.5))
     network = expand(checkpoint, adjacency)
     compilation = compile_network(network, Options(training_events=made(1, 24)))
-    loaded = LoadedNetwork(network=network, sha256="", checkpoint=checkpoint, adjacency=adjacency)
+    loaded = LoadedNetwork(network=network, sha256="", checkpoint=checkpoint)
     return loaded, compilation, recorded(made(1, 24))
 
 
@@ -201,7 +201,7 @@ def test_what_is_pruned_can_be_trained_on(compiled, as_json, refusal):
         weight[:, numbers] = 0
     dense = (first, *(replace(each, weight=weight) for each, weight in zip((second, last), silent, strict=True)))
     ran = [
-        float_simulation(expand(each, loaded.adjacency)).run(channels_last(seen.events)).spikes[3]
+        float_simulation(expand(each, loaded.network.convolution.propagation)).run(channels_last(seen.events)).spikes[3]
         for each in (narrow, replace(checkpoint, dense=dense))
     ]
     assert ran[0].any()

@@ -18,7 +18,7 @@ from test_dynamics import surrogate_spike
 from spikeloom.compiler import Options, compile_network, lift
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
-from spikeloom.compiler.passes.expand import Factored, expand
+from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, TACTILESGNET, Grid, in_order
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.graphs import NEUTOUCH, build_graph, normalised_adjacency
@@ -119,9 +119,9 @@ def test_initial_weights_follow_the_seed_and_leave_the_global_random_state_alone
 def test_recordings_do_not_influence_each_other(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     recordings = made_events(4, samples=BATCH + 3)  # two batches
-    together = float_spikes(checkpoint, adjacency, recordings)
+    together = float_spikes(expand(checkpoint, adjacency), recordings)
     for sample in (0, BATCH - 1, BATCH, BATCH + 2):
-        alone = float_spikes(checkpoint, adjacency, recordings[sample : sample + 1])
+        alone = float_spikes(expand(checkpoint, adjacency), recordings[sample : sample + 1])
         for layer, spikes in together.items():
             assert_array_equal(alone[layer][0], spikes[sample])
 
@@ -131,7 +131,7 @@ def test_every_released_spike_count(released_checkpoint, objects_zip, checkpoint
     checkpoint = read_checkpoint(released_checkpoint)
     data = load_data(objects_zip, "test", classes=checkpoint.classes, taxels=checkpoint.taxels)
     expected = json.loads((checkpoints / "objects_manual.expected.json").read_text())
-    spikes = float_spikes(checkpoint, adjacency_of(), data.events)
+    spikes = float_spikes(expand(checkpoint, adjacency_of()), data.events)
     assert list(data.files) == expected["files"]
     assert data.labels.tolist() == expected["labels"]
     counts = spikes["fc3"].sum(axis=1)
@@ -321,8 +321,8 @@ def test_spikes_and_membranes_are_those_of_plain_torch(tmp_path, system, padding
     network = network_of(system, padding=padding)
     state = {name: tensor.to(getattr(torch, dtype)) for name, tensor in state_of(network).items()}
     found, events = saved(tmp_path, network, padding=padding, beta=beta, theta=theta), events_of(7)
-    spikes = float_spikes(found, seen_by(system, padding), events, dtype=dtype)
-    membranes = float_membranes(found, seen_by(system, padding), events, dtype=dtype)
+    spikes = float_spikes(expand(found, seen_by(system, padding)), events, dtype=dtype)
+    membranes = float_membranes(expand(found, seen_by(system, padding)), events, dtype=dtype)
     assert list(spikes) == list(membranes) == ["conv1", "fc1", "fc2", "fc3"]
     tolerance = 1e-5 if dtype == "float32" else 1e-12
     for sample, recording in enumerate(events):
@@ -356,13 +356,13 @@ def test_fine_tuned_on_the_chips_integers_they_are_the_chip(tmp_path, system, bi
     checkpoint = saved(tmp_path, network)
     data = [synthetic_grasps(per_class=2, steps=12, seed=seed) for seed in (1, 2)]
     training, test = (grasps.part(grasps.labels < 4) for grasps in data)
-    tuned = finetune(Factored(checkpoint, seen), training, test, load_target("loihi1"), bits=[bits], epochs=4)
+    tuned = finetune(expand(checkpoint, seen), training, test, load_target("loihi1"), bits=[bits], epochs=4)
     assert system != TACTILESGNET or tuned.history[-1].loss < tuned.history[0].loss
     again = saved(tmp_path, network, weights=tuned.net.tensors(), forms=tuned.net.forms)
     netlist = compile_network(expand(again, seen), Options(forms=again.forms)).netlist
     assert {projection.bits for projection in lift(netlist).projections} == {bits}
-    verdict = verify(netlist, Factored(again, seen), test)
+    verdict = verify(netlist, expand(again, seen), test)
     assert verdict.model_different == 0
     assert verdict.spikes["fc1"].chip > 0
-    model = list(quantised_spikes(Factored(again, seen), test.events).values())[-1]
+    model = list(quantised_spikes(expand(again, seen), test.events).values())[-1]
     assert np.count_nonzero(model.sum(axis=1).argmax(axis=1) == test.labels) == tuned.after

@@ -25,7 +25,7 @@ from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import INPUT, depths, fan_in
-from spikeloom.compiler.passes.expand import Factored, expand, hop_powers, synapses
+from spikeloom.compiler.passes.expand import expand, hop_powers, synapses
 from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, removable, removals
 from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.pipeline import run
@@ -38,10 +38,10 @@ from spikeloom.runtime.equivalence.verify import verify
 
 def test_the_passes_run_in_order_and_hand_on_what_they_make():
     seen = {}
-    source = Factored(checkpoint=random_checkpoint(), propagation=ring(5))
+    source = expand(checkpoint=random_checkpoint(), propagation=ring(5))
     done = compile_network(source, after=lambda name, made: seen.setdefault(name, made.newest))
     assert list(seen) == [step.name for step in PASSES]
-    assert [seen[name] for name in ("expand", "quantize", "remove", "emit")] == [
+    assert [seen[name] for name in ("calibrate", "quantize", "remove", "emit")] == [
         done.network,
         done.integer,
         done.held,
@@ -56,6 +56,13 @@ def test_the_passes_run_in_order_and_hand_on_what_they_make():
     assert all(use.used <= use.allowed for use in done.uses)
     assert done.netlist.provenance["compensated"] == []
     assert list(done.netlist.provenance["digests"]) == ["conv1", "fc1", "fc2", "fc3"]
+
+
+def test_changed_weights_are_no_longer_those_of_the_filters():
+    network = expand(random_checkpoint(), ring(5))
+    silent = tuple(np.arange(population.size) == 0 for population in network.populations)
+    assert network.convolution is not None
+    assert disconnect(network, silent).convolution is None
 
 
 def test_the_table_of_passes_in_the_docs():
@@ -239,7 +246,7 @@ def test_unread_neurons_are_not_compared(tmp_path):
     compilation = compile_network(expand(changed, adjacency))
     netlist = compilation.netlist
     assert netlist.layers[0].unread == (0, 1, 2)
-    verdict = verify(netlist, Factored(changed, adjacency), recorded(events(2)))
+    verdict = verify(netlist, expand(changed, adjacency), recorded(events(2)))
     reference = run_float(compilation.network, channels_last(events(2))).spikes[0]
     assert reference[..., :3].any()
     assert verdict.spikes["conv1"].float == int(reference[..., 3:].sum())

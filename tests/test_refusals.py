@@ -98,7 +98,7 @@ TABLE = [
     (COMPILE.format("net.pt more"), "unrecognized arguments: more"),
     ("inspect net.loom --beta 0.3", "--beta 0.3: is for checkpoints|net.loom is a netlist"),
     ("inspect net.loom --weights best", "--weights best|net.loom is a netlist"),
-    (COMPILE.format("net.pt --dump-after nope"), "--dump-after nope|expand, calibrate"),
+    (COMPILE.format("net.pt --dump-after nope"), "--dump-after nope|calibrate, disconnect"),
     (VERIFY.format("--require E0 --min-agreement 0.9"), "--min-agreement 0.9|E3=0.9"),
     (RUN.format("data --bin 0.05"), "--bin 0.05: data holds bins"),
     ("estimate net.loom --data synthetic --bin 0.05", "--bin 0.05: synthetic holds bins"),

@@ -26,6 +26,7 @@ from zoo import specimen
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist, write_netlist
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.networks.reference import float_membranes, float_spikes
@@ -134,7 +135,7 @@ def test_spikes_and_membranes_are_those_of_both_sides(made, place):
     data = load_data(str(place / "data"), "test")
     one = data.events[recording["index"]][None]
     seen = normalised_adjacency(checkpoint.edges, TAXELS)
-    ours = float_spikes(checkpoint, seen, one)
+    ours = float_spikes(expand(checkpoint, seen), one)
     trace = engine.simulate(netlist, one.reshape(1, -1, STEPS), spikes=True, membranes=True)
     for i, layer in enumerate(recording["layers"]):
         chip = aligned(netlist, trace.spikes, i)[0]
@@ -145,7 +146,7 @@ def test_spikes_and_membranes_are_those_of_both_sides(made, place):
             assert_array_equal(found, wanted)
             assert layer[f"{side}_spikes"] == wanted.sum()
         assert layer["different"] == (ours[layer["name"]][0] != chip).sum() > 0
-    membranes = float_membranes(checkpoint, seen, one)
+    membranes = float_membranes(expand(checkpoint, seen), one)
     for shown in recording["membranes"]:
         window = slice(shown["first_step"], shown["first_step"] + len(shown["float"]))
         assert_array_equal(shown["float"], membranes[shown["layer"]][0, window, shown["neuron"]])

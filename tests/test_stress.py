@@ -15,7 +15,7 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.compiler.interpret import vote
-from spikeloom.compiler.passes.expand import Factored, expand
+from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.equivalence.verify import verify
@@ -67,7 +67,7 @@ def test_clean_recordings_are_what_reference_and_engine_say(bench, small):
     flat = with_clocks(bench.events, bench.pair.netlist.clocks)
     trace = engine.simulate(bench.pair.netlist, flat)
     assert_array_equal(found.votes["chip"], class_counts(bench.pair.netlist, trace.counts.spikes))
-    layers = float_spikes(*small, bench.events)
+    layers = float_spikes(expand(*small), bench.events)
     counts = readout_counts(bench.pair.network.readout, CLASSES, layers["fc3"])
     assert_array_equal(found.votes["float"], counts)
     for layer, (name, spikes) in enumerate(layers.items()):
@@ -75,7 +75,7 @@ def test_clean_recordings_are_what_reference_and_engine_say(bench, small):
         ids = bench.pair.netlist.compartments_of(layer)
         assert counted.layers[name][1] == trace.counts.spikes[:, ids].sum()
         assert counted.layers[name][3] == len(ids) * 8 * STEPS
-    for name, spikes in verify(bench.pair.netlist, Factored(*small), recorded(bench.events)).spikes.items():
+    for name, spikes in verify(bench.pair.netlist, expand(*small), recorded(bench.events)).spikes.items():
         assert counted.layers[name][:3] == (spikes.float, spikes.chip, spikes.different)
     equal = np.count_nonzero(vote(found.votes["chip"]) == vote(counts))
     assert counted.equal == equal

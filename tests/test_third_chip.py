@@ -14,7 +14,6 @@ from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.interpret import cut
 from spikeloom.compiler.targets.base import EnergyTable, Quantity, Target
 from spikeloom.compiler.targets.netlist_file import Netlist, NetlistFile
-from spikeloom.runtime.equivalence.reference import float_network
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.repeat import PLACING, ROUNDING, refuse
 from spikeloom.runtime.machines import backends
@@ -174,8 +173,8 @@ class Machinery(Machine):
     def simulate(self, channels, lengths, *, spikes, membranes):
         return simulate(self.netlist, channels, lengths)
 
-    def model(self, source):
-        again = lowered(float_network(source))
+    def model(self, network):
+        again = lowered(network)
 
         def spikes(events):
             found = simulate(again, with_clocks(events, again.clocks)).spikes

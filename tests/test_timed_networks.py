@@ -17,7 +17,7 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import IntegerProjection, Projection
 from spikeloom.compiler.passes.calibrate import calibrate
-from spikeloom.compiler.passes.expand import Factored, expand
+from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import never_fires, removable
 from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.targets.loihi1.emit import emit
@@ -129,7 +129,7 @@ def test_the_decay_alone_is_a_rung_of_the_ladder(tmp_path):
         assert [p.realised_alpha for p in integer.populations[1:]] == [0.5] * 3
         events = events_of(21, samples=8, steps=200)
         netlist = compile_network(network).netlist
-        verdict = verify(netlist, Factored(checkpoint, seen), recorded(events), spec_samples=1)
+        verdict = verify(netlist, expand(checkpoint, seen), recorded(events), spec_samples=1)
         different = {rung.stage: sum(rung.different.values()) for rung in verdict.ladder}
         moved.append(different["beta"] - different["float64"])
     assert moved[0] == 0

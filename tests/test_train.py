@@ -26,7 +26,7 @@ from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_integer
-from spikeloom.compiler.passes.expand import Factored, expand
+from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
@@ -252,7 +252,7 @@ def drawn(checkpoint, seed, *, samples=12, steps=20):
 
 def tuned_forms(checkpoint, adjacency, events, bits):
     asked = Options(packings=[Packing(bits=bits, groups=8)], keep_all=True, training_events=events)
-    return compile_network(Factored(checkpoint, adjacency), asked).integer.forms
+    return compile_network(expand(checkpoint, adjacency), asked).integer.forms
 
 
 @pytest.mark.parametrize(("bits", "seed"), [(2, 0), (3, 1), (4, 2), (8, 0)])
@@ -260,7 +260,7 @@ def test_the_model_computes_what_the_compiled_network_computes(tmp_path, bits, s
     checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
     data = drawn(checkpoint, seed)
     forms = tuned_forms(checkpoint, adjacency, data.events, bits)
-    model = QuantisedNet(Factored(checkpoint, adjacency), forms)
+    model = QuantisedNet(expand(checkpoint, adjacency), forms)
     integer, _ = round_to_forms(expand(checkpoint, adjacency), forms)
     found = model.spikes_of(time_first(data.events))
     expected = run_integer(integer, channels_last(data.events)).spikes
@@ -272,7 +272,7 @@ def test_the_model_computes_what_the_compiled_network_computes(tmp_path, bits, s
 def test_batches_do_not_mix(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     data = drawn(checkpoint, 0, samples=5)
-    model = QuantisedNet(Factored(checkpoint, adjacency), tuned_forms(checkpoint, adjacency, data.events, 4))
+    model = QuantisedNet(expand(checkpoint, adjacency), tuned_forms(checkpoint, adjacency, data.events, 4))
     together = model(time_first(data.events))
     alone = torch.cat([model(time_first(data.events[i : i + 1])) for i in range(5)])
     assert torch.equal(together, alone)
@@ -282,7 +282,7 @@ def test_gradients_are_those_of_the_rounded_float_model(tmp_path):
     """At 8 bits and with scales this fine the straight-through gradient is the float model's, to a few parts in 100."""
     checkpoint, adjacency = small_checkpoint(tmp_path)
     data = drawn(checkpoint, 1, samples=3)
-    model = QuantisedNet(Factored(checkpoint, adjacency), tuned_forms(checkpoint, adjacency, data.events, 8))
+    model = QuantisedNet(expand(checkpoint, adjacency), tuned_forms(checkpoint, adjacency, data.events, 8))
     model(time_first(data.events)).square().sum().backward()
     sizes = [len(dense.bias) for dense in checkpoint.dense]
     architecture = Architecture(
@@ -308,7 +308,7 @@ def test_weights_that_would_overflow_are_shrunk(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     data = drawn(checkpoint, 0)
     forms = tuned_forms(checkpoint, adjacency, data.events, 8)
-    model = QuantisedNet(Factored(checkpoint, adjacency), forms)
+    model = QuantisedNet(expand(checkpoint, adjacency), forms)
     with torch.no_grad():
         model.hops *= 40
         model.weights[0] *= 40
@@ -335,7 +335,7 @@ def test_what_is_lost_and_comes_has_its_chance():
 
 def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
-    network, train, test = Factored(checkpoint, adjacency), drawn(checkpoint, 0), drawn(checkpoint, 1)
+    network, train, test = expand(checkpoint, adjacency), drawn(checkpoint, 0), drawn(checkpoint, 1)
     whole = finetune(network, train, test, LOIHI, bits=[2], epochs=4, seed=3)
 
     state = tmp_path / "x.state"
@@ -352,7 +352,7 @@ def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
     moved = replace(checkpoint, conv_bias=checkpoint.conv_bias + 1)  # as other epochs of the same file are
     for other, what in ((moved, "network"), (replace(checkpoint, beta=0.6), "beta")):
         words = f"belongs to a training with other {what}"
-        refused(OptionError, words, finetune, Factored(other, adjacency), train, test, LOIHI, resume=True, **options)
+        refused(OptionError, words, finetune, expand(other, adjacency), train, test, LOIHI, resume=True, **options)
 
 
 @pytest.mark.parametrize(
@@ -369,7 +369,7 @@ def test_a_loss_that_is_no_number(tmp_path, monkeypatch, loss, name, found):
     data = drawn(checkpoint, 0)
     monkeypatch.setattr("spikeloom.models.training.finetune.rate_loss", loss)
     words = f"epoch 1, step 1: the {name} is {found}|state of the epoch before is kept"
-    refused(DataError, words, finetune, Factored(checkpoint, adjacency), data, data, LOIHI, bits=[4], epochs=2)
+    refused(DataError, words, finetune, expand(checkpoint, adjacency), data, data, LOIHI, bits=[4], epochs=2)
 
 
 @pytest.mark.parametrize(
@@ -409,7 +409,7 @@ def test_the_model_is_the_chip_on_every_recording(tmp_path, objects_zip, contain
         netlist = compile_network(expand(checkpoint, adjacency), Options(forms=checkpoint.forms)).netlist
         for split in ("train", "test"):
             data = load_data(place, split)
-            model = quantised_spikes(Factored(checkpoint, adjacency), data.events)
+            model = quantised_spikes(expand(checkpoint, adjacency), data.events)
             trace = engine.simulate(netlist, data.events.reshape(len(data), -1, data.steps), spikes=True)
             for index, layer in enumerate(netlist.layers):
                 kept = comparable(netlist, index)  # the chip leaves out what nobody hears

@@ -8,7 +8,7 @@ from made_files import events, recorded, small_checkpoint, weights
 
 from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.passes.expand import Factored, expand
+from spikeloom.compiler.passes.expand import expand
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
 from spikeloom.runtime.equivalence.verdict import (
     LayerSpikes,
@@ -167,7 +167,7 @@ def test_votes_that_decide_little(before, after, expected):
 def verified(folder, arrays, recordings, packing, **options):
     checkpoint, adjacency = small_checkpoint(folder, last=arrays)
     netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(packing,), **options)).netlist
-    made = verify(netlist, Factored(checkpoint, adjacency), recorded(recordings))
+    made = verify(netlist, expand(checkpoint, adjacency), recorded(recordings))
     return {breakdown.kind: breakdown for breakdown in made.breakdowns}
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler import Compilation, Options, compile_network, without
-from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import cut, vote
@@ -53,12 +52,12 @@ def measure(path: Path, training: Recordings, test: Recordings) -> Json:
         checkpoint = read_checkpoint(path, weights=which)
         epoch = (checkpoint.training or {})[which]["epoch"]
         if epoch not in epochs:
-            _, adjacency = propagation(checkpoint, None, str(path))
+            network = expand(checkpoint, propagation(checkpoint, None, str(path))[1])
             try:
-                compilation = _compiled(expand(checkpoint, adjacency), training)
+                compilation = _compiled(network, training)
             except CapacityError as error:
                 return found | {"refused": [str(violation) for violation in error.violations]}
-            decided = float_decisions(checkpoint, adjacency, test)
+            decided = float_decisions(network, test)
             epochs[epoch] = {"epoch": epoch} | _figures(compilation, target, training, test, decided)
         found[which] = epochs[epoch]
     return found
@@ -74,16 +73,16 @@ def _compiled(network: Network, training: Recordings) -> Compilation:
     return compile_network(network, Options(training_events=training.events))
 
 
-def float_decisions(checkpoint: Checkpoint, adjacency: FloatArray, test: Recordings) -> IntArray:
+def float_decisions(network: Network, test: Recordings) -> IntArray:
     """Class of each recording by the float32 model, in the released operator order."""
     from spikeloom.models.networks.reference import float_spikes
 
     counts = []
     for first in range(0, len(test), PART):
         part = slice(first, first + PART)
-        *_, spikes = float_spikes(checkpoint, adjacency, test.events[part]).values()
+        *_, spikes = float_spikes(network, test.events[part]).values()
         lengths = None if test.lengths is None else test.lengths[part]
-        counts.append(readout_counts(checkpoint.readout, checkpoint.classes, cut(spikes, lengths)))
+        counts.append(readout_counts(network.readout, network.classes, cut(spikes, lengths)))
     return vote(np.concatenate(counts))
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from spikeloom.compiler.checkpoint import SHARED, Checkpoint, layers_of, towers_of
+from spikeloom.compiler.checkpoint import Checkpoint, layers_of, merge, neurons_of, towers_of
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.ir import Form
@@ -106,27 +106,16 @@ def members(checkpoint: Checkpoint) -> tuple[Checkpoint, ...]:
     if checkpoint.towers == 1:
         return (checkpoint,)
     owners = towers_of(checkpoint)
-    found = []
+    parts = []
     for tower, arrays in enumerate(apart(arrays_of(checkpoint), checkpoint.towers)):
         forms = None
         if checkpoint.forms is not None:
             forms = tuple(
-                replace(form, threshold=form.threshold[(owner == tower) | (owner == SHARED)])
+                replace(form, threshold=form.threshold[neurons_of(tower, owner)])
                 for form, owner in zip(checkpoint.forms, owners, strict=True)
             )
-        found.append(replace(checkpoint, **layers_of(arrays), forms=forms, towers=1))
-    return tuple(found)
-
-
-def side_by_side(checkpoint: Checkpoint, every: Sequence[Mapping[str, AnyArray]]) -> Arrays:
-    """Values of all neurons from those of each tower; by layer, (..., neurons)."""
-    found = {}
-    for (name, neurons), owner in zip(checkpoint.neurons.items(), towers_of(checkpoint), strict=True):
-        first = every[0][name]
-        found[name] = np.empty((*first.shape[:-1], neurons), first.dtype)
-        for tower, values in enumerate(every):
-            found[name][..., (owner == tower) | (owner == SHARED)] = values[name]
-    return found
+        parts.append(replace(checkpoint, **layers_of(arrays), forms=forms, towers=1))
+    return tuple(parts)
 
 
 def arrays_of(checkpoint: Checkpoint) -> Arrays:
@@ -165,10 +154,8 @@ def _joined_forms(joined: Checkpoint, every: Sequence[Checkpoint]) -> tuple[Form
     forms = [member.forms for member in every if member.forms is not None]
     if not forms:
         return None
-    thresholds = side_by_side(
-        joined, [dict(zip(joined.neurons, (form.threshold for form in one), strict=True)) for one in forms]
-    )
-    return tuple(replace(form, threshold=thresholds[name]) for name, form in zip(joined.neurons, forms[0], strict=True))
+    thresholds = merge(towers_of(joined), [[form.threshold for form in one] for one in forms])
+    return tuple(replace(form, threshold=threshold) for form, threshold in zip(forms[0], thresholds, strict=True))
 
 
 def _facts(checkpoint: Checkpoint) -> dict[str, object]:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import Field, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -17,16 +17,22 @@ def text(made: Any) -> str:
     Arrays appear as ranges and hashes; where something is from (mappings) is left out.
     """
     lines = [type(made).__name__]
-    for field in fields(made):
+    for field in filter(_is_printed, fields(made)):
         held = getattr(made, field.name)
         entries = held if isinstance(held, tuple) else [held]
         lines += [f"  {field.name} {_shown(entry)}" for entry in entries if not isinstance(entry, Mapping)]
     return "\n".join(lines) + "\n"
 
 
+def _is_printed(field: Field[Any]) -> bool:
+    """Whether a field says something that the others do not."""
+    return field.repr
+
+
 def _shown(value: Any) -> str:
     if is_dataclass(value):
-        return " ".join(f"({field.name} {_shown(getattr(value, field.name))})" for field in fields(value))
+        printed = filter(_is_printed, fields(value))
+        return " ".join(f"({field.name} {_shown(getattr(value, field.name))})" for field in printed)
     if sparse.issparse(value):
         shape = " x ".join(map(str, value.shape))
         return f"{shape}, {value.nnz} synapses {_span(value.data)} #{_digest(value.indptr, value.indices, value.data)}"

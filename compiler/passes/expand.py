@@ -12,26 +12,15 @@ The other systems differ in what stands for the powers ``A^k``: a stack of matri
 filter. Outputs equal those of the factored form up to floating-point rounding (float64 throughout).
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy import sparse
 
-from spikeloom.compiler.checkpoint import SHARED, Checkpoint, towers_of
+from spikeloom.compiler.checkpoint import Checkpoint, neurons_of, towers_of
 from spikeloom.compiler.dynamics import RELAY_WEIGHT
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Sparse
+from spikeloom.compiler.ir import INPUT, Convolution, Input, Network, Population, Projection, Sparse
 from spikeloom.compiler.systems import TACTILESGNET, TITLES, in_order
 from spikeloom.compiler.types import BoolArray, FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Factored:
-    """Trained weights and what their first layer sees, not yet written out as synapses."""
-
-    checkpoint: Checkpoint  # Trained weights
-    # Of a TactileSGNet the normalised adjacency A, (taxels, taxels); else the stack (filters, places, taxels); float64
-    propagation: FloatArray
 
 
 def hop_powers(adjacency: FloatArray, hops: int) -> FloatArray:
@@ -42,11 +31,11 @@ def hop_powers(adjacency: FloatArray, hops: int) -> FloatArray:
     return np.stack(powers)
 
 
-def stack_of(checkpoint: Checkpoint, propagation: FloatArray) -> FloatArray:
-    """Matrices (filters, places, taxels) through which a checkpoint's filters see the taxels."""
-    if checkpoint.system == TACTILESGNET:
-        return hop_powers(propagation, len(checkpoint.hops))
-    return propagation
+def stack_of(convolution: Convolution) -> FloatArray:
+    """Matrices (filters, places, taxels) through which filters see the taxels."""
+    if convolution.system == TACTILESGNET:
+        return hop_powers(convolution.propagation, len(convolution.filters))
+    return convolution.propagation
 
 
 def effective_weight(stack: FloatArray, filters: FloatArray) -> FloatArray:
@@ -74,13 +63,13 @@ def synapses(stack: FloatArray, filters: FloatArray, system: str = TACTILESGNET)
     return matrix
 
 
-def expand_first_layer(checkpoint: Checkpoint, propagation: FloatArray) -> tuple[Sparse, FloatArray]:
+def expand_first_layer(checkpoint: Checkpoint, convolution: Convolution) -> tuple[Sparse, FloatArray]:
     """Weights (neurons, channels) and biases (neurons,) of a first layer, in the order of its neurons.
 
     A relay for each clock comes last, see :mod:`compiler.dynamics`.
     """
-    weight = synapses(stack_of(checkpoint, propagation), checkpoint.hops.astype(np.float64), checkpoint.system)
-    bias = in_order(checkpoint.system, np.tile(checkpoint.conv_bias.astype(np.float64), (checkpoint.places, 1)))
+    weight = synapses(stack_of(convolution), convolution.filters.astype(np.float64), convolution.system)
+    bias = in_order(convolution.system, np.tile(convolution.bias.astype(np.float64), (checkpoint.places, 1)))
     clocks = checkpoint.dynamics.clocks.channels
     if not clocks:
         return weight, bias
@@ -97,7 +86,7 @@ def expand_dense(checkpoint: Checkpoint, layer: int) -> Sparse:
     """
     weight = checkpoint.dense[layer - 1].weight
     before = towers_of(checkpoint)[layer - 1]
-    inputs = np.stack([np.flatnonzero((before == t) | (before == SHARED)) for t in range(checkpoint.towers)])
+    inputs = np.stack([np.flatnonzero(neurons_of(t, before)) for t in range(checkpoint.towers)])
     column = np.repeat(inputs, len(weight) // len(inputs), axis=0)
     first = np.arange(0, weight.size + 1, weight.shape[1])
     return sparse.csr_array(
@@ -109,11 +98,18 @@ def expand(checkpoint: Checkpoint, propagation: FloatArray) -> Network:
     """Lower trained weights to a network of populations and synapses, in float64.
 
     Spikes equal those of the float64 model up to the rounding of a differently ordered sum. `propagation` as of
-    :class:`Factored`; ModelError if it disagrees with the weights about the number of taxels, places or filters.
+    :class:`ir.Convolution`; ModelError if it disagrees with the weights about the number of taxels, places or filters.
     """
     _require_fit(checkpoint, propagation.shape)
     dynamics = checkpoint.dynamics
-    stages = [("conv1", *expand_first_layer(checkpoint, propagation))]
+    convolution = Convolution(
+        system=checkpoint.system,
+        filters=checkpoint.hops,
+        bias=checkpoint.conv_bias,
+        propagation=propagation,
+        towers=towers_of(checkpoint) if checkpoint.towers > 1 else (),
+    )
+    stages = [("conv1", *expand_first_layer(checkpoint, convolution))]
     for layer, dense in enumerate(checkpoint.dense, 1):
         stages.append((dense.name, expand_dense(checkpoint, layer), dense.bias.astype(np.float64)))
     polarities = checkpoint.hops.shape[2]
@@ -138,6 +134,7 @@ def expand(checkpoint: Checkpoint, propagation: FloatArray) -> Network:
         readout=checkpoint.readout,
         classes=checkpoint.classes,
         forms=checkpoint.forms,
+        convolution=convolution,
     )
 
 

@@ -126,6 +126,7 @@ def disconnect(network: Network, gone: Masks) -> Network:
             replace(p, weight=zeroed(p.weight, gone[p.post], of_source(gone, p.pre, p.weight.shape[1])))
             for p in network.projections
         ),
+        convolution=None,
     )
 
 

@@ -18,14 +18,15 @@ from scipy import sparse
 from torch import Tensor, nn
 
 from spikeloom.compiler import fixedpoint, fullest, ir, round_population
+from spikeloom.compiler.checkpoint import merge
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.tensors import members, side_by_side
-from spikeloom.compiler.passes.expand import Factored, expand, stack_of
+from spikeloom.compiler.passes.expand import stack_of
 from spikeloom.compiler.systems import in_order
 from spikeloom.compiler.types import EventArray
 from spikeloom.models.networks.layers import differentiate_step, events_of, gather, rates_of, scatter, time_first
 from spikeloom.models.networks.networks import Weights
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
+from spikeloom.models.networks.towers import split
 
 SHRINK = 0.98
 """A neuron whose weights would overflow the accumulator has them scaled by this, until they do not."""
@@ -92,24 +93,23 @@ class Integers:
 class QuantisedNet(nn.Module):
     """A network on chip integers; `forms` say how the chip stores each layer.
 
-    Of a checkpoint on its graph the filters of the first layer are learned, of everything else each synapse by itself.
+    Where the first layer has shared filters, these are learned, of everything else each synapse by itself.
     ModelError if a layer is too large for one matrix.
     """
 
-    def __init__(
-        self, model: Factored | ir.Network, forms: Sequence[ir.Form], surrogate: Surrogate = RECTANGLE
-    ) -> None:
+    def __init__(self, network: ir.Network, forms: Sequence[ir.Form], surrogate: Surrogate = RECTANGLE) -> None:
         super().__init__()
         self.surrogate = surrogate
         self.stack: Array | None = None
-        if isinstance(model, ir.Network):
-            self.network = in_thresholds(model)
+        convolution = network.convolution
+        if convolution is None:
+            self.network = in_thresholds(network)
         else:
-            checkpoint = model.checkpoint
-            self.network, self.system = expand(checkpoint, model.propagation), checkpoint.system
-            self.stack = stack_of(checkpoint, model.propagation)
-            self.hops = nn.Parameter(torch.tensor(checkpoint.hops))
-            self.conv_bias = nn.Parameter(torch.tensor(checkpoint.conv_bias))
+            self.network = network
+            self.system = convolution.system
+            self.stack = stack_of(convolution)
+            self.hops = nn.Parameter(torch.tensor(convolution.filters))
+            self.conv_bias = nn.Parameter(torch.tensor(convolution.bias))
         self.names = tuple(population.name for population in self.network.populations)
         self.forms = tuple(
             replace(form, exponents=(0,), threshold=np.full(each.size, RELAY)) if each.relays == each.size else form
@@ -170,7 +170,8 @@ class QuantisedNet(nn.Module):
                 size = self.network.input.size if pre == ir.INPUT else self.network.populations[pre].size
                 projections.append(ir.Projection(pre=pre, post=post, weight=whole[:, first : first + size]))
                 first += size
-        return replace(self.network, populations=tuple(populations), projections=tuple(projections))
+        changed = replace(self.network, populations=tuple(populations), projections=tuple(projections))
+        return replace(changed, convolution=None)
 
     def tensors(self) -> Weights:
         """Weights and biases as a checkpoint holds them."""
@@ -372,18 +373,21 @@ def _integrate_chip(
         _chip_step(sums[t], i, v, bias, threshold, unit, keep_u, keep_v, fired[t], membrane[t])
 
 
-def quantised_spikes(model: Factored | ir.Network, events: EventArray) -> dict[str, NDArray[np.bool_]]:
+def quantised_spikes(network: ir.Network, events: EventArray) -> dict[str, NDArray[np.bool_]]:
     """Spikes of every layer of a fine-tuned network as its torch model computes them, (samples, steps, neurons)."""
-    if not isinstance(model, ir.Network) and model.checkpoint.towers > 1:
-        parts = [replace(model, checkpoint=member) for member in members(model.checkpoint)]
-        return side_by_side(model.checkpoint, [quantised_spikes(part, events) for part in parts])
-    forms = model.forms if isinstance(model, ir.Network) else model.checkpoint.forms
-    assert forms is not None, "only a fine-tuned network has a quantised model"
-    network = QuantisedNet(model, forms)
-    found: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in network.names}
+    names = [population.name for population in network.populations]
+    towers = [_spikes(tower, events) for tower in split(network)]
+    owners = () if network.convolution is None else network.convolution.towers
+    return dict(zip(names, merge(owners, towers) if owners else towers[0], strict=True))
+
+
+def _spikes(network: ir.Network, events: EventArray) -> list[NDArray[np.bool_]]:
+    """Spikes of each layer of a network that is joined of no others."""
+    assert network.forms is not None, "only a fine-tuned network has a quantised model"
+    model = QuantisedNet(network, network.forms)
     with torch.no_grad():
-        for recording in events:
-            layers = network.spikes_of(time_first(recording[None]))
-            for name, spikes in zip(network.names, layers, strict=True):
-                found[name].append(spikes[:, 0].bool().numpy())
-    return {name: np.stack(parts) for name, parts in found.items()}
+        by_recording = [
+            [spikes[:, 0].bool().numpy() for spikes in model.spikes_of(time_first(recording[None]))]
+            for recording in events
+        ]
+    return [np.stack(layer) for layer in zip(*by_recording, strict=True)]

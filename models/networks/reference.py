@@ -1,4 +1,4 @@
-"""The float model of a checkpoint, in the released operator order, as ``verify`` compares the chip with it.
+"""The float model of a trained network in the released operator order, as ``verify`` compares the chip with it.
 
 Released order: hop 0 first, then one propagation and one linear map per hop, added up, bias last; then the
 recurrence. In float32 this gives every spike of the released code on the released test recordings. A GCN is mapped
@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.checkpoint import Checkpoint
+from spikeloom.compiler.checkpoint import merge
 from spikeloom.compiler.dynamics import RELAY_WEIGHT
-from spikeloom.compiler.formats.tensors import members, side_by_side
 from spikeloom.compiler.interpret import threads
+from spikeloom.compiler.ir import Network, Population, Projection
 from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached, copy, integrate_float, keep
-from spikeloom.compiler.systems import GCN, TACTILESGNET, feature_major, in_order
-from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, FloatArray
+from spikeloom.compiler.systems import GCN, TACTILESGNET, feature_major
+from spikeloom.compiler.types import AnyArray, BoolArray, EventArray
+from spikeloom.models.networks.towers import split
 
 BATCH = 8
 """Recordings that run together."""
@@ -27,85 +28,87 @@ STEPS = 32
 """Steps of these that run together: few enough for the caches."""
 
 
-def float_spikes(
-    checkpoint: Checkpoint, adjacency: FloatArray, events: EventArray, *, dtype: str = "float32"
-) -> dict[str, BoolArray]:
+def float_spikes(network: Network, events: EventArray, *, dtype: str = "float32") -> dict[str, BoolArray]:
     """Spikes of every layer, (samples, steps, neurons) by name, on recordings (samples, taxels, channels, steps).
 
-    What the first layer sees, see :func:`expand.stack_of`, is rounded to `dtype`; networks are trained in float32.
+    The network is one with a convolution, whose propagation is rounded to `dtype`; networks are trained in float32.
     """
-    return _run(checkpoint, adjacency, events, np.dtype(dtype), membranes=False)
+    return _run(network, events, np.dtype(dtype), membranes=False)
 
 
 def float_membranes(
-    checkpoint: Checkpoint, adjacency: FloatArray, events: EventArray, *, dtype: str = "float32"
+    network: Network, events: EventArray, *, dtype: str = "float32"
 ) -> dict[str, npt.NDArray[np.floating]]:
     """Membranes of every layer before the comparison; as :func:`float_spikes`, (samples, steps, neurons) of `dtype`."""
-    return _run(checkpoint, adjacency, events, np.dtype(dtype), membranes=True)
+    return _run(network, events, np.dtype(dtype), membranes=True)
 
 
-def _run(
-    checkpoint: Checkpoint, adjacency: AnyArray, events: AnyArray, dtype: np.dtype[Any], *, membranes: bool
-) -> dict[str, AnyArray]:
-    if checkpoint.towers > 1:
-        every = [_run(each, adjacency, events, dtype, membranes=membranes) for each in members(checkpoint)]
-        return side_by_side(checkpoint, every)
-    shape = (len(events), events.shape[3])
+def _run(network: Network, events: AnyArray, dtype: np.dtype[Any], *, membranes: bool) -> dict[str, AnyArray]:
+    names = [population.name for population in network.populations]
+    towers = [_run_tower(tower, events, dtype, membranes=membranes) for tower in split(network)]
+    assert network.convolution is not None, "only a checkpoint says in which order it is summed"
+    owners = network.convolution.towers
+    layers = merge(owners, towers) if owners else towers[0]
+    return dict(zip(names, layers, strict=True))
+
+
+def _run_tower(network: Network, events: AnyArray, dtype: np.dtype[Any], *, membranes: bool) -> list[AnyArray]:
+    """Spikes, or membranes, of each layer of a network that is joined of no others."""
+    samples, steps = len(events), events.shape[3]
     kind = dtype if membranes else np.bool_
-    kept = {name: np.empty((*shape, neurons), kind) for name, neurons in checkpoint.neurons.items()}
+    drives = _drives(network, dtype)
+    kept = [np.empty((samples, steps, population.size), kind) for population in network.populations]
 
     def batch(start: int) -> None:
         rows = slice(start, start + BATCH)
-        layers = _layers(checkpoint, adjacency, dtype)
-        for first in range(0, shape[1], STEPS):
-            steps = slice(first, first + STEPS)
-            spikes = np.ascontiguousarray(events[rows, :, :, steps].transpose(3, 0, 1, 2), dtype)
-            for name, layer in zip(checkpoint.neurons, layers, strict=True):
-                spikes, compared = layer(spikes)
-                if layer is layers[0]:
-                    spikes, compared = _with_relays(checkpoint, spikes, compared, first)
-                kept[name][rows, steps] = (compared if membranes else spikes).transpose(1, 0, 2)
+        layers = [_Neurons(*each, dtype) for each in zip(drives, network.populations, strict=True)]
+        for first in range(0, steps, STEPS):
+            part = slice(first, first + STEPS)
+            spikes = np.ascontiguousarray(events[rows, :, :, part].transpose(3, 0, 1, 2), dtype)
+            for layer, integrate in enumerate(layers):
+                spikes, compared = integrate(spikes)
+                if layer == 0:
+                    spikes, compared = _with_relays(network, spikes, compared, first)
+                kept[layer][rows, part] = (compared if membranes else spikes).transpose(1, 0, 2)
 
-    list(threads().map(batch, range(0, len(events), BATCH)))
+    list(threads().map(batch, range(0, samples, BATCH)))
     return kept
 
 
-def _layers(
-    checkpoint: Checkpoint, adjacency: AnyArray, dtype: np.dtype[Any]
-) -> list[Callable[[AnyArray], tuple[AnyArray, AnyArray]]]:
-    """What turns spikes of some steps into spikes and membranes of each layer, from rest at first."""
-    dynamics = checkpoint.dynamics
-    hops = checkpoint.hops.astype(dtype)
-    propagation = adjacency.astype(dtype)
-    bias = checkpoint.conv_bias.astype(dtype)
+def _drives(network: Network, dtype: np.dtype[Any]) -> list[Callable[[AnyArray], AnyArray]]:
+    """What spikes of some steps bring to each layer."""
+    dense = zip(network.populations[1:], network.projections[1:], strict=True)
+    return [_convolution(network, dtype), *(_linear(*each, dtype) for each in dense)]
+
+
+def _convolution(network: Network, dtype: np.dtype[Any]) -> Callable[[AnyArray], AnyArray]:
+    """What spikes bring to the first layer, the relays of clocks aside."""
+    convolution = network.convolution
+    assert convolution is not None
+    filters = convolution.filters.astype(dtype)
+    propagation = convolution.propagation.astype(dtype)
+    bias = convolution.bias.astype(dtype)
     # the bias is part of what the spikes bring, unless that outlasts its step
-    inside = np.zeros_like(bias) if dynamics.alpha(0) else bias
-    drives = [lambda x: _first(checkpoint.system, x, propagation, hops, inside)]
-    biases = [in_order(checkpoint.system, np.tile(bias, (checkpoint.places, 1)))]
-    for layer, dense in enumerate(checkpoint.dense, 1):
-        weight = dense.weight.T.astype(dtype)
-        bias = dense.bias.astype(dtype)
-        drives.append(_linear(weight, np.zeros_like(bias) if dynamics.alpha(layer) else bias))
-        biases.append(bias)
-    return [
-        _Neurons(drive, bias, dynamics.alpha(layer), dynamics.beta(layer, checkpoint.beta), checkpoint.theta)
-        for layer, (drive, bias) in enumerate(zip(drives, biases, strict=True))
-    ]
+    inside = np.zeros_like(bias) if network.populations[0].alpha else bias
+    return lambda spikes: _first(convolution.system, spikes, propagation, filters, inside)
 
 
-def _linear(weight: AnyArray, bias: AnyArray) -> Callable[[AnyArray], AnyArray]:
+def _linear(population: Population, projection: Projection, dtype: np.dtype[Any]) -> Callable[[AnyArray], AnyArray]:
+    """What spikes bring to a fully connected layer, all of whose synapses are stored."""
+    weight = projection.weight.data.reshape(population.size, -1).T.astype(dtype)
+    bias = np.zeros(population.size, dtype) if population.alpha else population.bias.astype(dtype)
     return lambda spikes: spikes @ weight + bias
 
 
 class _Neurons:
     """Neurons of a layer and their state; what arrives is what `drive` makes of spikes (steps, samples, neurons)."""
 
-    def __init__(
-        self, drive: Callable[[AnyArray], AnyArray], bias: AnyArray, alpha: float, beta: float, theta: float
-    ) -> None:
-        self._drive, self._bias = drive, bias if alpha else np.zeros_like(bias)
-        self._constants = [bias.dtype.type(value) for value in (alpha, beta, theta)]
-        self._state: AnyArray = np.zeros(0, bias.dtype)
+    def __init__(self, drive: Callable[[AnyArray], AnyArray], population: Population, dtype: np.dtype[Any]) -> None:
+        self._drive = drive
+        bias = population.bias[: population.size - population.relays].astype(dtype)
+        self._bias = bias if population.alpha else np.zeros_like(bias)
+        self._constants = [dtype.type(value) for value in (population.alpha, population.beta, population.theta)]
+        self._state: AnyArray = np.zeros(0, dtype)
 
     def __call__(self, spikes: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Spikes, zeros and ones of the float type, and membranes of some steps."""
@@ -136,16 +139,14 @@ def _integrate(
         copy(membrane, drive[t])
 
 
-def _with_relays(
-    checkpoint: Checkpoint, spikes: AnyArray, membranes: AnyArray, first: int
-) -> tuple[AnyArray, AnyArray]:
+def _with_relays(network: Network, spikes: AnyArray, membranes: AnyArray, first: int) -> tuple[AnyArray, AnyArray]:
     """Add those of the relays, which spike as their clocks tick."""
-    clocks = checkpoint.dynamics.clocks
+    clocks = network.input.clocks
     ticks = clocks.events(len(spikes), first=first).T.astype(spikes.dtype)
     relays = np.broadcast_to(ticks[:, None], (*spikes.shape[:2], clocks.channels))
     return (
         np.concatenate([spikes, relays], axis=2),
-        np.concatenate([membranes, relays * (RELAY_WEIGHT * checkpoint.theta)], axis=2),
+        np.concatenate([membranes, relays * (RELAY_WEIGHT * network.populations[0].theta)], axis=2),
     )
 
 

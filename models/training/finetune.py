@@ -28,7 +28,6 @@ from spikeloom.compiler.errors import require_least
 from spikeloom.compiler.interpret import channels_last, cut
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.calibrate import calibrate
-from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.networks.layers import time_first
@@ -71,7 +70,7 @@ class Tuned:
 
 
 def finetune(
-    model: Factored | Network,
+    network: Network,
     training: Recordings,
     test: Recordings,
     target: Target,
@@ -100,12 +99,12 @@ def finetune(
     require_chance(robust)
     packings = None if bits is None else [Packing(bits=width, groups=groups) for width in bits]
     asked = Options(packings=packings, keep=KEEP, keep_all=True, training_events=training.events)
-    chosen = compile_network(model, asked, target=target).integer
-    plain = isinstance(model, Factored) and model.checkpoint.dynamics.is_plain
+    chosen = compile_network(network, asked, target=target).integer
+    plain = has_released_dynamics(network)
     order = np.random.default_rng(seed)
     history: list[TunedEpoch] = []
     with one_thread():
-        net = QuantisedNet(model, chosen.forms, RECTANGLE if plain else TIMED.surrogate)
+        net = QuantisedNet(network, chosen.forms, RECTANGLE if plain else TIMED.surrogate)
         teacher = None if plain else float_rates(net.network, training)
         rate = LEARNING_RATE if plain else GENTLE_RATE
         net.start_at(chosen)
@@ -139,6 +138,13 @@ def finetune(
                     after_epoch(history[-1])
         _, after = evaluate(net, test)
     return Tuned(net=net, history=tuple(history), before=before, after=after)
+
+
+def has_released_dynamics(network: Network) -> bool:
+    """Whether it comes from a checkpoint whose layers have one membrane decay, no lasting currents and no clocks."""
+    decays = {(population.alpha, population.beta) for population in network.populations}
+    plain = len(decays) == 1 and not network.populations[0].alpha and not network.input.clocks.channels
+    return plain and network.convolution is not None
 
 
 def float_rates(network: Network, recordings: Recordings) -> Tensor:

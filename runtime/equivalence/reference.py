@@ -22,7 +22,6 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.interpret import Simulation, channels_last, cut, float_simulation, integer_simulation, run_float
 from spikeloom.compiler.ir import IntegerNetwork, Network, Projection, Sparse
-from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.passes.range_proof import prove_ranges
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
@@ -32,19 +31,14 @@ from spikeloom.runtime.machines.votes import votes_by_step
 from spikeloom.runtime.report.console import Progress
 
 
-def require_match(netlist: Netlist, model: Factored | Network) -> None:
-    """Refuse a netlist and a checkpoint or float network whose taxels, channels, timing or layers differ."""
+def require_match(netlist: Netlist, network: Network) -> None:
+    """Refuse a netlist and a float network whose taxels, channels, timing or layers differ."""
     ours = {"taxels": netlist.taxels, "channels": netlist.polarities}
     ours |= _timing(netlist.clocks, netlist.bins) | {layer.name: layer.neurons for layer in netlist.layers}
-    what = "network" if isinstance(model, Network) else "checkpoint"
-    if isinstance(model, Network):
-        theirs = {"taxels": model.input.taxels, "channels": model.input.polarities}
-        theirs |= _timing(model.input.clocks, model.input.bins) | {p.name: p.size for p in model.populations}
-    else:
-        checkpoint = model.checkpoint
-        theirs = {"taxels": checkpoint.taxels, "channels": checkpoint.hops.shape[2]}
-        theirs |= _timing(checkpoint.dynamics.clocks, checkpoint.bins) | checkpoint.neurons
+    theirs = {"taxels": network.input.taxels, "channels": network.input.polarities}
+    theirs |= _timing(network.input.clocks, network.input.bins) | {p.name: p.size for p in network.populations}
     if ours != theirs:
+        what = "network" if network.convolution is None else "checkpoint"
         sizes = [", ".join(f"{name} {neurons}" for name, neurons in side.items()) for side in (ours, theirs)]
         raise ModelError(
             f"netlist and {what} disagree: the netlist has {sizes[0]}, the {what} {sizes[1]}; "
@@ -57,25 +51,22 @@ def _timing(clocks: Clocks, bins: int) -> dict[str, int]:
     return clocked | ({"bins of a step": bins} if bins > 1 else {})
 
 
-def reference_of(model: Factored | Network) -> Callable[[EventArray], list[BoolArray]]:
-    """What gives the spikes of each layer in float32: of a checkpoint in its own operator order, else synapse sums."""
-    if isinstance(model, Network):
-        clocks = model.input.clocks
-        ready = float_simulation(model, np.float32)
+def reference_of(network: Network) -> Callable[[EventArray], list[BoolArray]]:
+    """What gives the spikes of each layer in float32, in the order of sums of training where that is known."""
+    if network.convolution is None:
+        clocks = network.input.clocks
+        ready = float_simulation(network, np.float32)
         return lambda events: list(ready.run(channels_last(events, clocks)).spikes)
     from spikeloom.models.networks.reference import float_spikes
 
-    return lambda events: list(float_spikes(model.checkpoint, model.propagation, events).values())
+    return lambda events: list(float_spikes(network, events).values())
 
 
-def votes_so_far(network: Network, model: Factored | Network, data: Recordings) -> IntArray:
-    """Votes of the float32 model after each step, (samples, steps, classes); a recording's stay from its end on.
-
-    `network` is the model's float stage.
-    """
+def votes_so_far(network: Network, data: Recordings) -> IntArray:
+    """Votes of the float32 model after each step, (samples, steps, classes); a recording's stay from its end on."""
     lengths = data.step_counts
     votes = []
-    reference = reference_of(model)
+    reference = reference_of(network)
     progress = Progress(len(data))
     readout = network.readout
     neurons = sum(population.size for population in network.populations)
@@ -86,27 +77,23 @@ def votes_so_far(network: Network, model: Factored | Network, data: Recordings) 
     return np.concatenate(votes)
 
 
-def membranes_of(model: Factored | Network, events: EventArray) -> list[npt.NDArray[np.floating]]:
+def membranes_of(network: Network, events: EventArray) -> list[npt.NDArray[np.floating]]:
     """Membranes of each layer in float32, likewise."""
+    if network.convolution is None:
+        inputs = channels_last(events, network.input.clocks)
+        return list(run_float(network, inputs, dtype=np.float32, membranes=True).membranes)
     from spikeloom.models.networks.reference import float_membranes
 
-    if isinstance(model, Network):
-        inputs = channels_last(events, model.input.clocks)
-        return list(run_float(model, inputs, dtype=np.float32, membranes=True).membranes)
-    return list(float_membranes(model.checkpoint, model.propagation, events).values())
+    return list(float_membranes(network, events).values())
 
 
-def taxel_and_feature(model: Factored | Network, layer: int, neuron: int) -> tuple[int, int] | tuple[None, None]:
+def taxel_and_feature(network: Network, layer: int, neuron: int) -> tuple[int, int] | tuple[None, None]:
     """Where a neuron of a graph convolution lies; others, and relays of clocks, lie nowhere."""
-    if layer or isinstance(model, Network) or model.checkpoint.system not in GRAPH_SYSTEMS:
+    convolution = network.convolution
+    if layer or convolution is None or convolution.system not in GRAPH_SYSTEMS:
         return None, None
-    taxel, feature = divmod(neuron, model.checkpoint.hops.shape[1])
-    return (taxel, feature) if taxel < model.checkpoint.taxels else (None, None)
-
-
-def float_network(model: Factored | Network) -> Network:
-    """The float stage of a model."""
-    return model if isinstance(model, Network) else expand(model.checkpoint, model.propagation)
+    taxel, feature = divmod(neuron, convolution.filters.shape[1])
+    return (taxel, feature) if taxel < network.input.taxels else (None, None)
 
 
 LADDER = ("float64", "beta", "weights", "bias_threshold", "rounding", "saturation")
@@ -135,6 +122,7 @@ def realised(network: Network, integer: IntegerNetwork) -> tuple[Network, Networ
             )
             for projection in integer.projections
         ),
+        convolution=None,
     )
     # A neuron with another threshold fires as one with the model's threshold whose weights and bias are scaled to it.
     stretch = [population.theta / np.maximum(population.realised_theta, 1e-300) for population in integer.populations]

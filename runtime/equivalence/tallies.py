@@ -8,12 +8,10 @@ import numpy as np
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.interpret import channels_last, cut
 from spikeloom.compiler.ir import Network
-from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.equivalence.breakdowns import Breakdown, breakdowns
 from spikeloom.runtime.equivalence.reference import (
     LADDER,
-    float_network,
     membranes_of,
     reference_of,
     rungs,
@@ -72,13 +70,12 @@ class ModelTally:
 class FloatTally:
     """Votes of a float model; its spikes, too, where the layers of the chip are the model's."""
 
-    def __init__(self, machine: Machine, model: Factored | Network, samples: int, begin: Begin) -> None:
-        network = float_network(model)
+    def __init__(self, machine: Machine, network: Network, samples: int, begin: Begin) -> None:
         self._begin = begin
         self._readout = network.readout
-        self._reference = reference_of(model)
+        self._reference = reference_of(network)
         self.votes = np.zeros((samples, network.classes), np.int64)
-        self.spikes = SpikeTally(machine, model, network, begin) if isinstance(machine, Comparable) else None
+        self.spikes = SpikeTally(machine, network, begin) if isinstance(machine, Comparable) else None
 
     def add(self, part: Part) -> None:
         """Run the model on some recordings."""
@@ -93,9 +90,9 @@ class FloatTally:
 class SpikeTally:
     """Spikes in which chip and float model differ, and which deviation of the chip costs what."""
 
-    def __init__(self, machine: Comparable, model: Factored | Network, network: Network, begin: Begin) -> None:
+    def __init__(self, machine: Comparable, network: Network, begin: Begin) -> None:
         self._machine = machine
-        self._model = model
+        self._network = network
         self._begin = begin
         self._names = machine.layers
         self._kept = machine.compared()
@@ -181,7 +178,7 @@ class SpikeTally:
         register = int(machine.run(recording, membranes=True).membranes[layer.name][0, step, neuron])
         scale = float(layer.scale[neuron])
         on_chip = not machine.absent[index][neuron]  # a neuron that the chip leaves out stays at zero
-        taxel, feature = taxel_and_feature(self._model, index, neuron)
+        taxel, feature = taxel_and_feature(self._network, index, neuron)
         return Divergence(
             file=part.files[sample],
             step=step,
@@ -189,7 +186,7 @@ class SpikeTally:
             neuron=neuron,
             taxel=taxel,
             feature=feature,
-            float_membrane=float(membranes_of(self._model, recording)[index][0, step, neuron]),
+            float_membrane=float(membranes_of(self._network, recording)[index][0, step, neuron]),
             chip_membrane=register / (scale * (1 << MEMBRANE_SHIFT)),
             chip_register=register,
             theta=layer.theta,

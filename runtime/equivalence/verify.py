@@ -13,11 +13,10 @@ import numpy as np
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.ir import Network
-from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.breakdowns import undecided
-from spikeloom.runtime.equivalence.reference import float_network, require_match
+from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.tallies import Begin, FloatTally, ModelTally, Part
 from spikeloom.runtime.equivalence.verdict import Verdict
 from spikeloom.runtime.machines.backends import machine_of
@@ -31,7 +30,7 @@ def verify(
     source: Any,
     data: Recordings,
     *,
-    original: Factored | Network | None = None,
+    original: Network | None = None,
     spec_samples: int = 3,
     engine_name: str = ENGINES[0],
     required: Mapping[str, float] | None = None,
@@ -44,11 +43,11 @@ def verify(
     ----------
     netlist : Netlist
         For any chip.
-    source : Factored, Network, NativeNetwork or Counters
+    source : Network, NativeNetwork or Counters
         What the netlist was compiled from, or another network of the same architecture.
     data : Recordings
         In steps of the network.
-    original : Factored or Network, optional
+    original : Network, optional
         The float model of E2 and E3; by default `source`, where that is one.
     spec_samples : int
         Recordings on which the specification runs beside the engine.
@@ -68,7 +67,7 @@ def verify(
         or cannot hold the netlist.
     """
     machine = machine_of(netlist)
-    floats = source if original is None and isinstance(source, Factored | Network) else original
+    floats = source if original is None and isinstance(source, Network) else original
     begin = progress or (lambda _part, _done: None)
     _require_fit(machine, source, floats, data, spec_samples)
     engines = _compare_engines(machine, data, min(spec_samples, len(data)), engine_name, begin)
@@ -82,7 +81,7 @@ def verify(
         labels=data.labels,
         chip_predictions=vote(votes),
         chip_counts=votes,
-        netlist=check or machine.check_lowering(_written_out(source)),
+        netlist=check or machine.check_lowering(source),
         model=None if lowered is None else lowered.layers,
         membranes_saturated=saturated,
         row_different=_different_in_a_row(machine, data, votes),
@@ -92,9 +91,7 @@ def verify(
     )
 
 
-def _require_fit(
-    machine: Machine, source: Any, floats: Factored | Network | None, data: Recordings, spec_samples: int
-) -> None:
+def _require_fit(machine: Machine, source: Any, floats: Network | None, data: Recordings, spec_samples: int) -> None:
     """Refuse networks or recordings of another size, and a specification that would run on nothing."""
     if spec_samples < 1:
         raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")
@@ -114,11 +111,6 @@ def _compare_engines(machine: Machine, data: Recordings, samples: int, name: str
         "engine": name,
         "engine_different": None if beside is None else beside(data.events, data.lengths),
     }
-
-
-def _written_out(source: Any) -> Any:
-    """A checkpoint as a network of synapses; anything else as it is."""
-    return float_network(source) if isinstance(source, Factored) else source
 
 
 def _run(

@@ -13,9 +13,9 @@ from spikeloom.compiler.formats import NETX, NIR, ONNX
 from spikeloom.compiler.formats.assemble import ReadNetwork
 from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.ir import Network
-from spikeloom.compiler.passes.expand import Factored, expand
+from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.netlist_file import Netlist
-from spikeloom.compiler.types import FloatArray, JsonObject
+from spikeloom.compiler.types import JsonObject
 from spikeloom.runtime.inputs.checkpoint import graph_of, load_checkpoint, propagation
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.repeat import INPUT_LAYOUT, LAYOUT, NETWORK, refuse
@@ -30,8 +30,6 @@ class LoadedNetwork:
     network: Network  # Float stage
     sha256: str  # Of the file
     checkpoint: Checkpoint | None = None  # Where it is from one
-    # (taxels, taxels) or (filters, places, taxels) float64; what its first layer sees, likewise; see `expand.stack_of`
-    adjacency: FloatArray | None = None
     graph: str | None = None  # Its name, likewise
     facts: tuple[str, ...] = ()  # What was read from an ONNX or NIR file and what was assumed
     format: str = "checkpoint"  # or ``onnx``, ``nir``, ``module``
@@ -73,13 +71,6 @@ class LoadedNetwork:
         """Refuse another network than the netlist at `path` is from, for the chip would be blamed: a ModelError."""
         if (difference := self.differs_from(netlist, run)) is not None:
             raise ModelError(f"{path}: {difference}")
-
-    @property
-    def model(self) -> Factored | Network:
-        """What is compiled, and run in its own operator order: the checkpoint on its graph where there is one."""
-        if self.checkpoint is None or self.adjacency is None:
-            return self.network
-        return Factored(self.checkpoint, self.adjacency)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,7 +147,6 @@ def _read_checkpoint(path: str, request: NetworkChoice, made: Mapping[str, Any])
         network=expand(checkpoint, adjacency),
         sha256=checkpoint.sha256,
         checkpoint=checkpoint,
-        adjacency=adjacency,
         graph=graph,
         training=checkpoint.training,
     )

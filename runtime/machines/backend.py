@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.ir import Network
-from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
@@ -39,23 +38,21 @@ class Lowered:
 class Reference:
     """What a netlist is held against.
 
-    source: the network as `compile` was given it.
-    network: the same, written out.
+    network: what `compile` was given.
     loaded: the float network beside the chip, and where it is from; None where there is none.
     whole: whether the network is whole numbers, so that the chip must have their every spike.
     difference: how the file is not what the netlist was compiled from.
     """
 
-    source: Any
     network: Any
     loaded: LoadedNetwork | None
     whole: bool = False
     difference: str | None = None
 
     @property
-    def floats(self) -> Factored | Network | None:
+    def floats(self) -> Network | None:
         """The float model that decides and spikes beside the chip."""
-        return None if self.loaded is None else self.loaded.model
+        return None if self.loaded is None else self.loaded.network
 
 
 class Backend(ABC):
@@ -116,7 +113,6 @@ class Backend(ABC):
         """Read the network that `verify` was given beside a netlist; by default a network of floats."""
         loaded = load_network(request.checkpoint, request, netlist)
         return Reference(
-            source=loaded.model,
             network=loaded.network,
             loaded=loaded,
             difference=loaded.differs_from(netlist, request.run),

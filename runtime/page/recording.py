@@ -115,7 +115,7 @@ def recording(machine: Comparable, loaded: LoadedNetwork, data: Recordings, inde
     """
     events = data.events[index : index + 1, ..., : data.steps_of(index)]
     run = machine.run(events, spikes=True, membranes=True)
-    sent = reference_of(loaded.model)(events)
+    sent = reference_of(loaded.network)(events)
     ours = [spikes[0] & ~unread for spikes, unread in zip(sent, machine.unread, strict=True)]
     chip = [spikes[0] & ~unread for spikes, unread in zip(run.spikes.values(), machine.unread, strict=True)]
     readout = loaded.network.readout
@@ -142,7 +142,7 @@ def recording(machine: Comparable, loaded: LoadedNetwork, data: Recordings, inde
             machine,
             loaded,
             (ours, chip),
-            [membranes[0] for membranes in membranes_of(loaded.model, events)],
+            [membranes[0] for membranes in membranes_of(loaded.network, events)],
             [
                 registers[0] / (population.scale * (1 << MEMBRANE_SHIFT))
                 for population, registers in zip(machine.integer.populations, run.membranes.values(), strict=True)
@@ -175,7 +175,7 @@ def _traces(
         population, held = machine.integer.populations[layer], not machine.absent[layer][neuron]
         first = max(0, step - AROUND)
         window = slice(first, step + AROUND + 1), neuron
-        taxel, feature = taxel_and_feature(loaded.model, layer, neuron)
+        taxel, feature = taxel_and_feature(loaded.network, layer, neuron)
         traces.append(
             Trace(
                 layer=population.name,

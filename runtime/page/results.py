@@ -120,12 +120,13 @@ def taxels(machine: Machine, loaded: LoadedNetwork, data: Recordings, counts: In
     edges: IntArray = np.zeros((0, 2), np.int64)
     spikes: FloatArray | None = None
     has_graph = checkpoint is not None and checkpoint.system in GRAPH_SYSTEMS
-    if checkpoint is not None and loaded.adjacency is not None and has_graph and isinstance(machine, Comparable):
-        seen = loaded.adjacency.reshape(-1, netlist.taxels, netlist.taxels)[0]
+    convolution = loaded.network.convolution
+    if convolution is not None and has_graph and isinstance(machine, Comparable):
+        seen = convolution.propagation.reshape(-1, netlist.taxels, netlist.taxels)[0]
         target, source = np.nonzero(seen)
         edges = np.stack([source, target], axis=1)[source != target]
         ids = netlist.compartments_of(0)
-        taxel = netlist.neuron[ids] // checkpoint.hops.shape[1]  # those of clocks come after the last
+        taxel = netlist.neuron[ids] // convolution.filters.shape[1]  # those of clocks come after the last
         fired = np.bincount(taxel, counts.mean(axis=0)[ids], netlist.taxels)
         spikes = fired[: netlist.taxels].astype(np.float64)
     return Taxels(

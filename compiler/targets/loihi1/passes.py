@@ -9,10 +9,9 @@ from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
 from spikeloom.compiler.passes import calibrate as calibration
-from spikeloom.compiler.passes import expand, prune
+from spikeloom.compiler.passes import prune
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.passes.digest import digests
-from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.passes.prune import Masks, Removal
 from spikeloom.compiler.passes.range_proof import RangeProof, prove_ranges
 from spikeloom.compiler.pipeline import LATER, Pass, run, step
@@ -35,10 +34,9 @@ from spikeloom.compiler.types import FloatArray, IntArray
 class Compilation:
     """Everything that one compilation was given and has made so far; the pass in brackets fills a field in."""
 
-    source: Factored | Network | IntegerNetwork  # What is compiled
     options: Options  # What was asked for
     target: Target  # Chip
-    network: Network = LATER  # Float network, a synapse for each pair of neurons (`expand`)
+    network: Network = LATER  # What is compiled, where it is one of floats
     calibration: Calibration | None = None  # What it did on training recordings, where there are any (`calibrate`)
     rates: tuple[FloatArray, ...] | None = None  # Spikes per step by population, likewise, by which traffic weighs
     connected: Network = LATER  # The same network without the weights of neurons that do nothing (`disconnect`)
@@ -72,17 +70,6 @@ class Compilation:
     def verify(self) -> None:
         """Check every rule of the newest artefact; VerifyError if a pass broke one."""
         FILE.verify(self.newest)
-
-
-@step(
-    "writes the graph convolution out as synapses, W = sum over hops k of A^k x W_k, in float64",
-    keeps="every spike, up to the rounding of a differently ordered sum",
-)
-def _expand(done: Compilation) -> Compilation:
-    assert not isinstance(done.source, IntegerNetwork), "integers start behind the passes of float networks"
-    source = done.source
-    network = source if isinstance(source, Network) else expand.expand(source.checkpoint, source.propagation)
-    return replace(done, network=network)
 
 
 @step("runs the float network on training recordings, where there are any", keeps="the network")
@@ -253,7 +240,7 @@ def _legalize(done: Compilation) -> Compilation:
     return replace(done, uses=require_legal(done.netlist, done.target))
 
 
-FLOATS = (_expand, _calibrate, _disconnect, _quantize)
+FLOATS = (_calibrate, _disconnect, _quantize)
 """From floats to integers."""
 
 INTEGERS = (_prove, _remove)
@@ -269,21 +256,22 @@ PASSES = (*STORAGE, *LAYOUT)
 
 
 def start(
-    source: expand.Factored | Network | IntegerNetwork, options: Options, target: Target
+    source: Network | IntegerNetwork, options: Options, target: Target
 ) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
     """What the passes begin with, and which of them are due: integers are rounded already.
 
-    OptionError if the options contradict each other.
+    OptionError if the options contradict each other, VerifyError if the network breaks a rule.
     """
     options.require_consistent(calibrated=options.training_events is not None)
-    work = Compilation(source=source, options=options, target=target)
+    FILE.verify(source)
+    empty = Compilation(options=options, target=target)
     if isinstance(source, IntegerNetwork):
-        return replace(work, integer=source), (*INTEGERS, *LAYOUT)
-    return work, PASSES
+        return replace(empty, integer=source), (*INTEGERS, *LAYOUT)
+    return replace(empty, network=source), PASSES
 
 
 def compile_network(
-    source: Factored | Network | IntegerNetwork,
+    source: Network | IntegerNetwork,
     options: Options | None = None,
     *,
     target: Target | None = None,
@@ -295,7 +283,7 @@ def compile_network(
     return run(passes, work, after)
 
 
-def to_integers(source: expand.Factored | Network, options: Options, target: Target) -> Compilation:
+def to_integers(source: Network, options: Options, target: Target) -> Compilation:
     """Round a network to the integers of the chip, without a layout: :func:`lay_out_again` makes as many as wanted."""
     return run(STORAGE, start(source, options, target)[0])
 

@@ -11,7 +11,6 @@ from typing import Any
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.ir import Network
-from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.pipeline import LATER, run, step
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.truenorth.counting import lower_counters
@@ -76,7 +75,7 @@ PASSES = (_place, _legalize)
 
 
 def compile_crossbars(
-    source: Source | Factored | Network,
+    source: Source | Network,
     options: Options | None = None,
     *,
     target: Target | None = None,
@@ -90,9 +89,8 @@ def compile_crossbars(
     return run(PASSES, work, after)
 
 
-def _unfit(source: Factored | Network, chip: Target) -> CapacityError | ModelError:
+def _unfit(network: Network, chip: Target) -> CapacityError | ModelError:
     """Why a float network is not for the chip."""
-    network = source if isinstance(source, Network) else expand(source.checkpoint, source.propagation)
     reasons = CapacityError(needs(network, chip))
     if not reasons.violations:
         return ModelError(f"a float network; {WAYS}")

@@ -38,7 +38,7 @@ def run(request: ExplainRequest) -> Outcome:
     machine = require_comparable(machine_for(request.netlist), request.netlist, "explain")
     netlist = machine.netlist
     loaded = load_network(request.checkpoint, request, netlist)
-    require_match(netlist, loaded.model)
+    require_match(netlist, loaded.network)
     loaded.require_same(request.netlist, netlist, request.run)
     if request.limit is None and request.sample is None:
         request = replace(request, limit=LIMIT)
@@ -57,7 +57,6 @@ def run(request: ExplainRequest) -> Outcome:
             machine.integer,
             channels_last(events, netlist.clocks)[0],
             Activity(spikes=tuple(ran.spikes.values()), membranes=tuple(ran.membranes.values())),
-            model=loaded.model,
             compensated=compensated,
             absent=machine.absent,
             unread=machine.unread,

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from spikeloom.compiler.passes.expand import expand
 from spikeloom.runtime.inputs.checkpoint import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import origin_of, recordings
 from spikeloom.runtime.report.sections import Outcome
@@ -27,6 +28,6 @@ def run(request: YardsticksRequest) -> Outcome:
         bins=checkpoint.bins,
         trained=origin_of(checkpoint.training),
     )
-    spikes = float_spikes(checkpoint, adjacency, data.events)
+    spikes = float_spikes(expand(checkpoint, adjacency), data.events)
     found = yardsticks.measure(checkpoint, adjacency, data.events, spikes, lengths=data.lengths)
     return Outcome(replace(found, graph=graph), yardsticks.sections)

@@ -48,11 +48,11 @@ def run(request: ReportRequest) -> Outcome:
     if reference.loaded is None:
         raise OptionError(f"--checkpoint {request.checkpoint}: there is no float model to show beside the chip")
     if isinstance(machine, Comparable):
-        require_match(netlist, reference.loaded.model)
+        require_match(netlist, reference.loaded.network)
     reference.loaded.require_same(request.netlist, netlist, request.run)
     data = load_recordings(request.data, request, netlist, labels_for="report", joined=False)
     machine.require_sensor(data.events)
-    report = _report(request, machine, reference.source, reference.loaded, data, battery)
+    report = _report(request, machine, reference.network, reference.loaded, data, battery)
     made = report.provenance
     title = f"{made.netlist.file} on {made.data.file}"
     with write_atomically(request.output) as file:
@@ -81,7 +81,7 @@ def _report(
         netlist,
         source,
         data,
-        original=loaded.model,
+        original=loaded.network,
         spec_samples=request.spec_samples,
         required={"E0": 1.0},
         progress=lambda part, done: count(done, part),

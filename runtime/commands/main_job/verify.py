@@ -40,18 +40,18 @@ def run(request: VerifyRequest) -> Outcome:
     if reference.whole:
         refuse(request, ("original", "min_agreement"), "the network is whole numbers, there is no float model")
     if isinstance(machine, Comparable):
-        require_match(machine.netlist, reference.source)
+        require_match(machine.netlist, reference.network)
     if reference.difference is not None:
         tell(f"warning: {request.netlist}: {reference.difference}")
     check = machine.check_lowering(reference.network)
     if request.data is None or not check.simulates:
         return Outcome(check, check_sections, 0 if check.holds else 1)
-    original = None if request.original is None else load_network(request.original, request).model
+    original = None if request.original is None else load_network(request.original, request).network
     data = load_recordings(request.data, request, netlist, labels_for="verify")
     count = Progress(len(data))
     verdict = verify(
         netlist,
-        reference.source,
+        reference.network,
         data,
         original=reference.floats if original is None else original,
         spec_samples=request.spec_samples,

@@ -153,7 +153,7 @@ def _finetuned(request: FinetuneRequest, output: Path) -> Finetuned:
     progress("compiling")
     try:
         tuned = tune(
-            loaded.model,
+            loaded.network,
             training,
             test,
             target,
@@ -214,14 +214,16 @@ def _write_checkpoint(
 ) -> None:
     from spikeloom.compiler.formats.own_checkpoint import save_again
 
-    output, checkpoint, adjacency = request.output, loaded.checkpoint, loaded.adjacency
+    output = request.output
+    checkpoint = loaded.checkpoint
+    convolution = loaded.network.convolution
     assert checkpoint is not None
-    assert adjacency is not None
+    assert convolution is not None
     asked = load_graph(request, checkpoint.system)
     edges = asked.edges if checkpoint.edges is None and asked is not None else checkpoint.edges
     changed = replace(checkpoint, graph=loaded.graph, edges=edges, forms=net.forms, **layers_of(net.tensors()))
     save_again(output, changed, training=record.to_json())
-    round_to_forms(expand(read_checkpoint(output), adjacency), net.forms)  # it compiles, or says why not
+    round_to_forms(expand(read_checkpoint(output), convolution.propagation), net.forms)  # it compiles, or says why not
 
 
 def _write_nir(request: FinetuneRequest, loaded: LoadedNetwork, net: QuantisedNet, record: FinetuneRecord) -> str:

@@ -22,7 +22,6 @@ import numpy as np
 from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, reach, step_units
 from spikeloom.compiler.interpret import Activity, run_float, step_late
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
-from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.equivalence.explanation import results
 from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots, sources_of
@@ -42,7 +41,6 @@ def explain(
     events: BoolArray,
     observed: Activity,
     *,
-    model: Factored | Network | None = None,
     compensated: Collection[str] = (),
     absent: Sequence[BoolArray] | None = None,
     unread: Sequence[BoolArray] | None = None,
@@ -50,7 +48,7 @@ def explain(
 ) -> results.Explanation:
     """Find the roots of all differences between float64 model and chip on one recording, and their causes.
 
-    `network` is the float stage of `model`, `integer` what the netlist holds, `events` (steps, channels) bool, and
+    `integer` is what the netlist holds of `network`, `events` are (steps, channels) bool, and
     `observed` what the chip did on this recording. Layers that were `compensated` store weights that need not be the
     nearest. The chip does not hold the `absent` neurons of each population, of which the `unread` reach no neuron and
     are not compared; they were `pruned` on evidence, or cannot fire with their rounded weights.
@@ -84,7 +82,6 @@ def explain(
             np.concatenate(inputs, axis=1).astype(np.float64),
             ideal,
             observed,
-            model=model or network,
             absent=absent[post],
             pruned=pruned,
             compensated=population.name in compensated,
@@ -115,7 +112,6 @@ def _name_causes(
     ideal: Activity,
     observed: Activity,
     *,
-    model: Factored | Network,
     absent: BoolArray,
     pruned: bool,
     compensated: bool,
@@ -165,7 +161,7 @@ def _name_causes(
             if moved[k, i] > 0:
                 amounts.setdefault(variants[k].cause, float(moved[k, i]))
         clipped = any(variants[k].weights == UNCLIPPED for k in enough)
-        taxel, feature = taxel_and_feature(model, post, root.neuron)
+        taxel, feature = taxel_and_feature(network, post, root.neuron)
         found.append(
             results.RootCause(
                 layer=population.name,

@@ -50,7 +50,7 @@ def lower(request: CompileRequest, after: Callable[[str, Any], object]) -> Lower
         training_events=training,
         provenance=provenance(request, loaded, calibrated=seen),
     )
-    done = compile_network(loaded.model, options, after=after)
+    done = compile_network(loaded.network, options, after=after)
     helps = _finetune(request, checkpoint=loaded.checkpoint is not None)
     return Lowered(
         netlist=done.netlist,

@@ -17,7 +17,6 @@ from spikeloom.compiler.errors import FormatError, NumericRangeError
 from spikeloom.compiler.files import reading
 from spikeloom.compiler.interpret import cut
 from spikeloom.compiler.ir import IntegerNetwork, Network
-from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
@@ -87,15 +86,14 @@ class Loihi(Threaded, Stoppable):
             return NetlistCheck(whole=(str(error),), simulates=False)
         return check_rounding(self.netlist, integer, self.target, network)
 
-    def model(self, source: Factored | Network) -> Model | None:
+    def model(self, network: Network) -> Model | None:
         """The torch model that a network was fine-tuned with, on the chip's integers."""
-        network = source if isinstance(source, Network) else source.checkpoint
         if network.forms is None:
             return None
         from spikeloom.models.networks.quantised import quantised_spikes  # torch, so only here
 
         first = {layer.name: layer.depth for layer in self.netlist.layers}
-        return Model(first=first, spikes=lambda events: quantised_spikes(source, events))
+        return Model(first=first, spikes=lambda events: quantised_spikes(network, events))
 
     def differing(self, run: Run, layer: str, expected: BoolArray, first: int, lengths: IntArray) -> int:
         """Of neurons whose spikes reach a neuron; both count time as the float model does."""

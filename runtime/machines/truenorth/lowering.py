@@ -8,7 +8,6 @@ from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.counters import read_counters
 from spikeloom.compiler.ir import Network
-from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Options, Source, compile_crossbars
@@ -40,14 +39,14 @@ def lower(request: CompileRequest, after: Callable[[str, Any], object]) -> Lower
     if isinstance(path, str) and path.endswith(NETX):
         raise OptionError(f"--target {request.target}: {path} holds integers of another chip; omit it")
     refuse(request, ("calibrate", *ROUNDING, *PLACING), "is not for truenorth")
-    source: Source | Factored | Network
+    source: Source | Network
     if isinstance(path, str) and is_trained(shipped(path)):
         trained = read(path, request)
         source = trained.network
         provenance = provenance_of(trained)
     else:
         loaded = load_network(path, request)
-        source = read_counters(shipped(str(path)))[0] if loaded.format == COUNTING.name else loaded.model
+        source = read_counters(shipped(str(path)))[0] if loaded.format == COUNTING.name else loaded.network
         provenance = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256}
         provenance |= loaded.origin(request.run) | origin_of(loaded.training)
     progress("compiling")
@@ -85,13 +84,13 @@ def reference(request: ComparisonChoice, netlist: CrossbarNetlist) -> Reference:
         loaded = load_network(path, request)
         _require_file(request, made, loaded.sha256)
         counters = read_counters(shipped(str(path)))[0]
-        return Reference(source=counters, network=counters, loaded=loaded, whole=True)
+        return Reference(network=counters, loaded=loaded, whole=True)
     trained = read(str(path), request)
     _require_file(request, made, trained.sha256)
     if made.get("weights") != trained.weights:
         compiled = f"{request.netlist} was compiled from {made.get('weights')}"
         raise OptionError(f"--weights {trained.weights}: {compiled}; give the same")
-    return Reference(source=trained.network, network=trained.network, loaded=None, whole=True)
+    return Reference(network=trained.network, loaded=None, whole=True)
 
 
 def _require_file(request: ComparisonChoice, made: Mapping[str, Any], sha256: str) -> None:

@@ -136,7 +136,7 @@ def _decided(network: NetworkFile, data: Data, windows: tuple[int, ...]) -> dict
     loaded, splits = _loaded(network), _in_steps(data, network)
 
     def decisions(part: Recordings) -> IntArray:
-        return vote(votes_so_far(loaded.network, loaded.model, part)[:, -1])
+        return vote(votes_so_far(loaded.network, part)[:, -1])
 
     return {
         window: {split: decisions(_part(network, part, window)) for split, part in splits.items()} for window in windows
@@ -205,7 +205,7 @@ def _rounded(work: Measurement, loaded: LoadedNetwork) -> Compilation:
         prune_unused=asked.prune_unused,
         training_events=_part(work.network, _in_steps(work.data, work.network)["train"], WHOLE).events,
     )
-    return to_integers(loaded.model, options, load_target(asked.target))
+    return to_integers(loaded.network, options, load_target(asked.target))
 
 
 def _compile_request(work: Measurement, layout: str) -> CompileRequest:

@@ -159,12 +159,14 @@ def without_hops(compilation: Compilation, loaded: LoadedNetwork, hops: tuple[in
 
     Neurons that were left out stay out. None where a register cannot hold what is left.
     """
-    checkpoint, adjacency = loaded.checkpoint, loaded.adjacency
+    checkpoint = loaded.checkpoint
+    convolution = loaded.network.convolution
     assert checkpoint is not None, "only a checkpoint has hops"
-    assert adjacency is not None, "and a graph"
+    assert convolution is not None
     fewer = checkpoint.hops.copy()
     fewer[list(hops)] = 0
-    integer, network = compilation.integer, expand(replace(checkpoint, hops=fewer), adjacency)
+    integer = compilation.integer
+    network = expand(replace(checkpoint, hops=fewer), convolution.propagation)
     planes = [p for p in integer.projections if p.post == 0]
     form = Form(
         bits=planes[0].bits,

@@ -71,4 +71,4 @@ def without(plan: Plan, training: Recordings, held: IntArray, epochs: int, targe
         loaded = load_network(str(file), NetworkChoice())
         events = np.ascontiguousarray(seen.events)
         options = Options(training_events=events, packings=(Packing(bits=storage or 8),))
-        return compile_network(loaded.model, options, target=target).netlist
+        return compile_network(loaded.network, options, target=target).netlist

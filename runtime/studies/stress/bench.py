@@ -114,7 +114,7 @@ def bench_of(request: StressRequest) -> tuple[Bench, LoadedNetwork, str]:
     """Everything that is stressed, the float network, and a hash of the recordings."""
     netlist = require_threaded(machine_for(request.netlist), request.netlist, "stress").netlist
     loaded = load_network(request.checkpoint, request, netlist)
-    require_match(netlist, loaded.model)
+    require_match(netlist, loaded.network)
     loaded.require_same(request.netlist, netlist, request.run)
     data = load_recordings(request.data, request, netlist, labels_for="stress", joined=False)
     bench = Bench(

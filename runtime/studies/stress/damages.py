@@ -40,7 +40,7 @@ def with_weights(pair: Pair, weight: AnyArray) -> Pair:
         here = (post == projection.post) & (pre == projection.pre)
         more = sparse.csr_array((step[here], (row[here], column[here])), shape=projection.weight.shape)
         projections.append(replace(projection, weight=projection.weight + more if here.any() else projection.weight))
-    return Pair(netlist=stored, network=replace(network, projections=tuple(projections)))
+    return Pair(netlist=stored, network=replace(network, projections=tuple(projections), convolution=None))
 
 
 def _codes(netlist: Netlist) -> tuple[IntArray, IntArray]:
@@ -144,7 +144,8 @@ def inputs_scaled(pair: Pair, factor: FloatArray, more: FloatArray) -> Network:
         weight = projection.weight.copy()
         weight.data *= np.repeat(factors[projection.post], np.diff(weight.indptr))
         projections.append(replace(projection, weight=weight))
-    return replace(pair.network, populations=tuple(populations), projections=tuple(projections))
+    changed = replace(pair.network, populations=tuple(populations), projections=tuple(projections))
+    return replace(changed, convolution=None)
 
 
 def scale_thresholds(pair: Pair, factor: FloatArray | float) -> Pair:
