@@ -24,7 +24,7 @@ from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes, read_netlis
 from spikeloom.compiler.targets.truenorth.netlist import crossbar_bytes
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.events import of_length
-from spikeloom.runtime.cli import build_parser
+from spikeloom.runtime.commands.options import request_of
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.machines.backends import backend_of, machine_for
 from spikeloom.runtime.machines.loihi1 import engine
@@ -33,6 +33,7 @@ from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
 from spikeloom.runtime.machines.truenorth import spec as crossbar_spec
 from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.requests.main_job import VerifyRequest
 
 CHECKPOINTS = tuple(name for name in FLOAT if name not in ("recurrent", "onnx", "counters"))
 STEP_BY_STEP = ("recurrent", "onnx", "counters")
@@ -46,8 +47,8 @@ def channels(made):
 
 def float_side(made):
     """The float network as the commands load it."""
-    words = ["verify", str(made.netlist), "--checkpoint", str(made.network), *made.reading, "--data", str(made.data)]
-    return load_network(str(made.network), build_parser("verify").parse_args(words), made.machine.netlist)
+    words = [str(made.netlist), "--checkpoint", str(made.network), *made.reading, "--data", str(made.data)]
+    return load_network(str(made.network), request_of(VerifyRequest, words), made.machine.netlist)
 
 
 LISTS = """
