@@ -22,9 +22,10 @@ from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.changes import by_running, single
 from spikeloom.runtime.report.encode import read_json
-from spikeloom.runtime.studies.stability.neighbours import KINDS, cells_of, channels_of
-from spikeloom.runtime.studies.stability.results import PHASES, Stability
-from spikeloom.runtime.studies.stability.sections import hanging_on
+from spikeloom.runtime.studies.robustness.certify_sections import hanging_on
+from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
+from spikeloom.runtime.studies.robustness.proofs.entries import cells_of, channels_of
+from spikeloom.runtime.studies.robustness.results import PHASES, Certificates
 
 Json = dict[str, Any]
 
@@ -42,23 +43,23 @@ def main() -> None:
     results = {}
     for each in arguments.verdicts:
         name, _, file = each.partition("=")
-        results[name] = read_json(Stability, Path(file), "--verdicts", "spikeloom certify -o")
+        results[name] = read_json(Certificates, Path(file), "--verdicts", "spikeloom certify -o")
     found["networks"] = {name: summary(result) for name, result in results.items()}
-    found["fall"] = {kind: fallen(list(results.values()), kind) for kind in KINDS}
+    found["fall"] = {kind: fallen(list(results.values()), kind) for kind in EXHAUSTIVE}
     if arguments.brute:
         found["brute_force"] = brute_force(arguments.brute, test)
     arguments.output.write_text(json.dumps(found, indent=1) + "\n")
 
 
-def fallen(results: list[Stability], kind: str) -> Json:
+def fallen(results: list[Certificates], kind: str) -> Json:
     """Recordings whose decision some change of a kind alters in every network, and in some."""
-    falls = [{each.file for each in result.verdicts if each.kinds[kind].alter} for result in results]
+    falls = [{each.file for each in result.certificates if each.kinds[kind].alter} for result in results]
     return {"in_all": len(set.intersection(*falls)), "in_some": len(set.union(*falls))}
 
 
-def summary(result: Stability) -> Json:
+def summary(result: Certificates) -> Json:
     """Counts over recordings, and a short line for each."""
-    found = result.verdicts
+    found = result.certificates
     sizes = {kind: [each.kinds[kind].least for each in found] for kind in ("shifted", "start cut", "end cut")}
     return {
         "recordings": len(found),
@@ -68,9 +69,9 @@ def summary(result: Stability) -> Json:
         "exact": sum(each.exact for each in found),
         "attacked": sum(each.at_most is not None for each in found),
         "ratio": statistics.median(each.at_most / max(each.at_least + 1, 1) for each in found if each.at_most),
-        "stand": {kind: result.unaltered(kind) for kind in KINDS},
-        "tried": {kind: sum(each.kinds[kind].tried for each in found) for kind in KINDS},
-        "alter": {kind: sum(each.kinds[kind].alter for each in found) for kind in KINDS},
+        "stand": {kind: result.unaltered(kind) for kind in EXHAUSTIVE},
+        "tried": {kind: sum(each.kinds[kind].tried for each in found) for kind in EXHAUSTIVE},
+        "alter": {kind: sum(each.kinds[kind].alter for each in found) for kind in EXHAUSTIVE},
         "stand_sizes": {kind: statistics.median(999 if n is None else n for n in each) for kind, each in sizes.items()},
         "hanging": {kind: each.tolist() for kind, each in hanging_on(result).items()},
         "phases": [sum(each.phases[phase] for each in found) for phase in range(PHASES)],
@@ -78,7 +79,7 @@ def summary(result: Stability) -> Json:
         "each": [
             [
                 *(each.file, each.label, each.decision, each.ahead, each.at_least, each.at_most),
-                *(each.kinds[kind].alter for kind in KINDS),
+                *(each.kinds[kind].alter for kind in EXHAUSTIVE),
             ]
             for each in found
         ],

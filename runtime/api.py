@@ -49,9 +49,8 @@ if TYPE_CHECKING:
     from spikeloom.runtime.studies.anytime.study import Anytime
     from spikeloom.runtime.studies.chart.results import Chart
     from spikeloom.runtime.studies.counting import CountersReport
+    from spikeloom.runtime.studies.robustness.results import Certificates, Stress
     from spikeloom.runtime.studies.smallest.results import Smallest
-    from spikeloom.runtime.studies.stability.results import Stability
-    from spikeloom.runtime.studies.stress.results import Stress
     from spikeloom.runtime.studies.training import TrainingReport
 
 Numbers = int | str | Sequence[int]
@@ -258,14 +257,14 @@ class Compiled:
         jobs: int | None = None,
         picture: str | None = None,
         output: str | None = None,
-    ) -> Stability:
+    ) -> Certificates:
         """Decide for every small change of each recording whether it alters the decision; none is sampled.
 
         Raises SpikeloomError if the recordings do not suit the netlist.
         """
         from spikeloom.runtime.commands.check import certify
 
-        result: Stability = certify.run(self._question(CertifyRequest, locals())).result
+        result: Certificates = certify.run(self._question(CertifyRequest, locals())).result
         return result
 
     @documented(AnytimeRequest)

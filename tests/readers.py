@@ -55,7 +55,7 @@ from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import terminal
 from spikeloom.runtime.studies.chart.work import Built
 from spikeloom.runtime.studies.jobs import Job, sealed, sweep
-from spikeloom.runtime.studies.stress.sections import read_stress, stability
+from spikeloom.runtime.studies.robustness.stress_sections import overview, read_stress
 
 MOST_SAID, MOST_SECONDS = 300, 5.0
 
@@ -192,7 +192,7 @@ def stress_file() -> list[bytes]:
 
 def stress(path: Path) -> str:
     found = json.loads(Path("stress.json").read_text())["provenance"]["netlist_sha256"]
-    return terminal(stability(read_stress(str(path), "net.loom", found)))
+    return terminal(overview(read_stress(str(path), "net.loom", found)))
 
 
 FIGURES = encode(made_figures(9, 10, 1.0, 1.0))

@@ -20,9 +20,10 @@ from spikeloom.models.recordings.events import joined_bins, load_data, of_length
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds, held_out, linear_rules
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.studies.counting import decisions_of
-from spikeloom.runtime.studies.stress.bench import NAMES, Bench, distances, warm_state, whole
-from spikeloom.runtime.studies.stress.pair import Pair, evaluate
-from spikeloom.runtime.studies.stress.study import clean
+from spikeloom.runtime.studies.robustness.bench import Bench, distances, whole
+from spikeloom.runtime.studies.robustness.pair import Pair, evaluate
+from spikeloom.runtime.studies.robustness.perturbations import SAMPLED, warm_state
+from spikeloom.runtime.studies.robustness.sampled import clean
 
 CLASSES, TAXELS, STEPS = 3, 4, 40
 PLANS = [
@@ -106,7 +107,7 @@ def test_stress_runs_them_to_the_end_of_their_ramp(plan):
     bench = Bench(
         pair=pair, distance=nearness, events=other.events, labels=other.labels, files=other.files, lengths=lengths
     )
-    late = NAMES["start_late"](other.events, 5)
+    late = SAMPLED["start_late"](other.events, 5)
     for found, recordings in (
         (clean(bench)[0], other),
         (evaluate(pair, whole(late, pair.netlist, lengths)), replace(other, events=late)),

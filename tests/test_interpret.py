@@ -12,7 +12,7 @@ from numpy.testing import assert_array_equal
 from oracles import refused
 from scipy import sparse
 
-import spikeloom.runtime.studies.stress.pair
+import spikeloom.runtime.studies.robustness.pair
 from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.formats.text import text
@@ -22,7 +22,7 @@ from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, f
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.capabilities import require_comparable
 from spikeloom.runtime.machines.votes import readout_counts
-from spikeloom.runtime.studies.stress.pair import Inputs, Pair, evaluate, float_layers
+from spikeloom.runtime.studies.robustness.pair import Inputs, Pair, evaluate, float_layers
 
 
 def weights_hit(incoming, spikes, post, neuron, t):
@@ -168,7 +168,7 @@ def test_neurons_that_the_chip_leaves_out_are_compared_if_others_receive_them():
 
 
 def test_shorter_recordings_and_late_beginnings(monkeypatch):
-    monkeypatch.setattr(spikeloom.runtime.studies.stress.pair, "HELD", 1000)  # so that there are several parts
+    monkeypatch.setattr(spikeloom.runtime.studies.robustness.pair, "HELD", 1000)  # so that there are several parts
     network = lively(seed=4)
     pair = Pair(netlist=compile_network(network, Options(keep_all=True)).netlist, network=network)
     events, lengths, begin = random_inputs(network.input.size, 4), np.array([30, 11, 1, 20]), np.array([0, 5, 0, 19])

@@ -14,8 +14,8 @@ from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.changes import kernel
 from spikeloom.runtime.machines.loihi1.costs import timing
 from spikeloom.runtime.machines.truenorth import engine as crossbars
-from spikeloom.runtime.studies.stability.bounds import lower_bound
-from spikeloom.runtime.studies.stability.neighbours import cells_of
+from spikeloom.runtime.studies.robustness.proofs.bounds import lower_bound
+from spikeloom.runtime.studies.robustness.proofs.entries import cells_of
 
 EVENTS = np.ones((2, 3, 4), np.uint8)
 

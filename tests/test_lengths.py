@@ -26,7 +26,7 @@ from spikeloom.models.recordings.release import write_released
 from spikeloom.models.training.evaluate import evaluate
 from spikeloom.models.training.train import train, validation_split
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.studies.stress import bench, disturbances
+from spikeloom.runtime.studies.robustness import bench, perturbations
 
 STEPS = (5, 40, 17, 17, 90, 1)
 
@@ -240,7 +240,7 @@ def test_what_is_done_to_recordings_is_done_before_they_are_joined():
     events = np.zeros((1, 1, 2, 7), np.uint8)
     events[..., 4] = 1
     netlist = SimpleNamespace(bins=3, clocks=NO_CLOCKS)
-    late = bench.whole(disturbances.start_late(events, 2), netlist, np.array([7]))
+    late = bench.whole(perturbations.start_late(events, 2), netlist, np.array([7]))
     assert late.channels(slice(None)).tolist() == [[[0, 0, 1]] * 2]
     assert late.lengths.tolist() == [3]
 

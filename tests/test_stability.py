@@ -26,12 +26,13 @@ from spikeloom.runtime.machines.changes import Changes, by_running, joined, sing
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.changes.kernel import overflows
 from spikeloom.runtime.report.encode import decode
-from spikeloom.runtime.studies.stability.bounds import lower_bound, needed
-from spikeloom.runtime.studies.stability.counting import least, tally_of
-from spikeloom.runtime.studies.stability.neighbours import KINDS, cells_of, channels_of
-from spikeloom.runtime.studies.stability.results import Stability
-from spikeloom.runtime.studies.stability.sections import hanging_on
-from spikeloom.runtime.studies.stability.study import share_robust_to_one_event, stability
+from spikeloom.runtime.studies.robustness.certify_sections import hanging_on
+from spikeloom.runtime.studies.robustness.exhaustive import certify, share_robust_to_one_event
+from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
+from spikeloom.runtime.studies.robustness.proofs.bounds import lower_bound, needed
+from spikeloom.runtime.studies.robustness.proofs.counting import least, tally_of
+from spikeloom.runtime.studies.robustness.proofs.entries import cells_of, channels_of
+from spikeloom.runtime.studies.robustness.results import Certificates
 
 REPEATABLE = settings(max_examples=40, derandomize=True)
 
@@ -127,7 +128,7 @@ def test_what_is_known_again_is_so_after_any_past(seed):
 
 
 def study_of(netlist, given, **options):
-    return stability(machine_of(netlist), recorded(given), jobs=1, **options)
+    return certify(machine_of(netlist), recorded(given), jobs=1, **options)
 
 
 def decided(netlist, given):
@@ -190,7 +191,7 @@ def test_counters_bear_exactly_so_many_events(plan):
     made = counters_of(seen, fit(seen, 3), data, 3)
     machine = machine_of(compile_network(counting_network(made)).netlist)
     tally, exact = tally_of(machine), set()
-    for one, found in zip(given[:5], stability(machine, data.part(slice(5)), jobs=1, most=2).verdicts, strict=True):
+    for one, found in zip(given[:5], certify(machine, data.part(slice(5)), jobs=1, most=2).certificates, strict=True):
         channels, cells = channels_of(one[None], machine.netlist)[0], cells_of(one, machine.netlist)
         votes, broken = machine.votes(channels[None])[0], 3
         known = least(tally, channels != 0, votes, cells, 2)
@@ -211,7 +212,7 @@ def test_counters_bear_exactly_so_many_events(plan):
     assert {1, 2} <= exact
     assert (
         share_robust_to_one_event(machine, data.part(slice(5)))
-        == stability(machine, data.part(slice(5)), jobs=1).certified(1) / 5
+        == certify(machine, data.part(slice(5)), jobs=1).certified(1) / 5
     )
 
 
@@ -219,10 +220,10 @@ def test_counters_bear_exactly_so_many_events(plan):
 def test_verdicts_are_those_of_plain_runs(bins, clocks):
     netlist = replace(small_netlist(1), bins=bins, clocks=clocks)
     given = events(5, samples=2, steps=20, rate=0.1)
-    for one, found in zip(given, study_of(netlist, given, shift=3, most=4).verdicts, strict=True):
+    for one, found in zip(given, study_of(netlist, given, shift=3, most=4).certificates, strict=True):
         known = decided(netlist, one[None])[0]
         assert found.decision == known
-        wanted = dict.fromkeys(KINDS, 0)
+        wanted = dict.fromkeys(EXHAUSTIVE, 0)
         hanging = {kind: set() for kind in ("removed", "added", "dead", "stuck")}
 
         def tally(kind, changed, taxel=None, known=known, wanted=wanted, hanging=hanging):
@@ -267,7 +268,7 @@ def test_a_chip_that_knows_no_short_cut_runs_every_change():
     counters = random_counters(1, taxels=2, classes=3)
     netlist = compile_crossbars(counters).netlist
     given = np.stack([random_events(seed, counters) for seed in (5, 6)])
-    for one, found in zip(given, study_of(netlist, given, shift=1).verdicts, strict=True):
+    for one, found in zip(given, study_of(netlist, given, shift=1).certificates, strict=True):
         cells, alter = cells_of(one, netlist), 0
         for channel, step in cells.cells.tolist():
             changed = one.copy()
@@ -280,8 +281,8 @@ def test_a_chip_that_knows_no_short_cut_runs_every_change():
 def test_an_attack_alters_the_decision_with_the_events_that_it_names():
     netlist, given = small_netlist(0), events(8, samples=4, steps=60, rate=0.1)
     result = study_of(netlist, given)
-    assert any(each.at_most is not None and each.at_most > 1 for each in result.verdicts)
-    for one, found in zip(given, result.verdicts, strict=True):
+    assert any(each.at_most is not None and each.at_most > 1 for each in result.certificates)
+    for one, found in zip(given, result.certificates, strict=True):
         changed = one.copy()
         for words in found.attack:
             taxel, polarity, step = (int(word.strip(",:")) for word in words.split() if word.strip(",:").isdigit())
@@ -299,10 +300,10 @@ def test_the_command(tmp_path, monkeypatch):
     found = as_json(*words, "-o", "found.json", "--picture", "map.svg")
     assert json.loads((tmp_path / "found.json").read_text()) == found
     assert (tmp_path / "map.svg").read_bytes().startswith(b"<?xml")
-    result = decode(Stability, found)
-    assert len(result.verdicts) == 4
-    assert result.unaltered("dead") == sum(not each.taxels["dead"] for each in result.verdicts)
-    assert sum(hanging_on(result)["dead"]) == sum(each.kinds["dead"].alter for each in result.verdicts)
+    result = decode(Certificates, found)
+    assert len(result.certificates) == 4
+    assert result.unaltered("dead") == sum(not each.taxels["dead"] for each in result.certificates)
+    assert sum(hanging_on(result)["dead"]) == sum(each.kinds["dead"].alter for each in result.certificates)
     code, out, err = run(*words)
     assert code == 0
     singles = events(3, samples=4).size

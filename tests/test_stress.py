@@ -24,11 +24,12 @@ from spikeloom.runtime.machines.loihi1.trace import unpack
 from spikeloom.runtime.machines.votes import class_counts, readout_counts
 from spikeloom.runtime.report.encode import decode, encode
 from spikeloom.runtime.report.numbers import wilson
-from spikeloom.runtime.studies.stress.bench import NAMES, Bench, by_length, distances, longer, warm_state, whole
-from spikeloom.runtime.studies.stress.pair import Pair, evaluate
-from spikeloom.runtime.studies.stress.results import Run, Spread
-from spikeloom.runtime.studies.stress.study import clean, generator, measure
-from spikeloom.runtime.studies.stress.verdicts import curve, parse_requirement, reasons, spread, unmet
+from spikeloom.runtime.studies.robustness.bench import Bench, by_length, distances, whole
+from spikeloom.runtime.studies.robustness.curves import curve, parse_requirement, reasons, spread, unmet
+from spikeloom.runtime.studies.robustness.pair import Pair, evaluate
+from spikeloom.runtime.studies.robustness.perturbations import SAMPLED, longer, warm_state
+from spikeloom.runtime.studies.robustness.results import Run, Spread
+from spikeloom.runtime.studies.robustness.sampled import clean, generator, measure
 
 STRESS, REPORT = (f"{command} net.loom --checkpoint net.pt --data data".split() for command in ("stress", "report"))
 FEW = "taxels_dead,events_lost,warm_state,longer,weight_bit_flips,fewer_bits"
@@ -114,7 +115,7 @@ def test_clocks_are_no_taxels(tmp_path):
     made = bench_of(network, netlist, events_of(3))
     ticks = netlist.clocks.events(15)
     sensor = netlist.taxels * netlist.polarities
-    silent = NAMES["taxels_dead"](made.events, 39, generator("taxels_dead", 0))
+    silent = SAMPLED["taxels_dead"](made.events, 39, generator("taxels_dead", 0))
     reached = whole(silent, netlist, made.lengths).channels(slice(None))
     assert not reached[:, :sensor].any()
     assert_array_equal(reached[0, sensor:], ticks)
@@ -155,12 +156,12 @@ def test_an_overflow_stops_its_recording_and_no_other(bench):
     assert not found.votes["chip"][0].any()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SAMPLED)
 def test_every_perturbation_runs_at_its_mildest_and_harshest_the_same_for_a_seed(bench, name):
     reference, undisturbed = clean(bench)
-    levels = NAMES[name].levels_of(TAXELS)
+    levels = SAMPLED[name].levels_of(TAXELS)
     for level in {levels[0], levels[-1]}:
-        seeds = [0, 1] if NAMES[name].seeded else [0]
+        seeds = [0, 1] if SAMPLED[name].seeded else [0]
         runs = [measure(bench, name, level, seed, reference) for seed in seeds]
         assert runs == [measure(bench, name, level, seed, reference) for seed in seeds]
         assert [run.seed for run in runs] == seeds
@@ -171,15 +172,15 @@ def test_every_perturbation_runs_at_its_mildest_and_harshest_the_same_for_a_seed
 
 
 def test_levels_are_in_order_and_make_sense():
-    assert len(NAMES) == 26
-    for known in NAMES.values():
+    assert len(SAMPLED) == 26
+    for known in SAMPLED.values():
         levels = list(known.levels_of(39))
         assert levels in (sorted(levels), sorted(levels, reverse=True))
         assert all(known.least <= level <= known.most for level in levels)
         assert len(set(levels)) == len(levels)
-        assert known.to in ("events", "pair", "bench")
-    assert NAMES["taxels_dead"].levels_of(6, [2]) == (1, 2, 3, 5)
-    assert NAMES["taxels_dead"].level_of("3") == 3
+        assert known.to in ("events", "memory", "bench")
+    assert SAMPLED["taxels_dead"].levels_of(6, [2]) == (1, 2, 3, 5)
+    assert SAMPLED["taxels_dead"].level_of("3") == 3
 
 
 def run_of(right, *, equal=100, spikes=(1000, 1000, 100, 10000), signs=None, most=10, stopped=0, seed=0):
@@ -295,7 +296,7 @@ def test_any_number_of_threads_says_the_same(spikeloom, place):
     assert (place / "one.json").read_bytes() == (place / "two.json").read_bytes()
     report = json.loads((place / "one.json").read_bytes())
     wanted = {*FEW.split(",")}
-    assert list(report["perturbations"]) == [name for name in NAMES if name in wanted]
+    assert list(report["perturbations"]) == [name for name in SAMPLED if name in wanted]
     assert report["not_applicable"] == {}
     levels = report["perturbations"]["taxels_dead"]["levels"]
     assert [point["level"] for point in levels] == [1, 3, 5]
@@ -317,8 +318,8 @@ def test_requirements_decide_about_the_exit_code(as_json):
 def test_what_does_not_apply(bench):
     netlist = compile_network(bench.pair.network, Options(packings=(Packing(planes=2),))).netlist
     pair = Pair(netlist=netlist, network=bench.pair.network)
-    assert NAMES["fewer_bits"].why_not(pair) == "weights are stored in several planes"
-    assert NAMES["fewer_bits"].why_not(bench.pair) is None
+    assert SAMPLED["fewer_bits"].why_not(pair) == "weights are stored in several planes"
+    assert SAMPLED["fewer_bits"].why_not(bench.pair) is None
 
 
 def test_the_page_of_a_network_shows_it_if_it_is_a_result_about_its_netlist(as_json, refusal, place):

@@ -1,13 +1,15 @@
 """What some chips offer beyond :class:`machines.base.Machine`, one class for each thing that a study may need."""
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.ir import IntegerNetwork
+from spikeloom.compiler.ir import IntegerNetwork, Network
+from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.runtime.machines.base import Machine
 
@@ -96,6 +98,76 @@ class Threaded(Comparable):
         Channels (samples, channels, steps) include the clocks. Raises NumericRangeError if a register overflows in any
         recording.
         """
+
+
+class Memory(ABC):
+    """What a chip stores of a network, and the float network beside it: damage is done to both alike.
+
+    The float network changes by as much in its own units, which is the same relative change up to rounding. Neurons are
+    those that the chip holds, in its order; one that it does not hold stays as it is in the float network.
+    """
+
+    netlist: Netlist
+    network: Network
+
+    @property
+    @abstractmethod
+    def codes(self) -> IntArray:
+        """Stored weights, (synapses,) int64, in two's complement, in steps of their format."""
+
+    @property
+    @abstractmethod
+    def widths(self) -> IntArray:
+        """Bits of each of them."""
+
+    @property
+    @abstractmethod
+    def planes(self) -> int:
+        """Stored weights that make one of the network's, at most."""
+
+    @property
+    @abstractmethod
+    def thresholds(self) -> IntArray:
+        """Threshold registers, (neurons,) int64."""
+
+    @property
+    @abstractmethod
+    def hidden(self) -> IntArray:
+        """Numbers of the neurons that neither vote nor relay a clock."""
+
+    @property
+    @abstractmethod
+    def windows(self) -> bool:
+        """Whether layers wait for their input."""
+
+    @abstractmethod
+    def with_codes(self, codes: IntArray) -> Self:
+        """Other stored weights; where nothing changes, the float weight stays as it is, bit for bit."""
+
+    @abstractmethod
+    def with_stuck(self, neurons: IntArray, *, firing: bool) -> Self:
+        """Neurons that never fire, or fire in every step, whatever reaches them; given by their numbers."""
+
+    @abstractmethod
+    def with_thresholds(self, thresholds: IntArray) -> Self:
+        """Other thresholds, as far as registers hold them; those of relays stay."""
+
+    @abstractmethod
+    def with_late_layers(self, steps: int) -> Self:
+        """Layers after the first open their windows so many steps late."""
+
+    @abstractmethod
+    def with_decays(self, factor: float) -> Self:
+        """Membranes and lasting currents keep so much of the share that they keep."""
+
+
+@dataclass(frozen=True)
+class Damageable(Threaded):
+    """What it stores can be damaged."""
+
+    @abstractmethod
+    def memory(self, network: Network) -> Memory:
+        """What it stores, beside the float network that was compiled."""
 
 
 LONGEST = 4096

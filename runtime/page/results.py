@@ -29,7 +29,7 @@ from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL, key
 from spikeloom.runtime.report.sections import Block, Outcome
 from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.requests.main_job import ReportRequest
-from spikeloom.runtime.studies.stress.results import Stress
+from spikeloom.runtime.studies.robustness.results import Stress
 
 PACKAGES = ("numpy", "scipy", "torch", "numba", "networkx")
 """Packages whose versions may move a float spike."""

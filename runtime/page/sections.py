@@ -18,7 +18,7 @@ from spikeloom.runtime.page.results import Decisions, Provenance, Report, Taxels
 from spikeloom.runtime.report import drawing
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Outcome, Section, Table, Text
-from spikeloom.runtime.studies.stress.sections import stability
+from spikeloom.runtime.studies.robustness.stress_sections import overview
 
 LISTED = 10
 """Rows that a terminal shows of a table that is sorted by weight."""
@@ -56,7 +56,7 @@ def sections(report: Report) -> list[Section]:
         Section("Taxels", _taxels(report.taxels)),
         Section("One recording", [] if report.recording is None else _recording(report.recording)),
         Section("Energy and time", [*_of_chip(report.price.outcome), Section("", report.figures)]),
-        Section("Stress", [] if report.stress is None else stability(report.stress)),
+        Section("Stress", [] if report.stress is None else overview(report.stress)),
         Section("Provenance", _provenance(report.provenance)),
         Section("Words", [Table(["word", "meaning"], list(map(list, WORDS.items())), words=True, most=0)]),
     ]

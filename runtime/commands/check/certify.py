@@ -16,12 +16,15 @@ from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.check import CertifyRequest
-from spikeloom.runtime.studies.stability.results import Provenance
-from spikeloom.runtime.studies.stability.sections import sections, taxel_map
-from spikeloom.runtime.studies.stability.study import stability
+from spikeloom.runtime.studies.robustness.certify_sections import sections, taxel_map
+from spikeloom.runtime.studies.robustness.exhaustive import certify
+from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
+from spikeloom.runtime.studies.robustness.results import Provenance
 
-NOTES = """\
-On each recording every one of these changes is decided, none is sampled: {kinds}.
+KINDS = "; ".join(kind.what for kind in EXHAUSTIVE.values())
+
+NOTES = f"""\
+On each recording every one of these changes is decided, none is sampled: {KINDS}.
 For several changed events it says how many are proven to be harmless and how many are shown to suffice.
 """
 
@@ -38,9 +41,9 @@ def run(request: CertifyRequest) -> Outcome:
     data = load_recordings(request.data, request, machine.netlist, labels_for="certify", joined=False)
     singles = int(data.step_counts.sum()) * data.taxels * data.events.shape[2]
     tell(f"trying {singles:,} single events of {number(len(data), 'recording')}, then taxels, pairs, shifts and cuts")
-    found = stability(machine, data, shift=request.shift, most=request.most, jobs=request.jobs)
+    certificates = certify(machine, data, shift=request.shift, most=request.most, jobs=request.jobs)
     result = replace(
-        found,
+        certificates,
         provenance=Provenance(
             spikeloom=__version__,
             netlist=Path(request.netlist).name,

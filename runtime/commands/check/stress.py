@@ -5,13 +5,13 @@ from spikeloom.runtime.inputs.files import require_picture, require_place, write
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.check import StressRequest
-from spikeloom.runtime.studies.stress.bench import NAMES
-from spikeloom.runtime.studies.stress.sections import picture, sections
-from spikeloom.runtime.studies.stress.study import study
-from spikeloom.runtime.studies.stress.verdicts import parse_requirement
+from spikeloom.runtime.studies.robustness.curves import parse_requirement
+from spikeloom.runtime.studies.robustness.perturbations import SAMPLED
+from spikeloom.runtime.studies.robustness.sampled import stress
+from spikeloom.runtime.studies.robustness.stress_sections import picture, sections
 
-NOTES = """\
-Perturbations: {names}.
+NOTES = f"""\
+Perturbations: {", ".join(SAMPLED)}.
 Accuracies are means over the seeds with a 95 % interval; a level leaves where the mean is below the interval of the
 clean accuracy.
 """
@@ -25,15 +25,15 @@ def run(request: StressRequest) -> Outcome:
     require_place(request.output, "-o", request)
     require_picture(request, [request.output])
     require_least(vars(request), seeds=1, jobs=1)
-    chosen = list(NAMES) if request.only is None else [name.strip() for name in request.only.split(",")]
+    chosen = list(SAMPLED) if request.only is None else [name.strip() for name in request.only.split(",")]
     for name in chosen:
-        if name not in NAMES:
-            raise OptionError(f"--only {name}: no such perturbation; choose from {', '.join(NAMES)}")
+        if name not in SAMPLED:
+            raise OptionError(f"--only {name}: no such perturbation; choose from {', '.join(SAMPLED)}")
     requirements = list(map(parse_requirement, request.require))
     for wanted in requirements:
         if wanted.name not in chosen:
             raise OptionError(f"--require {wanted}: --only leaves {wanted.name} out; add it there")
-    result = study(request, [name for name in NAMES if name in chosen], requirements)
+    result = stress(request, [name for name in SAMPLED if name in chosen], requirements)
     write_picture(request.picture, lambda: picture(result))
     write_json(request.output, result)
     return Outcome(result, sections, 1 if result.missed else 0)

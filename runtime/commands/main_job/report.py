@@ -22,8 +22,8 @@ from spikeloom.runtime.report import html
 from spikeloom.runtime.report.console import Progress, progress
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 from spikeloom.runtime.requests.main_job import ReportRequest
-from spikeloom.runtime.studies.stress.results import Stress
-from spikeloom.runtime.studies.stress.sections import read_stress
+from spikeloom.runtime.studies.robustness.results import Stress
+from spikeloom.runtime.studies.robustness.stress_sections import read_stress
 
 NOTES = """\
 The page opens from disk and loads nothing; its figures are inline SVG, each with its numbers as a table. What is

@@ -22,7 +22,7 @@ from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.machines.base import Done, Model, Price, Run, T, differences, one_by_one
-from spikeloom.runtime.machines.capabilities import Cumulative, Stoppable, Threaded
+from spikeloom.runtime.machines.capabilities import Cumulative, Damageable, Memory, Stoppable
 from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.stream import Stream
@@ -42,7 +42,7 @@ SUMS = 1 << 24
 
 
 @dataclass(frozen=True)
-class Loihi(Threaded, Stoppable):
+class Loihi(Damageable, Stoppable):
     """A netlist and its simulator."""
 
     netlist: Netlist
@@ -209,6 +209,12 @@ class Loihi(Threaded, Stoppable):
         spikes = unpack(trace.packed[:, first:], self.netlist.n_compartments)
         layers = (aligned(self.netlist, spikes, layer) for layer in range(len(self.netlist.layers)))
         return layers, trace.counts.saturations.sum(axis=1)
+
+    def memory(self, network: Network) -> Memory:
+        """Registers of compartments, weights of synapses."""
+        from spikeloom.runtime.machines.loihi1.changes.memory import LoihiMemory
+
+        return LoihiMemory(netlist=self.netlist, network=network)
 
     @cached_property
     def _chip(self) -> Chip | None:

@@ -38,11 +38,11 @@ from spikeloom.runtime.studies.processor import Processor
 from spikeloom.runtime.studies.pruning.results import Costs
 from spikeloom.runtime.studies.pruning.trials import decisions as decisions_on_chip
 from spikeloom.runtime.studies.pruning.trials import priced
+from spikeloom.runtime.studies.robustness.exhaustive import share_robust_to_one_event
 from spikeloom.runtime.studies.smallest import baselines
 from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF
 from spikeloom.runtime.studies.smallest.space import Candidate
 from spikeloom.runtime.studies.smallest.trained import Sensor, plan_of, without
-from spikeloom.runtime.studies.stability.study import share_robust_to_one_event
 
 FORMAT = 3
 """Of what is measured; goes up when a figure means something else."""

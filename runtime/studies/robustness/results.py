@@ -1,11 +1,11 @@
-"""What ``stress`` returns."""
+"""What ``stress`` returns: curves by perturbation; and ``certify``: a certificate of each recording."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from spikeloom.runtime.report.encode import OPTIONAL, key
 from spikeloom.runtime.report.shown import Shown
-from spikeloom.runtime.studies.stress.pair import Level
+from spikeloom.runtime.studies.robustness.definition import Level
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,19 +77,25 @@ class Curve:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Provenance:
-    """What the runs depend on beside perturbation, level and seed: versions, hashes, names of files."""
+    """What either depends on, beside its options: versions, hashes, names of files."""
 
     spikeloom: str
+    netlist: str
     netlist_sha256: str
+    data: str
+    data_sha256: str
+    split: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparedProvenance(Provenance):
+    """The same, where a float network stands beside the chip."""
+
+    checkpoint: str
     checkpoint_sha256: str
     dt: float | None = field(default=None, metadata=OPTIONAL)
     convention: str | None = field(default=None, metadata=OPTIONAL)
     graph: str | None
-    data_sha256: str
-    netlist: str
-    checkpoint: str
-    data: str
-    split: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -104,7 +110,7 @@ class Stress(Shown):
     not_applicable: Mapping[str, str]
     required: tuple[str, ...]
     missed: tuple[str, ...]
-    provenance: Provenance
+    provenance: ComparedProvenance
 
 
 def shown(level: Level) -> str:
@@ -114,3 +120,66 @@ def shown(level: Level) -> str:
     ('3', '0.25', '0.0001')
     """
     return f"{level:g}"
+
+
+PHASES = 10
+"""Parts of a recording in which altering events are counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decided:
+    """One kind of change on one recording: how many there are, how many alter the decision, the first that does."""
+
+    tried: int
+    alter: int
+    first: str | None = None
+    to: int | None = None  # What is decided then
+    least: int | None = None  # Bins of the smallest that does, where a kind has sizes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Certificate:
+    """What is proven and known of one recording.
+
+    No change of up to `at_least` events alters its decision; the change `attack` of `at_most` events does, if one was
+    found. `taxels` are those on which the decision hangs, by kind of change; `phases` the single events that alter it,
+    by tenth of the recording.
+    """
+
+    file: str
+    label: int
+    decision: int
+    ahead: int  # Votes that another class must gain on the decision
+    kinds: Mapping[str, Decided]
+    at_least: int
+    at_most: int | None
+    exact: bool  # Whether `at_least` is the largest number of which this is true, up to the largest that was looked for
+    attack: tuple[str, ...]
+    taxels: Mapping[str, tuple[int, ...]]
+    phases: tuple[int, ...]
+
+    @property
+    def right(self) -> bool:
+        """Whether the decision is the label."""
+        return self.label == self.decision
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Certificates(Shown):
+    """Those of all recordings; `most` is the largest number of events that was looked for, `shift` that of bins."""
+
+    target: str
+    taxels: int
+    classes: int
+    shift: int
+    most: int
+    certificates: tuple[Certificate, ...]
+    provenance: Provenance | None = None
+
+    def certified(self, events: int) -> int:
+        """Recordings whose decision no change of up to so many events alters."""
+        return sum(each.at_least >= events for each in self.certificates)
+
+    def unaltered(self, kind: str) -> int:
+        """Recordings whose decision no change of a kind alters."""
+        return sum(not each.kinds[kind].alter for each in self.certificates)

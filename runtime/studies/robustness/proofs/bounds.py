@@ -16,7 +16,7 @@ import numpy as np
 
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.changes import Effects, Forgetting
-from spikeloom.runtime.studies.stability.neighbours import Cells
+from spikeloom.runtime.studies.robustness.proofs.entries import Cells
 
 
 def needed(votes: IntArray) -> tuple[int, IntArray]:
@@ -37,7 +37,7 @@ def lower_bound(votes: IntArray, cells: Cells, effects: Effects, known: Forgetti
     `votes` (classes,) are those of the known run, `effects` those of each entry flipped alone.
     """
     from spikeloom.compiler.layer_kernel import require_below
-    from spikeloom.runtime.studies.stability.worst import most_lost  # with numba, which help need not wait for
+    from spikeloom.runtime.studies.robustness.proofs.worst import most_lost  # with numba, which help need not wait for
 
     decision, gaps = needed(votes)
     steps = len(known.back) - 1

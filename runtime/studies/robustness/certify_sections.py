@@ -1,4 +1,4 @@
-"""Verdicts, laid out for terminals, and the picture of a sensor and of what hangs on its taxels."""
+"""Certificates, laid out for terminals, and the picture of a sensor and of what hangs on its taxels."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.runtime.report.drawing import GREY, Drawing, sheet, styled
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Section, Table, Text
-from spikeloom.runtime.studies.stability.neighbours import KINDS, SIZED
-from spikeloom.runtime.studies.stability.results import PHASES, Stability, Verdict
+from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
+from spikeloom.runtime.studies.robustness.results import PHASES, Certificate, Certificates
 
 SHOWN = 20
 """Recordings and taxels that a terminal shows."""
@@ -26,22 +26,23 @@ KEY = (
 )
 
 
-def sections(result: Stability) -> Iterator[Section]:
+def sections(result: Certificates) -> Iterator[Section]:
     """How many decisions stand, kind by kind; how many events they bear; what alters the others."""
-    found, count = result.verdicts, len(result.verdicts)
+    certificates = result.certificates
+    count = len(certificates)
     lines = [
-        f"right: {percent(sum(verdict.right for verdict in found), count)}",
+        f"right: {percent(sum(each.right for each in certificates), count)}",
         f"no single event alters the decision: {percent(result.certified(1), count)}",
     ]
     rows = [
         [
-            KINDS[name],
+            kind.what,
             f"{result.unaltered(name)} of {count}",
-            f"{sum(verdict.kinds[name].tried for verdict in found):,}",
-            f"{sum(verdict.kinds[name].alter for verdict in found):,}",
-            _size([verdict.kinds[name].least for verdict in found]) if name in SIZED else "",
+            f"{sum(each.kinds[name].tried for each in certificates):,}",
+            f"{sum(each.kinds[name].alter for each in certificates):,}",
+            _size([each.kinds[name].least for each in certificates]) if kind.sized else "",
         ]
-        for name in KINDS
+        for name, kind in EXHAUSTIVE.items()
     ]
     head = ["change", "decisions that stand", "tried", "alter", "smallest that alters, median"]
     yield Section("Verdicts", [Text("\n".join(lines)), Table(head, rows)])
@@ -51,14 +52,14 @@ def sections(result: Stability) -> Iterator[Section]:
     taxels = [[str(taxel), *(str(each[taxel]) for each in hanging.values())] for taxel in most.tolist()]
     head = ["taxel", *PANELS.values()]
     yield Section("Decisions that hang on a taxel", [Table(head, taxels, most=SHOWN)])
-    phases = np.sum([verdict.phases for verdict in found], axis=0)
+    phases = np.sum([each.phases for each in certificates], axis=0)
     if phases.any():
         cells = [f"{100 * each / phases.sum():.0f} %" for each in phases]
         head = ["tenth of the recording", *(str(phase + 1) for phase in range(PHASES))]
         yield Section("When single events alter", [Table(head, [["of them", *cells]])])
-    fragile = sorted(found, key=lambda verdict: (verdict.at_least, verdict.ahead))
+    fragile = sorted(certificates, key=lambda each: (each.at_least, each.ahead))
     head = ["recording", "label", "decided", "ahead", "at least", "at most", "alters"]
-    yield Section("The least stable", [Table(head, [_row(verdict) for verdict in fragile], words=True, most=SHOWN)])
+    yield Section("The least stable", [Table(head, [_row(each) for each in fragile], words=True, most=SHOWN)])
 
 
 def _size(least: list[int | None]) -> str:
@@ -67,31 +68,32 @@ def _size(least: list[int | None]) -> str:
     return "none" if middle is None else f"{middle} bins"
 
 
-def _radii(result: Stability) -> Table:
+def _radii(result: Certificates) -> Table:
     """Recordings by how many events they bear."""
-    count, rows = len(result.verdicts), []
+    count = len(result.certificates)
+    rows = []
     for events in (1, 2, 3, 4, 6, 8, 12, 16):
         if events <= result.most:
-            broken = sum(each.at_most is not None and each.at_most <= events for each in result.verdicts)
+            broken = sum(each.at_most is not None and each.at_most <= events for each in result.certificates)
             sure = result.certified(events)
             rows.append([str(events), f"{sure} of {count}", f"{broken}", f"{count - sure - broken}"])
     return Table(["changed events", "proven to stand", "shown to fall", "open"], rows)
 
 
-def _row(verdict: Verdict) -> list[str]:
-    kinds = [name for name, kind in verdict.kinds.items() if kind.alter]
-    most = "–" if verdict.at_most is None else str(verdict.at_most)
-    words = [verdict.file, verdict.label, verdict.decision, verdict.ahead, verdict.at_least, most]
+def _row(one: Certificate) -> list[str]:
+    kinds = [name for name, kind in one.kinds.items() if kind.alter]
+    most = "–" if one.at_most is None else str(one.at_most)
+    words = [one.file, one.label, one.decision, one.ahead, one.at_least, most]
     return [*map(str, words), ", ".join(kinds) or "–"]
 
 
-def hanging_on(result: Stability) -> dict[str, IntArray]:
+def hanging_on(result: Certificates) -> dict[str, IntArray]:
     """Decisions that hang on each taxel: on its failure, and on any of its events."""
     kinds = {"dead": ("dead",), "stuck": ("stuck",), "event": ("removed", "added")}
-    found = {name: np.zeros(result.taxels, np.int64) for name in kinds}
-    for (name, of), verdict in product(kinds.items(), result.verdicts):
-        found[name][list({taxel for kind in of for taxel in verdict.taxels[kind]})] += 1
-    return found
+    hanging = {name: np.zeros(result.taxels, np.int64) for name in kinds}
+    for (name, of), one in product(kinds.items(), result.certificates):
+        hanging[name][list({taxel for kind in of for taxel in one.taxels[kind]})] += 1
+    return hanging
 
 
 def _places(taxels: int) -> FloatArray:
@@ -103,12 +105,12 @@ def _places(taxels: int) -> FloatArray:
 
 
 @styled()
-def taxel_map(result: Stability) -> Drawing:
+def taxel_map(result: Certificates) -> Drawing:
     """Taxels where they lie, coloured by how many decisions hang on each."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    count = len(result.verdicts)
+    count = len(result.certificates)
     name = "" if result.provenance is None else f"{result.provenance.netlist} on {result.provenance.data}: "
     title = f"{name}decisions, of {count}, that change if one taxel …"
     drawing = sheet(title, 4.2)

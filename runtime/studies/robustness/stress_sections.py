@@ -12,8 +12,8 @@ from spikeloom.runtime.report.drawing import CHIP, FLOAT, GREY, WIDTH, Drawing, 
 from spikeloom.runtime.report.encode import read_json
 from spikeloom.runtime.report.numbers import percent, wilson
 from spikeloom.runtime.report.sections import Figure, Section, Table, Text, terminal
-from spikeloom.runtime.studies.stress.pair import SIDES
-from spikeloom.runtime.studies.stress.results import Curve, Spread, Stress, shown
+from spikeloom.runtime.studies.robustness.pair import SIDES
+from spikeloom.runtime.studies.robustness.results import Curve, Spread, Stress, shown
 
 NONE = "–"
 
@@ -38,14 +38,14 @@ def sections(result: Stress) -> list[Section]:
     missed = {text.partition(": ")[0]: text for text in result.missed}
     required = [f"required {missed.get(words, f'{words}: kept')}" for words in result.required]
     return [
-        *stability(result),
+        *overview(result),
         Section("Key", [Text(CURVE_KEY)]),
         *(Section(name, [Text(_title(name, each)), _table(each)]) for name, each in result.perturbations.items()),
         Section("Required", [Text("\n".join(required))]),
     ]
 
 
-def stability(result: Stress) -> list[Section]:
+def overview(result: Stress) -> list[Section]:
     """Clean accuracy, verdicts, the curves as a figure with their numbers, and what was not measured."""
     clean, recordings = result.clean, result.recordings
     lines = [f"{side} accuracy, clean: {percent(clean.right[side], recordings)}" for side in SIDES]
@@ -179,6 +179,6 @@ def read_stress(path: str, netlist: str, sha256: str) -> Stress:
             "stress that one, or report the other"
         )
     with reading(f"--stress {path}", DataError, "write it with spikeloom stress -o"):
-        terminal(stability(result))
+        terminal(overview(result))
         figure(result).file("svg")
     return result

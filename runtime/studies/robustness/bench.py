@@ -7,7 +7,6 @@ import numpy as np
 
 from spikeloom.compiler import Netlist
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import fitted, join_bins
@@ -19,8 +18,8 @@ from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.capabilities import require_threaded
 from spikeloom.runtime.requests.check import StressRequest
-from spikeloom.runtime.studies.stress import damages, disturbances
-from spikeloom.runtime.studies.stress.pair import Events, Inputs, Pair, Perturbation, perturbation
+from spikeloom.runtime.studies.robustness.pair import Events, Inputs, Pair
+from spikeloom.runtime.studies.robustness.proofs.entries import channels_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,7 +49,7 @@ def whole(events: Events, netlist: Netlist, lengths: IntArray) -> Inputs:
     """Recordings from their first bin on."""
 
     def channels(rows: slice) -> Events:
-        return with_clocks(in_steps(events[rows], lengths[rows], netlist)[0], netlist.clocks)
+        return channels_of(events[rows], netlist)
 
     return Inputs(channels=channels, lengths=in_steps(events[:1], lengths, netlist)[1], begin=np.zeros_like(lengths))
 
@@ -66,48 +65,20 @@ def by_length(events: Events, lengths: IntArray, change: Callable[[Events], Even
     return changed
 
 
-@perturbation("recordings before", (1, 2), least=1, most=100)
-def warm_state(bench: Bench, before: int, rng: np.random.Generator) -> Inputs:
-    """Other recordings run before, without a reset between.
-
-    Clocks start again with each.
-    """
-    steps, lengths = in_steps(bench.events, bench.lengths, bench.pair.netlist)
-    flat = with_clocks(steps, bench.pair.netlist.clocks)
-    order = np.stack([rng.permutation(len(flat)) for _ in range(before)] + [np.arange(len(flat))], axis=1)
-    return _last_of(order, lengths, lambda rows: _in_a_row(flat, lengths, order[rows]))
-
-
-@perturbation("times the length", (2, 10), least=1, most=100)
-def longer(bench: Bench, rounds: int) -> Inputs:
-    """The recording goes round again without a reset; decided on the last round alone.
-
-    Clocks run on and end, as they would.
-    """
-    steps, lengths = in_steps(bench.events, bench.lengths, bench.pair.netlist)
-    order, clocks = np.repeat(np.arange(len(steps))[:, None], rounds, axis=1), bench.pair.netlist.clocks
-    return _last_of(order, lengths, lambda rows: with_clocks(_in_a_row(steps, lengths, order[rows]), clocks))
-
-
-def _last_of(order: IntArray, lengths: IntArray, channels: Callable[[slice], Events]) -> Inputs:
+def last_of(order: IntArray, lengths: IntArray, channels: Callable[[slice], Events]) -> Inputs:
     """Recordings in a row, (rows, recordings), of which the last one counts."""
     length = lengths[order].sum(axis=1)
     return Inputs(channels=channels, lengths=length, begin=length - lengths)
 
 
-def _in_a_row(events: Events, lengths: IntArray, order: IntArray) -> Events:
+def in_a_row(events: Events, lengths: IntArray, order: IntArray) -> Events:
     """Recordings one after another, silence at the end."""
-    found = np.zeros((len(order), *events.shape[1:-1], int(lengths[order].sum(axis=1).max())), np.uint8)
-    for row, parts in zip(found, order.tolist(), strict=True):
-        one = np.concatenate([events[part, ..., : lengths[part]] for part in parts], axis=-1)
-        row[..., : one.shape[-1]] = one
-    return found
-
-
-_ALL = (*vars(disturbances).values(), warm_state, longer, *vars(damages).values())
-
-NAMES = {each.name: each for each in _ALL if isinstance(each, Perturbation)}
-"""Every perturbation: of recordings, of the state that is left over, of the network."""
+    longest = int(lengths[order].sum(axis=1).max())
+    rows = np.zeros((len(order), *events.shape[1:-1], longest), np.uint8)
+    for row, parts in zip(rows, order.tolist(), strict=True):
+        joined = np.concatenate([events[part, ..., : lengths[part]] for part in parts], axis=-1)
+        row[..., : joined.shape[-1]] = joined
+    return rows
 
 
 def bench_of(request: StressRequest) -> tuple[Bench, LoadedNetwork, str]:

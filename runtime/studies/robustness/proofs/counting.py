@@ -21,7 +21,7 @@ from spikeloom.compiler.ir import IntegerNetwork, Sparse, added_up
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.machines.capabilities import Comparable
-from spikeloom.runtime.studies.stability.neighbours import Cells
+from spikeloom.runtime.studies.robustness.proofs.entries import Cells
 
 FAR = 1 << 40
 """Beyond every sum."""

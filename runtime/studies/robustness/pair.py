@@ -1,25 +1,23 @@
-"""A float network and the netlist beside it on the same recordings, compared spike by spike; and what perturbs them.
+"""A float network and the netlist beside it on the same recordings, compared spike by spike.
 
 What is counted is what spikes after `begin`, so that recordings may follow others without a reset.
 """
 
-import inspect
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from threading import Lock
-from typing import Any
 
 import numpy as np
 
 from spikeloom.compiler import Netlist
-from spikeloom.compiler.errors import NumericRangeError, OptionError
+from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.interpret import Simulation, cut, float_simulation, vote
 from spikeloom.compiler.ir import INPUT, Network
-from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
+from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.machines.backends import machine_of
-from spikeloom.runtime.machines.capabilities import Threaded, require_threaded
+from spikeloom.runtime.machines.capabilities import Damageable, Memory, Threaded, require_threaded
 from spikeloom.runtime.machines.votes import readout_counts
 
 Events = EventArray
@@ -49,6 +47,11 @@ class Pair:
     def chip(self) -> Threaded:
         """The netlist, ready to run."""
         return require_threaded(machine_of(self.netlist))
+
+    @cached_property
+    def memory(self) -> Memory | None:
+        """What can be damaged of both; None where nothing is known of what the chip stores."""
+        return self.chip.memory(self.network) if isinstance(self.chip, Damageable) else None
 
     @cached_property
     def model(self) -> Simulation:
@@ -142,94 +145,3 @@ def _from(spikes: BoolArray, step: int) -> BoolArray:
     moved = np.zeros_like(spikes)
     moved[:, :-step] = spikes[:, step:]
     return moved
-
-
-Level = int | float
-
-TAXELS = "taxels"
-"""Unit of levels of which a sensor has only so many."""
-
-Obstacle = Callable[[Pair], str | None]
-
-
-@dataclass(frozen=True, slots=True)
-class Perturbation:
-    """One kind of trouble, its levels from mild to harsh, and which others make sense.
-
-    Its function takes what it is done to, first: `events`, a `pair`, or a `bench` of which recordings follow each other
-    in another way; then the level; then, if it needs them, `distance` between taxels, (taxels, taxels), and `rng`, a
-    source of chance.
-    """
-
-    act: Callable[..., Any]
-    unit: str
-    levels: tuple[Level, ...]
-    least: float
-    most: float
-    obstacle: Obstacle | None
-
-    @property
-    def name(self) -> str:
-        """That of the function."""
-        return self.act.__name__
-
-    @property
-    def what(self) -> str:
-        """A line for people."""
-        line = str(inspect.getdoc(self.act)).partition("\n")[0].removesuffix(".")
-        return line[0].lower() + line[1:]
-
-    @property
-    def seeded(self) -> bool:
-        """Whether chance has a part in it."""
-        return "rng" in self._takes
-
-    @property
-    def to(self) -> str:
-        """What it is done to: ``events``, ``pair`` or ``bench``."""
-        return self._takes[0]
-
-    @property
-    def _takes(self) -> list[str]:
-        return list(inspect.signature(self.act).parameters)
-
-    def __call__(self, *arguments: Any) -> Any:
-        """The function itself."""
-        return self.act(*arguments)
-
-    def done(self, to: Any, level: Any, distance: FloatArray, rng: np.random.Generator) -> Any:
-        """What becomes of events, a pair or a bench."""
-        known = {"distance": distance, "rng": rng}
-        return self.act(to, level, *(known[name] for name in self._takes[2:]))
-
-    def why_not(self, pair: Pair) -> str | None:
-        """Why it makes no sense for a network, or None where it does."""
-        return None if self.obstacle is None else self.obstacle(pair)
-
-    def level_of(self, words: str) -> Level:
-        """Read a level; refused if it is none that makes sense."""
-        try:
-            level = float(words)
-        except ValueError:
-            level = float("nan")
-        whole = all(isinstance(each, int) for each in self.levels)
-        if not self.least <= level <= self.most or (whole and level != int(level)):
-            kind = "a whole number" if whole else "a number"
-            limits = f"from {self.least:g}" + ("" if self.most == np.inf else f" to {self.most:g}")
-            raise OptionError(f"{self.name}:{words}: {words!r} is no level of it; give {kind} {limits} ({self.unit})")
-        return int(level) if level == int(level) else level
-
-    def levels_of(self, taxels: int, also: Sequence[Level] = ()) -> tuple[Level, ...]:
-        """Levels to measure on a sensor of so many taxels, further ones among them."""
-        levels = [level for level in self.levels if self.unit != TAXELS or level <= taxels]
-        return tuple(sorted({*levels, *also}, reverse=self.levels[0] > self.levels[-1]))
-
-
-def perturbation(
-    unit: str, levels: tuple[Level, ...], *, least: float = 0, most: float = 1, unless: Obstacle | None = None
-) -> Callable[[Callable[..., Any]], Perturbation]:
-    """Make a function a perturbation; the first line of its documentation is what people read of it.
-
-    Levels are counted in `unit` and lie between `least` and `most`; `unless` says why it makes no sense for a network.
-    """
-    return partial(Perturbation, unit=unit, levels=levels, least=least, most=most, obstacle=unless)

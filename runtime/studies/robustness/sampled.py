@@ -15,21 +15,23 @@ from spikeloom.runtime.equivalence.breakdowns import undecided
 from spikeloom.runtime.inputs.recordings import name_of
 from spikeloom.runtime.report.console import Progress, progress
 from spikeloom.runtime.requests.check import StressRequest
-from spikeloom.runtime.studies.stress.bench import NAMES, Bench, bench_of, by_length, whole
-from spikeloom.runtime.studies.stress.pair import SIDES, TAXELS, Inputs, Level, Outcome, evaluate
-from spikeloom.runtime.studies.stress.results import Provenance, Run, Stress
-from spikeloom.runtime.studies.stress.verdicts import Requirement, curve, unmet
+from spikeloom.runtime.studies.robustness.bench import Bench, bench_of, by_length, whole
+from spikeloom.runtime.studies.robustness.curves import Requirement, curve, unmet
+from spikeloom.runtime.studies.robustness.definition import TAXELS, Level
+from spikeloom.runtime.studies.robustness.pair import SIDES, Inputs, Outcome, Pair, evaluate
+from spikeloom.runtime.studies.robustness.perturbations import SAMPLED
+from spikeloom.runtime.studies.robustness.results import ComparedProvenance, Run, Stress
 
 
-def study(request: StressRequest, names: Sequence[str], requirements: Sequence[Requirement]) -> Stress:
+def stress(request: StressRequest, names: Sequence[str], requirements: Sequence[Requirement]) -> Stress:
     """Measure perturbations on the files that a command's options name, and judge them."""
     bench, loaded, data = bench_of(request)
     recordings, classes, taxels = len(bench.labels), bench.pair.netlist.classes, bench.events.shape[1]
-    reasons = {name: NAMES[name].why_not(bench.pair) for name in names}
+    reasons = {name: SAMPLED[name].why_not(bench.pair) for name in names}
     for wanted in requirements:
         if reasons[wanted.name] is not None:
             raise OptionError(f"--require {wanted}: does not apply, {reasons[wanted.name]}; omit it")
-        if NAMES[wanted.name].unit == TAXELS and wanted.level > taxels:
+        if SAMPLED[wanted.name].unit == TAXELS and wanted.level > taxels:
             raise OptionError(f"--require {wanted}: the sensor has {taxels} taxels; give a smaller level")
     progress("clean recordings")
     reference, undisturbed = clean(bench)
@@ -37,8 +39,8 @@ def study(request: StressRequest, names: Sequence[str], requirements: Sequence[R
         (name, level, seed)
         for name in names
         if reasons[name] is None
-        for level in NAMES[name].levels_of(taxels, [each.level for each in requirements if each.name == name])
-        for seed in range(request.seeds if NAMES[name].seeded else 1)
+        for level in SAMPLED[name].levels_of(taxels, [each.level for each in requirements if each.name == name])
+        for seed in range(request.seeds if SAMPLED[name].seeded else 1)
     ]
     measured: dict[str, dict[Level, list[Run]]] = {}
     for (name, level, _), run in zip(points, _runs(points, bench, reference, request.jobs), strict=True):
@@ -53,7 +55,7 @@ def study(request: StressRequest, names: Sequence[str], requirements: Sequence[R
         not_applicable={name: reason for name, reason in reasons.items() if reason is not None},
         required=tuple(map(str, requirements)),
         missed=unmet(requirements, curves),
-        provenance=Provenance(
+        provenance=ComparedProvenance(
             spikeloom=__version__,
             netlist_sha256=sha256_of(request.netlist),
             checkpoint_sha256=loaded.sha256,
@@ -92,11 +94,12 @@ def clean(bench: Bench) -> tuple[Outcome, Run]:
 
 def measure(bench: Bench, name: str, level: Level, seed: int, reference: Outcome) -> Run:
     """One perturbation at one level under one seed; `reference` is of the clean recordings."""
-    trouble, rng, pair = NAMES[name], generator(name, seed), bench.pair
+    trouble, rng, pair = SAMPLED[name], generator(name, seed), bench.pair
     if trouble.to == "bench":
         inputs: Inputs = trouble.done(bench, level, bench.distance, rng)
-    elif trouble.to == "pair":
-        pair = trouble.done(pair, level, bench.distance, rng)
+    elif trouble.to == "memory":
+        damaged = trouble.done(pair.memory, level, bench.distance, rng)
+        pair = Pair(netlist=damaged.netlist, network=damaged.network)
         inputs = whole(bench.events, pair.netlist, bench.lengths)
     else:
         events = by_length(bench.events, bench.lengths, lambda part: trouble.done(part, level, bench.distance, rng))

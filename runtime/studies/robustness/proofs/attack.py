@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import EventArray, IntArray
 from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.machines.changes import Effects, joined, single
-from spikeloom.runtime.studies.stability.bounds import needed
-from spikeloom.runtime.studies.stability.neighbours import Cells
+from spikeloom.runtime.studies.robustness.proofs.bounds import needed
+from spikeloom.runtime.studies.robustness.proofs.entries import Cells
 
 CANDIDATES = 2000
 """Entries that a further round looks at."""
@@ -17,9 +16,7 @@ CANDIDATES = 2000
 ROUNDS = 6
 
 
-def attack(
-    machine: Machine, channels: npt.NDArray[np.uint8], votes: IntArray, cells: Cells, effects: Effects
-) -> IntArray:
+def attack(machine: Machine, channels: EventArray, votes: IntArray, cells: Cells, effects: Effects) -> IntArray:
     """Entries whose flips together alter the decision of a recording (channels, steps); none if none were found.
 
     Those that cost the decision most votes against one class are taken, none while another still has an effect; then,
@@ -46,7 +43,7 @@ def _easiest(gaps: IntArray, decision: int, cells: Cells, effects: Effects) -> l
 
 def _against(
     machine: Machine,
-    channels: npt.NDArray[np.uint8],
+    channels: EventArray,
     votes: IntArray,
     cells: Cells,
     effects: Effects,
@@ -84,9 +81,7 @@ def _against(
     return None
 
 
-def _without_idle(
-    machine: Machine, channels: npt.NDArray[np.uint8], votes: IntArray, cells: Cells, taken: IntArray
-) -> IntArray:
+def _without_idle(machine: Machine, channels: EventArray, votes: IntArray, cells: Cells, taken: IntArray) -> IntArray:
     """Entries whose flips still alter the decision when none can be dropped alone."""
     while len(taken) > 1:
         fewer = [np.delete(taken, place) for place in range(len(taken))]

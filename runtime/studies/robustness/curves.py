@@ -15,9 +15,10 @@ from statistics import fmean
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.equivalence.breakdowns import OFTEN
 from spikeloom.runtime.report.numbers import of_mean, wilson
-from spikeloom.runtime.studies.stress.bench import NAMES
-from spikeloom.runtime.studies.stress.pair import SIDES, Level
-from spikeloom.runtime.studies.stress.results import Breaks, Curve, Point, Run, Spread, shown
+from spikeloom.runtime.studies.robustness.definition import Level
+from spikeloom.runtime.studies.robustness.pair import SIDES
+from spikeloom.runtime.studies.robustness.perturbations import SAMPLED
+from spikeloom.runtime.studies.robustness.results import Breaks, Curve, Point, Run, Spread, shown
 
 ROBUST, DEGRADES, BREAKS = "robust", "degrades", "breaks"
 
@@ -51,15 +52,15 @@ def parse_requirement(words: str) -> Requirement:
     name, named, level = (part.strip() for part in left.partition(":"))
     if not (given and named):
         raise OptionError(f"--require {words}: is not NAME:LEVEL>=SHARE; write for example taxels_dead:3>=0.85")
-    if name not in NAMES:
-        raise OptionError(f"--require {words}: {name!r} is no perturbation; choose from {', '.join(NAMES)}")
+    if name not in SAMPLED:
+        raise OptionError(f"--require {words}: {name!r} is no perturbation; choose from {', '.join(SAMPLED)}")
     try:
         share = float(right)
     except ValueError:
         share = math.nan
     if not 0 <= share <= 1:
         raise OptionError(f"--require {words}: {right.strip()!r} is no share; give a number from 0 to 1")
-    return Requirement(name=name, level=NAMES[name].level_of(level), share=share)
+    return Requirement(name=name, level=SAMPLED[name].level_of(level), share=share)
 
 
 def unmet(requirements: Sequence[Requirement], curves: Mapping[str, Curve]) -> tuple[str, ...]:
@@ -96,9 +97,9 @@ def curve(name: str, runs: Mapping[Level, Sequence[Run]], clean: Run, recordings
     first = next((point for point in levels if point.level in left), None)
     overlap = first is not None and max(first.model.low, first.chip.low) <= min(first.model.high, first.chip.high)
     return Curve(
-        what=NAMES[name].what,
-        unit=NAMES[name].unit,
-        seeded=NAMES[name].seeded,
+        what=SAMPLED[name].what,
+        unit=SAMPLED[name].unit,
+        seeded=SAMPLED[name].seeded,
         levels=levels,
         breaks=breaks,
         same_place=first is None or left == {first.level} or overlap,

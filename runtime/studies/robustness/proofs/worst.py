@@ -1,4 +1,4 @@
-"""The dynamic program of :mod:`stability.bounds`, compiled with numba."""
+"""The dynamic program of :mod:`proofs.bounds`, compiled with numba."""
 
 from __future__ import annotations
 

@@ -1,0 +1,195 @@
+"""Certificates of recordings: every small change is tried, or shown to be as harmless as one that was."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+from joblib import Parallel, delayed
+
+from spikeloom.compiler.types import IntArray
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.machines.base import Machine
+from spikeloom.runtime.machines.changes import PART, Effects, joined, single
+from spikeloom.runtime.report.console import Progress
+from spikeloom.runtime.studies.robustness.definition import TAXEL, Exhaustive
+from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
+from spikeloom.runtime.studies.robustness.proofs.attack import attack
+from spikeloom.runtime.studies.robustness.proofs.bounds import lower_bound, needed
+from spikeloom.runtime.studies.robustness.proofs.counting import Tally, least, tally_of
+from spikeloom.runtime.studies.robustness.proofs.entries import Cells, Events, cells_of, channels_of, words_of
+from spikeloom.runtime.studies.robustness.results import PHASES, Certificate, Certificates, Decided
+
+SHIFT = 25
+"""Bins that a recording is shifted by at most."""
+
+MOST = 16
+"""Changed events up to which a proof is looked for."""
+
+
+def certify(
+    machine: Machine, data: Recordings, *, shift: int = SHIFT, most: int = MOST, jobs: int | None = None
+) -> Certificates:
+    """Certificates of recordings in their own bins; `jobs` of them at a time, one a core by default.
+
+    Raises DataError for another sensor, NumericRangeError where a register overflows.
+    """
+    machine.require_sensor(data.events)
+    tally = tally_of(machine)
+    work = Parallel(jobs or os.cpu_count(), backend="threading", return_as="generator")
+    recordings = zip(data.events, data.step_counts.tolist(), data.labels.tolist(), data.files, strict=True)
+    calls = (
+        delayed(certificate)(machine, events[..., :length], label, file, shift=shift, most=most, tally=tally)
+        for events, length, label, file in recordings
+    )
+    certificates = []
+    progress = Progress(len(data))
+    progress(0, "certifying")
+    for done, one in enumerate(work(calls), 1):
+        certificates.append(one)
+        progress(done, "certifying")
+    netlist = machine.netlist
+    return Certificates(
+        target=netlist.target,
+        taxels=netlist.taxels,
+        classes=netlist.classes,
+        shift=shift,
+        most=most,
+        certificates=tuple(certificates),
+    )
+
+
+def certificate(
+    machine: Machine, events: Events, label: int, file: str, *, shift: int, most: int, tally: Tally | None = None
+) -> Certificate:
+    """What is known of one recording (taxels, polarities, bins); `tally` is that of a counting network."""
+    singles = _flip_each(machine, events, most, tally)
+    cells = singles.cells
+    kinds = {}
+    taxels = {}
+    for kind in EXHAUSTIVE.values():
+        if kind.to == "there":
+            kinds[kind.name], taxels[kind.name] = _decide_flips(machine, kind, singles)
+        else:
+            kinds[kind.name], hanging = _decide_cases(machine, kind, events, shift, singles.decision)
+            if kind.unit == TAXEL:
+                taxels[kind.name] = hanging
+    at_least, flips = _bounds(machine, singles, most)
+    at_most = int(cells.cost[flips].sum()) or None
+    steps = max(int(cells.cells[-1, 1]) + 1, 1)
+    phase = cells.cells[singles.altering, 1] * PHASES // steps
+    decision, gaps = needed(singles.votes)
+    return Certificate(
+        file=file,
+        label=label,
+        decision=decision,
+        ahead=int(np.delete(gaps, decision).min(initial=int(singles.votes[decision]))),
+        kinds=kinds,
+        at_least=at_least,
+        at_most=at_most,
+        exact=at_most == at_least + 1,
+        attack=tuple(words_of(cells.cells[flip], bool(cells.there[flip]), machine.netlist) for flip in flips),
+        taxels=taxels,
+        phases=tuple(np.bincount(phase, minlength=PHASES).tolist()),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Singles:
+    """A recording, and what becomes of it when each of its entries is flipped alone."""
+
+    channels: Events
+    votes: IntArray
+    cells: Cells
+    counted: tuple[int, IntArray | None] | None  # What :func:`least` knows of a counting network
+    effects: Effects
+    decided: IntArray  # By entry
+
+    @property
+    def decision(self) -> int:
+        """Of the recording as it is."""
+        return int(self.votes.argmax())
+
+    @property
+    def altering(self) -> IntArray:
+        """Entries of one event that alter the decision; those of several are no single events."""
+        return np.flatnonzero((self.decided != self.decision) & (self.cells.cost == 1))
+
+
+def _flip_each(machine: Machine, events: Events, most: int, tally: Tally | None) -> _Singles:
+    """Run a recording with each entry flipped; where entries are known to do the same, one of them."""
+    channels = channels_of(events[None], machine.netlist)[0]
+    votes = machine.votes(channels[None])[0]
+    cells = cells_of(events, machine.netlist)
+    counted = None if tally is None else least(tally, channels != 0, votes, cells, most)
+    alike = np.arange(len(cells.cells))
+    if tally is not None and counted is not None:
+        alike = 2 * tally.groups(*cells.cells.T) + cells.there
+    _, first, those = np.unique(alike, return_index=True, return_inverse=True)
+    effects = machine.effects(channels, single(cells.cells[first]))
+    decided = (effects.votes + votes).argmax(axis=1)[those]
+    return _Singles(channels=channels, votes=votes, cells=cells, counted=counted, effects=effects, decided=decided)
+
+
+def _decide_flips(machine: Machine, kind: Exhaustive, singles: _Singles) -> tuple[Decided, tuple[int, ...]]:
+    """A perturbation of single events, and the taxels on which the decision hangs."""
+    cells = singles.cells
+    chosen = kind(cells.there)
+    tried = int(np.count_nonzero(chosen & (cells.cost == 1)))  # the others change nothing
+    altering = singles.altering[chosen[singles.altering]]
+    if not len(altering):
+        return Decided(tried, 0), ()
+    first = altering[0]
+    words = words_of(cells.cells[first], bool(cells.there[first]), machine.netlist)
+    taxels = np.unique(cells.cells[altering, 0] // machine.netlist.polarities)
+    return Decided(tried, len(altering), words, int(singles.decided[first])), tuple(taxels.tolist())
+
+
+def _decide_cases(
+    machine: Machine, kind: Exhaustive, events: Events, shift: int, decision: int
+) -> tuple[Decided, tuple[int, ...]]:
+    """A perturbation of which each case is run, and the first number of those that alter the decision."""
+    tried = 0
+    altering: list[tuple[tuple[int, ...], int]] = []
+    cases = kind.cases(events, shift)
+    while part := list(islice(cases, PART)):
+        changed = channels_of(np.stack([each for _, each in part]), machine.netlist)
+        decided = machine.votes(changed).argmax(axis=1).tolist()
+        tried += len(part)
+        altering += [(numbers, to) for (numbers, _), to in zip(part, decided, strict=True) if to != decision]
+    if not altering:
+        return Decided(tried, 0), ()
+    numbers, to = altering[0]
+    size = abs(numbers[0]) if kind.sized else None
+    return Decided(tried, len(altering), kind.words(numbers), to, size), tuple(each[0] for each, _ in altering)
+
+
+def _bounds(machine: Machine, singles: _Singles, most: int) -> tuple[int, IntArray]:
+    """How many changed events alter nothing, and entries whose flips together alter the decision, none if unknown."""
+    cells = singles.cells
+    flips = singles.altering[:1]
+    if len(flips):
+        at_least = 0
+    elif singles.counted is not None:
+        at_least, fewest = singles.counted
+        flips = flips if fewest is None else fewest
+    elif (known := machine.forgetting(singles.channels)) is not None:
+        at_least = max(1, lower_bound(singles.votes, cells, singles.effects, known, most))
+        flips = attack(machine, singles.channels, singles.votes, cells, singles.effects)
+    else:
+        at_least = 1
+    if len(flips):
+        changed = machine.effects(singles.channels, joined([cells.cells[flips]])).votes + singles.votes
+        if changed.argmax() == singles.decision:
+            flips = flips[:0]
+    return at_least, flips
+
+
+def share_robust_to_one_event(machine: Machine, data: Recordings) -> float:
+    """Share of recordings, in their own bins, whose decision no single event alters."""
+    tally = tally_of(machine)
+    recordings = zip(data.events, data.step_counts.tolist(), strict=True)
+    altered = (len(_flip_each(machine, events[..., :length], 1, tally).altering) for events, length in recordings)
+    return sum(not count for count in altered) / len(data)

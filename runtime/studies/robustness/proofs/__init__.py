@@ -1,0 +1,1 @@
+"""How many changed events a decision bears at least, and which alter it."""

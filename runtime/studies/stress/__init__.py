@@ -1,1 +1,0 @@
-"""Where float network and chip break."""
