@@ -16,7 +16,7 @@ from typing import IO, Any
 import numpy as np
 
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.types import AnyArray, EventArray
+from spikeloom.compiler.types import AnyArray, EventArray, IntArray
 from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.counts import GAP_S, EventCounts
 from spikeloom.models.recordings.csvtable import LABELS, is_table, labels_beside
@@ -52,7 +52,7 @@ def load_data(
     split: str = "test",
     *,
     bin_s: float | None = None,
-    usual: float = BIN_S,
+    default_bin_s: float = BIN_S,
     taxels: int | None = None,
     classes: int | None = None,
     limit: int | None = None,
@@ -61,7 +61,7 @@ def load_data(
 
     The path is a folder or zip in the released layout; a folder of ``.csv``, ``.npz`` and ``.npy`` recordings, flat (it
     stands for any split) or with ``train/`` and ``test/``; one such file; or the name of a data set that was fetched.
-    `bin_s` is the width of a time bin in seconds, where it is not given the `usual` one; the released layout and
+    `bin_s` is the width of a time bin in seconds, by default `default_bin_s`; the released layout and
     ``.npy`` files have bins already, see `require_events`. The network expects so many `taxels` and `classes`; without
     `taxels` the highest taxel with an event decides. Labels are `UNLABELLED` where nothing says them, see
     `need_labels`. In the released layout all recordings have labels, the same steps and taxels, and no counts.
@@ -69,49 +69,34 @@ def load_data(
     DataError if a recording cannot be used, with file and place; OptionError if `bin_s` is not a duration or given for
     what has bins already, or `limit` is below 1.
     """
-    if bin_s is not None and not (math.isfinite(bin_s) and bin_s > 0):
-        raise OptionError(f"--bin {bin_s:g}: not a duration; give seconds above 0, for example {BIN_S:g}")
-    if limit is not None and limit < 1:
-        raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
-    path = find_data(str(path)) if str(path) in DATA_SETS else Path(path)
-    source = path.name or str(path)
-    with _data_set(path, split) as (members, found):
-        if split not in found and "" not in found:
-            present = ", ".join(sorted(found))
+    _require_options(bin_s, limit)
+    place = _place_of(path)
+    source = place.name or str(place)
+    with _data_set(place, split) as (members, splits):
+        if split not in splits and "" not in splits:
+            present = ", ".join(sorted(splits))
             raise DataError(f"{source}: split {split!r} is missing or empty; splits with recordings: {present}")
-        folder = f"{split}/" if split in found else ""
-        chosen = sorted(found[split if split in found else ""].items())[:limit]
+        folder = split if split in splits else ""
+        chosen = sorted(splits[folder].items())[:limit]
         binned = all(name.lower().endswith(".npy") for name, _ in chosen)
-        released = bool(folder) and binned
-        held = evtouch.parse_width(source, members, chosen[0][1]) if binned else None
-        width = (held or BIN_S) if binned else bin_s or usual
+        stated = evtouch.parse_width(source, members, chosen[0][1]) if binned else None
+        width = (stated or BIN_S) if binned else bin_s or default_bin_s
         if binned:
             require_events(source, bin_s, width)
-        files = [(path.parent if path.is_file() else path) / member for _, member in chosen]
-        table, notes = labels_beside(path, files, source)
+        files = [(place.parent if place.is_file() else place) / member for _, member in chosen]
+        table, notes = labels_beside(place, files, source)
+        released = bool(folder) and binned
         read: list[_Recording] = []
         size = 0
         for file, (name, member) in zip(files, chosen, strict=True):
-            where = source if path == file else f"{source}: {folder}{name}"
+            where = source if place == file else f"{source}: {Path(folder, name).as_posix()}"
             read.append(_read(file, members[member], where, width, taxels, table.get(file)))
             _require_alike(read[-1], read[0], released)
             evtouch.require_class(where, read[-1].label, classes)
             size += read[-1].grid.size
             evtouch.require_memory(source, size)
-    steps = np.array([each.grid.shape[2] for each in read], np.int64)
-    shape = max(each.grid.shape[0] for each in read), read[0].grid.shape[1], int(steps.max())
-    evtouch.require_memory(source, len(read) * math.prod(shape))
-    events = np.zeros((len(read), *shape), dtype=np.uint8)
-    for index, each in enumerate(read):
-        events[index, : each.grid.shape[0], :, : each.grid.shape[2]] = each.grid
-    counts = EventCounts(
-        events=sum(each.counts.events for each in read),
-        out_of_order=sum(each.counts.out_of_order for each in read),
-        duplicates=sum(each.counts.duplicates for each in read),
-        gaps=sum(each.counts.gaps for each in read),
-        shorter=int(np.count_nonzero(steps < steps.max())),
-        notes=(*notes, *_unit_notes(read), *(_taxel_notes(source, events) if taxels is None else ())),
-    )
+    events, steps = _stack(read, source)
+    notes = [*notes, *_unit_notes(read), *(_taxel_notes(source, events) if taxels is None else ())]
     return evtouch.Recordings(
         events=events,
         labels=np.array([each.label for each in read], dtype=np.int64),
@@ -119,8 +104,44 @@ def load_data(
         split=split,
         source=source,
         lengths=None if steps.min() == steps.max() else steps,
-        counts=None if released else counts,
-        bin_s=held if binned else width,
+        counts=None if released else _sum_counts(read, steps, notes),
+        bin_s=stated if binned else width,
+    )
+
+
+def _require_options(bin_s: float | None, limit: int | None) -> None:
+    """Refuse a width that no bin has, and no recordings."""
+    if bin_s is not None and not (math.isfinite(bin_s) and bin_s > 0):
+        raise OptionError(f"--bin {bin_s:g}: not a duration; give seconds above 0, for example {BIN_S:g}")
+    if limit is not None and limit < 1:
+        raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
+
+
+def _place_of(path: str | os.PathLike[str]) -> Path:
+    """Where a data set lies, which may have been fetched by its name."""
+    return find_data(str(path)) if str(path) in DATA_SETS else Path(path)
+
+
+def _stack(read: Sequence[_Recording], source: str) -> tuple[EventArray, IntArray]:
+    """Events of all recordings, filled up with silence, and the steps of each."""
+    steps = np.array([each.grid.shape[2] for each in read], np.int64)
+    shape = max(each.grid.shape[0] for each in read), read[0].grid.shape[1], int(steps.max())
+    evtouch.require_memory(source, len(read) * math.prod(shape))
+    events = np.zeros((len(read), *shape), dtype=np.uint8)
+    for index, each in enumerate(read):
+        events[index, : each.grid.shape[0], :, : each.grid.shape[2]] = each.grid
+    return events, steps
+
+
+def _sum_counts(read: Sequence[_Recording], steps: IntArray, notes: Sequence[str]) -> EventCounts:
+    """Counts of all recordings together."""
+    return EventCounts(
+        events=sum(each.counts.events for each in read),
+        out_of_order=sum(each.counts.out_of_order for each in read),
+        duplicates=sum(each.counts.duplicates for each in read),
+        gaps=sum(each.counts.gaps for each in read),
+        shorter=int(np.count_nonzero(steps < steps.max())),
+        notes=tuple(notes),
     )
 
 
@@ -143,8 +164,8 @@ def require_events(where: str, bin_s: float | None, held: float = BIN_S) -> None
 
 def data_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
     """Splits that a data set has; none if it is flat or one recording, DataError if there are no recordings."""
-    with _data_set(find_data(str(path)) if str(path) in DATA_SETS else Path(path)) as (_, found):
-        return tuple(sorted(filter(None, found)))
+    with _data_set(_place_of(path)) as (_, splits):
+        return tuple(sorted(filter(None, splits)))
 
 
 def need_labels(recordings: evtouch.Recordings, what: str) -> evtouch.Recordings:

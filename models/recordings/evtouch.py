@@ -80,7 +80,7 @@ class Recordings:
 
     @property
     def seconds(self) -> float:
-        """Seconds of a bin, where nobody said so the usual ones."""
+        """Seconds of a bin, by default ``BIN_S``."""
         return BIN_S if self.bin_s is None else self.bin_s
 
     @property

@@ -64,10 +64,10 @@ class Recipe:
     robust: float = 0.0  # Chance of an event and of a taxel to be lost, see :func:`robust.worn`
 
     def to_json(self) -> JsonObject:
-        """JSON values; without the number of epochs, which a training states by itself, and what is usual."""
+        """JSON values; without the number of epochs, which a training states by itself, and without defaults."""
         values = asdict(self) | {"betas": dict(self.betas), "alphas": dict(self.alphas)}
-        usual = {"epochs": self.epochs, "hidden": HIDDEN, "penalty": 0, "robust": 0}
-        return {name: value for name, value in values.items() if name not in usual or value != usual[name]}
+        defaults = {"epochs": self.epochs, "hidden": HIDDEN, "penalty": 0, "robust": 0}
+        return {name: value for name, value in values.items() if name not in defaults or value != defaults[name]}
 
     @property
     def layers(self) -> tuple[str, ...]:

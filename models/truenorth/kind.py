@@ -6,10 +6,10 @@ from typing import Any
 
 from spikeloom.compiler.dynamics import clocks_over
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.targets.truenorth.native import BASES, SYSTEM, USUAL_COPIES
+from spikeloom.compiler.targets.truenorth.native import BASES, DEFAULT_COPIES, SYSTEM
 from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained, write_trained
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, Surrogate
-from spikeloom.models.training.kinds import Plan, same_graph
+from spikeloom.models.training.plan import Plan, same_graph
 from spikeloom.models.training.recipes import ADAMW, COSINE, CROSS_ENTROPY, Recipe
 from spikeloom.models.truenorth import network
 
@@ -60,7 +60,7 @@ def architecture(plan: Plan) -> network.NativeArchitecture:
         classes=plan.classes,
         hops=plan.recipe.hops,
         features=plan.recipe.features,
-        copies=plan.copies or USUAL_COPIES,
+        copies=plan.copies or DEFAULT_COPIES,
         clocks=clocks_over(plan.recipe.clocks, plan.steps),
     )
 
@@ -74,5 +74,5 @@ def save(path: Path, kept: Mapping[str, Any], plan: Plan, record: Mapping[str, A
 
 def differing(found: Trained, plan: Plan) -> list[str]:
     """In what a file is of another plan."""
-    same = {"graph": same_graph(found, plan), "copies": found.network.copies == (plan.copies or USUAL_COPIES)}
+    same = {"graph": same_graph(found, plan), "copies": found.network.copies == (plan.copies or DEFAULT_COPIES)}
     return [name for name, equal in same.items() if not equal]

@@ -58,8 +58,15 @@ def recordings(
     if path != SYNTHETIC:
         if own is not None and bin_s not in (None, own):
             raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {own:g} s; omit --bin")
-        usual = BIN_S if own is None else own
-        data = events.load_data(path, split, bin_s=bin_s, usual=usual, limit=limit, classes=classes, taxels=taxels)
+        data = events.load_data(
+            path,
+            split,
+            bin_s=bin_s,
+            default_bin_s=BIN_S if own is None else own,
+            limit=limit,
+            classes=classes,
+            taxels=taxels,
+        )
         _require_width(data, own)
         _require_sensor(data, split, taxels)
         show_counts(data.source, data.split, data.counts)

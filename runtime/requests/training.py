@@ -9,7 +9,7 @@ from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, SYSTEMS, TACTILESGNET
-from spikeloom.compiler.targets.native import BASES, USUAL_COPIES
+from spikeloom.compiler.targets.native import BASES, DEFAULT_COPIES
 from spikeloom.compiler.targets.native import SYSTEM as NATIVE
 from spikeloom.models.systems import PADDINGS
 from spikeloom.models.training.recipes import RECIPES, RELEASED
@@ -51,7 +51,7 @@ class TrainRequest(SensorChoice, DataChoice):
     features: int | None = option("of the first layer, per place", metavar="N")
     hops: int | None = option("of a tactilesgnet's graph convolution (default: 3)", metavar="K")
     hidden: str | None = option("neurons of each dense layer but the last (default: 128,256)", metavar="N[,N]")
-    copies: int | None = option(f"axons of an input of {NATIVE} (default: {USUAL_COPIES})", choices=tuple(BASES))
+    copies: int | None = option(f"axons of an input of {NATIVE} (default: {DEFAULT_COPIES})", choices=tuple(BASES))
     thresholds: str | None = option(
         "events at which counters spike (default: 1,4,16,64)", metavar="K[,K]", group="counters"
     )

@@ -15,7 +15,7 @@ from spikeloom.compiler.errors import OptionError, UnfinishedError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
-from spikeloom.models.training.kinds import Plan, seen_by
+from spikeloom.models.training.plan import Plan, seen_by
 from spikeloom.models.training.recipes import MSE, RELEASED
 from spikeloom.models.training.record import Reached, TrainingRecord
 from spikeloom.runtime.report.console import tell

@@ -43,7 +43,7 @@ UNIT = 32
 BASES = {2: (-1, 1), 3: (-3, 1, 2), 4: (-7, 1, 2, 4)}
 """Weights of the axon types by number of copies, in units."""
 
-USUAL_COPIES = 3
+DEFAULT_COPIES = 3
 
 LEAK_MOST = 255
 """Magnitude of a leak, 9 bits with sign."""

@@ -8,13 +8,13 @@ from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import DataError, OptionError, require_least
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
+from spikeloom.compiler.targets.native import DEFAULT_COPIES
 from spikeloom.compiler.targets.native import SYSTEM as NATIVE
-from spikeloom.compiler.targets.native import USUAL_COPIES
 from spikeloom.models.graphs import CHOICES, Graph
 from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part, parse_window
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.models.systems import sensor_grid, taxels_alone
-from spikeloom.models.training.kinds import Plan
+from spikeloom.models.training.plan import Plan
 from spikeloom.models.training.recipes import RELEASED, STEPS, Recipe, check_recipe, decays_asked
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.checkpoint import load_graph, sensor_places
@@ -197,7 +197,7 @@ def _named_recipe(request: TrainRequest) -> Recipe:
 def _words(request: TrainRequest, first: dict[str, Any], last: dict[str, Any]) -> list[str]:
     """The words that ask for the same training, without the seed and the output."""
     names = ("bin", "join", "window", "system", "padding", "copies", "graph", "taxels", "edges", "directed", "recipe")
-    usual = {"join": 1, "system": TACTILESGNET, "copies": USUAL_COPIES, "recipe": RELEASED.name}
+    usual = {"join": 1, "system": TACTILESGNET, "copies": DEFAULT_COPIES, "recipe": RELEASED.name}
     recipe = _named_recipe(request)
     usual |= {name: getattr(recipe, name, None) for name in OVERRIDES}
     options = repeat.given(request, (*names, *OVERRIDES))

@@ -19,7 +19,7 @@ from spikeloom.models.graphs import Graph
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import taxels_alone
-from spikeloom.models.training.kinds import Plan, seen_by
+from spikeloom.models.training.plan import Plan, seen_by
 from spikeloom.models.training.recipes import RECIPES
 from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.network import load_network

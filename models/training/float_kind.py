@@ -1,4 +1,4 @@
-"""Networks of floats, for chips whose compiler rounds them."""
+"""Networks of real numbers, for chips whose compiler rounds them."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,7 +11,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.models.networks.networks import Architecture
-from spikeloom.models.training.kinds import Plan, same_graph
+from spikeloom.models.training.plan import Plan, same_graph
 from spikeloom.models.training.recipes import RECIPES, Recipe
 
 SYSTEMS: tuple[str, ...] = systems.SYSTEMS
@@ -21,10 +21,7 @@ read = read_checkpoint
 
 
 def recipe_for(name: str, given: Mapping[str, Any]) -> Recipe:
-    """The recipe of that name.
-
-    OptionError if copies of inputs are wanted.
-    """
+    """The recipe of that name; OptionError if copies of inputs are given."""
     if "--copies" in given:
         raise OptionError(f"--copies {given['--copies']}: is for chips whose inputs have copies; omit it")
     return RECIPES[name]

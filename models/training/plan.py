@@ -1,4 +1,4 @@
-"""The kinds of network that are trained: what sizes each has, how it is stored and read back.
+"""What decides a network before it is trained, and what each kind of network offers a training.
 
 All kinds are listed in :mod:`models.network_kinds`.
 """
@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
 
 from spikeloom.compiler.systems import SYSTEMS, TACTILESGNET, Grid
 from spikeloom.compiler.types import FloatArray
@@ -47,8 +49,8 @@ class Stored(Protocol):
         """Epochs that it holds."""
 
 
-class Kind(Protocol):
-    """What a module of a kind offers."""
+class NetworkKind(Protocol):
+    """What the module of a kind of network offers: its sizes, how it is stored and read back."""
 
     SYSTEMS: tuple[str, ...]
     COPIES: tuple[int, ...]
@@ -78,6 +80,4 @@ def seen_by(plan: Plan) -> FloatArray:
 
 def same_graph(found: Any, plan: Plan) -> bool:
     """Whether a checkpoint was trained on the graph of the plan, edge for edge."""
-    if found.graph != plan.graph.name or found.edges is None:
-        return False
-    return found.edges.shape == plan.graph.edges.shape and bool((found.edges == plan.graph.edges).all())
+    return bool(found.graph == plan.graph.name and np.array_equal(found.edges, plan.graph.edges))
