@@ -35,9 +35,9 @@ from random import Random
 from typing import Any
 
 NUMERIC = {
-    "compiler": "dynamics fixedpoint interpret range_proof",
+    "compiler": "dynamics interpret",
     "compiler/passes": "calibrate expand prune",
-    "compiler/targets/loihi1": "emit legalize lift",
+    "compiler/targets/loihi1": "bounds emit integers legalize lift registers remove",
     "compiler/targets/loihi1/layout": "choose core_needs partition place",
     "compiler/targets/loihi1/storage": "choose_storage compensate scales spike_exact weight_storage",
     "compiler/targets/truenorth": "legalize lower native",

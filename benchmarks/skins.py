@@ -25,11 +25,12 @@ from growth_chart import draw_skins
 from made import made
 from scipy import sparse
 
-from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.runtime.machines.loihi1 import engine
 
 TAXELS = (1000, 2000, 5000, 10000, 20000)

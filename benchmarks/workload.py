@@ -15,15 +15,16 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, decay_registers, encode_bias
-from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Readout
+from spikeloom.compiler.ir import INPUT, Input, Readout
 from spikeloom.compiler.passes.expand import hop_powers, synapses
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerPopulation, IntegerProjection
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.registers import ONE_STEP_SUM_MAX, decay_registers, encode_bias
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.arrays import frozen
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
-from spikeloom.compiler.fixedpoint import frozen
 from spikeloom.compiler.ir import Form, Readout
 from spikeloom.compiler.systems import MLP, TACTILESGNET, Grid, in_order
 from spikeloom.compiler.types import AnyArray, BoolArray, Float32Array, IntArray

@@ -1,7 +1,7 @@
 """The meaning of the intermediate representation: layer by layer over all time steps.
 
 What a step's spikes bring is summed, then the neurons integrate, compare and reset. A recurrent population also
-receives what it fired in the step before. The integer stage is exact.
+receives what it fired in the step before.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import numpy.typing as npt
 
 from spikeloom.compiler import ir
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks, with_clocks
-from spikeloom.compiler.fixedpoint import DECAY_ONE, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, IntArray
 
 if TYPE_CHECKING:
@@ -105,31 +104,6 @@ def float_layer(
     return Layer(pres=pres, size=population.size, fixed=(*synapses, population.bias.astype(dtype), registers))
 
 
-def integer_layer(
-    population: ir.IntegerPopulation,
-    projections: Sequence[ir.IntegerProjection],
-    *,
-    saturates: bool = True,
-    loops: bool = True,
-) -> Layer:
-    """A population on the chip with all projections to it; the machine's ``spec`` holds the definition.
-
-    With `saturates` off the membrane has no limits, which tells what saturation does; `loops` as of
-    :func:`float_layer`.
-    """
-    keep_u, keep_v = (round(kept * DECAY_ONE) for kept in (population.realised_alpha, population.realised_beta))
-    weights = [(p, p.effective()) for p in projections]
-    largest = sum(abs(weight).sum(axis=1).max(initial=0) for _, weight in weights) << MEMBRANE_SHIFT
-    largest += MEMBRANE_MAX + int(abs(population.bias).max(initial=0))
-    # 32 bits are as exact, and twice as fast, where membranes have limits and no current outlasts its step
-    dtype = np.int32 if saturates and not keep_u and largest < 2**31 else np.int64
-    limit = MEMBRANE_MAX if saturates else 2**62
-    pres, synapses = synapses_of(weights, dtype, loops=loops)
-    threshold = (population.threshold << MEMBRANE_SHIFT).astype(dtype)
-    registers = threshold, *(dtype(value) for value in (keep_u, keep_v, limit))
-    return Layer(pres=pres, size=population.size, fixed=(*synapses, population.bias.astype(dtype), registers))
-
-
 def synapses_of(
     weights: Sequence[tuple[Any, ir.Sparse]], dtype: npt.DTypeLike, *, loops: bool = True
 ) -> tuple[tuple[int, ...], tuple[Synapses, Synapses]]:
@@ -176,25 +150,11 @@ def float_simulation(network: ir.Network, dtype: npt.DTypeLike = np.float64) -> 
     return Simulation(layers=tuple(float_layer(*each, dtype) for each in zip(network.populations, into, strict=True)))
 
 
-def integer_simulation(network: ir.IntegerNetwork, *, saturates: bool = True) -> Simulation:
-    """The integer stage; `saturates` as of :func:`integer_layer`."""
-    into = [[p for p in network.projections if p.post == post] for post in range(len(network.populations))]
-    layers = zip(network.populations, into, strict=True)
-    return Simulation(layers=tuple(integer_layer(*each, saturates=saturates) for each in layers))
-
-
 def run_float(
     network: ir.Network, events: BoolArray, *, dtype: npt.DTypeLike = np.float64, membranes: bool = False
 ) -> Activity:
     """Run the float stage on events (samples, steps, channels), in the arithmetic of `dtype`."""
     return float_simulation(network, dtype).run(events, membranes=membranes)
-
-
-def run_integer(
-    network: ir.IntegerNetwork, events: BoolArray, *, membranes: bool = False, saturates: bool = True
-) -> Activity:
-    """Run the integer stage, aligned with the data; membranes are register values."""
-    return integer_simulation(network, saturates=saturates).run(events, membranes=membranes)
 
 
 def step_late(spikes: BoolArray) -> BoolArray:

@@ -4,28 +4,25 @@ A broken rule is a defect of a pass, not of the user: :class:`errors.VerifyError
 refused by the front-ends and by the target's ``legalize`` before it gets here.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from spikeloom.compiler import ir
 from spikeloom.compiler.errors import VerifyError
-from spikeloom.compiler.fixedpoint import BIAS_EXPONENT_MAX, BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, weight_step
 
 Faults = Iterator[str]
 
 
-def _names_are_unique(network: ir.Network | ir.IntegerNetwork) -> Faults:
+def _names_are_unique(network: ir.Graph) -> Faults:
     names = [population.name for population in network.populations]
     for name in sorted({name for name in names if names.count(name) > 1}):
         yield f"two populations are called {name!r}"
 
 
-def _projections_fit(network: ir.Network | ir.IntegerNetwork) -> Faults:
-    populations: tuple[ir.Population | ir.IntegerPopulation, ...] = network.populations
-    sizes = {ir.INPUT: network.input.size} | {i: population.size for i, population in enumerate(populations)}
-    projections: tuple[ir.Projection | ir.IntegerProjection, ...] = network.projections
-    for i, p in enumerate(projections):
+def _projections_fit(network: ir.Graph) -> Faults:
+    sizes = {i: population.size for i, population in enumerate(network.populations)} | {ir.INPUT: network.input.size}
+    for i, p in enumerate(network.projections):
         expected = (sizes.get(p.post), sizes.get(p.pre))
         if p.post == ir.INPUT or p.weight.shape != expected:
             yield f"projection {i} has shape {p.weight.shape}, its populations ask for {expected}"
@@ -35,9 +32,9 @@ def _projections_fit(network: ir.Network | ir.IntegerNetwork) -> Faults:
             yield f"projection {i} runs from population {p.pre} to {p.post}, not forward"
 
 
-def _steps_are_kept(network: ir.Network | ir.IntegerNetwork) -> Faults:
+def _steps_are_kept(network: ir.Graph) -> Faults:
     count = len(network.populations)
-    projections: tuple[ir.Projection | ir.IntegerProjection, ...] = network.projections
+    projections = network.projections
     if not all(ir.INPUT <= p.pre < count and 0 <= p.post < count for p in projections):
         return  # to populations that there are not, which is said above
     depth = {ir.INPUT: -1} | dict(enumerate(ir.depths(network)))
@@ -52,7 +49,7 @@ def _steps_are_kept(network: ir.Network | ir.IntegerNetwork) -> Faults:
         yield f"population {network.populations[post].name!r} is not reached from the input"
 
 
-def _readout_fits(network: ir.Network | ir.IntegerNetwork) -> Faults:
+def _readout_fits(network: ir.Graph) -> Faults:
     label = network.readout.label
     if not 0 <= network.readout.population < len(network.populations):
         yield f"the read-out names population {network.readout.population}"
@@ -75,35 +72,20 @@ def _values_are_finite(network: ir.Network) -> Faults:
             yield f"projection {i} has weights that are not finite float64"
 
 
-def _registers_hold(network: ir.IntegerNetwork) -> Faults:
-    for population in network.populations:
-        for what, values, low, high in (
-            ("decay", np.array([population.decay_u, population.decay_v]), 0, 4095),
-            ("threshold", population.threshold, 0, THRESHOLD_MANTISSA_MAX),
-            ("bias mantissa", population.bias_mantissa, -BIAS_MANTISSA_MAX, BIAS_MANTISSA_MAX),
-            ("bias exponent", population.bias_exponent, 0, BIAS_EXPONENT_MAX),
-        ):
-            if np.any((values < low) | (values > high)):
-                yield f"population {population.name!r} has a {what} outside {low} … {high}"
+def graph_faults(network: ir.Graph) -> Faults:
+    """Rules that a network in any kind of numbers breaks."""
+    yield from _names_are_unique(network)
+    yield from _projections_fit(network)
+    yield from _steps_are_kept(network)
+    yield from _readout_fits(network)
 
 
-def _mantissas_hold(network: ir.IntegerNetwork) -> Faults:
-    for i, projection in enumerate(network.projections):
-        step = weight_step(projection.bits)
-        data = projection.weight.data
-        if data.dtype.kind != "i" or np.any(data % step) or np.any(data < -256) or np.any(data > 256 - step):
-            yield f"projection {i} has mantissas that {projection.bits} bits cannot hold"
-        if projection.exponent < -1:
-            yield f"projection {i} has exponent {projection.exponent}: below -1 its weights are no whole units"
+def verify(network: ir.Network) -> None:
+    """Check every rule; VerifyError names all that are broken."""
+    require_none([*graph_faults(network), *_values_are_finite(network)])
 
 
-def verify(network: ir.Network | ir.IntegerNetwork) -> None:
-    """Check every rule of the network's stage; VerifyError names all that are broken."""
-    faults = [*_names_are_unique(network), *_projections_fit(network)]
-    faults += [*_steps_are_kept(network), *_readout_fits(network)]
-    if isinstance(network, ir.Network):
-        faults += _values_are_finite(network)
-    else:
-        faults += [*_registers_hold(network), *_mantissas_hold(network)]
+def require_none(faults: Sequence[str]) -> None:
+    """Refuse broken rules with a VerifyError that names all of them."""
     if faults:
         raise VerifyError("; ".join(faults))

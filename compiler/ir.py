@@ -1,4 +1,4 @@
-"""The intermediate representation: populations, projections, input and read-out, in a float and an integer stage.
+"""The intermediate representation: populations, projections, input and read-out of a network in real numbers.
 
 Populations are numbered by their place in the tuple; ``INPUT`` (-1) stands for the input wherever a projection names
 its source. A projection from a population to itself is recurrent: it brings the spikes of the step before. Weights are
@@ -6,15 +6,14 @@ sparse matrices whose *stored* entries are the structural synapses: a stored zer
 object can know is checked on construction, everything else in :mod:`compiler.invariants`.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
-from spikeloom.compiler.fixedpoint import in_units, kept_shares
 from spikeloom.compiler.types import AnyArray, Float32Array, FloatArray, IntArray
 
 INPUT = -1
@@ -22,9 +21,6 @@ INPUT = -1
 
 Sparse = Any
 """A ``scipy.sparse.csr_array``; scipy ships no types."""
-
-MANTISSA = np.int16
-"""Type that mantissas are stored in."""
 
 PART = 1 << 19
 """Synapses that are worked on at a time where that saves memory."""
@@ -124,86 +120,59 @@ class Network:
     convolution: Convolution | None = field(default=None, repr=False)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IntegerPopulation:
-    """The same neurons in the chip's registers; units as in :class:`netlist.Netlist`."""
+class Neurons(Protocol):
+    """A population in any kind of numbers."""
 
-    name: str  # Unique in the network
-    beta: float  # Of the float model, as theta and alpha
-    theta: float
-    scale: FloatArray  # (neurons,) float64; weight units per membrane unit of the float model
-    decay_u: int  # Decay register of the current
-    decay_v: int  # Decay register of the membrane
-    threshold: IntArray  # (neurons,) int64; threshold mantissas
-    bias_mantissa: IntArray  # (neurons,) int64
-    bias_exponent: IntArray  # (neurons,) int64
-    alpha: float = 0.0
+    @property
+    def name(self) -> str:
+        """Unique in the network."""
 
     @property
     def size(self) -> int:
         """Number of neurons."""
-        return len(self.threshold)
+
+
+class Synapses(Protocol):
+    """A projection in any kind of numbers."""
 
     @property
-    def bias(self) -> IntArray:
-        """``mantissa * 2**exponent``, membrane units; shape (neurons,)."""
-        return self.bias_mantissa << self.bias_exponent
+    def pre(self) -> int:
+        """Index of the source population, or ``INPUT``."""
 
     @property
-    def realised_beta(self) -> float:
-        """Decay factor of the membrane register."""
-        return float(kept_shares(self.decay_u, self.decay_v)[1])
+    def post(self) -> int:
+        """Index of the target."""
 
     @property
-    def realised_alpha(self) -> float:
-        """Decay factor of the current register."""
-        return float(kept_shares(self.decay_u, self.decay_v)[0])
+    def weight(self) -> Sparse:
+        """From neuron (column) to neuron (row)."""
+
+
+class Graph(Protocol):
+    """A network in any kind of numbers, real ones or a chip's."""
 
     @property
-    def realised_theta(self) -> FloatArray:
-        """Thresholds in the float model's units; shape (neurons,)."""
-        return np.asarray(self.threshold / self.scale)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IntegerProjection:
-    """Synapses as stored: mantissas of `bits` bits with a common exponent."""
-
-    # pre, post: Population indices; `pre` may be ``INPUT``
-    pre: int
-    post: int
-    weight: Sparse  # Signed mantissas, usually ``MANTISSA``
-    exponent: int  # A synapse adds ``mantissa * 2**exponent`` weight units
-    bits: int  # Storage width of a mantissa
-
-    def effective(self) -> Sparse:
-        """Weights in weight units, csr_array of int32; exact, since mantissas are even."""
-        units = self.weight.data.astype(np.int32)
-        return with_data(self.weight, units >> 1 if self.exponent < 0 else units << self.exponent)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IntegerNetwork:
-    """A spiking network in chip integers, not yet on cores."""
-
-    input: Input
-    populations: tuple[IntegerPopulation, ...]
-    projections: tuple[IntegerProjection, ...]
-    readout: Readout
-    classes: int
+    def input(self) -> Input:
+        """What it receives."""
 
     @property
-    def forms(self) -> tuple[Form, ...]:
-        """How each population is stored."""
-        found = []
-        for post, population in enumerate(self.populations):
-            planes = [p for p in self.projections if p.post == post]
-            exponents = tuple(sorted({p.exponent for p in planes}))
-            found.append(Form(bits=planes[0].bits, exponents=exponents, threshold=population.threshold))
-        return tuple(found)
+    def populations(self) -> Sequence[Neurons]:
+        """In an order in which all but their own spikes run forward."""
+
+    @property
+    def projections(self) -> Sequence[Synapses]:
+        """Between them."""
+
+    @property
+    def readout(self) -> Readout:
+        """What votes."""
+
+    @property
+    def classes(self) -> int:
+        """Number of classes."""
 
 
-def depths(network: Network | IntegerNetwork) -> tuple[int, ...]:
+def depths(network: Graph) -> tuple[int, ...]:
     """Steps that each population lags behind the data: the longest path from the input, loops aside, minus one."""
     depth = [0] * len(network.populations)
     for post in range(len(network.populations)):
@@ -212,13 +181,13 @@ def depths(network: Network | IntegerNetwork) -> tuple[int, ...]:
     return tuple(depth)
 
 
-def recurrent(network: Network | IntegerNetwork) -> tuple[str, ...]:
+def recurrent(network: Graph) -> tuple[str, ...]:
     """Names of the populations that receive their own spikes."""
     loops = {projection.post for projection in network.projections if projection.pre == projection.post}
     return tuple(network.populations[post].name for post in sorted(loops))
 
 
-def fan_in(network: Network | IntegerNetwork, post: int) -> IntArray:
+def fan_in(network: Graph, post: int) -> IntArray:
     """Structural synapses into each neuron of a population, planes of one synapse counted once; shape (neurons,)."""
     into = ((p.pre, p.weight) for p in network.projections if p.post == post)
     ones = added_up((pre, with_data(weight, np.ones(weight.nnz, np.int32))) for pre, weight in into)
@@ -237,25 +206,6 @@ def added_up(weights: Iterable[tuple[int, Sparse]]) -> dict[int, Sparse]:
 def with_data(weight: Sparse, data: AnyArray) -> Sparse:
     """A csr_array of other numbers that shares its structure with `weight`: change neither in place."""
     return sparse.csr_array((data, weight.indices, weight.indptr), shape=weight.shape)
-
-
-def one_sided(projections: Iterable[IntegerProjection], neurons: int) -> tuple[IntArray, IntArray]:
-    """Largest positive and negative synaptic sum that any input can bring to each neuron, as magnitudes, weight units.
-
-    Planes count one by one, which covers every order of their arrival.
-    """
-    positive, negative = np.zeros((2, neurons), np.int64)
-    for projection in projections:
-        for rows in row_parts(projection.weight):
-            ends = projection.weight.indptr[rows.start : rows.stop + 1]
-            units = in_units(projection.weight.data[ends[0] : ends[-1]], projection.exponent)
-            filled = np.flatnonzero(np.diff(ends))
-            if len(filled):
-                begins = ends[filled] - ends[0]
-                up = np.add.reduceat(np.maximum(units, 0), begins, dtype=np.int64)
-                positive[rows.start + filled] += up
-                negative[rows.start + filled] += up - np.add.reduceat(units, begins, dtype=np.int64)
-    return positive, negative
 
 
 def row_parts(weight: Sparse) -> Iterator[slice]:

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from numba.core import event as numba_event
 from scipy import sparse
 
-from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT
 from spikeloom.compiler.ir import Sparse
 from spikeloom.compiler.types import AnyArray, BoolArray, IntArray
 
@@ -23,6 +22,9 @@ Function = Callable[..., Any]
 
 DENORMAL = 1e-30
 """Membranes and currents below this are flushed to zero; beside a threshold they are nothing."""
+
+SHARE_BITS = 12
+"""Layers of whole numbers keep shares of so many binary digits."""
 
 GAP = 16
 """Targets this near are joined in one run, with weights of zero in between: a vector costs no more than a weight."""
@@ -101,6 +103,11 @@ _PART: Any = {**_KERNEL, "no_cpython_wrapper": True}
 def compiled(function: Function) -> Function:
     """Compile a part of a kernel; it is cached with the whole."""
     return cast(Function, numba.njit(**_PART)(function))
+
+
+def inlined(function: Function) -> Function:
+    """Put a part of a kernel in place of each call, before anything is optimised: loops around it are vectorised."""
+    return cast(Function, numba.njit(**_PART, inline="always")(function))
 
 
 def compiled_and_cached(function: Function) -> Function:
@@ -240,29 +247,48 @@ def integrate_float(membrane: Any, current: Any, bias: Any, beta: Any, theta: An
         fired[i] = u > theta
 
 
+@inlined
+def decayed(value: Any, keep: Any) -> Any:
+    """``value * keep / 4096`` rounded toward zero, in the type of the value: no product is wider."""
+    # every result is cast: otherwise it is 64 bits wide, and half as many fit a vector
+    kind = type(value)
+    magnitude = kind(abs(value))
+    high = kind(kind(magnitude >> SHARE_BITS) * keep)
+    low = kind(kind(kind(magnitude & kind(2**SHARE_BITS - 1)) * keep) >> SHARE_BITS)
+    kept = kind(high + low)
+    return kind(-kept) if value < kind(0) else kept
+
+
+@inlined
+def charged(current: Any, keep: Any, arrived: Any) -> Any:
+    """A current after a step: what is kept of it, and what arrived."""
+    return type(current)(decayed(current, keep) + arrived)
+
+
+@inlined
+def integrated(kept: Any, current: Any, bias: Any) -> Any:
+    """A membrane after a step, before it saturates: what is kept of it, the current and the bias."""
+    kind = type(kept)
+    return kind(kind(kept + current) + bias)
+
+
+@inlined
+def saturated(membrane: Any, limit: Any) -> Any:
+    """A membrane that passes its limit nowhere."""
+    return type(membrane)(min(max(membrane, type(membrane)(-limit)), limit))
+
+
 @compiled
 def _integrate_integer(membrane: Any, current: Any, sums: Any, bias: Any, registers: Any, fired: Any) -> None:
-    # every result is cast: otherwise they are 64 bits wide, and half as many fit a vector
     threshold, keep_u, keep_v, limit = registers
-    kind = membrane.dtype.type
-    zero = kind(0)
-    low = kind(2**DECAY_BITS - 1)
+    zero = membrane.dtype.type(0)
     for i in range(len(bias)):
-        arrived = kind(sums[i] << MEMBRANE_SHIFT)
+        arrived = membrane.dtype.type(sums[i])
         if keep_u:
-            magnitude = kind(abs(current[i]))
-            high = kind(magnitude >> DECAY_BITS)
-            rest = kind(magnitude & low)
-            kept = kind(kind(high * keep_u) + kind(kind(rest * keep_u) >> DECAY_BITS))
-            arrived = kind(arrived + (kind(-kept) if current[i] < zero else kept))
+            arrived = charged(current[i], keep_u, arrived)
             current[i] = arrived
-        magnitude = kind(abs(membrane[i]))
-        high = kind(magnitude >> DECAY_BITS)
-        rest = kind(magnitude & low)
-        kept = kind(kind(high * keep_v) + kind(kind(rest * keep_v) >> DECAY_BITS))
-        kept = kind(-kept) if membrane[i] < zero else kept
-        v = kind(kind((zero if membrane[i] > threshold[i] else kept) + arrived) + bias[i])
-        v = kind(min(max(v, kind(-limit)), limit))
+        kept = zero if membrane[i] > threshold[i] else decayed(membrane[i], keep_v)
+        v = saturated(integrated(kept, arrived, bias[i]), limit)
         membrane[i] = v
         fired[i] = v > threshold[i]
 
@@ -283,8 +309,8 @@ def run_layer(
 ) -> None:
     """Run the recordings of a raster in the number type of `bias`, each from rest.
 
-    `registers` are the alpha, beta and theta of floats. Of integers they are the thresholds, in membrane units as
-    `bias` is, the shares that current and membrane keep, in 1/4096, and what no membrane passes. `state` (3, neurons)
+    `registers` are the alpha, beta and theta of floats. Of whole numbers they are the thresholds, the shares that
+    current and membrane keep in 1/4096, and what no membrane passes. `state` (3, neurons)
     and `before` (neurons,) int32 are for its own use: making them here would take compilation.
 
     `fired` (recordings, steps, neurons) uint8 is filled, and `membranes`, likewise and before the reset, unless it is

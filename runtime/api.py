@@ -16,8 +16,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.targets import DEFAULT_TARGET
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.requests.check import CertifyRequest, StressRequest

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from hypothesis import strategies as st
 
-from spikeloom.compiler.fixedpoint import read_only, read_only_float
+from spikeloom.compiler.arrays import read_only, read_only_float
 from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.trace import Counts, Trace

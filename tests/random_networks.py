@@ -12,22 +12,12 @@ from scipy import sparse
 from spikeloom.compiler.checkpoint import Checkpoint, Dense
 from spikeloom.compiler.dynamics import PLAIN
 from spikeloom.compiler.errors import CapacityError
-from spikeloom.compiler.fixedpoint import weight_step
-from spikeloom.compiler.interpret import run_integer
-from spikeloom.compiler.ir import (
-    INPUT,
-    Input,
-    IntegerNetwork,
-    IntegerPopulation,
-    IntegerProjection,
-    Network,
-    Population,
-    Projection,
-    Readout,
-)
+from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout
 from spikeloom.compiler.targets.base import Quantity, Target, load_target
 from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerPopulation, IntegerProjection, run_integer
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
+from spikeloom.compiler.targets.loihi1.registers import weight_step
 from spikeloom.models.graphs import normalised_adjacency
 
 LOIHI = load_target("loihi1")

@@ -11,14 +11,14 @@ from made_files import events, own_file, recordings_folder, weights
 from numpy.testing import assert_allclose, assert_array_equal
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
 
-from spikeloom.compiler import compile_network
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import NumericRangeError
-from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.recordings.events import load_data, of_length
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from random_netlists import MEMORYLESS, SIMULATORS, large_netlist, ungated
 
-from spikeloom.compiler.fixedpoint import read_only
+from spikeloom.compiler.arrays import read_only
 from spikeloom.runtime.machines.loihi1.engine import simulate
 from spikeloom.runtime.machines.loihi1.trace import aligned
 

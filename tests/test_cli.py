@@ -16,10 +16,12 @@ from made_files import weights as made_weights
 from numpy.testing import assert_array_equal
 
 from spikeloom.__main__ import main as start
-from spikeloom.compiler import __version__, lift
+from spikeloom.compiler import __version__
 from spikeloom.compiler.formats.text import text
-from spikeloom.compiler.interpret import channels_last, run_integer
+from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.targets.base import EVENTS, load_target
+from spikeloom.compiler.targets.loihi1.integers import run_integer
+from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.loihi1.passes import PASSES
 from spikeloom.models.graphs import build_graph

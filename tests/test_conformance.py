@@ -16,10 +16,11 @@ from test_onnx_engine import assert_as_specified
 from zoo import CROSSBARS, FLOAT, LAYERED, MAKERS, over, specified, specimen
 
 import spikeloom
-from spikeloom.compiler import lift
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.text import text
-from spikeloom.compiler.interpret import channels_last, run_float, run_integer
+from spikeloom.compiler.interpret import channels_last, run_float
+from spikeloom.compiler.targets.loihi1.integers import run_integer
+from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes, read_netlist
 from spikeloom.compiler.targets.truenorth.netlist import crossbar_bytes
 from spikeloom.models.networks.reference import float_spikes

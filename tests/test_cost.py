@@ -8,10 +8,12 @@ from made_files import events, small_checkpoint
 from random_netlists import Axon, Neuron, build
 from random_networks import LOIHI, random_checkpoint
 
-from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.checkpoint import Dense
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.base import EnergyTable, Quantity
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate

@@ -11,11 +11,11 @@ from numpy.testing import assert_array_equal
 from oracles import refused
 
 import spikeloom
-from spikeloom.compiler import compile_network
 from spikeloom.compiler.archive import read_members
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.formats.counters import BLOCK, counting_network, read_counters, write_counters
 from spikeloom.compiler.interpret import channels_last, float_simulation
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.recordings.events import joined_bins, load_data, of_length
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds, held_out, linear_rules
 from spikeloom.runtime.machines.backends import machine_of

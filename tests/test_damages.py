@@ -7,10 +7,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from random_networks import chain, compiled, integer_chain, random_checkpoint
 from timed_networks import written
 
-from spikeloom.compiler import Options, Packing, compile_network, lift
-from spikeloom.compiler.fixedpoint import decay_registers
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
+from spikeloom.compiler.targets.loihi1.registers import decay_registers
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks

@@ -12,17 +12,20 @@ from hypothesis import strategies as st
 from oracles import assert_same_network, refused
 from random_netlists import Axon, Neuron, build
 
-from spikeloom.compiler import Options, Packing, compile_network, lift, write_netlist
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError, OptionError
-from spikeloom.compiler.fixedpoint import read_only
-from spikeloom.compiler.invariants import verify
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, fan_in
+from spikeloom.compiler.ir import INPUT, fan_in
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, verify
 from spikeloom.compiler.targets.loihi1.layout.choose import lay_out, least_cores
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, write_netlist
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 
 

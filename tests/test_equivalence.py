@@ -9,10 +9,13 @@ from hypothesis import strategies as st
 from made_files import STEPS, events, recorded, small_checkpoint, weights
 from random_netlists import Neuron, build
 
-from spikeloom.compiler import Options, Packing, compile_network, lift
-from spikeloom.compiler.fixedpoint import read_only
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.runtime.equivalence.reference import LADDER, realised
 from spikeloom.runtime.equivalence.verify import verify

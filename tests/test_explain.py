@@ -10,9 +10,10 @@ from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, weights
 from random_networks import chain, integer_chain, with_population
 
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.interpret import channels_last, run_float, run_integer
+from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
 from spikeloom.models.graphs import normalised_adjacency

@@ -10,10 +10,12 @@ from numpy.testing import assert_array_equal
 from oracles import refused
 from random_networks import chain, small_target
 
-from spikeloom.compiler import Options, Packing
 from spikeloom.compiler.errors import CapacityError
-from spikeloom.compiler.interpret import channels_last, run_float, run_integer
+from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.calibrate import FEW, evenly_spaced
+from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.targets.loihi1.integers import run_integer
+from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.targets.loihi1.storage.held_out import HELD, KEPT, split
 

@@ -13,12 +13,15 @@ from oracles import refused
 from scipy import sparse
 
 import spikeloom.runtime.studies.robustness.pair
-from spikeloom.compiler import Options, compile_network
+from spikeloom.compiler import invariants
 from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.formats.text import text
-from spikeloom.compiler.interpret import run_float, run_integer
-from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.interpret import run_float
 from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent
+from spikeloom.compiler.targets.loihi1 import integers
+from spikeloom.compiler.targets.loihi1.integers import run_integer
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.capabilities import require_comparable
 from spikeloom.runtime.machines.votes import readout_counts
@@ -212,14 +215,14 @@ def with_projection(network, index, **changes):
     return replace(network, projections=tuple(projections))
 
 
-@pytest.mark.parametrize("make", [nets.chain, nets.integer_chain])
-def test_a_sound_network_passes(make):
+@pytest.mark.parametrize(("make", "verify"), [(nets.chain, invariants.verify), (nets.integer_chain, integers.verify)])
+def test_a_sound_network_passes(make, verify):
     verify(make([[2, 4, 6], [8, 10, 12]], [[2, 0], [0, 2]]))
 
 
 def test_a_recurrent_population_is_no_deeper_for_it():
     network = more(1, 1, (2, 2))(small())
-    verify(network)
+    invariants.verify(network)
     assert depths(network) == (0, 1)
     assert recurrent(network) == ("fc2",)
 
@@ -274,7 +277,7 @@ FLOATS = [
 
 @pytest.mark.parametrize(("change", "words"), FLOATS)
 def test_a_float_network_that_breaks_a_rule(change, words):
-    refused(VerifyError, words, verify, change(small()))
+    refused(VerifyError, words, invariants.verify, change(small()))
 
 
 @pytest.mark.parametrize(
@@ -294,9 +297,9 @@ def test_registers_at_their_ends_and_one_past_them(field, good, bad, words):
         return nets.with_population(network, 0, **{field: value if field.startswith("decay") else np.array([value])})
 
     for value in good:
-        verify(changed(value))
+        integers.verify(changed(value))
     for value in bad:
-        refused(VerifyError, f"'fc1'|{words}", verify, changed(value))
+        refused(VerifyError, f"'fc1'|{words}", integers.verify, changed(value))
 
 
 @pytest.mark.parametrize(
@@ -305,12 +308,12 @@ def test_registers_at_their_ends_and_one_past_them(field, good, bad, words):
 )
 def test_mantissas_of_each_width(bits, good, bad):
     for value in good:
-        verify(nets.integer_chain([[value]], bits=bits, exponent=-1))
+        integers.verify(nets.integer_chain([[value]], bits=bits, exponent=-1))
     for value in bad:
-        refused(VerifyError, f"projection 0|{bits} bits", verify, nets.integer_chain([[value]], bits=bits))
+        refused(VerifyError, f"projection 0|{bits} bits", integers.verify, nets.integer_chain([[value]], bits=bits))
     floats = with_projection(nets.integer_chain([[2]]), 0, weight=nets.stored(np.array([[2.0]])))
-    refused(VerifyError, "projection 0|8 bits", verify, floats)
-    refused(VerifyError, "exponent -2|below -1", verify, nets.integer_chain([[0]], exponent=-2))
+    refused(VerifyError, "projection 0|8 bits", integers.verify, floats)
+    refused(VerifyError, "exponent -2|below -1", integers.verify, nets.integer_chain([[0]], exponent=-2))
 
 
 def test_fan_in_counts_stored_zeros():

@@ -8,14 +8,16 @@ from made_files import CLASSES, TAXELS, events, own_file, recorded, recordings_f
 from numpy.testing import assert_array_equal
 from random_netlists import Axon, Neuron, build
 
-from spikeloom.compiler import Options, compile_network, lift
-from spikeloom.compiler.fixedpoint import read_only
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.passes.prune import without_channels
+from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
+from spikeloom.compiler.targets.loihi1.remove import without_channels
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.loihi1 import engine

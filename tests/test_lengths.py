@@ -11,11 +11,11 @@ from numpy.testing import assert_array_equal
 from oracles import refused
 from test_checkpoint import rebuilt
 
-from spikeloom.compiler import lift
 from spikeloom.compiler.dynamics import NO_CLOCKS
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.interpret import run_integer
+from spikeloom.compiler.targets.loihi1.integers import run_integer
+from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes, read_netlist
 from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
 from spikeloom.models.networks.networks import Architecture, SpikingNet

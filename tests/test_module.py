@@ -8,9 +8,9 @@ from made_modules import CLASSES, NETS, TAXELS, AllSteps, OneStep, example_of, m
 from oracles import refused
 from torch import nn
 
-from spikeloom.compiler import compile_network
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.interpret import channels_last, run_float
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.networks.lif import LIF, reset
 from spikeloom.models.networks.module import module_network
 from spikeloom.runtime.equivalence.verify import verify

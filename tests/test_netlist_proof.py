@@ -15,11 +15,14 @@ from random_networks import chain, random_checkpoint, ring
 from test_truenorth_counting import random_counters
 from timed_networks import events_of, written
 
-from spikeloom.compiler import Options, Packing, compile_network, read_netlist, write_netlist
-from spikeloom.compiler.fixedpoint import read_only
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.counters import write_counters
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist, write_netlist
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.targets.truenorth.netlist import read_crossbars, write_crossbars
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.machines.backends import machine_of

@@ -15,12 +15,14 @@ from oracles import probed
 from scipy import sparse
 from test_dynamics import surrogate_spike
 
-from spikeloom.compiler import Options, compile_network, lift
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, TACTILESGNET, Grid, in_order
 from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.graphs import NEUTOUCH, build_graph, normalised_adjacency
 from spikeloom.models.networks.layers import filter_places, lif, spike_linear, times
 from spikeloom.models.networks.networks import Architecture, SpikingNet

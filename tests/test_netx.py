@@ -10,13 +10,13 @@ from made_netx import conv, dense, even, events, flatten, given_input, neuron, w
 from numpy.testing import assert_array_equal
 from oracles import refused
 
-from spikeloom.compiler import compile_network, lift
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats import hdf5
 from spikeloom.compiler.formats.netx.reader import integers_of, read_netx
-from spikeloom.compiler.interpret import run_integer
-from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.targets.loihi1.integers import run_integer, verify
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.runtime.machines.loihi1 import engine
 
 W = np.full((4, 6), 2)

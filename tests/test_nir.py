@@ -14,12 +14,13 @@ from random_networks import float_networks
 from timed_networks import events_of
 from zoo import specimen
 
-from spikeloom.compiler import compile_network, lift
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.nir import writer as nir_export
 from spikeloom.compiler.formats.nir.reader import read_nir
 from spikeloom.compiler.interpret import run_float
 from spikeloom.compiler.ir import recurrent
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.runtime.machines.loihi1 import engine
 
 FILES = Path(__file__).parent / "nir"

@@ -15,12 +15,13 @@ from random_netlists import Axon, Neuron, build, large_netlist, netlists, record
 from test_timing import six_steps
 from zoo import specimen
 
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, read_only
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.formats.onnx.writer import digits, plan
 from spikeloom.compiler.targets.loihi1.netlist import reach, read_netlist
+from spikeloom.compiler.targets.loihi1.registers import ACCUMULATOR_MAX, CURRENT_MAX
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine, spec

@@ -15,7 +15,6 @@ from onnx import helper
 from onnx.reference import ReferenceEvaluator
 from oracles import assert_same_network, refused
 
-from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.affine import Affine
 from spikeloom.compiler.formats.onnx.atoms import INPUT_ATOM, Table
@@ -23,7 +22,11 @@ from spikeloom.compiler.formats.onnx.file import Node
 from spikeloom.compiler.formats.onnx.operators import apply
 from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.networks.module import module_network
 from spikeloom.runtime import cli
 

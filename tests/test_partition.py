@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from oracles import refused
 
 from spikeloom.compiler.errors import CapacityError
-from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerProjection, Readout
+from spikeloom.compiler.ir import INPUT, Input, Readout
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerProjection
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, index_bits
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound, partition
 from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place

@@ -20,18 +20,21 @@ from random_networks import (
     ring,
 )
 
-from spikeloom.compiler import Options, compile_network, invariants
+from spikeloom.compiler import invariants
 from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.formats.text import text
-from spikeloom.compiler.interpret import channels_last, run_float, run_integer
+from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.ir import INPUT, depths, fan_in
 from spikeloom.compiler.passes.expand import expand, hop_powers, synapses
-from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, removable, removals
-from spikeloom.compiler.passes.range_proof import prove_ranges
+from spikeloom.compiler.passes.prune import disconnect, either, never_fires
 from spikeloom.compiler.pipeline import run
 from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.bounds import prove_ranges
+from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
-from spikeloom.compiler.targets.loihi1.passes import PASSES, start
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import PASSES, compile_network, start
+from spikeloom.compiler.targets.loihi1.remove import compact, removable, removals
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.runtime.equivalence.verify import verify
 

@@ -10,11 +10,13 @@ import random_networks as nets
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spikeloom.compiler import Packing, fixedpoint
-from spikeloom.compiler.interpret import run_float, run_integer
-from spikeloom.compiler.ir import Form, one_sided
+from spikeloom.compiler.interpret import run_float
+from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import calibrate, evenly_spaced
-from spikeloom.compiler.passes.range_proof import prove_ranges
+from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.targets.loihi1 import registers
+from spikeloom.compiler.targets.loihi1.bounds import one_sided, prove_ranges
+from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.storage import choose_storage as choice_module
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import assemble, best_scale, choose_storage, nudged
 from spikeloom.compiler.targets.loihi1.storage.scales import candidate, layer_of
@@ -35,7 +37,7 @@ def noisy_layer(seed=0, *, inputs=40, outputs=30, outlier=0.0):
 
 
 def test_decays_are_the_nearest_registers():
-    found = [fixedpoint.decay_registers(beta)[1] for beta in (0.0, 1.0, 0.5, 0.9, 819 / 4096)]
+    found = [registers.decay_registers(beta)[1] for beta in (0.0, 1.0, 0.5, 0.9, 819 / 4096)]
     assert found == [4095, 0, 2048, 410, 3277]
     population = choose_storage(noisy_layer(), nets.LOIHI)[0].populations[0]
     assert (population.beta, population.realised_beta) == (0.2, 819 / 4096)
@@ -58,19 +60,19 @@ def test_no_input_brings_more_than_the_stated_worst_case(data):
         # The worst case is reached by the input that hits just the positive or just the negative synapses.
         worst = max(np.abs((sign * weights[i] > 0) @ weights[i]) for i in range(len(weights)) for sign in (1, -1))
         assert proof.accumulator == 64 * worst
-        assert choice.headroom == pytest.approx(1 - worst / fixedpoint.ONE_STEP_SUM_MAX, abs=1e-12)
+        assert choice.headroom == pytest.approx(1 - worst / registers.ONE_STEP_SUM_MAX, abs=1e-12)
 
 
 def test_a_large_layer_gives_up_scale_for_the_proof():
     """2000 equal weights: only their sum, not the largest of them, limits the scale."""
     integer, (choice,) = choose_storage(nets.chain(np.full((1, 2000), 0.5)), nets.LOIHI)
     assert choice.headroom >= 0
-    assert int(integer.projections[0].effective().sum()) <= fixedpoint.ONE_STEP_SUM_MAX
+    assert int(integer.projections[0].effective().sum()) <= registers.ONE_STEP_SUM_MAX
     # One unit of threshold more would not fit.
     network = nets.chain(np.full((1, 2000), 0.5))
     form = Form(bits=8, exponents=(choice.exponent,), threshold=integer.populations[0].threshold + 1)
     _, finer = round_population(network.populations[0], network.projections, form)
-    assert np.maximum(*one_sided(finer, 1))[0] > fixedpoint.ONE_STEP_SUM_MAX
+    assert np.maximum(*one_sided(finer, 1))[0] > registers.ONE_STEP_SUM_MAX
 
 
 def test_a_small_layer_uses_the_full_range():
@@ -295,18 +297,18 @@ def test_a_proof_means_that_saturation_changes_nothing(data):
 
 def mantissas(weight, scale, bits):
     """Weights rounded to one plane of a width."""
-    return fixedpoint.round_steps(weight, scale, bits, (0,)) * fixedpoint.weight_step(bits)
+    return registers.round_steps(weight, scale, bits, (0,)) * registers.weight_step(bits)
 
 
 def test_registers_have_their_published_widths():
-    assert (fixedpoint.ACCUMULATOR_MAX, fixedpoint.CURRENT_MAX, fixedpoint.MEMBRANE_MAX) == (2097151, 8388607, 8388607)
-    assert (fixedpoint.BIAS_MANTISSA_MAX, fixedpoint.BIAS_EXPONENT_MAX, fixedpoint.THRESHOLD_MANTISSA_MAX) == (
+    assert (registers.ACCUMULATOR_MAX, registers.CURRENT_MAX, registers.MEMBRANE_MAX) == (2097151, 8388607, 8388607)
+    assert (registers.BIAS_MANTISSA_MAX, registers.BIAS_EXPONENT_MAX, registers.THRESHOLD_MANTISSA_MAX) == (
         4095,
         7,
         131071,
     )
-    assert fixedpoint.MEMBRANE_SHIFT == 6
-    assert 64 * fixedpoint.ONE_STEP_SUM_MAX <= fixedpoint.ACCUMULATOR_MAX < 64 * (fixedpoint.ONE_STEP_SUM_MAX + 1)
+    assert registers.MEMBRANE_SHIFT == 6
+    assert 64 * registers.ONE_STEP_SUM_MAX <= registers.ACCUMULATOR_MAX < 64 * (registers.ONE_STEP_SUM_MAX + 1)
 
 
 @given(st.integers(-(2**24), 2**24), st.integers(0, 4096))
@@ -316,7 +318,7 @@ def test_decay_rounds_the_exact_product_toward_zero(x, lost):
 
 @given(st.sampled_from(nets.BITS), st.lists(st.floats(-3, 3), min_size=1, max_size=5), st.floats(0.1, 300))
 def test_weights_are_the_nearest_of_their_grid_and_symmetric(bits, weights, scale):
-    step, weight = fixedpoint.weight_step(bits), np.array(weights)
+    step, weight = registers.weight_step(bits), np.array(weights)
     mantissa = mantissas(weight, scale, bits)
     grid = np.arange(-(256 - step), 256, step)
     assert set(mantissa.tolist()) <= set(grid.tolist())
@@ -329,12 +331,12 @@ def test_weights_are_the_nearest_of_their_grid_and_symmetric(bits, weights, scal
 def test_a_bias_beyond_the_register_is_refused(bias):
     message = f"bias of magnitude {abs(bias):.6g} exceeds 4095 * 2**7 membrane units"
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
-        fixedpoint.encode_bias(np.array([0.0, bias]))
+        registers.encode_bias(np.array([0.0, bias]))
 
 
 @given(st.lists(st.floats(-4095 * 128, 4095 * 128), min_size=1, max_size=4))
 def test_a_bias_is_off_by_half_a_unit_of_its_exponent_at_most(bias):
-    mantissa, exponent = fixedpoint.encode_bias(np.array(bias))
+    mantissa, exponent = registers.encode_bias(np.array(bias))
     assert np.all(np.abs(mantissa) <= 4095)
     assert np.all((exponent >= 0) & (exponent <= 7))
     assert np.all(np.abs(mantissa * 2.0**exponent - bias) <= 2.0**exponent / 2)

@@ -19,7 +19,7 @@ import torch
 from made_files import CLASSES, TAXELS, csv_folder, events, own_file, recordings_folder, released, state_dict, zipped
 from made_files import weights as made_weights
 
-from spikeloom.compiler import read_netlist, write_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist, write_netlist
 from spikeloom.runtime import cli
 
 GOOD = events(2)[0].astype(np.float32)

@@ -21,7 +21,7 @@ from commands import as_json
 from random_netlists import Axon, Neuron, build, large_netlist, ungated
 from test_timing import DETAILED, ENERGY_PJ, LOIHI, PICO, SANAFE, SIMPLE, six_steps
 
-from spikeloom.compiler.fixedpoint import read_only
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, write_netlist

@@ -15,10 +15,11 @@ from random_netlists import large_netlist, lively, netlists, recordings, voting
 from random_networks import random_checkpoint, ring
 from test_truenorth_counting import random_counters, random_events
 
-from spikeloom.compiler import compile_network, write_netlist
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.netlist import write_netlist
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.targets.truenorth.passes import compile_crossbars
 from spikeloom.models.training.counters import Plan, counted, counters_of, fit
 from spikeloom.runtime.machines.backends import machine_of

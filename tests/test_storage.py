@@ -8,12 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_networks import BITS, LOIHI, chain, float_networks, moved, recordings_for
 
-from spikeloom.compiler import Packing
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, plane_distance, reach, split_planes, weight_step
-from spikeloom.compiler.invariants import verify
-from spikeloom.compiler.ir import Form, one_sided
+from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import calibrate
-from spikeloom.compiler.passes.range_proof import prove_ranges
+from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.targets.loihi1.bounds import one_sided, prove_ranges
+from spikeloom.compiler.targets.loihi1.integers import verify
+from spikeloom.compiler.targets.loihi1.registers import (
+    ONE_STEP_SUM_MAX,
+    plane_distance,
+    reach,
+    split_planes,
+    weight_step,
+)
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.compiler.targets.loihi1.storage.compensate import DAMPING, _round_in_turn, _share, compensated
 from spikeloom.compiler.targets.loihi1.storage.scales import (

@@ -10,12 +10,14 @@ from made_files import CLASSES, STEPS, TAXELS, events, recorded, recordings_fold
 from numpy.testing import assert_array_equal
 from timed_networks import events_of, written
 
-from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.equivalence.verify import verify

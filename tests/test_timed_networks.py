@@ -10,20 +10,26 @@ from oracles import refused
 from random_networks import LOIHI, chain, integer_chain, integer_population, small_target, stored
 from timed_networks import TIMING, events_of, written
 
-from spikeloom.compiler import Options, Packing, compile_network, fixedpoint, lift
 from spikeloom.compiler.dynamics import Dynamics, with_clocks
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.interpret import channels_last, run_float, run_integer
-from spikeloom.compiler.ir import IntegerProjection, Projection
+from spikeloom.compiler.interpret import channels_last, run_float
+from spikeloom.compiler.ir import Projection
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.passes.prune import never_fires, removable
-from spikeloom.compiler.passes.range_proof import prove_ranges
+from spikeloom.compiler.passes.prune import never_fires
+from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.targets.loihi1 import registers
+from spikeloom.compiler.targets.loihi1.bounds import prove_ranges
 from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.integers import IntegerProjection, run_integer
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
+from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
+from spikeloom.compiler.targets.loihi1.remove import removable
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.runtime.equivalence.verify import verify
@@ -58,7 +64,7 @@ def compilation(timed):
     [(0.0, 4095, 0.0), (0.5, 2047, 0.5), (0.95, 204, 3891 / 4096), (0.9999, 0, 4095 / 4096), (0.0001, 4095, 0.0)],
 )
 def test_the_current_register_is_the_nearest(alpha, register, realised):
-    assert fixedpoint.decay_registers(0.2, alpha) == (register, 3277)
+    assert registers.decay_registers(0.2, alpha) == (register, 3277)
     assert replace(integer_population("fc1", 1), decay_u=register).realised_alpha == realised
     assert abs(realised - alpha) <= 1.5e-4  # half a step, at the end of the register a little more
 
@@ -67,8 +73,8 @@ def test_a_current_counts_by_the_register_that_it_fills_first():
     """Loses 205/4096 a step: 6,559 units a step add up to 6,559 * 64 * 4096 / 205 = 8,387,4xx of 8,388,607."""
     assert current_load(4095) == current_load(1023) == 1.0  # four times as wide a register
     assert current_load(204) == pytest.approx((4096 / 205) * 32767 * 64 / 8388607, rel=1e-12)
-    most = int(fixedpoint.ONE_STEP_SUM_MAX / current_load(204))
-    assert most * 64 * 4096 // 205 <= fixedpoint.CURRENT_MAX < (most + 1) * 64 * 4096 // 205
+    most = int(registers.ONE_STEP_SUM_MAX / current_load(204))
+    assert most * 64 * 4096 // 205 <= registers.CURRENT_MAX < (most + 1) * 64 * 4096 // 205
 
 
 def test_a_neuron_that_only_fires_from_its_gathered_current_is_kept():
@@ -89,14 +95,14 @@ def test_ranges_are_proven_for_any_input(compilation):
     assert all(proof.holds for proof in compilation.proofs)
     lasting = compilation.proofs[1]
     widest = max(lasting.current, lasting.membrane)
-    assert 0.8 * fixedpoint.MEMBRANE_MAX < widest <= fixedpoint.MEMBRANE_MAX, "the scale is as fine as can be"
-    assert lasting.accumulator < 0.3 * fixedpoint.ACCUMULATOR_MAX
+    assert 0.8 * registers.MEMBRANE_MAX < widest <= registers.MEMBRANE_MAX, "the scale is as fine as can be"
+    assert lasting.accumulator < 0.3 * registers.ACCUMULATOR_MAX
     assert_allclose(
         [p.accumulator for p in prove_ranges(lift(compilation.netlist))], [p.accumulator for p in compilation.proofs]
     )
     positive, negative = one_step_bounds(compilation.netlist)
     ids = compilation.netlist.compartments_of(1)
-    assert np.all(np.maximum(positive, negative)[ids] * 64 * 4096 // 205 <= fixedpoint.CURRENT_MAX)
+    assert np.all(np.maximum(positive, negative)[ids] * 64 * 4096 // 205 <= registers.CURRENT_MAX)
 
 
 @pytest.mark.parametrize(

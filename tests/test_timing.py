@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_netlists import Axon, Neuron, build, by_engine, large_netlist, netlists, recordings, ungated
 
-from spikeloom.compiler.fixedpoint import read_only
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.targets.base import LATENCIES, Quantity, load_target
 from spikeloom.runtime.machines.loihi1 import engine

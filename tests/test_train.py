@@ -20,15 +20,17 @@ from oracles import comparable, load_weights, refused
 from test_checkpoint import rebuilt
 
 import spikeloom.models.training.train
-from spikeloom.compiler import Options, Packing
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
-from spikeloom.compiler.interpret import channels_last, run_integer
+from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.integers import run_integer
+from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
+from spikeloom.compiler.targets.loihi1.registers import ONE_STEP_SUM_MAX
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.layers import time_first

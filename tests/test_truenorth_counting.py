@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from made_files import recordings_folder
 from random_crossbars import CHIP, both, with_limit
 
-from spikeloom.compiler import compile_network
 from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.formats.counters import counting_network, write_counters
 from spikeloom.compiler.interpret import channels_last, float_simulation
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.targets.truenorth.counting import LARGEST, planned, run_counters
 from spikeloom.compiler.targets.truenorth.netlist import write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import compile_crossbars

@@ -19,8 +19,8 @@ from random_crossbars import IN_RANCS_TERMS, alone, crossbars, events
 
 from spikeloom.compiler import archive
 from spikeloom.compiler.archive import is_netlist
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.errors import FormatError, ModelError
-from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import ranc
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.truenorth import netlist as crossbar

@@ -6,9 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_files import events, recorded, small_checkpoint, weights
 
-from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
 from spikeloom.runtime.equivalence.verdict import (
     LayerSpikes,

@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from oracles import refused
 from random_netlists import Axon, Neuron, build, lively, netlists, recordings, voting
 
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.errors import DataError, NumericRangeError
-from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, write_netlist
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.cli import build_parser

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import Compilation, Options, compile_network, without
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import cut, vote
@@ -16,6 +15,8 @@ from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import Compilation, compile_network, without
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.checkpoint import propagation

@@ -12,7 +12,8 @@ import numpy as np
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, Network, Population, Projection, Readout, Sparse, depths
+from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout, Sparse, depths
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.types import IntArray
 
 N = TypeVar("N", bound=Network | IntegerNetwork)

@@ -21,11 +21,11 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler import archive
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import reading, sha256_of
-from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble
 from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
 

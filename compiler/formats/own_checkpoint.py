@@ -52,11 +52,11 @@ from spikeloom.compiler.archive import (
     read_npy,
     zip_bytes,
 )
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, constant_faults, layers_of
 from spikeloom.compiler.dynamics import MOST_STEPS, PLAIN, Clocks, Dynamics, dynamics_faults
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import FileFault, write_atomically
-from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, plane_distance, read_only
 from spikeloom.compiler.formats.tensors import (
     Arrays,
     apart,
@@ -78,6 +78,7 @@ from spikeloom.compiler.systems import (
     Grid,
     shape_faults,
 )
+from spikeloom.compiler.targets.loihi1.registers import THRESHOLD_MANTISSA_MAX, plane_distance
 from spikeloom.compiler.types import AnyArray, IntArray
 
 FORMAT = "spikeloom-checkpoint"

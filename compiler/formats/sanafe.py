@@ -27,11 +27,11 @@ from itertools import pairwise
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT, kept_shares
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.place import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.registers import MEMBRANE_SHIFT, kept_shares
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import FORGETS
 from spikeloom.compiler.types import BoolArray, IntArray
 

@@ -19,11 +19,10 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from spikeloom.compiler import archive, invariants
+from spikeloom.compiler.arrays import frozen, read_only, read_only_float
 from spikeloom.compiler.dynamics import Clocks
-from spikeloom.compiler.errors import FormatError, VerifyError
+from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.files import FileFault, reading
-from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
-from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.types import IntArray
 
 N = TypeVar("N")
@@ -101,12 +100,9 @@ class NetlistFile(Generic[N]):
         kind: Any = self.netlist
         return tuple(each.name for each in fields(kind) if each.name not in COMMON | self.entries | self.optional)
 
-    def verify(self, made: object) -> None:
-        """Check every rule of what a pass made, a network or a netlist; VerifyError if it broke one."""
-        if isinstance(made, Network | IntegerNetwork):
-            invariants.verify(made)
-        elif isinstance(made, self.netlist) and (faults := self.inconsistencies(made)):
-            raise VerifyError("; ".join(faults))
+    def verify(self, netlist: N) -> None:
+        """Check every rule of a netlist that a pass made; VerifyError names all that are broken."""
+        invariants.require_none(self.inconsistencies(netlist))
 
     def content(self, netlist: N) -> bytes:
         """File content of a netlist; equal netlists give equal bytes."""

@@ -1,6 +1,6 @@
 """The network on the chip's own integers, as a torch model with gradients: what it computes is what the chip computes.
 
-Weights, biases and thresholds are rounded by :mod:`fixedpoint`, the compiler's own rounding. Synaptic sums are sums of
+Weights, biases and thresholds are rounded by the compiler's own rounding. Synaptic sums are sums of
 integers in float32, exact below 2**24, which the 21-bit accumulator guarantees; the recurrence runs in integers.
 Gradients pass the rounding straight through, and a spike by the same surrogate as in training; those of a recurrent
 layer run through its own spikes, too.
@@ -17,11 +17,18 @@ from numpy.typing import NDArray
 from scipy import sparse
 from torch import Tensor, nn
 
-from spikeloom.compiler import fixedpoint, fullest, ir, round_population
+from spikeloom.compiler import ir
 from spikeloom.compiler.checkpoint import merge
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.passes.expand import stack_of
 from spikeloom.compiler.systems import in_order
+from spikeloom.compiler.targets.compartments import (
+    IntegerNetwork,
+    IntegerPopulation,
+    fullest,
+    registers,
+    round_population,
+)
 from spikeloom.compiler.types import EventArray
 from spikeloom.models.networks.layers import differentiate_step, events_of, gather, rates_of, scatter, time_first
 from spikeloom.models.networks.networks import Weights
@@ -64,17 +71,15 @@ class Stage:
         self.learning = self.population.size - self.population.relays
         held = int(weight.indptr[self.learning])
         self.weight, self.relays = torch.tensor(weight.data[:held]).float(), torch.tensor(weight.data[held:])
-        self.step = fixedpoint.step_units(form.bits, form.exponents)
+        self.step = registers.step_units(form.bits, form.exponents)
         self.scale = form.threshold / self.population.theta
 
     def one_sided(self, steps: Array) -> tuple[Array, Array]:
-        """Largest positive and negative sum of each neuron, each plane by itself, as :func:`ir.one_sided`."""
+        """Largest positive and negative sum of each neuron, each plane by itself, as :func:`bounds.one_sided`."""
         sides = np.zeros((2, self.shape[0]))
         exponents = self.form.exponents
-        for mantissa, exponent in zip(
-            fixedpoint.split_planes(steps, self.form.bits, exponents), exponents, strict=True
-        ):
-            units = fixedpoint.in_units(mantissa, exponent)
+        for mantissa, exponent in zip(registers.split_planes(steps, self.form.bits, exponents), exponents, strict=True):
+            units = registers.in_units(mantissa, exponent)
             sides += [np.bincount(self.row, np.maximum(sign * units, 0), self.shape[0]) for sign in (1, -1)]
         return sides[0], sides[1]
 
@@ -86,7 +91,7 @@ class Integers:
     stage: Stage
     units: Array  # (inputs, neurons) float32; weights in weight units, whole numbers (halves of a step never occur)
     real: Array  # (neurons, inputs) float32; the same in the float model's units
-    registers: ir.IntegerPopulation
+    population: IntegerPopulation
     full: Array  # (neurons,) float64; the fullest that any input makes the accumulator, see :func:`fullest`
 
 
@@ -124,7 +129,7 @@ class QuantisedNet(nn.Module):
         self.integers: tuple[Integers, ...] = ()
         self.round()
 
-    def start_at(self, integer: ir.IntegerNetwork) -> None:
+    def start_at(self, integer: IntegerNetwork) -> None:
         """Move weights and biases to where they round to an integer network of these forms, no farther."""
         for post, stage in list(enumerate(self.stages))[self.first :]:
             planes = ir.added_up((p.pre, p.effective()) for p in integer.projections if p.post == post)
@@ -135,7 +140,7 @@ class QuantisedNet(nn.Module):
             steps = units[stage.row[learned], stage.column[learned]] / stage.step
             step = (stage.step / stage.scale)[stage.row[learned]]
             near = np.clip(weight.detach().numpy() / step, steps - WITHIN, steps + WITHIN) * step
-            held = integer.populations[post].bias / (stage.scale * (1 << fixedpoint.MEMBRANE_SHIFT))
+            held = integer.populations[post].bias / (stage.scale * (1 << registers.MEMBRANE_SHIFT))
             with torch.no_grad():
                 weight.copy_(torch.tensor(near))
                 bias.copy_(torch.tensor(held[: stage.learning]))
@@ -185,20 +190,20 @@ class QuantisedNet(nn.Module):
         found = []
         for post, stage in enumerate(self.stages):
             weight, bias = (each.detach().numpy() for each in self.given(post))
-            registers, _ = round_population(stage.population, (), stage.form, bias=bias)
-            steps = fixedpoint.round_steps(weight, stage.scale[stage.row], stage.form.bits, stage.form.exponents)
+            population, _ = round_population(stage.population, (), stage.form, bias=bias)
+            steps = registers.round_steps(weight, stage.scale[stage.row], stage.form.bits, stage.form.exponents)
             units = np.zeros(stage.shape[::-1], np.float32)
             units[stage.column, stage.row] = steps * stage.step
             real = np.ascontiguousarray((units / stage.scale.astype(np.float32)).T)
-            full = fullest(registers, *stage.one_sided(steps))
-            found.append(Integers(stage=stage, units=units, real=real, registers=registers, full=full))
+            full = fullest(population, *stage.one_sided(steps))
+            found.append(Integers(stage=stage, units=units, real=real, population=population, full=full))
         self.integers = tuple(found)
 
     def clip_weights(self) -> None:
         """Keep single weights within half a step of what their storage holds, so that none gets lost."""
         with torch.no_grad():
             for weight, stage in zip(self.weights, self.stages[self.first :], strict=True):
-                most = (fixedpoint.reach(stage.form.bits, stage.form.exponents) + 0.5) * stage.step / stage.scale
+                most = (registers.reach(stage.form.bits, stage.form.exponents) + 0.5) * stage.step / stage.scale
                 limit = torch.tensor(most[stage.row[: len(weight)]], dtype=torch.float32)
                 weight.copy_(torch.clamp(weight, -limit, limit))
 
@@ -208,15 +213,15 @@ class QuantisedNet(nn.Module):
             for post, stage in enumerate(self.stages):
                 shared = post < self.first
                 bias = self.conv_bias if shared else self.biases[post - self.first]
-                most = (fixedpoint.BIAS_MANTISSA_MAX << fixedpoint.BIAS_EXPONENT_MAX) / (
-                    stage.scale * (1 << fixedpoint.MEMBRANE_SHIFT)
+                most = (registers.BIAS_MANTISSA_MAX << registers.BIAS_EXPONENT_MAX) / (
+                    stage.scale * (1 << registers.MEMBRANE_SHIFT)
                 )
                 bound = torch.tensor(most.min() if shared else most[: stage.learning], dtype=torch.float32) * SHRINK
                 bias.copy_(torch.clamp(bias, -bound, bound))
             self.round()
-            while any((integers.full > fixedpoint.ONE_STEP_SUM_MAX).any() for integers in self.integers):
+            while any((integers.full > registers.ONE_STEP_SUM_MAX).any() for integers in self.integers):
                 for post, integers in enumerate(self.integers):
-                    wrong = integers.full > fixedpoint.ONE_STEP_SUM_MAX
+                    wrong = integers.full > registers.ONE_STEP_SUM_MAX
                     stage = integers.stage
                     if post >= self.first:
                         weight = self.weights[post - self.first]
@@ -275,19 +280,19 @@ class _ChipLayer(torch.autograd.Function):
         ctx: Any, spikes: Tensor, _weight: Tensor, _bias: Tensor, integers: Integers, surrogate: Surrogate
     ) -> Tensor:
         steps, samples, inputs = spikes.shape
-        registers = integers.registers
+        population = integers.population
         stage = integers.stage
         source, bounds = events_of(spikes.detach().reshape(-1, inputs).contiguous().numpy())
-        sums = np.zeros((steps * samples, registers.size), np.float32)
+        sums = np.zeros((steps * samples, population.size), np.float32)
         gather(source, bounds, integers.units[:inputs], sums)
-        shape = steps, samples * registers.size
+        shape = steps, samples * population.size
         fired = np.empty(shape, np.float32)
         membrane = np.empty(shape, np.float32)
-        unit = 1 / (stage.scale * (1 << fixedpoint.MEMBRANE_SHIFT))  # membrane of the float model in one membrane unit
-        threshold = registers.threshold << fixedpoint.MEMBRANE_SHIFT
-        bias, threshold, unit = (np.tile(each, samples) for each in (registers.bias, threshold, unit))
+        unit = 1 / (stage.scale * (1 << registers.MEMBRANE_SHIFT))  # membrane of the float model in one membrane unit
+        threshold = population.threshold << registers.MEMBRANE_SHIFT
+        bias, threshold, unit = (np.tile(each, samples) for each in (population.bias, threshold, unit))
         alpha, beta = (
-            round(kept * fixedpoint.DECAY_ONE) for kept in (registers.realised_alpha, registers.realised_beta)
+            round(kept * registers.DECAY_ONE) for kept in (population.realised_alpha, population.realised_beta)
         )
         own = integers.units[inputs:]
         _integrate_chip(sums.reshape(shape), own, bias, threshold, unit, alpha, beta, fired, membrane)
@@ -299,7 +304,7 @@ class _ChipLayer(torch.autograd.Function):
         source, bounds, fired, membrane, integers, samples, surrogate = ctx.kept
         stage = integers.stage
         inputs = integers.stage.inputs
-        neurons = integers.registers.size
+        neurons = integers.population.size
         above = gradients[0].contiguous().view(membrane.shape).numpy()
         current, through_bias = _backwards(above, membrane, integers, samples, surrogate)
         rows = current.reshape(len(membrane) * samples, -1)
@@ -319,10 +324,10 @@ def _backwards(
 ) -> tuple[Array, Array]:
     """Gradients of what flows into the currents and of the bias, both (steps, samples * neurons), from the spikes'."""
     own = integers.real[:, integers.stage.inputs :]
-    registers = integers.registers
-    alpha = np.float32(registers.realised_alpha)
+    population = integers.population
+    alpha = np.float32(population.realised_alpha)
     theta = np.float32(integers.stage.population.theta)
-    beta, width, reset = map(np.float32, (registers.realised_beta, surrogate.width, surrogate.reset))
+    beta, width, reset = map(np.float32, (population.realised_beta, surrogate.width, surrogate.reset))
     smooth = surrogate.shape == FAST_SIGMOID
     current = np.empty_like(membrane)
     direct = np.empty_like(membrane)
@@ -341,11 +346,11 @@ def _chip_step(
     sums: Any, i: Any, v: Any, bias: Any, threshold: Any, unit: Any, keep_u: Any, keep_v: Any, fired: Any, membrane: Any
 ) -> None:
     for n in range(len(v)):
-        left = abs(i[n]) * keep_u >> fixedpoint.DECAY_BITS
-        magnitude = abs(v[n]) * keep_v >> fixedpoint.DECAY_BITS
-        i[n] = (left if i[n] >= 0 else -left) + (np.int64(sums[n]) << fixedpoint.MEMBRANE_SHIFT)
+        left = abs(i[n]) * keep_u >> registers.DECAY_BITS
+        magnitude = abs(v[n]) * keep_v >> registers.DECAY_BITS
+        i[n] = (left if i[n] >= 0 else -left) + (np.int64(sums[n]) << registers.MEMBRANE_SHIFT)
         u = (magnitude if v[n] >= 0 else -magnitude) + i[n] + bias[n]
-        u = min(max(u, -fixedpoint.MEMBRANE_MAX), fixedpoint.MEMBRANE_MAX)
+        u = min(max(u, -registers.MEMBRANE_MAX), registers.MEMBRANE_MAX)
         spike = u > threshold[n]
         fired[n] = spike
         membrane[n] = u * unit[n]

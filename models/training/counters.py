@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import MOST_CLOCKS
 from spikeloom.compiler.errors import DataError, OptionError, require_least
-from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import WHOLE, Recordings

@@ -22,13 +22,14 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from spikeloom.compiler import KEEP, Options, Packing
 from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.errors import require_least
 from spikeloom.compiler.interpret import channels_last, cut
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.calibrate import calibrate
+from spikeloom.compiler.storage import KEEP, Packing
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.compartments import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.quantised import QuantisedNet

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 
 from spikeloom.compiler.dynamics import MOST_CLOCKS, Dynamics, clocks_over
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import decay_registers, kept_shares
+from spikeloom.compiler.targets.compartments import decay_registers, kept_shares
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 from spikeloom.models.systems import HOPS

@@ -16,14 +16,18 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler import Netlist
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
-from spikeloom.compiler.interpret import Simulation, channels_last, cut, float_simulation, integer_simulation, run_float
-from spikeloom.compiler.ir import IntegerNetwork, Network, Projection, Sparse
-from spikeloom.compiler.passes.range_proof import prove_ranges
+from spikeloom.compiler.interpret import Simulation, channels_last, cut, float_simulation, run_float
+from spikeloom.compiler.ir import Network, Projection, Sparse
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
+from spikeloom.compiler.targets.compartments import (
+    MEMBRANE_SHIFT,
+    IntegerNetwork,
+    Netlist,
+    integer_simulation,
+    prove_ranges,
+)
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import parts_of

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.interpret import channels_last, cut
 from spikeloom.compiler.ir import Network
+from spikeloom.compiler.targets.compartments import MEMBRANE_SHIFT
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.equivalence.breakdowns import Breakdown, breakdowns
 from spikeloom.runtime.equivalence.reference import (

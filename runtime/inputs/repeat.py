@@ -4,8 +4,8 @@ import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.targets import DEFAULT_TARGET
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import BIN_S
 from spikeloom.runtime.requests.fields import Request

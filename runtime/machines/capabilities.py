@@ -8,7 +8,8 @@ from typing import Self
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.ir import IntegerNetwork, Network
+from spikeloom.compiler.ir import Network
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.runtime.machines.base import Machine

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
+from spikeloom.compiler.targets.compartments import MEMBRANE_SHIFT
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.reference import membranes_of, reference_of, taxel_and_feature

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from spikeloom.compiler import DEFAULT_TARGET
+from spikeloom.compiler.targets import DEFAULT_TARGET
 from spikeloom.runtime.requests.choices import (
     NETWORK_FILES,
     CheckpointChoice,

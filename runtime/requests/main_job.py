@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from spikeloom.compiler import DEFAULT_TARGET, KEEP
+from spikeloom.compiler.storage import KEEP
+from spikeloom.compiler.targets import DEFAULT_TARGET
 from spikeloom.runtime.requests.choices import (
     BIN_HELP,
     DATA_HELP,

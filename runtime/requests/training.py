@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, SYSTEMS, TACTILESGNET
+from spikeloom.compiler.targets import DEFAULT_TARGET
 from spikeloom.compiler.targets.native import BASES, DEFAULT_COPIES
 from spikeloom.compiler.targets.native import SYSTEM as NATIVE
 from spikeloom.models.systems import PADDINGS

@@ -22,12 +22,13 @@ from scipy import sparse
 from spikeloom.compiler import ir
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import reading
-from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, kept_shares
 from spikeloom.compiler.formats.affine import convolution
 from spikeloom.compiler.formats.assemble import ReadNetwork
 from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, entry_of, read_hdf5
 from spikeloom.compiler.formats.names import named, printable
 from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.targets.loihi1.integers import MANTISSA, IntegerNetwork, IntegerPopulation, IntegerProjection
+from spikeloom.compiler.targets.loihi1.registers import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, kept_shares
 from spikeloom.compiler.types import IntArray
 
 BIAS_EXPONENT = 6
@@ -86,7 +87,7 @@ def blocks_of(tree: Tree) -> list[Block]:
 
 def read_netx(
     path: str | os.PathLike[str], *, polarities: int | None = None, polarities_first: bool | None = None
-) -> ReadNetwork[ir.IntegerNetwork]:
+) -> ReadNetwork[IntegerNetwork]:
     """Read a network; polarities are as of :func:`sensor_layout.sensor_layout`.
 
     Raises ModelError if the file cannot be read, or holds what the chip's neurons here do not do, naming the layer;
@@ -100,14 +101,14 @@ def read_netx(
 
 def integers_of(
     tree: Tree, polarities: int | None = None, polarities_first: bool | None = None
-) -> tuple[ir.IntegerNetwork, list[str]]:
+) -> tuple[IntegerNetwork, list[str]]:
     """Integer network of the content of a file, and facts; raises as :func:`read_netx`."""
     blocks = blocks_of(tree)
     shape = _input_shape(blocks[0])
     sensor, positions, words = sensor_layout(shape, polarities=polarities, polarities_first=polarities_first)
     facts = [f"netx, {len(blocks)} layers, read as they stand", f"input: {words}"]
-    populations: list[ir.IntegerPopulation] = []
-    projections: list[ir.IntegerProjection] = []
+    populations: list[IntegerPopulation] = []
+    projections: list[IntegerProjection] = []
     for block in blocks:
         if block.type == "flatten":
             shape = (math.prod(shape),)
@@ -123,7 +124,7 @@ def integers_of(
             sources[post] = sparse.csr_array(_matrix(block, "weight_rec", neurons, neurons))
         stored = {pre: _planes(block, part) for pre, part in sources.items()}
         projections += [
-            ir.IntegerProjection(pre=pre, post=post, weight=plane, exponent=exponent, bits=8)
+            IntegerProjection(pre=pre, post=post, weight=plane, exponent=exponent, bits=8)
             for pre, planes in stored.items()
             for plane, exponent in planes
         ]
@@ -132,7 +133,7 @@ def integers_of(
         raise ModelError(f"has no layer of neurons; {AGAIN}")
     voters = populations[-1].size
     facts.append(f"classes: the spikes of {populations[-1].name}, a neuron each")
-    network = ir.IntegerNetwork(
+    network = IntegerNetwork(
         input=sensor,
         populations=tuple(populations),
         projections=tuple(projections),
@@ -212,16 +213,16 @@ def _planes(block: Block, weight: ir.Sparse) -> list[tuple[ir.Sparse, int]]:
     if data.size and (data.min() < -256 or data.max() > 255):
         raise block.fail(f"has weights from {data.min()} to {data.max()}, allowed are -256 to 255; netx clips them")
     if not np.any(data % 2):
-        return [(ir.with_data(weight, data.astype(ir.MANTISSA)), 0)]
+        return [(ir.with_data(weight, data.astype(MANTISSA)), 0)]
     if np.abs(data).max() <= 127:
-        return [(ir.with_data(weight, (2 * data).astype(ir.MANTISSA)), -1)]
+        return [(ir.with_data(weight, (2 * data).astype(MANTISSA)), -1)]
     odd = data % 2  # one half step, stored twice as large at half the value
-    units = ir.with_data(weight, (2 * odd).astype(ir.MANTISSA)).copy()
+    units = ir.with_data(weight, (2 * odd).astype(MANTISSA)).copy()
     units.eliminate_zeros()
-    return [(ir.with_data(weight, (data - odd).astype(ir.MANTISSA)), 0), (units, -1)]
+    return [(ir.with_data(weight, (data - odd).astype(MANTISSA)), 0), (units, -1)]
 
 
-def _population(block: Block, size: int, shape: tuple[int, ...]) -> ir.IntegerPopulation:
+def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopulation:
     entries: Tree = entry_of(block.values, "neuron", dict)
     if not entries:
         raise block.fail("has no neuron, so its membranes are the result, and a chip counts spikes; remove it")
@@ -238,7 +239,7 @@ def _population(block: Block, size: int, shape: tuple[int, ...]) -> ir.IntegerPo
     decay_u, decay_v, threshold = neuron.few("iDecay")[0] - 1, neuron.few("vDecay")[0], neuron.few("vThMant")[0]
     bias = _bias(block, size, shape)
     alpha, beta = kept_shares(decay_u, decay_v)
-    return ir.IntegerPopulation(
+    return IntegerPopulation(
         name=f"{block.type}{block.number}",
         beta=beta,
         theta=float(max(threshold, 1)),
@@ -264,7 +265,7 @@ def _bias(block: Block, size: int, shape: tuple[int, ...]) -> IntArray:
     return np.asarray(np.repeat(values, size // values.size))
 
 
-def _fact(block: Block, population: ir.IntegerPopulation, planes: int) -> str:
+def _fact(block: Block, population: IntegerPopulation, planes: int) -> str:
     fact = (
         f"{population.name}: {population.size} neurons, decay_u {population.decay_u}, decay_v {population.decay_v}, "
         f"fires at v > 64 * {population.threshold[0]}"

@@ -13,16 +13,10 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.dynamics import MOST_STEPS, RELAY_WEIGHT, Clocks
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import reading
-from spikeloom.compiler.fixedpoint import (
-    THRESHOLD_MANTISSA_MAX,
-    decay_registers,
-    kept_shares,
-    plane_distance,
-    read_only,
-)
 from spikeloom.compiler.formats.affine import scaled, shifted
 from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble, by_depth, class_of_each
 from spikeloom.compiler.formats.hdf5 import AGAIN, entry_of, read_hdf5
@@ -32,6 +26,12 @@ from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
 from spikeloom.compiler.ir import INPUT, Form, Input, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.targets.loihi1.registers import (
+    THRESHOLD_MANTISSA_MAX,
+    decay_registers,
+    kept_shares,
+    plane_distance,
+)
 from spikeloom.compiler.types import FloatArray, IntArray
 
 AXES, ELEMENTS = 8, 2**20

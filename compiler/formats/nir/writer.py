@@ -19,11 +19,12 @@ import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import MOST_STEPS, Clocks
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.formats.nir.stages import require_step
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Sparse, added_up
+from spikeloom.compiler.ir import INPUT, Sparse, added_up
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerPopulation
+from spikeloom.compiler.targets.loihi1.registers import MEMBRANE_SHIFT
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import FORGETS
 from spikeloom.compiler.types import FloatArray
 

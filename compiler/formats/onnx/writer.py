@@ -41,11 +41,17 @@ import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_ONE, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.formats.onnx.builder import Model, Nodes, Port, model_bytes, one_each, whole_recordings
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, Reach, netlist_bytes, reach
+from spikeloom.compiler.targets.loihi1.registers import (
+    ACCUMULATOR_MAX,
+    CURRENT_MAX,
+    DECAY_ONE,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+)
 from spikeloom.compiler.types import IntArray
 
 SIZE_LIMIT = 2**31 - 2**20

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
-from spikeloom.compiler.ir import INPUT, MANTISSA, IntegerNetwork, depths, fan_in
+from spikeloom.compiler.arrays import frozen, read_only, read_only_float
+from spikeloom.compiler.ir import INPUT, depths, fan_in
 from spikeloom.compiler.passes.prune import Masks, none_of
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.integers import MANTISSA, IntegerNetwork
 from spikeloom.compiler.targets.loihi1.layout import core_needs
 from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
 from spikeloom.compiler.types import AnyArray, IntArray

@@ -11,9 +11,10 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import FormatError
-from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX
-from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Readout
+from spikeloom.compiler.ir import INPUT, Input, Readout
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerPopulation, IntegerProjection
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.registers import THRESHOLD_MANTISSA_MAX
 from spikeloom.compiler.types import AnyArray, IntArray
 
 

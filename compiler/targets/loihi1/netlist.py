@@ -32,8 +32,14 @@ import numpy as np
 
 from spikeloom.compiler.archive import Kind
 from spikeloom.compiler.dynamics import MOST_STEPS, NO_CLOCKS, Clocks
-from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, in_units, largest_current
 from spikeloom.compiler.targets import netlist_file
+from spikeloom.compiler.targets.loihi1.registers import (
+    DECAY_BITS,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+    in_units,
+    largest_current,
+)
 from spikeloom.compiler.targets.netlist_file import MOST, NetlistFile, column_faults, is_outside, part_of
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 

@@ -5,24 +5,29 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from spikeloom.compiler import invariants
 from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import channels_last
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
+from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.passes import calibrate as calibration
 from spikeloom.compiler.passes import prune
 from spikeloom.compiler.passes.calibrate import Calibration
-from spikeloom.compiler.passes.digest import digests
-from spikeloom.compiler.passes.prune import Masks, Removal
-from spikeloom.compiler.passes.range_proof import RangeProof, prove_ranges
+from spikeloom.compiler.passes.prune import Masks
 from spikeloom.compiler.pipeline import LATER, Pass, run, step
+from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.base import Target, load_target
+from spikeloom.compiler.targets.loihi1 import integers, remove
+from spikeloom.compiler.targets.loihi1.bounds import RangeProof, prove_ranges
+from spikeloom.compiler.targets.loihi1.digest import digests
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.idle import forgotten
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.targets.loihi1.layout.choose import Layout, lay_out
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, require_legal
 from spikeloom.compiler.targets.loihi1.netlist import FILE, Netlist
-from spikeloom.compiler.targets.loihi1.options import Options, Packing, check_packings, require_stored
+from spikeloom.compiler.targets.loihi1.options import Options, check_packings, require_stored
+from spikeloom.compiler.targets.loihi1.remove import Removal
 from spikeloom.compiler.targets.loihi1.storage import held_out
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice, choose_storage, round_to_forms
 from spikeloom.compiler.targets.loihi1.storage.held_out import HeldOut, Trial
@@ -69,7 +74,13 @@ class Compilation:
 
     def verify(self) -> None:
         """Check every rule of the newest artefact; VerifyError if a pass broke one."""
-        FILE.verify(self.newest)
+        newest = self.newest
+        if isinstance(newest, Network):
+            invariants.verify(newest)
+        elif isinstance(newest, IntegerNetwork):
+            integers.verify(newest)
+        elif isinstance(newest, Netlist):
+            FILE.verify(newest)
 
 
 @step("runs the float network on training recordings, where there are any", keeps="the network")
@@ -195,10 +206,10 @@ def _remove(done: Compilation) -> Compilation:
     integer = done.integer
     network = done.network
     none = prune.none_of(integer)
-    silent, unread = (none, none) if done.options.keep_all else prune.removable(integer)
+    silent, unread = (none, none) if done.options.keep_all else remove.removable(integer)
     silent = prune.either(silent, done.gone or none)
-    removals = () if network is LATER else prune.removals(network, silent, unread, done.quiet)
-    kept, identity = prune.compact(integer, prune.either(silent, unread))
+    removals = () if network is LATER else remove.removals(network, silent, unread, done.quiet)
+    kept, identity = remove.compact(integer, prune.either(silent, unread))
     return replace(done, held=kept, identity=identity, silent=silent, unread=unread, removals=removals)
 
 
@@ -263,11 +274,10 @@ def start(
     OptionError if the options contradict each other, VerifyError if the network breaks a rule.
     """
     options.require_consistent(calibrated=options.training_events is not None)
-    FILE.verify(source)
     empty = Compilation(options=options, target=target)
-    if isinstance(source, IntegerNetwork):
-        return replace(empty, integer=source), (*INTEGERS, *LAYOUT)
-    return replace(empty, network=source), PASSES
+    work = replace(empty, integer=source) if isinstance(source, IntegerNetwork) else replace(empty, network=source)
+    work.verify()
+    return work, (*INTEGERS, *LAYOUT) if work.network is LATER else PASSES
 
 
 def compile_network(

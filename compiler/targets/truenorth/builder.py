@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.errors import CapacityError
-from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_TO, CrossbarNetlist
 from spikeloom.compiler.types import IntArray

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler import archive
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import reading, sha256_of
-from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.truenorth.native import NativeNetwork, Stage, faults
 from spikeloom.compiler.types import IntArray
 

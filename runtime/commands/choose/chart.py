@@ -3,8 +3,8 @@
 from functools import partial
 from pathlib import Path
 
-from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.errors import OptionError, require_least
+from spikeloom.compiler.targets import DEFAULT_TARGET
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import require_place

@@ -4,8 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from spikeloom.compiler import __version__, write_netlist
+from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.targets.compartments import write_netlist
 from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.checkpoint import load_graph

@@ -8,14 +8,15 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spikeloom.compiler import Packing, check_packings, round_to_forms
 from spikeloom.compiler.checkpoint import WEIGHTS, layers_of
 from spikeloom.compiler.errors import ModelError, OptionError, require_least
 from spikeloom.compiler.files import remove_leftovers, sha256_of, write_atomically
 from spikeloom.compiler.formats import NIR
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
+from spikeloom.compiler.targets.compartments import check_packings, round_to_forms
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import BIN_S, data_digest

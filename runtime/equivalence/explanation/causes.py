@@ -19,9 +19,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, reach, step_units
 from spikeloom.compiler.interpret import Activity, run_float, step_late
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
+from spikeloom.compiler.ir import INPUT, Network
+from spikeloom.compiler.targets.compartments import (
+    DECAY_BITS,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+    IntegerNetwork,
+    reach,
+    step_units,
+)
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.equivalence.explanation import results
 from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots, sources_of

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
+from spikeloom.compiler.ir import INPUT, Network
+from spikeloom.compiler.targets.compartments import IntegerNetwork
 from spikeloom.compiler.types import BoolArray
 
 Sources = tuple[tuple[tuple[int, BoolArray], ...], ...]

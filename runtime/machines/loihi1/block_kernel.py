@@ -32,8 +32,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from spikeloom.compiler.fixedpoint import DECAY_BITS
 from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached
+from spikeloom.compiler.targets.loihi1.registers import DECAY_BITS
 from spikeloom.compiler.types import AnyArray, IntArray
 
 Function = Callable[..., Any]

@@ -3,12 +3,12 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX
-from spikeloom.compiler.passes.prune import Removal
-from spikeloom.compiler.passes.range_proof import RangeProof, open_ranges
+from spikeloom.compiler.targets.loihi1.bounds import RangeProof, open_ranges
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.passes import Compilation
+from spikeloom.compiler.targets.loihi1.registers import ACCUMULATOR_MAX
+from spikeloom.compiler.targets.loihi1.remove import Removal
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice
 from spikeloom.compiler.targets.loihi1.storage.held_out import Trial
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness

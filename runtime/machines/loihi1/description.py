@@ -9,12 +9,12 @@ import numpy as np
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
 from spikeloom.compiler.files import sha256_of
-from spikeloom.compiler.fixedpoint import kept_shares
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.idle import Forgotten, forgotten
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, words_of_axons
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
+from spikeloom.compiler.targets.loihi1.registers import kept_shares
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.inputs.recordings import origin_of

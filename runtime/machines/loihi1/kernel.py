@@ -11,9 +11,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached, copy
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.registers import (
+    ACCUMULATOR_MAX,
+    CURRENT_MAX,
+    DECAY_BITS,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+)
 from spikeloom.compiler.types import AnyArray, IntArray
 
 ARRIVAL_BITS = 24

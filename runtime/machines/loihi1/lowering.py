@@ -4,10 +4,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from spikeloom.compiler import Compilation, Options, __version__, compile_network, invariants, write_netlist
+from spikeloom.compiler import __version__
 from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
-from spikeloom.compiler.interpret import channels_last, run_integer
+from spikeloom.compiler.interpret import channels_last
+from spikeloom.compiler.targets.loihi1 import integers
+from spikeloom.compiler.targets.loihi1.integers import run_integer
+from spikeloom.compiler.targets.loihi1.netlist import write_netlist
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import Compilation, compile_network
 from spikeloom.compiler.types import BoolArray, EventArray
 from spikeloom.models.recordings.events import of_length
 from spikeloom.models.recordings.evtouch import Recordings
@@ -125,7 +130,7 @@ def _lower_integers(path: str, request: CompileRequest) -> Lowered:
     refuse(request, NETWORK, f"is for checkpoints, the netx file {path} holds all it needs")
     progress("reading the network")
     read = read_netx(path, polarities=request.polarities, polarities_first=request.polarities_first)
-    invariants.verify(read.network)
+    integers.verify(read.network)
     progress("compiling")
     cores_for = parse_cores(request.cores_for)
     origin = {

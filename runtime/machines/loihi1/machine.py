@@ -16,8 +16,9 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import FormatError, NumericRangeError
 from spikeloom.compiler.files import reading
 from spikeloom.compiler.interpret import cut
-from spikeloom.compiler.ir import IntegerNetwork, Network
+from spikeloom.compiler.ir import Network
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray

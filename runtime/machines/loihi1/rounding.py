@@ -10,7 +10,7 @@ All is judged at the netlist's own scale, threshold / theta of each neuron, so o
 
 Weights and biases are not so in a layer that was rounded on recordings so that its errors cancel
 (:mod:`storage.compensate`), and neurons may be left out because they did not fire in them. What these recordings chose
-is held against the digests that the compiler took before it placed the network (:mod:`passes.digest`). Besides, most
+is held against the digests that the compiler took before it placed the network (:mod:`loihi1.digest`). Besides, most
 weights must be the nearest, and no bias may make up for more than its neuron's weights have lost, beside what
 calibration moves it by at most.
 """
@@ -21,14 +21,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from spikeloom.compiler import fixedpoint
 from spikeloom.compiler.errors import CapacityError
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection, Network, Projection, Sparse, depths
+from spikeloom.compiler.ir import INPUT, Network, Projection, Sparse, depths
 from spikeloom.compiler.passes.calibrate import NUDGES
-from spikeloom.compiler.passes.digest import digests
 from spikeloom.compiler.passes.prune import never_fires
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1 import registers
+from spikeloom.compiler.targets.loihi1.digest import digests
 from spikeloom.compiler.targets.loihi1.idle import forgotten
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerProjection
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
@@ -37,7 +38,7 @@ from spikeloom.runtime.machines.netlist_check import NetlistCheck
 SLACK = 1 + 1e-9
 """Factor by which a value may miss a limit that it meets in real numbers."""
 
-BIAS_LIMIT = fixedpoint.BIAS_MANTISSA_MAX << fixedpoint.BIAS_EXPONENT_MAX
+BIAS_LIMIT = registers.BIAS_MANTISSA_MAX << registers.BIAS_EXPONENT_MAX
 """Largest bias that a register holds, membrane units."""
 
 MOVED = 0.5
@@ -199,7 +200,7 @@ def _other_registers(netlist: Netlist, integer: IntegerNetwork, network: Network
     if wrong_threshold.any():
         worst = int(np.argmax(wrong_threshold))
         yield f"{wanted.name} neuron {worst} has threshold {chip.threshold[worst]} instead of {theta[worst]:g}"
-    decay_u, decay_v = fixedpoint.decay_registers(wanted.beta, wanted.alpha)
+    decay_u, decay_v = registers.decay_registers(wanted.beta, wanted.alpha)
     for what, stored, due in (
         ("decay registers", f"{chip.decay_u} and {chip.decay_v}", f"{decay_u} and {decay_v}"),
         *((name, getattr(layer, name), getattr(wanted, name)) for name in ("beta", "alpha", "theta")),
@@ -245,8 +246,8 @@ def _compare_weights(
     bits = min(plane.bits for plane in planes)
     exponents = tuple(sorted({plane.exponent for plane in planes if plane.weight.nnz}))
     exponents = exponents or (coarsest,)  # a layer that stores no weight: all of them rounded to zero at some step
-    step = fixedpoint.step_units(bits, exponents)
-    most = fixedpoint.reach(bits, exponents) * step
+    step = registers.step_units(bits, exponents)
+    most = registers.reach(bits, exponents) * step
     weights = _Weights(lost=np.zeros(chip.size), gained=np.zeros(chip.size))
     for pre in sorted({each.pre for stage in (network, integer) for each in stage.projections if each.post == post}):
         real = summed(network, pre, post)
@@ -274,15 +275,15 @@ def _wrong_numbers(
             f"{wanted.name} has {weights.wrong:,} of {weights.count:,} weights that are not the nearest, "
             f"{weights.where}"
         )
-    unit = chip.scale * (1 << fixedpoint.MEMBRANE_SHIFT)
+    unit = chip.scale * (1 << registers.MEMBRANE_SHIFT)
     bias = np.clip(wanted.bias * unit, -BIAS_LIMIT, BIAS_LIMIT)
-    coarse = 0.5 * (1 << np.maximum(fixedpoint.encode_bias(bias)[1], chip.bias_exponent)) * SLACK
+    coarse = 0.5 * (1 << np.maximum(registers.encode_bias(bias)[1], chip.bias_exponent)) * SLACK
     above = below = coarse
     if compensates and weights.wrong <= MOVED * weights.count:
         # where no weight was moved, the bias takes up what the nearest ones lose
         shift = sum(NUDGES) * wanted.theta * unit
-        above = weights.lost * (1 << fixedpoint.MEMBRANE_SHIFT) * SLACK + shift + coarse
-        below = weights.gained * (1 << fixedpoint.MEMBRANE_SHIFT) * SLACK + shift + coarse
+        above = weights.lost * (1 << registers.MEMBRANE_SHIFT) * SLACK + shift + coarse
+        below = weights.gained * (1 << registers.MEMBRANE_SHIFT) * SLACK + shift + coarse
     error = chip.bias - bias
     present = ~silence.absent[post]
     wrong = present & ((error > above) | (-error > below)) & ~(silence.zeroed[post] & (chip.bias == 0))

@@ -31,8 +31,14 @@ References
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.registers import (
+    ACCUMULATOR_MAX,
+    CURRENT_MAX,
+    DECAY_BITS,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+)
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.base import require_channels
 from spikeloom.runtime.machines.loihi1.trace import Counts, Trace, range_error

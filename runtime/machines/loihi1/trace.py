@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import NumericRangeError
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.registers import ACCUMULATOR_MAX, CURRENT_MAX
 from spikeloom.compiler.types import AnyArray, BoolArray, IntArray
 
 MembraneArray = npt.NDArray[np.int32]

@@ -9,8 +9,8 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-from spikeloom.compiler import MAX_PLANES
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.storage import MAX_PLANES
 from spikeloom.compiler.targets.base import Target
 from spikeloom.models.recordings.evtouch import WHOLE
 

@@ -6,12 +6,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar
 
-from spikeloom.compiler import Packing, check_packings
 from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.counters import SYSTEM, counting_network, read_counters
 from spikeloom.compiler.ir import Form
+from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.compartments import check_packings
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import NO_GRAPH

@@ -12,17 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import (
-    Compilation,
-    Options,
-    __version__,
-    lay_out_again,
-    to_integers,
-    write_netlist,
-)
+from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
+from spikeloom.compiler.targets.compartments import Compilation, Options, lay_out_again, to_integers, write_netlist
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part

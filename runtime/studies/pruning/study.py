@@ -4,8 +4,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from spikeloom.compiler import Netlist, Options, compile_network
 from spikeloom.compiler.systems import TACTILESGNET
+from spikeloom.compiler.targets.compartments import Netlist, Options, compile_network
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork

@@ -10,12 +10,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from spikeloom.compiler import Compilation, Netlist, layer_of, rounded, without
+from spikeloom.compiler.arrays import frozen
 from spikeloom.compiler.checkpoint import Checkpoint, Dense
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, frozen
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.passes.prune import without_channels
+from spikeloom.compiler.targets.compartments import (
+    ONE_STEP_SUM_MAX,
+    Compilation,
+    Netlist,
+    layer_of,
+    rounded,
+    without,
+    without_channels,
+)
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork

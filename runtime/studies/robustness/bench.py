@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler import Netlist
 from spikeloom.compiler.checkpoint import Checkpoint
+from spikeloom.compiler.targets.compartments import Netlist
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import fitted, join_bins

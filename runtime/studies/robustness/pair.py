@@ -11,10 +11,10 @@ from threading import Lock
 
 import numpy as np
 
-from spikeloom.compiler import Netlist
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.interpret import Simulation, cut, float_simulation, vote
 from spikeloom.compiler.ir import INPUT, Network
+from spikeloom.compiler.targets.compartments import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.capabilities import Damageable, Memory, Threaded, require_threaded

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Cores
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.layout.place import Placement, core_traffic, place_on_chips

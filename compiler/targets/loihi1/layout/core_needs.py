@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection
+from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerProjection
 from spikeloom.compiler.targets.loihi1.legalize import list_words, stored_once
 from spikeloom.compiler.types import IntArray
 

@@ -15,8 +15,8 @@ from itertools import pairwise
 import numpy as np
 
 from spikeloom.compiler.errors import CapacityError, OptionError, Violation
-from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Core, Cores, Needs
 from spikeloom.compiler.targets.loihi1.layout.place import core_traffic
 from spikeloom.compiler.targets.loihi1.legalize import violation

@@ -16,8 +16,9 @@ from typing import TypeVar
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.ir import INPUT, IntegerNetwork
+from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Cores, lists_into
 from spikeloom.compiler.types import FloatArray, IntArray
 

@@ -13,7 +13,14 @@ from operator import attrgetter
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import (
+from spikeloom.compiler.ir import Form, Network, Population, row_parts
+from spikeloom.compiler.passes.calibrate import MANY, NUDGES, Calibration, fewer
+from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerPopulation, integer_layer
+from spikeloom.compiler.targets.loihi1.legalize import stored_once
+from spikeloom.compiler.targets.loihi1.options import check_packings
+from spikeloom.compiler.targets.loihi1.registers import (
     BIAS_EXPONENT_MAX,
     BIAS_MANTISSA_MAX,
     MEMBRANE_SHIFT,
@@ -23,12 +30,6 @@ from spikeloom.compiler.fixedpoint import (
     reach,
     step_units,
 )
-from spikeloom.compiler.interpret import integer_layer
-from spikeloom.compiler.ir import Form, IntegerNetwork, IntegerPopulation, Network, Population, row_parts
-from spikeloom.compiler.passes.calibrate import MANY, NUDGES, Calibration, fewer
-from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.legalize import stored_once
-from spikeloom.compiler.targets.loihi1.options import Packing, check_packings
 from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
 from spikeloom.compiler.targets.loihi1.storage.scales import (
     FloatLayer,

@@ -20,9 +20,9 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, reach, step_units
 from spikeloom.compiler.ir import PART, Projection
 from spikeloom.compiler.passes.calibrate import Calibration
+from spikeloom.compiler.targets.loihi1.registers import ONE_STEP_SUM_MAX, reach, step_units
 from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, judged, lost, rounded
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, nearest_steps, scales
 from spikeloom.compiler.types import FloatArray, IntArray

@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from spikeloom.compiler.interpret import channels_last, integer_simulation, vote
-from spikeloom.compiler.ir import IntegerNetwork, Network
+from spikeloom.compiler.interpret import channels_last, vote
+from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.calibrate import FEW, Spikes, calibrate, evenly_spaced
+from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.options import Packing
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, integer_simulation
 from spikeloom.compiler.types import AnyArray, IntArray
 
 HELD = 96

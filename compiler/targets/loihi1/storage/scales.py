@@ -8,7 +8,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import (
+from spikeloom.compiler.ir import Form, Network, Population, Projection
+from spikeloom.compiler.passes.calibrate import Calibration
+from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.targets.loihi1.integers import IntegerPopulation, IntegerProjection, integer_layer
+from spikeloom.compiler.targets.loihi1.registers import (
     BIAS_EXPONENT_MAX,
     BIAS_MANTISSA_MAX,
     MEMBRANE_SHIFT,
@@ -19,10 +23,6 @@ from spikeloom.compiler.fixedpoint import (
     step_units,
     weight_step,
 )
-from spikeloom.compiler.interpret import integer_layer
-from spikeloom.compiler.ir import Form, IntegerPopulation, IntegerProjection, Network, Population, Projection
-from spikeloom.compiler.passes.calibrate import Calibration
-from spikeloom.compiler.targets.loihi1.options import Packing
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, round_population
 from spikeloom.compiler.types import FloatArray, IntArray
 

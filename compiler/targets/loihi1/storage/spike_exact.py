@@ -9,12 +9,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, decay_registers, kept_shares, reach, step_units
 from spikeloom.compiler.interpret import float_layer
-from spikeloom.compiler.ir import IntegerNetwork, Network
+from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.calibrate import Calibration, fewer
+from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.options import Packing
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
+from spikeloom.compiler.targets.loihi1.registers import (
+    THRESHOLD_MANTISSA_MAX,
+    decay_registers,
+    kept_shares,
+    reach,
+    step_units,
+)
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import (
     Choice,
     assemble,

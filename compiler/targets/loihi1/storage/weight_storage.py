@@ -14,7 +14,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from spikeloom.compiler import ir
-from spikeloom.compiler.fixedpoint import (
+from spikeloom.compiler.targets.loihi1.bounds import one_sided
+from spikeloom.compiler.targets.loihi1.integers import MANTISSA, IntegerPopulation, IntegerProjection
+from spikeloom.compiler.targets.loihi1.registers import (
     CURRENT_MAX,
     DECAY_ONE,
     MEMBRANE_MAX,
@@ -36,18 +38,18 @@ def scales(population: ir.Population, form: ir.Form) -> FloatArray:
     return np.asarray(form.threshold / population.theta)
 
 
-def store_steps(projection: ir.Projection, steps: IntArray, form: ir.Form) -> tuple[ir.IntegerProjection, ...]:
+def store_steps(projection: ir.Projection, steps: IntArray, form: ir.Form) -> tuple[IntegerProjection, ...]:
     """One integer projection for each plane in use; the finest holds every structural synapse."""
     pre = projection.pre
     post = projection.post
-    stored = list[ir.IntegerProjection]()
+    stored = list[IntegerProjection]()
     for exponent, mantissa in zip(form.exponents, split_planes(steps, form.bits, form.exponents), strict=True):
-        weight = ir.with_data(projection.weight, mantissa.astype(ir.MANTISSA))
+        weight = ir.with_data(projection.weight, mantissa.astype(MANTISSA))
         if stored:
             weight = weight.copy()
             weight.eliminate_zeros()
         if weight.nnz or not stored:
-            stored.append(ir.IntegerProjection(pre=pre, post=post, weight=weight, exponent=exponent, bits=form.bits))
+            stored.append(IntegerProjection(pre=pre, post=post, weight=weight, exponent=exponent, bits=form.bits))
     return tuple(stored)
 
 
@@ -69,7 +71,7 @@ def round_population(
     form: ir.Form,
     steps: Sequence[IntArray] | None = None,
     bias: FloatArray | None = None,
-) -> tuple[ir.IntegerPopulation, tuple[ir.IntegerProjection, ...]]:
+) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
     """Registers of one population and its synapses, every weight rounded to the nearest.
 
     Where `steps` are given, an array for each projection, they are taken instead of the weights; a `bias` (neurons,),
@@ -79,7 +81,7 @@ def round_population(
     wanted = population.bias if bias is None else bias
     mantissa, exponent = encode_bias(wanted * scale * (1 << MEMBRANE_SHIFT))
     decay_u, decay_v = decay_registers(population.beta, population.alpha)
-    integer = ir.IntegerPopulation(
+    integer = IntegerPopulation(
         name=population.name,
         beta=population.beta,
         theta=population.theta,
@@ -105,16 +107,16 @@ def current_load(decay_u: int) -> float:
     return max(1.0, ONE_STEP_SUM_MAX * (4096 / (decay_u + 1)) * (1 << MEMBRANE_SHIFT) / CURRENT_MAX)
 
 
-def loads(population: ir.IntegerPopulation, projections: tuple[ir.IntegerProjection, ...]) -> FloatArray:
+def loads(population: IntegerPopulation, projections: tuple[IntegerProjection, ...]) -> FloatArray:
     """One-sided sums, or more where a current that outlasts its step fills a register sooner; shape (neurons,).
 
     What is within ``ONE_STEP_SUM_MAX`` overflows neither accumulator nor current, whatever the input. Nor does it
     saturate a membrane, unless that keeps more than half of itself: the scale would then be too coarse.
     """
-    return fullest(population, *ir.one_sided(projections, population.size))
+    return fullest(population, *one_sided(projections, population.size))
 
 
-def fullest(population: ir.IntegerPopulation, up: AnyArray, down: AnyArray) -> FloatArray:
+def fullest(population: IntegerPopulation, up: AnyArray, down: AnyArray) -> FloatArray:
     """The same from the largest positive and negative sum of a step, (neurons,) in weight units."""
     filled: FloatArray = np.maximum(up, down).astype(np.float64)
     if population.decay_u == FORGETS:

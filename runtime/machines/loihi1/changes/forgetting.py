@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import CURRENT_MAX, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.layer_kernel import clear, compiled, compiled_and_cached
+from spikeloom.compiler.targets.loihi1.registers import CURRENT_MAX, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.runtime.machines.changes import Forgetting
 from spikeloom.runtime.machines.loihi1.changes.kernel import LANES, NEVER, Chip, Known
 from spikeloom.runtime.machines.loihi1.kernel import kept

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.layer_kernel import (
     Synapses,
     by_source,
@@ -26,6 +25,13 @@ from spikeloom.compiler.layer_kernel import (
     require_below,
 )
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, reach
+from spikeloom.compiler.targets.loihi1.registers import (
+    ACCUMULATOR_MAX,
+    CURRENT_MAX,
+    DECAY_BITS,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+)
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.changes import Changes, Effects
 from spikeloom.runtime.machines.loihi1.kernel import kept

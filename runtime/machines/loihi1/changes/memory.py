@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from spikeloom.compiler import fixedpoint
+from spikeloom.compiler.arrays import frozen, read_only
 from spikeloom.compiler.ir import INPUT, Network
+from spikeloom.compiler.targets.loihi1 import registers
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.capabilities import Memory
@@ -67,7 +68,7 @@ class LoihiMemory(Memory):
     def with_codes(self, codes: IntArray) -> LoihiMemory:
         """Change mantissas, and float weights by as many weight units."""
         weight = (codes * weight_steps(self.widths)).astype(self.netlist.synapse_weight.dtype)
-        netlist = replace(self.netlist, synapse_weight=fixedpoint.frozen(weight))
+        netlist = replace(self.netlist, synapse_weight=frozen(weight))
         changed = np.flatnonzero(weight != self.netlist.synapse_weight)
         units = netlist.effective_weight()[changed] - self.netlist.effective_weight()[changed]
         return LoihiMemory(netlist=netlist, network=self._with_weight_units(changed, units))
@@ -100,10 +101,10 @@ class LoihiMemory(Memory):
         weight = np.where(stuck[netlist.synapse_compartment()], 0, netlist.synapse_weight)
         damaged = replace(
             netlist,
-            synapse_weight=fixedpoint.frozen(weight.astype(netlist.synapse_weight.dtype)),
-            bias_mantissa=fixedpoint.read_only(np.where(stuck, int(firing), netlist.bias_mantissa)),
-            bias_exponent=fixedpoint.read_only(np.where(stuck, 0, netlist.bias_exponent)),
-            threshold=fixedpoint.read_only(np.where(stuck & firing, 0, netlist.threshold)),
+            synapse_weight=frozen(weight.astype(netlist.synapse_weight.dtype)),
+            bias_mantissa=read_only(np.where(stuck, int(firing), netlist.bias_mantissa)),
+            bias_exponent=read_only(np.where(stuck, 0, netlist.bias_exponent)),
+            threshold=read_only(np.where(stuck & firing, 0, netlist.threshold)),
         )
         network = self._scaled_inputs(np.where(stuck, 0.0, 1.0), np.where(stuck, 2.0 * firing, 0.0))
         return LoihiMemory(netlist=damaged, network=network)
@@ -114,10 +115,10 @@ class LoihiMemory(Memory):
         A neuron with another threshold fires as one with the old one whose weights and bias are divided by the factor.
         """
         before = self.netlist.threshold
-        most = fixedpoint.THRESHOLD_MANTISSA_MAX
+        most = registers.THRESHOLD_MANTISSA_MAX
         after = np.where(self._relays, before, np.clip(thresholds, 1, most))
         factor = np.maximum(before, 1) / np.maximum(after, 1)
-        netlist = replace(self.netlist, threshold=fixedpoint.read_only(after))
+        netlist = replace(self.netlist, threshold=read_only(after))
         return LoihiMemory(netlist=netlist, network=self._scaled_inputs(factor, np.zeros(len(factor))))
 
     def _scaled_inputs(self, factor: FloatArray, more: FloatArray) -> Network:
@@ -149,19 +150,19 @@ class LoihiMemory(Memory):
 
     def with_decays(self, factor: float) -> LoihiMemory:
         """Change decay registers; the float network has what they realise."""
-        registers = np.array(
-            [fixedpoint.decay_registers(layer.beta * factor, layer.alpha * factor) for layer in self.netlist.layers]
+        decays = np.array(
+            [registers.decay_registers(layer.beta * factor, layer.alpha * factor) for layer in self.netlist.layers]
         )
-        decay_u, decay_v = registers[self.netlist.layer].T
-        netlist = replace(self.netlist, decay_u=fixedpoint.read_only(decay_u), decay_v=fixedpoint.read_only(decay_v))
-        one = 1 << fixedpoint.DECAY_BITS
+        decay_u, decay_v = decays[self.netlist.layer].T
+        netlist = replace(self.netlist, decay_u=read_only(decay_u), decay_v=read_only(decay_v))
+        one = 1 << registers.DECAY_BITS
         populations = tuple(
             replace(population, beta=(one - v) / one, alpha=(one - 1 - u) / one)
-            for population, (u, v) in zip(self.network.populations, registers.tolist(), strict=True)
+            for population, (u, v) in zip(self.network.populations, decays.tolist(), strict=True)
         )
         return LoihiMemory(netlist=netlist, network=replace(self.network, populations=populations))
 
 
 def weight_steps(bits: IntArray) -> IntArray:
-    """Distance of neighbouring mantissas of each width; as :func:`fixedpoint.weight_step`."""
-    return np.array([0, 0, *(fixedpoint.weight_step(width) for width in range(2, 9))])[bits]
+    """Distance of neighbouring mantissas of each width; as :func:`registers.weight_step`."""
+    return np.array([0, 0, *(registers.weight_step(width) for width in range(2, 9))])[bits]

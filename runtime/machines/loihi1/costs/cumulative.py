@@ -6,9 +6,9 @@ window is run for itself. A chip that is stopped after so many steps has done, a
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, largest_current
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
+from spikeloom.compiler.targets.loihi1.registers import DECAY_BITS, MEMBRANE_SHIFT, largest_current
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.runtime.machines.capabilities import LONGEST, Cumulative
 from spikeloom.runtime.machines.loihi1 import engine

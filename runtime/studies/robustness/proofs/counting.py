@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.counters import BLOCK
-from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
-from spikeloom.compiler.ir import IntegerNetwork, Sparse, added_up
+from spikeloom.compiler.ir import Sparse, added_up
+from spikeloom.compiler.targets.compartments import MEMBRANE_SHIFT, IntegerNetwork
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.machines.capabilities import Comparable

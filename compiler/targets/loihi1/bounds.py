@@ -1,14 +1,22 @@
-"""Prove that registers stay in range for any input, from the weights alone."""
+"""Bounds of sums and registers for any input, from the weights alone; the proof that they stay in range."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX, MEMBRANE_SHIFT
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, one_sided
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.ir import INPUT, row_parts
+from spikeloom.compiler.passes.prune import settled
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerProjection
+from spikeloom.compiler.targets.loihi1.registers import (
+    ACCUMULATOR_MAX,
+    CURRENT_MAX,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+    in_units,
+)
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,9 +50,30 @@ def open_ranges(unproven: Sequence[str], saturating: Sequence[str]) -> Iterator[
         yield f"no register of {', '.join(saturating)} overflows for any input, but some may saturate a membrane"
 
 
-def settled(inflow: FloatArray | IntArray, kept: float) -> FloatArray:
-    """Limit of ``x <- kept * x + inflow``: what a leaking register can add up to."""
-    return np.asarray(inflow / (1 - kept) if kept < 1 else np.where(inflow > 0, np.inf, 0.0))
+def one_sided(
+    projections: Iterable[IntegerProjection], neurons: int, silent: Mapping[int, BoolArray] | None = None
+) -> tuple[IntArray, IntArray]:
+    """Largest positive and negative synaptic sum that any input can bring to each neuron, as magnitudes, weight units.
+
+    Planes count one by one, which covers every order of their arrival. Sources that are known to be `silent`, by
+    population, bring nothing.
+    """
+    positive = np.zeros(neurons, np.int64)
+    negative = np.zeros(neurons, np.int64)
+    for projection in projections:
+        for rows in row_parts(projection.weight):
+            ends = projection.weight.indptr[rows.start : rows.stop + 1]
+            stored = slice(ends[0], ends[-1])
+            units = in_units(projection.weight.data[stored], projection.exponent)
+            if silent is not None:
+                units[silent[projection.pre][projection.weight.indices[stored]]] = 0
+            filled = np.flatnonzero(np.diff(ends))
+            if len(filled):
+                begins = ends[filled] - ends[0]
+                up = np.add.reduceat(np.maximum(units, 0), begins, dtype=np.int64)
+                positive[rows.start + filled] += up
+                negative[rows.start + filled] += up - np.add.reduceat(units, begins, dtype=np.int64)
+    return positive, negative
 
 
 def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:

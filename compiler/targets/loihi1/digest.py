@@ -9,8 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spikeloom.compiler.ir import IntegerNetwork, added_up
+from spikeloom.compiler.ir import added_up
 from spikeloom.compiler.passes.prune import of_source, zeroed
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.types import BoolArray
 
 DIGITS = 16

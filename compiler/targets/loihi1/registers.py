@@ -1,6 +1,6 @@
-"""How numbers are rounded to the registers: decays, planes of weights, biases. Exact and small; int64 out.
+"""Loihi's registers, and how numbers are rounded to them: decays, planes of weights, biases. Exact; int64 out.
 
-What registers do with them from step to step stands in a machine's ``spec``.
+What registers do with them from step to step stands in :mod:`machines.loihi1.spec`.
 
 References
 ----------
@@ -11,9 +11,8 @@ References
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from spikeloom.compiler.types import AnyArray, FloatArray, IntArray
+from spikeloom.compiler.types import FloatArray, IntArray
 
 DECAY_BITS = 12
 """Decay registers count in 1/4096."""
@@ -157,19 +156,3 @@ def encode_bias(bias: FloatArray) -> tuple[IntArray, IntArray]:
     if np.any(np.abs(mantissa) > BIAS_MANTISSA_MAX):
         raise ValueError(f"bias of magnitude {np.abs(bias).max():.6g} exceeds 4095 * 2**7 membrane units")
     return mantissa, exponent
-
-
-def frozen(array: AnyArray) -> AnyArray:
-    """The same array, read-only from now on."""
-    array.flags.writeable = False
-    return array
-
-
-def read_only(array: npt.ArrayLike) -> IntArray:
-    """Copy to a read-only int64 array, as most fields of netlists are."""
-    return frozen(np.array(array, dtype=np.int64))
-
-
-def read_only_float(array: npt.ArrayLike) -> FloatArray:
-    """Copy to a read-only float64 array."""
-    return frozen(np.array(array, dtype=np.float64))
