@@ -19,9 +19,10 @@ from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_fo
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence.explanation.causes import explain
-from spikeloom.runtime.equivalence.explanation.results import BETA, BIAS, LEFT_OUT, SATURATION, TIE, TRUNCATION, WEIGHTS
-from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots, sources_of
+from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots
+from spikeloom.runtime.machines.deviations import BETA, BIAS, LEFT_OUT, SATURATION, TIE, TRUNCATION, WEIGHTS
 from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.changes.deviations import LoihiDeviations
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
 
@@ -44,7 +45,7 @@ def test_an_entry_with_agreeing_inputs_is_a_root_and_those_that_drag_most_come_f
 def test_a_synapse_counts_if_it_is_there_on_either_side():
     network = chain([[1.0, 1.0]], [[0.5]], [[0.0], [0.25]])
     integer = integer_chain([[2, 2]], [[0]], [[2], [0]])
-    first, second, third = sources_of(network, integer)
+    first, second, third = LoihiDeviations(network=network, integer=integer).sources
     assert first == ()
     assert [(pre, connected.tolist()) for pre, connected in second] == [(0, [[True]])]
     assert [(pre, connected.tolist()) for pre, connected in third] == [(1, [[True, True]])]
@@ -117,9 +118,10 @@ def stored_as(network, thresholds, exponents=(0,)):
     return round_to_forms(network, forms)[0]
 
 
-def explained(network, integer, events, **options):
+def explained(network, integer, events, compensated=(), **options):
     """Explain what an intact machine does with one recording."""
-    return explain(network, integer, events, run_integer(integer, events[None], membranes=True), **options)
+    deviations = LoihiDeviations(network=network, integer=integer, compensated=compensated)
+    return explain(network, deviations, events, run_integer(integer, events[None], membranes=True), **options)
 
 
 def test_equal_spikes_have_no_diagnosis():

@@ -1,7 +1,7 @@
 """What some chips offer beyond :class:`machines.base.Machine`, one class for each thing that a study may need."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Self
 
@@ -13,6 +13,7 @@ from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.runtime.machines.base import Machine
+from spikeloom.runtime.machines.deviations import Deviations
 
 
 @dataclass(frozen=True)
@@ -171,13 +172,22 @@ class Damageable(Threaded):
         """What it stores, beside the float network that was compiled."""
 
 
+@dataclass(frozen=True)
+class Explainable(Comparable):
+    """Every difference from the float network has a cause that can be named."""
+
+    @abstractmethod
+    def deviations(self, network: Network, compensated: Collection[str]) -> Deviations:
+        """From the float network that was compiled; weights of `compensated` layers need not be the nearest."""
+
+
 LONGEST = 4096
 """Steps after which :attr:`Stoppable.least_intervals` looks no further: a spike may follow then."""
 
 
-def require_comparable(machine: Machine, path: str = "netlist", command: str = "this command") -> Comparable:
-    """The same machine, if a float model can be compared with it; else an OptionError, which names file and command."""
-    if not isinstance(machine, Comparable):
+def require_explainable(machine: Machine, path: str = "netlist", command: str = "this command") -> Explainable:
+    """The same machine, if its differences can be explained; else an OptionError, which names file and command."""
+    if not isinstance(machine, Explainable):
         raise _lacking(machine, path, command)
     return machine
 

@@ -5,15 +5,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from textwrap import wrap
 
+from spikeloom.runtime.machines.deviations import TIE
 from spikeloom.runtime.report.encode import HIDDEN, INLINE
 from spikeloom.runtime.report.sections import Section, Table, Text
 from spikeloom.runtime.report.shown import Shown
-
-WEIGHTS, BIAS, BETA = "weight rounding", "bias rounding", "realised beta"
-TRUNCATION, SATURATION, TIE = "round toward zero", "saturation or overflow", "tie (> or >=)"
-LEFT_OUT, UNKNOWN = "neuron left out", "not known"
-
-_BOUND = ", as far as the accumulator lets it"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,26 +131,6 @@ class Explained(Shown):
     faults: tuple[str, ...]
     top: tuple[RootCause, ...]
     reference: str = "float64"
-
-
-def remedy(cause: str, layer: str, *, bits: int, planes: int, clipped: bool = False, held: bool = True) -> str:
-    """The change that would remove a root of a layer that is stored with so many bits and planes."""
-    if cause == WEIGHTS:
-        why = "the range cuts off its largest weights" if clipped else "its weights are too coarse"
-        if not held:
-            why = "no input can make it fire with its rounded weights"
-        wider = "--weight-bits 8 or " if bits < 8 else ""
-        if planes < 3:
-            return f"{why}: compile {layer} with {wider}--planes {planes + 1}{_BOUND if planes > 1 else ''}"
-        return f"{why}: compile {layer} with {wider}--scale-groups 8{_BOUND}"
-    return {
-        BIAS: f"a bias counts in 64ths of a weight unit: compile {layer} with --scale-groups 8, for finer units",
-        BETA: "none on this chip, whose decay has 12 bits; a model trained with the realised decay would agree",
-        TRUNCATION: f"what the chip drops is part of one unit: compile {layer} with --scale-groups 8, for finer units",
-        SATURATION: f"the membrane leaves its 23 bits: compile {layer} with a coarser scale",
-        LEFT_OUT: "compile without --prune-unused",
-        TIE: "none: the order of a sum in float64 decides here, either spike is right",
-    }.get(cause, "none is known")
 
 
 WIDTH = 116

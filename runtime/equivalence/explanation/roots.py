@@ -16,12 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.ir import INPUT, Network
-from spikeloom.compiler.targets.compartments import IntegerNetwork
 from spikeloom.compiler.types import BoolArray
-
-Sources = tuple[tuple[tuple[int, BoolArray], ...], ...]
-"""For each population its presynaptic populations, and which pairs (neurons of pre, neurons of post) are connected."""
+from spikeloom.runtime.machines.deviations import Sources
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,21 +34,6 @@ class Root:
     begin: int
     dragged: int
     alone: int
-
-
-def sources_of(network: Network, integer: IntegerNetwork) -> Sources:
-    """Presynaptic populations, by synapses whose weight is not zero in the float model or on the chip.
-
-    The input is left out: it cannot differ.
-    """
-    found: list[dict[int, BoolArray]] = [{} for _ in network.populations]
-    for stage in (network, integer):
-        for projection in stage.projections:
-            if projection.pre != INPUT:
-                connected = (projection.weight != 0).toarray().T
-                known = found[projection.post].get(projection.pre)
-                found[projection.post][projection.pre] = connected if known is None else connected | known
-    return tuple(tuple(sorted(pres.items(), key=lambda item: item[0])) for pres in found)
 
 
 def find_roots(differs: Sequence[BoolArray], resets: Sequence[BoolArray], sources: Sources) -> tuple[Root, ...]:

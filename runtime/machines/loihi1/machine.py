@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,8 +23,9 @@ from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.machines.base import Done, Model, Price, Run, T, differences, one_by_one
-from spikeloom.runtime.machines.capabilities import Cumulative, Damageable, Memory, Stoppable
+from spikeloom.runtime.machines.capabilities import Cumulative, Damageable, Explainable, Memory, Stoppable
 from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting
+from spikeloom.runtime.machines.deviations import Deviations
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.stream import Stream
 from spikeloom.runtime.machines.loihi1.trace import Trace, aligned, unpack
@@ -43,7 +44,7 @@ SUMS = 1 << 24
 
 
 @dataclass(frozen=True)
-class Loihi(Damageable, Stoppable):
+class Loihi(Damageable, Explainable, Stoppable):
     """A netlist and its simulator."""
 
     netlist: Netlist
@@ -216,6 +217,12 @@ class Loihi(Damageable, Stoppable):
         from spikeloom.runtime.machines.loihi1.changes.memory import LoihiMemory
 
         return LoihiMemory(netlist=self.netlist, network=network)
+
+    def deviations(self, network: Network, compensated: Collection[str]) -> Deviations:
+        """Roundings, and limits of registers."""
+        from spikeloom.runtime.machines.loihi1.changes.deviations import LoihiDeviations
+
+        return LoihiDeviations(network=network, integer=self.integer, compensated=compensated)
 
     @cached_property
     def _chip(self) -> Chip | None:

@@ -1,1 +1,1 @@
-"""What a changed event brings about on the chip, beside a run that is known."""
+"""What becomes of the chip where something else is true: an event, what it stores, how it rounds."""
