@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.errors import require_least
@@ -31,13 +30,14 @@ from spikeloom.compiler.storage import KEEP, Packing
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.compartments import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
+from spikeloom.compiler.types import JsonObject
 from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.quantised import QuantisedNet
 from spikeloom.models.networks.surrogate import RECTANGLE
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.evaluate import evaluate, one_thread, rate_loss, require_finite
 from spikeloom.models.training.recipes import TIMED
-from spikeloom.models.training.resume import restore, set_rate, write_state
+from spikeloom.models.training.resume import Course, set_rate
 from spikeloom.models.training.robust import require_chance, worn
 
 BATCH = 4
@@ -85,60 +85,64 @@ def finetune(
     resume: bool = False,
     after_epoch: Callable[[TunedEpoch], None] | None = None,
 ) -> Tuned:
-    """Train a network on chip integers: storage of `bits`, one or one a layer, with at most so many `groups` of scales.
+    """Train a network on chip integers: `bits` wide, one or one a layer, with at most so many `groups` of scales.
 
-    Without `bits` the storage is what the compiler chooses on held-out training recordings. Training begins with the
-    compiler's integers; of a checkpoint's first layer, whose filters are shared, with its scales. Nothing is chosen on
-    `test`, it is read before the first epoch and after the last. The `seed` is that of the order of recordings, and of
-    what of them is lost (`robust`, see :func:`robust.worn`). The file `state` holds the state after each epoch, which
-    the caller removes when the result is safe; `resume` goes on from it, to the same weights as without interruption.
+    Without `bits` the storage is what the compiler chooses on held-out training recordings. Training starts from the
+    compiler's integers; filters that a first layer shares start from its scales alone. Nothing is chosen on `test`,
+    which is read before the first epoch and after the last. The `seed` orders the recordings, and draws what of them
+    is lost (`robust`, see :func:`robust.worn`). `state` and `resume` as of :func:`train.train`.
 
-    OptionError, ModelError, CapacityError or DataError if options, network or recordings cannot be used, or the loss is
-    no longer a number.
+    OptionError, ModelError, CapacityError or DataError if options, network or recordings cannot be used, or the loss
+    is no longer a number.
     """
     require_least({"epochs": epochs, "seed": seed}, epochs=1, seed=0)
     require_chance(robust)
     packings = None if bits is None else [Packing(bits=width, groups=groups) for width in bits]
-    asked = Options(packings=packings, keep=KEEP, keep_all=True, training_events=training.events)
-    chosen = compile_network(network, asked, target=target).integer
-    plain = has_released_dynamics(network)
-    order = np.random.default_rng(seed)
-    history: list[TunedEpoch] = []
+    storage = Options(packings=packings, keep=KEEP, keep_all=True, training_events=training.events)
+    chosen = compile_network(network, storage, target=target).integer
+    released = has_released_dynamics(network)
     with one_thread():
-        net = QuantisedNet(network, chosen.forms, RECTANGLE if plain else TIMED.surrogate)
-        teacher = None if plain else float_rates(net.network, training)
-        rate = LEARNING_RATE if plain else GENTLE_RATE
+        net = QuantisedNet(network, chosen.forms, RECTANGLE if released else TIMED.surrogate)
+        teacher = None if released else float_rates(net.network, training)
+        rate = LEARNING_RATE if released else GENTLE_RATE
         net.start_at(chosen)
         net.make_legal()
-        optimizer = torch.optim.Adam(net.parameters(), lr=rate, amsgrad=True)
-        begun = {name: parameter.detach().numpy() for name, parameter in net.named_parameters()}
-        options = {
-            "network": arrays_digest({**begun, **{f"form.{i}": form.threshold for i, form in enumerate(net.forms)}}),
-            "beta": [population.beta for population in net.network.populations],
-            "chip": target.name,
-            "training data": training.sha256,
-            "test data": test.sha256,
-            "weight bits": [form.bits for form in net.forms],
-            "scale groups": groups,
-            "epochs": epochs,
-            "seed": seed,
-            "robust": robust,
-        }
+        options = _identity(net, training, test)
+        options |= {"chip": target.name, "scale groups": groups, "epochs": epochs, "seed": seed, "robust": robust}
+        course = Course(
+            options=options,
+            network=net,
+            optimizer=torch.optim.Adam(net.parameters(), lr=rate, amsgrad=True),
+            draw=np.random.default_rng(seed),
+            epoch=TunedEpoch,
+        )
         _, before = evaluate(net, test)
         if resume and state is not None and state.exists():
-            history, _ = restore(state, options, net, optimizer, order, TunedEpoch)
+            course.restore(state)
             net.round()
-        with tqdm(total=epochs, initial=len(history), desc="finetune", unit="epoch", disable=None) as bar:
-            for index in range(len(history), epochs):
-                history.append(_epoch(net, optimizer, training, teacher, order, robust, rate, index, epochs))
-                if state is not None:
-                    write_state(state, options, net, optimizer, order, history)
-                bar.set_postfix(loss=f"{history[-1].loss:.4f}", training=f"{history[-1].correct}/{len(training)}")
-                bar.update()
-                if after_epoch is not None:
-                    after_epoch(history[-1])
+        course.run(
+            epochs,
+            lambda index: _run_epoch(course, net, training, teacher, robust, rate, index, epochs),
+            state=state,
+            after_epoch=after_epoch,
+            shown=lambda epoch: {"loss": f"{epoch.loss:.4f}", "training": f"{epoch.correct}/{len(training)}"},
+            label="finetune",
+        )
         _, after = evaluate(net, test)
-    return Tuned(net=net, history=tuple(history), before=before, after=after)
+    return Tuned(net=net, history=tuple(course.history), before=before, after=after)
+
+
+def _identity(net: QuantisedNet, training: Recordings, test: Recordings) -> JsonObject:
+    """What the same fine-tuning begins with, as JSON values."""
+    parameters = {name: parameter.detach().numpy() for name, parameter in net.named_parameters()}
+    thresholds = {f"form.{i}": form.threshold for i, form in enumerate(net.forms)}
+    return {
+        "network": arrays_digest(parameters | thresholds),
+        "beta": [population.beta for population in net.network.populations],
+        "training data": arrays_digest(training.identity()),
+        "test data": arrays_digest(test.identity()),
+        "weight bits": [form.bits for form in net.forms],
+    }
 
 
 def has_released_dynamics(network: Network) -> bool:
@@ -156,38 +160,40 @@ def float_rates(network: Network, recordings: Recordings) -> Tensor:
     return torch.tensor(votes / recordings.step_counts[:, None], dtype=torch.float32)
 
 
-def _epoch(
+def _run_epoch(
+    course: Course[TunedEpoch],
     model: QuantisedNet,
-    optimizer: torch.optim.Optimizer,
     training: Recordings,
     teacher: Tensor | None,
-    draw: np.random.Generator,
     robust: float,
     rate: float,
     index: int,
     epochs: int,
 ) -> TunedEpoch:
-    order = draw.permutation(len(training))
+    """Train on all recordings once; `teacher` has the rates of the float model, where it is to decide as that does."""
+    order = course.draw.permutation(len(training))
     steps = math.ceil(len(order) / BATCH)
     total = 0.0
     correct = 0
     for step in range(steps):
-        set_rate(optimizer, rate * 0.5 * (1 + math.cos(math.pi * (index * steps + step) / (epochs * steps))))
+        set_rate(course.optimizer, rate * 0.5 * (1 + math.cos(math.pi * (index * steps + step) / (epochs * steps))))
         chosen = order[step * BATCH : (step + 1) * BATCH]
-        optimizer.zero_grad()
-        labels = training.labels[chosen]
+        course.optimizer.zero_grad()
         lengths = None if training.lengths is None else torch.tensor(training.lengths[chosen])
-        rates = model(time_first(worn(training.events[chosen], robust, draw)), lengths)
-        if teacher is None:
-            loss = rate_loss(rates, labels)
-        else:  # as far as they lead to other decisions than the float model's
-            wanted = torch.softmax(TIMED.gain * teacher[chosen], dim=1)
-            loss = torch.nn.functional.cross_entropy(TIMED.gain * rates, wanted)
+        rates = model(time_first(worn(training.events[chosen], robust, course.draw)), lengths)
+        labels = training.labels[chosen]
+        loss = rate_loss(rates, labels) if teacher is None else _distilled_loss(rates, teacher[chosen])
         loss.backward()  # type: ignore[no-untyped-call]
         require_finite(model, float(loss.detach()), index + 1, step + 1)
-        optimizer.step()
+        course.optimizer.step()
         model.clip_weights()
         model.make_legal()
         total += float(loss.detach()) * len(chosen)
         correct += int(np.sum(rates.detach().numpy().argmax(axis=1) == labels))
     return TunedEpoch(epoch=index + 1, loss=total / len(order), correct=correct)
+
+
+def _distilled_loss(rates: Tensor, teacher: Tensor) -> Tensor:
+    """How far rates lead to other decisions than the float model's."""
+    wanted = torch.softmax(TIMED.gain * teacher, dim=1)
+    return torch.nn.functional.cross_entropy(TIMED.gain * rates, wanted)

@@ -2,53 +2,111 @@
 
 import copy
 import math
-import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, Generic, TypeVar, get_type_hints
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from tqdm import tqdm
 
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import FileFault, read_whole, reading, write_atomically
 from spikeloom.compiler.formats.torch_checkpoint import load_torch
-
-Weights = Mapping[str, NDArray[np.float32]]
+from spikeloom.models.networks.networks import Weights
 
 E = TypeVar("E")
 
 
-def write_state(
-    path: str | os.PathLike[str],
-    options: Mapping[str, Any],
-    network: torch.nn.Module,
-    optimizer: torch.optim.Optimizer,
-    order: np.random.Generator,
-    history: Sequence[Any],
-    weights: Mapping[str, Weights] = MappingProxyType({}),
-) -> None:
-    """Write what an epoch hands to the next, whole or not at all.
+@dataclass(kw_only=True, eq=False)
+class Course(Generic[E]):
+    """A training between two epochs: all that one epoch hands to the next."""
 
-    `options` are the JSON values that must be equal to go on: digests of data and graph, architecture, epochs, seed,
-    rates. `history` has a dataclass of figures for each epoch, `weights` are those of epochs that are kept.
-    """
-    state = {
-        "options": dict(options),
-        "history": [asdict(epoch) for epoch in history],
-        "order": order.bit_generator.state,
-        **_trained(network, optimizer, weights),
-    }
-    with write_atomically(path) as file:
-        try:
-            torch.save(state, file)
-        except RuntimeError as error:
-            if isinstance(error.__context__, KeyboardInterrupt):  # torch then finds its file cut short
-                raise error.__context__ from None
-            raise
+    # JSON values that must be equal to go on: digests of data and graph, architecture, epochs, seed, rates
+    options: Mapping[str, Any]
+    network: torch.nn.Module
+    optimizer: torch.optim.Optimizer
+    draw: np.random.Generator  # Of the order of recordings
+    epoch: type[E]  # Dataclass of the figures of an epoch
+    history: list[E] = field(default_factory=list)  # Figures of the epochs so far
+    weights: dict[str, Weights] = field(default_factory=dict)  # Those of epochs that are kept
+
+    def run(
+        self,
+        epochs: int,
+        train_epoch: Callable[[int], E],
+        *,
+        state: Path | None,
+        after_epoch: Callable[[E], None] | None,
+        shown: Callable[[E], Mapping[str, str]],
+        label: str,
+        position: int = 0,
+    ) -> None:
+        """Train the epochs that are left, by their index, with a progress bar; write the `state` after each."""
+        done = len(self.history)
+        with tqdm(total=epochs, initial=done, desc=label, unit="epoch", position=position, disable=None) as bar:
+            for index in range(done, epochs):
+                self.history.append(train_epoch(index))
+                if state is not None:
+                    self.write(state)
+                bar.set_postfix(shown(self.history[-1]))
+                bar.update()
+                if after_epoch is not None:
+                    after_epoch(self.history[-1])
+
+    def write(self, path: Path) -> None:
+        """Write the state, whole or not at all."""
+        state = {
+            "options": dict(self.options),
+            "history": [asdict(epoch) for epoch in self.history],  # type: ignore[call-overload]
+            "order": self.draw.bit_generator.state,
+            **_trained(self.network, self.optimizer, self.weights),
+        }
+        with write_atomically(path) as file:
+            try:
+                torch.save(state, file)
+            except RuntimeError as error:
+                if isinstance(error.__context__, KeyboardInterrupt):  # torch then finds its file cut short
+                    raise error.__context__ from None
+                raise
+
+    def restore(self, path: Path, keeps: Callable[[int], Mapping[str, Weights]] = lambda _: {}) -> None:
+        """Put back what was written; `keeps` gives weights of the shapes that are kept after so many epochs.
+
+        ModelError if the state is missing or damaged, OptionError if it is that of another training.
+        """
+        with reading(path, ModelError, "delete it and train anew"):
+            state = load_torch(read_whole(path, "training state"))
+            self._require_same(path, state)
+            self._require_history(state["history"])
+            after_epoch = _after_an_epoch(self.network, self.optimizer, keeps(len(state["history"])))
+            if not _alike({name: state[name] for name in after_epoch}, after_epoch):
+                raise FileFault("is not the state of this network")
+            self.network.load_state_dict(state["network"], strict=False)
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.draw.bit_generator.state = state["order"]
+        self.history = [self.epoch(**each) for each in state["history"]]
+        self.weights = {
+            which: {name: array.numpy() for name, array in arrays.items()} for which, arrays in state["kept"].items()
+        }
+
+    def _require_same(self, path: Path, state: Any) -> None:
+        if not isinstance(state, dict) or not isinstance(written := state.get("options"), dict):
+            raise FileFault("is not a training state")
+        names = {*written, *self.options}
+        if differing := sorted(str(name) for name in names if written.get(name) != self.options.get(name)):
+            raise OptionError(
+                f"{path}: belongs to a training with other {', '.join(differing)[:100]}; give the same options and "
+                "data, or delete it to train anew"
+            )
+
+    def _require_history(self, figures: Any) -> None:
+        types = get_type_hints(self.epoch)
+        typed = all({name: type(value) for name, value in each.items()} == types for each in figures)
+        last = min(len(figures), self.options["epochs"])
+        if not typed or [each["epoch"] for each in figures] != [*range(1, last + 1)]:
+            raise FileFault("has no usable history")
 
 
 def _trained(
@@ -57,52 +115,19 @@ def _trained(
     return {
         "network": {name: parameter.detach() for name, parameter in network.named_parameters()},
         "optimizer": optimizer.state_dict(),
-        "kept": {which: {name: torch.tensor(array) for name, array in held.items()} for which, held in weights.items()},
+        "kept": {which: {name: torch.tensor(array) for name, array in kept.items()} for which, kept in weights.items()},
     }
 
 
-def restore(
-    path: str | os.PathLike[str],
-    options: Mapping[str, Any],
-    network: torch.nn.Module,
-    optimizer: torch.optim.Optimizer,
-    order: np.random.Generator,
-    epoch: type[E],
-    keeps: Callable[[int], Mapping[str, Weights]] = lambda _: {},
-) -> tuple[list[E], dict[str, dict[str, NDArray[np.float32]]]]:
-    """Put parameters, optimizer and order of recordings back; returns the figures of the epochs and the kept weights.
-
-    Figures are of a dataclass `epoch`; `keeps` gives weights of the shapes that are kept after so many epochs.
-
-    ModelError if the state is missing or damaged, OptionError if it is that of another training.
-    """
-    path = Path(path)
-    with reading(path, ModelError, "delete it and train anew"):
-        state = load_torch(read_whole(path, "training state"))
-        if not isinstance(state, dict) or not isinstance(found := state.get("options"), dict):
-            raise FileFault("is not a training state")
-        if differing := sorted(str(name) for name in {*found, *options} if found.get(name) != options.get(name)):
-            raise OptionError(
-                f"{path}: belongs to a training with other {', '.join(differing)[:100]}; give the same options and "
-                "data, or delete it to train anew"
-            )
-        kinds = get_type_hints(epoch)
-        figures = state["history"]
-        right = all({name: type(value) for name, value in each.items()} == kinds for each in figures)
-        if not right or [each["epoch"] for each in figures] != [*range(1, min(len(figures), options["epochs"]) + 1)]:
-            raise FileFault("has no usable history")
-        model, stepped = copy.deepcopy((network, optimizer))  # what their state after an epoch looks like
-        for parameter in model.parameters():
-            parameter.grad = torch.zeros_like(parameter)
-        stepped.step()
-        due = _trained(model, stepped, keeps(len(figures)))
-        if not _alike({name: state[name] for name in due}, due):
-            raise FileFault("is not the state of this network")
-        network.load_state_dict(state["network"], strict=False)
-        optimizer.load_state_dict(state["optimizer"])
-        order.bit_generator.state = state["order"]
-    kept = {which: {name: array.numpy() for name, array in held.items()} for which, held in state["kept"].items()}
-    return [epoch(**each) for each in figures], kept
+def _after_an_epoch(
+    network: torch.nn.Module, optimizer: torch.optim.Optimizer, weights: Mapping[str, Weights]
+) -> dict[str, Any]:
+    """What the state of a network and its optimizer looks like after an epoch."""
+    network, optimizer = copy.deepcopy((network, optimizer))
+    for parameter in network.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+    optimizer.step()
+    return _trained(network, optimizer, weights)
 
 
 def _alike(found: Any, wanted: Any) -> bool:

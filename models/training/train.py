@@ -27,17 +27,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.errors import DataError, OptionError, require_least
-from spikeloom.compiler.types import FloatArray
+from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.networks import Sizes, SpikingNet, TrainedModule, Weights
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.evaluate import evaluate, loss_of, one_thread, require_finite
 from spikeloom.models.training.recipes import ADAMW, COSINE, RELEASED, Recipe
-from spikeloom.models.training.resume import restore, set_rate, write_state
+from spikeloom.models.training.resume import Course, set_rate
 from spikeloom.models.training.robust import worn
 
 MOST_SEED = 2**63 - 1
@@ -106,69 +105,95 @@ def train(
     _require_options(epochs, recipe.decay_epochs, seed)
     for recordings in (training, test):
         _require_suited(recordings, architecture)
-    options = {
-        "architecture": repr(architecture),
-        "graph": arrays_digest({"adjacency": propagation}),
-        "training data": training.sha256,
-        "test data": test.sha256,
-        "epochs": epochs,
-        "seed": seed,
-        "recipe": recipe.to_json(),
-        "kept epoch": keep_epoch,
-    }
-    order = np.random.default_rng(seed)
-    history: list[Epoch] = []
-    weights: dict[str, Weights] = {}
+    options = _identity(training, test, propagation, architecture, recipe)
+    options |= {"epochs": epochs, "seed": seed, "kept epoch": keep_epoch}
     with one_thread():
         network = architecture.network(propagation, seed=seed, surrogate=recipe.surrogate)
-        optimizer = _optimizer_of(recipe, network)
+        course = Course(
+            options=options,
+            network=network,
+            optimizer=_optimizer_of(recipe, network),
+            draw=np.random.default_rng(seed),
+            epoch=Epoch,
+        )
         if resume and state is not None and state.exists():
-            start = network.export_weights()
-            first = {"best": 1, "kept": epochs + 1 if keep_epoch is None else keep_epoch}
-            history, weights = restore(
-                *(state, options, network, optimizer, order, Epoch),
-                keeps=lambda done: {which: start for which, epoch in first.items() if epoch <= done},
-            )
-        bar = tqdm(total=epochs, initial=len(history), desc=label, unit="epoch", position=position, disable=None)
-        with bar as progress:
-            for index in range(len(history), epochs):
-                course = _course_of(recipe, index, epochs)
-                if course is not None:
-                    set_rate(optimizer, course(0.0))
-                rate = float(optimizer.param_groups[0]["lr"])
-                training_loss = _train_epoch(network, optimizer, training, order, recipe, course, epoch=index + 1)
-                if course is None and index % recipe.decay_epochs == 0 and index > 1:
-                    set_rate(optimizer, rate * 0.1)
-                test_loss, correct = evaluate(network, test, recipe)
-                if correct > max((epoch.correct for epoch in history), default=-1):
-                    weights["best"] = network.export_weights()
-                if index + 1 == keep_epoch:
-                    weights["kept"] = network.export_weights()
-                history.append(
-                    Epoch(
-                        epoch=index + 1,
-                        learning_rate=rate,
-                        training_loss=training_loss,
-                        test_loss=test_loss,
-                        correct=correct,
-                        tested=len(test),
-                    )
-                )
-                if state is not None:
-                    write_state(state, options, network, optimizer, order, history, weights)
-                progress.set_postfix(loss=f"{training_loss:.4f}", test=f"{correct}/{len(test)}")
-                progress.update()
-                if after_epoch is not None:
-                    after_epoch(history[-1])
-        last = network.export_weights()
-    correct_by_epoch = [epoch.correct for epoch in history]
+            course.restore(state, keeps=lambda done: _kept_after(done, network, keep_epoch))
+        course.run(
+            epochs,
+            lambda index: _run_epoch(course, network, training, test, recipe, epochs, keep_epoch, index),
+            state=state,
+            after_epoch=after_epoch,
+            shown=lambda epoch: {"loss": f"{epoch.training_loss:.4f}", "test": f"{epoch.correct}/{epoch.tested}"},
+            label=label,
+            position=position,
+        )
+        return _trained(architecture, network.export_weights(), course)
+
+
+def _trained(architecture: Sizes, last: Weights, course: Course[Epoch]) -> Trained:
+    """What is left after the last epoch."""
+    correct = [epoch.correct for epoch in course.history]
     return Trained(
         architecture=architecture,
         last=last,
-        best=weights["best"],
-        best_epoch=correct_by_epoch.index(max(correct_by_epoch)) + 1,
-        kept=weights.get("kept"),
-        history=tuple(history),
+        best=course.weights["best"],
+        best_epoch=correct.index(max(correct)) + 1,
+        kept=course.weights.get("kept"),
+        history=tuple(course.history),
+    )
+
+
+def _identity(
+    training: Recordings, test: Recordings, propagation: FloatArray, architecture: Sizes, recipe: Recipe
+) -> JsonObject:
+    """What is trained, and how."""
+    return {
+        "architecture": repr(architecture),
+        "graph": arrays_digest({"adjacency": propagation}),
+        "training data": arrays_digest(training.identity()),
+        "test data": arrays_digest(test.identity()),
+        "recipe": recipe.to_json(),
+    }
+
+
+def _kept_after(epochs: int, network: TrainedModule, keep_epoch: int | None) -> dict[str, Weights]:
+    """Weights of the shapes that are kept after so many epochs."""
+    shapes = network.export_weights()
+    since = {"best": 1, "kept": keep_epoch}
+    return {which: shapes for which, epoch in since.items() if epoch is not None and epoch <= epochs}
+
+
+def _run_epoch(
+    course: Course[Epoch],
+    network: TrainedModule,
+    training: Recordings,
+    test: Recordings,
+    recipe: Recipe,
+    epochs: int,
+    keep_epoch: int | None,
+    index: int,
+) -> Epoch:
+    """Train an epoch, look at the test recordings, and keep the weights if it is the best, or the one to keep."""
+    optimizer = course.optimizer
+    schedule = _schedule_of(recipe, index, epochs)
+    if schedule is not None:
+        set_rate(optimizer, schedule(0.0))
+    rate = float(optimizer.param_groups[0]["lr"])
+    training_loss = _train_epoch(network, optimizer, training, course.draw, recipe, schedule, epoch=index + 1)
+    if schedule is None and index % recipe.decay_epochs == 0 and index > 1:
+        set_rate(optimizer, rate * 0.1)
+    test_loss, correct = evaluate(network, test, recipe)
+    if correct > max((epoch.correct for epoch in course.history), default=-1):
+        course.weights["best"] = network.export_weights()
+    if index + 1 == keep_epoch:
+        course.weights["kept"] = network.export_weights()
+    return Epoch(
+        epoch=index + 1,
+        learning_rate=rate,
+        training_loss=training_loss,
+        test_loss=test_loss,
+        correct=correct,
+        tested=len(test),
     )
 
 
@@ -181,7 +206,7 @@ def _optimizer_of(recipe: Recipe, network: torch.nn.Module) -> torch.optim.Optim
     return torch.optim.Adam(parameters, lr=rate, amsgrad=True, fused=True)
 
 
-def _course_of(recipe: Recipe, epoch: int, epochs: int) -> Callable[[float], float] | None:
+def _schedule_of(recipe: Recipe, epoch: int, epochs: int) -> Callable[[float], float] | None:
     """Learning rate within an epoch by the share of it that is done, counted from 0; None where it is constant."""
     if recipe.schedule != COSINE:
         return None
@@ -194,7 +219,7 @@ def _train_epoch(
     recordings: Recordings,
     draw: np.random.Generator,
     recipe: Recipe,
-    course: Callable[[float], float] | None,
+    schedule: Callable[[float], float] | None,
     *,
     epoch: int,
 ) -> float:
@@ -202,26 +227,30 @@ def _train_epoch(
     order = draw.permutation(len(recordings))
     for step, start in enumerate(range(0, len(order), recipe.batch), 1):
         chosen = order[start : start + recipe.batch]
-        if course is not None:
-            set_rate(optimizer, course(start / len(order)))
+        if schedule is not None:
+            set_rate(optimizer, schedule(start / len(order)))
         optimizer.zero_grad()
-        lengths = np.array([recordings.steps_of(int(index)) for index in chosen])
-        events = worn(recordings.events[chosen][..., : lengths.max()], recipe.robust, draw)
-        filled = lengths if lengths.min() < lengths.max() else None
-        inside = None if filled is None else torch.tensor(filled)
-        shown = time_first(events)
-        if isinstance(network, SpikingNet) and recipe.penalty:
-            layers = network.layers(shown)
-            loss = loss_of(recipe, network.rates(layers, inside), recordings.labels[chosen])
-            loss = loss + recipe.penalty * network.activity(layers, inside)
-        else:
-            loss = loss_of(recipe, network(shown, inside), recordings.labels[chosen])
-        found = float(loss.detach())
+        loss = _loss(network, recordings, chosen, recipe, draw)
+        value = float(loss.detach())
         loss.backward()  # type: ignore[no-untyped-call]
-        require_finite(network, found, epoch, step)
+        require_finite(network, value, epoch, step)
         optimizer.step()
-        total += found * len(chosen)
+        total += value * len(chosen)
     return total / len(order)
+
+
+def _loss(
+    network: TrainedModule, recordings: Recordings, chosen: IntArray, recipe: Recipe, draw: np.random.Generator
+) -> torch.Tensor:
+    """Loss of some recordings, with the penalty on spikes."""
+    lengths = np.array([recordings.steps_of(int(index)) for index in chosen])
+    events = time_first(worn(recordings.events[chosen][..., : lengths.max()], recipe.robust, draw))
+    labels = recordings.labels[chosen]
+    filled = torch.tensor(lengths) if lengths.min() < lengths.max() else None
+    if not isinstance(network, SpikingNet) or not recipe.penalty:
+        return loss_of(recipe, network(events, filled), labels)
+    layers = network.layers(events)
+    return loss_of(recipe, network.rates(layers, filled), labels) + recipe.penalty * network.activity(layers, filled)
 
 
 def _require_options(epochs: int, decay_epochs: int, seed: int) -> None:
