@@ -20,7 +20,8 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.formats.onnx.writer import digits, plan
-from spikeloom.compiler.targets.loihi1.netlist import reach, read_netlist
+from spikeloom.compiler.targets.loihi1.bounds import reach
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.loihi1.registers import ACCUMULATOR_MAX, CURRENT_MAX
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli

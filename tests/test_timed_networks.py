@@ -20,13 +20,12 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import never_fires
 from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.loihi1 import registers
-from spikeloom.compiler.targets.loihi1.bounds import prove_ranges
+from spikeloom.compiler.targets.loihi1.bounds import one_step_bounds, prove_ranges
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.integers import IntegerProjection, run_integer
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.lift import lift
-from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.targets.loihi1.remove import removable

@@ -70,9 +70,10 @@ def _sums(network: Network, post: int, silent: Known) -> tuple[FloatArray, Float
     return up, total
 
 
-def settled(inflow: FloatArray | IntArray, kept: float) -> FloatArray:
+def settled(inflow: FloatArray | IntArray, kept: FloatArray | float) -> FloatArray:
     """Limit of ``x <- kept * x + inflow``: what a leaking register can add up to."""
-    return np.asarray(inflow / (1 - kept) if kept < 1 else np.where(inflow > 0, np.inf, 0.0))
+    endless = np.where(inflow > 0, np.inf, 0.0)
+    return np.divide(inflow, 1 - kept, out=endless, where=np.less(kept, 1))
 
 
 def _never_fires(network: Network, post: int, silent: Known) -> BoolArray:

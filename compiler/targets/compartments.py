@@ -1,7 +1,7 @@
 """Chips of compartments: the names that rooms which serve every chip take from them."""
 
 from spikeloom.compiler.targets.loihi1 import registers
-from spikeloom.compiler.targets.loihi1.bounds import prove_ranges
+from spikeloom.compiler.targets.loihi1.bounds import one_sided_sums, prove_ranges
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerPopulation, integer_simulation
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, write_netlist
 from spikeloom.compiler.targets.loihi1.options import Options, check_packings
@@ -39,6 +39,7 @@ __all__ = [
     "kept_shares",
     "lay_out_again",
     "layer_of",
+    "one_sided_sums",
     "prove_ranges",
     "reach",
     "registers",

@@ -26,6 +26,7 @@ from spikeloom.compiler.targets.compartments import (
     IntegerNetwork,
     IntegerPopulation,
     fullest,
+    one_sided_sums,
     registers,
     round_population,
 )
@@ -67,6 +68,7 @@ class Stage:
             size = f"{weight.shape[0]:,} x {weight.shape[1]:,} weights, zeros among them"
             raise ModelError(f"{self.population.name}: has {size}, fine-tuning holds {MATRIX_LIMIT:,}; use it as it is")
         self.row, self.column = np.repeat(np.arange(weight.shape[0]), np.diff(weight.indptr)), weight.indices
+        self.ends = weight.indptr
         # neurons that relay a clock come last; they learn nothing
         self.learning = self.population.size - self.population.relays
         held = int(weight.indptr[self.learning])
@@ -76,12 +78,11 @@ class Stage:
 
     def one_sided(self, steps: Array) -> tuple[Array, Array]:
         """Largest positive and negative sum of each neuron, each plane by itself, as :func:`bounds.one_sided`."""
-        sides = np.zeros((2, self.shape[0]))
         exponents = self.form.exponents
-        for mantissa, exponent in zip(registers.split_planes(steps, self.form.bits, exponents), exponents, strict=True):
-            units = registers.in_units(mantissa, exponent)
-            sides += [np.bincount(self.row, np.maximum(sign * units, 0), self.shape[0]) for sign in (1, -1)]
-        return sides[0], sides[1]
+        planes = zip(registers.split_planes(steps, self.form.bits, exponents), exponents, strict=True)
+        sides = [one_sided_sums(registers.in_units(mantissa, exponent), self.ends) for mantissa, exponent in planes]
+        positive, negative = np.sum(sides, axis=0)
+        return positive, negative
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -44,7 +44,8 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.formats.onnx.builder import Model, Nodes, Port, model_bytes, one_each, whole_recordings
 from spikeloom.compiler.ir import INPUT
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, Reach, netlist_bytes, reach
+from spikeloom.compiler.targets.loihi1.bounds import Reach, reach
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, netlist_bytes
 from spikeloom.compiler.targets.loihi1.registers import (
     ACCUMULATOR_MAX,
     CURRENT_MAX,

@@ -1,22 +1,125 @@
-"""Bounds of sums and registers for any input, from the weights alone; the proof that they stay in range."""
+"""Bounds of sums and registers for any input, from the weights alone; the proof that they stay in range.
+
+Sums are in weight units, registers in membrane units; all are magnitudes.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from spikeloom.compiler.ir import INPUT, row_parts
 from spikeloom.compiler.passes.prune import settled
-from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerProjection
+from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerPopulation, IntegerProjection
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.registers import (
     ACCUMULATOR_MAX,
     CURRENT_MAX,
+    DECAY_ONE,
     MEMBRANE_MAX,
     MEMBRANE_SHIFT,
     in_units,
 )
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+
+
+def one_sided_sums(units: IntArray, ends: IntArray) -> tuple[IntArray, IntArray]:
+    """Sums of the positive and of the negative entries of each range; `ends` (ranges + 1,) bound these in `units`.
+
+    >>> [side.tolist() for side in one_sided_sums(np.array([3, -4, 5]), np.array([0, 2, 2, 3]))]
+    [[3, 0, 5], [4, 0, 0]]
+    """
+    positive = np.zeros(len(ends) - 1, np.int64)
+    negative = np.zeros(len(ends) - 1, np.int64)
+    filled = np.flatnonzero(np.diff(ends))
+    if len(filled):
+        begins = ends[filled] - ends[0]
+        positive[filled] = np.add.reduceat(np.maximum(units, 0), begins, dtype=np.int64)
+        negative[filled] = positive[filled] - np.add.reduceat(units, begins, dtype=np.int64)
+    return positive, negative
+
+
+def one_sided(
+    projections: Iterable[IntegerProjection], neurons: int, silent: Mapping[int, BoolArray] | None = None
+) -> tuple[IntArray, IntArray]:
+    """Largest positive and negative synaptic sum that any input can bring to each neuron in a step.
+
+    Planes count one by one, which covers every order of their arrival. Sources that are known to be `silent`, by
+    population, bring nothing.
+    """
+    positive = np.zeros(neurons, np.int64)
+    negative = np.zeros(neurons, np.int64)
+    for projection in projections:
+        weight = projection.weight
+        for rows in row_parts(weight):
+            ends = weight.indptr[rows.start : rows.stop + 1]
+            stored = slice(ends[0], ends[-1])
+            units = in_units(weight.data[stored], projection.exponent)
+            if silent is not None:
+                units[silent[projection.pre][weight.indices[stored]]] = 0
+            up, down = one_sided_sums(units, ends)
+            positive[rows] += up
+            negative[rows] += down
+    return positive, negative
+
+
+def one_step_bounds(netlist: Netlist) -> tuple[IntArray, IntArray]:
+    """Largest positive and negative synaptic sum that one step can bring to each compartment.
+
+    No order of arrival and no input can bring a running sum outside ``-negative … positive``: it is reached when
+    every positive (negative) synapse is hit at once.
+    """
+    synapse = np.arange(netlist.n_synapses)
+    shape = netlist.n_compartments, netlist.n_synapses
+    ordered = sparse.csr_array((netlist.effective_weight(), (netlist.synapse_compartment(), synapse)), shape=shape)
+    return one_sided_sums(ordered.data, ordered.indptr)
+
+
+def largest_current(sums: IntArray | FloatArray, decay_u: IntArray | int) -> FloatArray:
+    """Largest current that sums of one sign add up to.
+
+    What loses ``lost / 4096`` a step and gains x cannot climb beyond ``x * 4096 / lost``.
+    """
+    return np.asarray(sums * (DECAY_ONE << MEMBRANE_SHIFT) / (decay_u + 1))
+
+
+def extreme_membranes(
+    threshold: IntArray, bias: IntArray, decay_v: IntArray | int, up: FloatArray, down: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Highest and, as a magnitude, lowest membrane that currents up to `up` and down to ``-down`` bring about.
+
+    A membrane above its threshold is reset: what a step begins with is at most that. Below zero it sinks until it
+    loses as much as it gains; infinite where it loses nothing.
+    """
+    kept = (DECAY_ONE - decay_v) / DECAY_ONE
+    highest = kept * (threshold << MEMBRANE_SHIFT) + up + np.maximum(bias, 0)
+    return highest, settled(down + np.maximum(-bias, 0), kept)
+
+
+class Reach(NamedTuple):
+    """What no input can exceed, whole numbers; all (compartments,) int64."""
+
+    sums: IntArray  # of the weights of one sign that one step brings, in membrane units
+    current: IntArray
+    highest: IntArray  # the membrane, held against the threshold
+    stored: IntArray  # the membrane after that, of either sign
+
+
+def reach(netlist: Netlist) -> Reach:
+    """Bounds of the registers of each compartment, whatever the input."""
+    bounds = one_step_bounds(netlist)
+    up, down = (np.floor(largest_current(sums, netlist.decay_u)) for sums in bounds)
+    bias = netlist.bias_mantissa << netlist.bias_exponent
+    highest, lowest = extreme_membranes(netlist.threshold, bias, netlist.decay_v, up, down)
+    sinking = np.floor(np.minimum(lowest, MEMBRANE_MAX + 1))  # beyond its register counts as just beyond
+    return Reach(
+        sums=np.maximum(*bounds) << MEMBRANE_SHIFT,
+        current=np.maximum(up, down).astype(np.int64),
+        highest=np.floor(highest).astype(np.int64),
+        stored=np.maximum(netlist.threshold << MEMBRANE_SHIFT, sinking.astype(np.int64)),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,32 +153,6 @@ def open_ranges(unproven: Sequence[str], saturating: Sequence[str]) -> Iterator[
         yield f"no register of {', '.join(saturating)} overflows for any input, but some may saturate a membrane"
 
 
-def one_sided(
-    projections: Iterable[IntegerProjection], neurons: int, silent: Mapping[int, BoolArray] | None = None
-) -> tuple[IntArray, IntArray]:
-    """Largest positive and negative synaptic sum that any input can bring to each neuron, as magnitudes, weight units.
-
-    Planes count one by one, which covers every order of their arrival. Sources that are known to be `silent`, by
-    population, bring nothing.
-    """
-    positive = np.zeros(neurons, np.int64)
-    negative = np.zeros(neurons, np.int64)
-    for projection in projections:
-        for rows in row_parts(projection.weight):
-            ends = projection.weight.indptr[rows.start : rows.stop + 1]
-            stored = slice(ends[0], ends[-1])
-            units = in_units(projection.weight.data[stored], projection.exponent)
-            if silent is not None:
-                units[silent[projection.pre][projection.weight.indices[stored]]] = 0
-            filled = np.flatnonzero(np.diff(ends))
-            if len(filled):
-                begins = ends[filled] - ends[0]
-                up = np.add.reduceat(np.maximum(units, 0), begins, dtype=np.int64)
-                positive[rows.start + filled] += up
-                negative[rows.start + filled] += up - np.add.reduceat(units, begins, dtype=np.int64)
-    return positive, negative
-
-
 def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:
     """Bound every register of every population.
 
@@ -86,40 +163,49 @@ def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:
     """
     proofs = []
     length = network.input.clocks.length or np.inf
-    unit = 1 << MEMBRANE_SHIFT
     spikes: dict[int, FloatArray] = {INPUT: np.full(network.input.size, length)}  # in a recording, at most
     for post, population in enumerate(network.populations):
         into = [projection for projection in network.projections if projection.post == post]
-        positive, negative = one_sided(into, population.size)
-        kept_u = population.realised_alpha
-        kept_v = population.realised_beta
-        up = settled(positive * unit, kept_u)
-        down = settled(negative * unit, kept_u)
-        itself = np.zeros(population.size)
-        others = np.zeros(population.size)
-        for p in into:
-            inhibition = -p.effective().minimum(0)
-            inhibition.eliminate_zeros()  # a zero of what has no end is none
-            if p.pre == post and inhibition.nnz == np.count_nonzero(diagonal := inhibition.diagonal()):
-                itself += diagonal
-            else:
-                others += inhibition @ spikes.get(p.pre, np.full(inhibition.shape[1], length))
-        rise = kept_v * population.threshold * unit + up + np.maximum(population.bias, 0)
-        sinking = np.maximum(-population.bias, 0)
-        if kept_v < 1:
-            fall = settled(down + sinking, kept_v)
-        else:
-            sinking = np.multiply(sinking, length, out=np.zeros(population.size), where=sinking > 0)
-            fall = settled((itself + others) * unit, kept_u) + sinking
-        pause = np.floor((itself + population.threshold) * unit / np.maximum(up + np.maximum(population.bias, 0), 1))
-        rests = kept_v == 1 and kept_u == 0
-        spikes[post] = 1 + np.floor((length - 1) / (pause + 1)) if rests else np.full(population.size, length)
+        sums = one_sided(into, population.size)
+        up, down = (largest_current(side, population.decay_u) for side in sums)
+        rise, fall = extreme_membranes(population.threshold, population.bias, population.decay_v, up, down)
+        itself, others = _inhibition(into, population.size, spikes, length)
+        if population.decay_v == 0:
+            sinking = np.maximum(-population.bias, 0)
+            sunk = np.multiply(sinking, length, out=np.zeros(population.size), where=sinking > 0)
+            fall = largest_current(itself + others, population.decay_u) + sunk
+        spikes[post] = _most_spikes(population, up, itself, length)
         proofs.append(
             RangeProof(
                 layer=population.name,
-                accumulator=float(np.maximum(positive, negative).max(initial=0) * unit),
+                accumulator=float(np.maximum(*sums).max(initial=0) << MEMBRANE_SHIFT),
                 current=float(np.maximum(up, down).max(initial=0)),
                 membrane=float(np.maximum(rise, fall).max(initial=0)),
             )
         )
     return tuple(proofs)
+
+
+def _inhibition(
+    into: Sequence[IntegerProjection], neurons: int, spikes: Mapping[int, FloatArray], length: float
+) -> tuple[FloatArray, FloatArray]:
+    """Negative weight that a neuron's own synapse brings, once, and what all others bring in a recording."""
+    itself = np.zeros(neurons)
+    others = np.zeros(neurons)
+    for p in into:
+        inhibition = -p.effective().minimum(0)
+        inhibition.eliminate_zeros()  # a zero of what has no end is none
+        if p.pre == p.post and inhibition.nnz == np.count_nonzero(diagonal := inhibition.diagonal()):
+            itself += diagonal
+        else:
+            others += inhibition @ spikes.get(p.pre, np.full(inhibition.shape[1], length))
+    return itself, others
+
+
+def _most_spikes(population: IntegerPopulation, up: FloatArray, itself: FloatArray, length: float) -> FloatArray:
+    """Spikes of each neuron in a recording at most, where its registers keep all or nothing."""
+    if population.decay_v != 0 or population.decay_u + 1 != DECAY_ONE:
+        return np.full(population.size, length)
+    step = np.maximum(up + np.maximum(population.bias, 0), 1)
+    pause = np.floor((itself + population.threshold) * (1 << MEMBRANE_SHIFT) / step)
+    return 1 + np.floor((length - 1) / (pause + 1))

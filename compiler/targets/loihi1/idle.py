@@ -13,7 +13,8 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.targets.loihi1.netlist import MOST_BLANK, Netlist, reach
+from spikeloom.compiler.targets.loihi1.bounds import reach
+from spikeloom.compiler.targets.loihi1.netlist import MOST_BLANK, Netlist
 from spikeloom.compiler.targets.loihi1.registers import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.types import IntArray
 

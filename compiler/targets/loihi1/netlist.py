@@ -26,7 +26,7 @@ steps, all compartments always integrate, and a recording is followed by so many
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -34,11 +34,7 @@ from spikeloom.compiler.archive import Kind
 from spikeloom.compiler.dynamics import MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.targets import netlist_file
 from spikeloom.compiler.targets.loihi1.registers import (
-    DECAY_BITS,
-    MEMBRANE_MAX,
-    MEMBRANE_SHIFT,
     in_units,
-    largest_current,
 )
 from spikeloom.compiler.targets.netlist_file import MOST, NetlistFile, column_faults, is_outside, part_of
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
@@ -189,47 +185,6 @@ class Netlist(netlist_file.Netlist):
         """Compartment id that each synapse targets; shape (synapses,)."""
         base = self.core_compartments[self.core_of_axon()]
         return self.synapse_target + base[self.axon_of_synapse()]
-
-
-def one_step_bounds(netlist: Netlist) -> tuple[IntArray, IntArray]:
-    """Largest positive and negative synaptic sum that one step can bring to each compartment.
-
-    No order of arrival and no input can bring a running sum outside ``-negative … positive``: it is reached when
-    every positive (negative) synapse is hit at once. Both are magnitudes, (compartments,), in weight units.
-    """
-    compartment = netlist.synapse_compartment()
-    weight = netlist.effective_weight()
-    # float64 sums of integers below 2**53 are exact
-    both = [np.bincount(compartment, np.maximum(each, 0), netlist.n_compartments) for each in (weight, -weight)]
-    return both[0].astype(np.int64), both[1].astype(np.int64)
-
-
-class Reach(NamedTuple):
-    """What no input can exceed, as magnitudes in membrane units; all (compartments,) int64."""
-
-    sums: IntArray  # of the weights of one sign that one step brings
-    current: IntArray
-    highest: IntArray  # the membrane, held against the threshold
-    stored: IntArray  # the membrane after that, of either sign
-
-
-def reach(netlist: Netlist) -> Reach:
-    """Bounds of the registers of each compartment, whatever the input."""
-    bounds = one_step_bounds(netlist)
-    up, down = (largest_current(sums, netlist.decay_u) for sums in bounds)
-    bias = netlist.bias_mantissa << netlist.bias_exponent
-    # a membrane is left at the threshold at most; below zero it loses as much as it can gain at the far end
-    above = np.maximum(netlist.threshold << MEMBRANE_SHIFT, 0)
-    decay = netlist.decay_v
-    gained = down + np.maximum(-bias, 0)
-    endless = np.where(gained > 0, MEMBRANE_MAX + 1, 0)
-    below = np.where(decay > 0, (gained << DECAY_BITS) // np.maximum(decay, 1), endless)
-    return Reach(
-        sums=np.maximum(*bounds) << MEMBRANE_SHIFT,
-        current=np.maximum(up, down),
-        highest=(above * (2**DECAY_BITS - decay) >> DECAY_BITS) + up + np.maximum(bias, 0),
-        stored=np.maximum(above, below),
-    )
 
 
 LAYER: Kind = {

@@ -81,14 +81,6 @@ def in_units(mantissa: IntArray, exponent: IntArray | int) -> IntArray:
     return np.where(np.less(exponent, 0), wide >> 1, wide << np.maximum(exponent, 0))
 
 
-def largest_current(worst: IntArray, decay_u: IntArray | int) -> IntArray:
-    """Largest current, in register units, that sums of up to `worst` weight units a step add up to.
-
-    What loses ``lost / 4096`` a step and gains x cannot climb beyond ``x * 4096 / lost``.
-    """
-    return (worst << MEMBRANE_SHIFT + DECAY_BITS) // (decay_u + 1)
-
-
 def plane_distance(bits: int) -> int:
     """Largest difference of exponents at which two planes leave no gap between their values."""
     return bits - 1

@@ -20,7 +20,7 @@ from spikeloom.compiler.passes.prune import (
     touched,
     zeroed,
 )
-from spikeloom.compiler.targets.loihi1.bounds import one_sided
+from spikeloom.compiler.targets.loihi1.bounds import largest_current, one_sided
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.targets.loihi1.registers import MEMBRANE_SHIFT
 from spikeloom.compiler.types import BoolArray, IntArray
@@ -62,8 +62,7 @@ def _silent(network: IntegerNetwork, post: int, silent: Known) -> BoolArray:
     population = network.populations[post]
     into = [p for p in network.projections if p.post == post]
     positive, _ = one_sided(into, population.size, silent)
-    current = settled(positive << MEMBRANE_SHIFT, population.realised_alpha)
-    step = np.maximum(current + population.bias, 0)
+    step = np.maximum(largest_current(positive, population.decay_u) + population.bias, 0)
     return settled(step, population.realised_beta) <= population.threshold << MEMBRANE_SHIFT
 
 

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, reach
+from spikeloom.compiler.targets.loihi1.bounds import reach
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.registers import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.loihi1.block_kernel import LANES, Blocks

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from spikeloom.compiler import ir
-from spikeloom.compiler.targets.loihi1.bounds import one_sided
+from spikeloom.compiler.targets.loihi1.bounds import extreme_membranes, largest_current, one_sided
 from spikeloom.compiler.targets.loihi1.integers import MANTISSA, IntegerPopulation, IntegerProjection
 from spikeloom.compiler.targets.loihi1.registers import (
     CURRENT_MAX,
@@ -123,10 +123,7 @@ def fullest(population: IntegerPopulation, up: AnyArray, down: AnyArray) -> Floa
         return filled
     filled *= current_load(population.decay_u)
     if 2 * population.decay_v >= DECAY_ONE:
-        gather = (1 << MEMBRANE_SHIFT) * DECAY_ONE / (population.decay_u + 1)
-        decay = population.decay_v / DECAY_ONE
-        kept = (1 - decay) * (population.threshold << MEMBRANE_SHIFT)
-        rise = kept + gather * up + np.maximum(population.bias, 0)
-        fall = (gather * down + np.maximum(-population.bias, 0)) / decay
-        filled = np.maximum(filled, np.maximum(rise, fall) * (ONE_STEP_SUM_MAX / MEMBRANE_MAX))
+        currents = (largest_current(sums, population.decay_u) for sums in (up, down))
+        ends = extreme_membranes(population.threshold, population.bias, population.decay_v, *currents)
+        filled = np.maximum(filled, np.maximum(*ends) * (ONE_STEP_SUM_MAX / MEMBRANE_MAX))
     return filled

@@ -24,7 +24,8 @@ from spikeloom.compiler.layer_kernel import (
     list_fired,
     require_below,
 )
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, reach
+from spikeloom.compiler.targets.loihi1.bounds import reach
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.registers import (
     ACCUMULATOR_MAX,
     CURRENT_MAX,

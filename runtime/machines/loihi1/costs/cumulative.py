@@ -7,8 +7,9 @@ window is run for itself. A chip that is stopped after so many steps has done, a
 import numpy as np
 
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
-from spikeloom.compiler.targets.loihi1.registers import DECAY_BITS, MEMBRANE_SHIFT, largest_current
+from spikeloom.compiler.targets.loihi1.bounds import largest_current, one_step_bounds
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.registers import DECAY_BITS, MEMBRANE_SHIFT
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
 from spikeloom.runtime.machines.capabilities import LONGEST, Cumulative
 from spikeloom.runtime.machines.loihi1 import engine
@@ -19,8 +20,8 @@ from spikeloom.runtime.machines.loihi1.trace import Charges, side_by_side
 def least_intervals(netlist: Netlist) -> IntArray:
     """See :attr:`Stoppable.least_intervals`; in the order of compartments."""
     voters = np.flatnonzero(netlist.readout_class >= 0)
-    current = largest_current(one_step_bounds(netlist)[0][voters], netlist.decay_u[voters])
-    gain = current + (netlist.bias_mantissa << netlist.bias_exponent)[voters]
+    current = np.floor(largest_current(one_step_bounds(netlist)[0][voters], netlist.decay_u[voters]))
+    gain = current.astype(np.int64) + (netlist.bias_mantissa << netlist.bias_exponent)[voters]
     threshold = netlist.threshold[voters] << MEMBRANE_SHIFT
     keep = 2**DECAY_BITS - netlist.decay_v[voters]
     membrane = np.zeros_like(gain)
