@@ -278,6 +278,14 @@ def saturated(membrane: Any, limit: Any) -> Any:
     return type(membrane)(min(max(membrane, type(membrane)(-limit)), limit))
 
 
+@compiled_and_cached
+def decay(values: Any, keep: Any) -> None:
+    """Let whole numbers (rows, neurons) decay, each neuron's by its own share (neurons,) of 4096."""
+    for row in range(len(values)):
+        for i in range(len(keep)):
+            values[row, i] = decayed(values[row, i], keep[i])
+
+
 @compiled
 def _integrate_integer(membrane: Any, current: Any, sums: Any, bias: Any, registers: Any, fired: Any) -> None:
     threshold, keep_u, keep_v, limit = registers

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from spikeloom.compiler import ir
 from spikeloom.compiler.checkpoint import merge
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.layer_kernel import charged, decayed, integrated, saturated
 from spikeloom.compiler.passes.expand import stack_of
 from spikeloom.compiler.systems import in_order
 from spikeloom.compiler.targets.compartments import (
@@ -347,11 +348,8 @@ def _chip_step(
     sums: Any, i: Any, v: Any, bias: Any, threshold: Any, unit: Any, keep_u: Any, keep_v: Any, fired: Any, membrane: Any
 ) -> None:
     for n in range(len(v)):
-        left = abs(i[n]) * keep_u >> registers.DECAY_BITS
-        magnitude = abs(v[n]) * keep_v >> registers.DECAY_BITS
-        i[n] = (left if i[n] >= 0 else -left) + (np.int64(sums[n]) << registers.MEMBRANE_SHIFT)
-        u = (magnitude if v[n] >= 0 else -magnitude) + i[n] + bias[n]
-        u = min(max(u, -registers.MEMBRANE_MAX), registers.MEMBRANE_MAX)
+        i[n] = charged(i[n], keep_u, np.int64(sums[n]) << registers.MEMBRANE_SHIFT)
+        u = saturated(integrated(decayed(v[n], keep_v), i[n], bias[n]), registers.MEMBRANE_MAX)
         spike = u > threshold[n]
         fired[n] = spike
         membrane[n] = u * unit[n]

@@ -15,7 +15,7 @@ from scipy import sparse
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.loihi1.bounds import reach
 from spikeloom.compiler.targets.loihi1.netlist import MOST_BLANK, Netlist
-from spikeloom.compiler.targets.loihi1.registers import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
+from spikeloom.compiler.targets.loihi1.registers import CURRENT_MAX, DECAY_ONE, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.types import IntArray
 
 
@@ -81,6 +81,9 @@ def forgotten(netlist: Netlist) -> Forgotten:
 
 
 def _kept(value: IntArray, lost: IntArray) -> IntArray:
-    """Registers after a step's decay, rounded toward zero."""
-    kept: IntArray = np.sign(value) * (np.abs(value) * (2**DECAY_BITS - lost) >> DECAY_BITS)
-    return kept
+    """Registers (2, compartments) after a step's decay, rounded toward zero."""
+    from spikeloom.compiler.layer_kernel import decay
+
+    after = value.copy()
+    decay(after, DECAY_ONE - lost)
+    return after

@@ -2,16 +2,13 @@
 
 *Arrivals.* Each compartment has two sums, of positive and of negative weights. A synapse adds ``magnitude << 24 | 1``
 to one of them, so that the low bits say whether anything arrived at all, which the count of neuron updates needs.
-
-*Decay in 32 bits.* With ``m = 4096 a + b``, ``floor(m f / 4096) = a f + floor(b f / 4096)``; for ``m < 2**23`` and
-``f <= 4096`` nothing exceeds 2**24.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached, copy
+from spikeloom.compiler.layer_kernel import charged, compiled, compiled_and_cached, copy, decayed, integrated, saturated
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.registers import (
     ACCUMULATOR_MAX,
@@ -106,16 +103,6 @@ def state_of(netlist: Netlist) -> State:
 
 
 @compiled
-def kept(x: Any, factor: Any) -> Any:
-    """``x * factor / 4096`` rounded toward zero; all int32."""
-    magnitude = np.int32(abs(x))
-    high = np.int32(np.int32(magnitude >> DECAY_BITS) * factor)
-    low = np.int32(np.int32(np.int32(magnitude & (2**DECAY_BITS - 1)) * factor) >> DECAY_BITS)
-    kept = np.int32(high + low)
-    return np.int32(-kept) if x < 0 else kept
-
-
-@compiled
 def _list_sources(state: State, events: AnyArray, t: int, length: int) -> Any:
     """List the channels with an event in column `t` and the compartments that spiked one step ago."""
     n = 0
@@ -165,11 +152,11 @@ def _integrate(tables: Tables, state: State, step: int, length: int) -> bool:
         # the current decays, and the sums are added
         positive = sums[2 * c] >> ARRIVAL_BITS
         negative = sums[2 * c + 1] >> ARRIVAL_BITS
-        u = np.int32(kept(current[c], keep_u[c]) + np.int32(np.int32(positive - negative) << MEMBRANE_SHIFT))
+        u = charged(current[c], keep_u[c], np.int32(np.int32(positive - negative) << MEMBRANE_SHIFT))
         any_overflow |= is_open & ((max(positive, negative) > SUM_MAX) | (abs(u) > CURRENT_MAX))
         # the membrane decays, current and bias are added, it saturates and is compared
-        v = np.int32(np.int32(kept(membrane[c], keep_v[c]) + u) + bias[c])
-        compared = np.int32(min(max(v, np.int32(-MEMBRANE_MAX)), np.int32(MEMBRANE_MAX)))
+        v = integrated(decayed(membrane[c], keep_v[c]), u, bias[c])
+        compared = saturated(v, np.int32(MEMBRANE_MAX))
         saturations[c] += is_open & (compared != v)
         flags[c] = is_open & (compared > threshold[c])
         current[c], membrane[c] = (u, compared) if is_open else (np.int32(0), np.int32(0))

@@ -11,11 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.layer_kernel import clear, compiled, compiled_and_cached
+from spikeloom.compiler.layer_kernel import (
+    charged,
+    clear,
+    compiled,
+    compiled_and_cached,
+    decayed,
+    integrated,
+    saturated,
+)
 from spikeloom.compiler.targets.loihi1.registers import CURRENT_MAX, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.runtime.machines.changes import Forgetting
 from spikeloom.runtime.machines.loihi1.changes.kernel import LANES, NEVER, Chip, Known
-from spikeloom.runtime.machines.loihi1.kernel import kept
 
 
 def forgetting(chip: Chip, known: Known, classes: int) -> Forgetting:
@@ -52,10 +59,10 @@ def _widen(low: Any, high: Any, weight: Any, sign: Any, first: Any, begin: Any, 
 @compiled
 def _after(chip: Chip, c: Any, total: Any, current: Any, membrane: Any) -> Any:
     """Current and membrane at one end of what is possible; in 64 bits, since not both ends have to be."""
-    u = np.int64(kept(current, chip.keep_u[c])) + (np.int64(total) << MEMBRANE_SHIFT)
-    u = min(max(u, np.int64(-CURRENT_MAX)), np.int64(CURRENT_MAX))  # no run has more, whatever its input
-    v = np.int64(kept(membrane, chip.keep_v[c])) + u + chip.bias[c]
-    return np.int32(u), np.int32(min(max(v, np.int64(-MEMBRANE_MAX)), np.int64(MEMBRANE_MAX)))
+    u = charged(np.int64(current), chip.keep_u[c], np.int64(total) << MEMBRANE_SHIFT)
+    u = saturated(u, np.int64(CURRENT_MAX))  # no run has more, whatever its input
+    v = integrated(decayed(np.int64(membrane), chip.keep_v[c]), u, chip.bias[c])
+    return np.int32(u), np.int32(saturated(v, np.int64(MEMBRANE_MAX)))
 
 
 @compiled

@@ -17,12 +17,16 @@ from scipy import sparse
 from spikeloom.compiler.layer_kernel import (
     Synapses,
     by_source,
+    charged,
     clear,
     compiled,
     compiled_and_cached,
     copy,
+    decayed,
+    integrated,
     list_fired,
     require_below,
+    saturated,
 )
 from spikeloom.compiler.targets.loihi1.bounds import reach
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
@@ -35,7 +39,6 @@ from spikeloom.compiler.targets.loihi1.registers import (
 )
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.changes import Changes, Effects
-from spikeloom.runtime.machines.loihi1.kernel import kept
 
 AnyArray = npt.NDArray[Any]
 
@@ -162,14 +165,14 @@ def _run_of(chip: Chip, known: Known) -> _Run:
 def _charge(current: Any, keep: Any, sums: Any, delta: Any, first: Any, places: Any) -> None:
     for i in range(first, first + places):
         arrived = np.int32(np.int32(sums[i] + delta[i]) << np.int32(MEMBRANE_SHIFT))
-        current[i] = np.int32(kept(current[i], keep[i]) + arrived)
+        current[i] = charged(current[i], keep[i], arrived)
 
 
 @compiled
 def _integrate(membrane: Any, keep: Any, current: Any, bias: Any, first: Any, places: Any) -> None:
     for i in range(first, first + places):
-        v = np.int32(np.int32(kept(membrane[i], keep[i]) + current[i]) + bias[i])
-        membrane[i] = min(max(v, np.int32(-MEMBRANE_MAX)), np.int32(MEMBRANE_MAX))
+        v = integrated(decayed(membrane[i], keep[i]), current[i], bias[i])
+        membrane[i] = saturated(v, np.int32(MEMBRANE_MAX))
 
 
 @compiled
