@@ -321,9 +321,10 @@ def hardware(session: Session, kind: str) -> Json:
     return found
 
 
-def yardsticks(session: Session) -> Json:
-    """NeuroBench's metrics and the arithmetic of the float model."""
-    return session.run(f"yardsticks {MANUAL} --graph manual --data {OBJECTS}")
+def neurobench(session: Session) -> Json:
+    """NeuroBench's metrics of the released network on the chip."""
+    session.run(f"compile {MANUAL} --graph manual --calibrate {OBJECTS} --weight-bits 8 -o net.loom")
+    return session.run(f"estimate net.loom --data {OBJECTS} --neurobench")["neurobench"]
 
 
 def shown(session: Session, page: str) -> Json:
@@ -398,7 +399,7 @@ STUDIES: dict[str, Callable[[Session], Json]] = {
     "truenorth": truenorth,
     "rtl-counters": lambda session: hardware(session, "counters"),
     "rtl-native": lambda session: hardware(session, "native"),
-    "yardsticks": yardsticks,
+    "neurobench": neurobench,
     "confusion-containers": confusion,
     "longer-bins": longer_bins,
     "pretrained": pretrained,

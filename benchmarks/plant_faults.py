@@ -44,7 +44,7 @@ NUMERIC = {
     "models": "graphs",
     "models/networks": "layers lif quantised reference",
     "models/truenorth": "neurons",
-    "runtime/studies": "yardsticks",
+    "runtime/studies": "neurobench",
     "runtime/equivalence": "reference tallies verdict verify",
     "runtime/machines": "votes",
     "runtime/machines/loihi1": "block_kernel blocks engine kernel rounding spec",

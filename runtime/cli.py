@@ -42,7 +42,6 @@ GROUPS: dict[str, dict[str, str]] = {
         "explain": "why chip and float model differ on one recording: roots, their causes, and what removes them",
         "stress": "where float network and chip break: a seeded battery of perturbations, with verdicts and reasons",
         "certify": "which decisions no small change of a recording alters: proven, not sampled",
-        "yardsticks": "NeuroBench's metrics of a checkpoint, and arithmetic energy on a processor",
     },
     "training": {
         "train": "train networks by the released recipe; last, best and clean epoch reported",

@@ -129,7 +129,7 @@ QUESTIONS = {
 BESIDE = {"self", "network", "example", "path", "return"}
 """Keywords that are no options: what a question is about."""
 COMMAND_ONLY = {
-    "estimate": {"against_processor"},  # gives another result
+    "estimate": {"against_processor", "neurobench"},  # give another result
     "compile": {"dump_after", "output", "checkpoint"},
     "finetune": {"checkpoint"},
 }

@@ -114,8 +114,6 @@ watch end:
     after_decision bins events grasps interrupted kind late repeated
 watch grasp:
     bins counts decision grasp kind margin time_s
-yardsticks:
-    arithmetic graph neurobench not_counted prices_pj samples source
 """
 """A command, and the keys that scripts rely on; with a question mark those that only some networks have."""
 
@@ -319,7 +317,6 @@ COMMANDS = {
     "lean": ("joined-timed", "lean {file} --data {data} -o {out}/lean.loom"),
     "stress": ("recurrent", "stress {net} --checkpoint {file} --dt 0.02 --data {data} --seeds 1 --only taxels_dead"),
     "chart": ("binned", "chart {file} --data {data} --grid bits=8 --jobs 1 -o {out}/chart"),
-    "yardsticks": ("joined", "yardsticks {file} --data {data}"),
     "train": ("mlp", "train --data {data} --system mlp --features 2 --epochs 1 -o {out}/x.pt"),
     "finetune": ("recurrent", "finetune {file} --dt 0.02 --data {data} --weight-bits 4 --epochs 1 -o {out}/x.nir"),
     "join": ("joined", "join {folder}/1.pt {folder}/2.pt -o {out}/x.pt"),

@@ -1,25 +1,25 @@
-"""Costs, counted a second time spike by spike and synapse by synapse, and priced by hand; yardsticks likewise."""
+"""Costs, counted a second time spike by spike and synapse by synapse, and priced by hand; NeuroBench's metrics."""
 
 import dataclasses
 
 import numpy as np
 import pytest
-from made_files import events, small_checkpoint
+from made_files import events, recorded, small_checkpoint
 from random_netlists import Axon, Neuron, build
-from random_networks import LOIHI, random_checkpoint
+from random_networks import LOIHI, compiled, integer_chain
 
-from spikeloom.compiler.checkpoint import Dense
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.base import EnergyTable, Quantity
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.report.encode import encode
-from spikeloom.runtime.studies.yardsticks import HOROWITZ, measure
+from spikeloom.runtime.studies import neurobench
 
 DAVIES = {"synaptic_operation": 23.6, "neuron_idle": 52, "neuron_active": 81, "packet": 1.7}
 DAVIES |= {"hop_east_west": 3, "hop_north_south": 4}
@@ -270,63 +270,30 @@ def test_the_range_names_both_ends(small, found):
     assert cost_report(netlist, LOIHI, single, bin_s=0.02).energy_range_j is None
 
 
-PAIR = np.array([[0.0, 1.0], [1.0, 0.0]])
-"""Propagation between two taxels."""
+def chained():
+    """Two input channels, two neurons and one on the chip: of six weights between them one is zero."""
+    chain = integer_chain([[2, 4], [6, 2]], [[2, 0]], thresholds=[1, 1], bits=4)
+    return machine_of(compiled(chain))
 
 
-def by_hand():
-    """Two taxels, one channel, one feature, two hops: the effective matrix is [[1, 2], [2, 1]]; fc1 is [[1, 0]]."""
-    checkpoint = dataclasses.replace(
-        random_checkpoint(taxels=2, features=1, hops=2, sizes=(1,)),
-        hops=np.array([[[1.0]], [[2.0]]], np.float32),
-        conv_bias=np.zeros(1, np.float32),
-        dense=(Dense(name="fc1", weight=np.array([[1.0, 0.0]], np.float32), bias=np.zeros(1, np.float32)),),
-    )
-    events = np.array([[[[1, 0, 1]], [[0, 0, 1]]]], np.uint8)  # one recording, three steps: taxel 0, nothing, both
-    conv = np.array([[[1, 1], [0, 0], [0, 1]]], np.bool_)
-    fc1 = np.array([[[1], [0], [0]]], np.bool_)
-    return checkpoint, events, {"conv1": conv, "fc1": fc1}
+EVENTS = np.array([[[[1, 0, 1]], [[0, 0, 1]]]], np.uint8)
+"""One recording of three steps: the first channel, nothing, both."""
 
 
-def test_a_network_counted_by_hand():
-    checkpoint, events, spikes = by_hand()
-    found = encode(measure(checkpoint, PAIR, events, spikes))
-    assert found["neurobench"] == {
-        "footprint": (4 + 2 + 2 + 1) * 4,  # weights and biases of both layers
-        "connection_sparsity": 0.1667,  # one of six
-        "activation_sparsity": 1 - 4 / 9,
-        "synaptic_operations": {
-            "Effective_MACs": 0.0,
-            # three events on two weights each; of the spikes of conv1, neuron 0's one meets the weight that is not zero
-            "Effective_ACs": 3 * 2 + 1,
-            "Dense": 3 * 6,
-        },
+def test_neurobench_counted_by_hand():
+    # both neurons of the first layer fire in the first step and in the last one, and the second layer with them
+    assert encode(neurobench.measure(chained(), recorded(EVENTS))) == {
+        "footprint": (5 * 4 + 3 * 16 + 7) // 8,
+        "connection_sparsity": 0.1667,
+        "activation_sparsity": pytest.approx(1 - 6 / 9),
+        # three events on two weights each, and two spikes of the neuron whose weight is not zero
+        "synaptic_operations": {"Effective_MACs": 0.0, "Effective_ACs": 3 * 2 + 2, "Dense": 3 * 6},
     }
-    rows = {(row["what"], row["numbers"]): row for row in found["arithmetic"]}
-    # three steps of six products and three decays; in factors two maps of two products and one hop over two edges
-    assert rows["dense", "float32"]["macs"] == 3 * 9
-    assert rows["dense, convolution in factors", "float32"]["macs"] == 3 * (4 + 2 + 2 + 3)
-    assert (rows["effective", "int8"]["macs"], rows["effective", "int8"]["acs"]) == (9, 7)
-    assert rows["dense", "float32"]["energy_j"] == pytest.approx(27 * 4.6e-12)
-    assert rows["dense", "int8"]["energy_j"] == pytest.approx(27 * 0.3e-12)
-    assert rows["effective", "float32"]["energy_j"] == pytest.approx(9 * 4.6e-12 + 7 * 0.9e-12)
 
 
-def test_prices_are_the_published_ones():
-    assert HOROWITZ == {"float32_add": 0.9, "float32_multiply": 3.7, "int8_multiply": 0.2, "int32_add": 0.1}
-
-
-def test_steps_with_other_inputs_than_ones_are_multiplications():
-    checkpoint, events, spikes = by_hand()
-    events[0, 0, 0, 0] = 3
-    bench = measure(checkpoint, PAIR, events, spikes).neurobench
-    assert (bench.synaptic_operations.effective_macs, bench.synaptic_operations.effective_acs) == (2, 5)
-
-
-def test_what_comes_after_a_recording_is_not_counted():
-    checkpoint, events, spikes = by_hand()
-    long_events, long_spikes = np.repeat(events, 2, axis=0), {k: np.repeat(s, 2, axis=0) for k, s in spikes.items()}
-    found = measure(checkpoint, PAIR, long_events, long_spikes, lengths=np.array([3, 1])).neurobench
-    assert found.synaptic_operations.effective_acs == (7 + 3) / 2
+def test_neurobench_counts_nothing_after_the_end_of_a_recording():
+    both = dataclasses.replace(recorded(np.repeat(EVENTS, 2, axis=0)), lengths=np.array([3, 1]))
+    found = neurobench.measure(chained(), both)
+    assert found.synaptic_operations.effective_acs == (8 + 3) / 2
     assert found.synaptic_operations.dense == (18 + 6) / 2
-    assert found.activation_sparsity == pytest.approx((5 / 9 + 0 / 3) / 2)
+    assert found.activation_sparsity == pytest.approx((3 / 9 + 0 / 3) / 2)

@@ -22,7 +22,6 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.runtime.machines.votes import readout_counts
-from spikeloom.runtime.studies import yardsticks
 
 CASES = pytest.mark.parametrize(
     ("system", "dynamics"),
@@ -148,20 +147,6 @@ def test_the_expanded_network_is_sparse_in_blocks(tmp_path, system, dynamics):
     assert [population.relays for population in network.populations] == [clocks, 0, 0, 0]
     assert network.classes == 4
     assert network.readout.label.tolist() == [0, 1, 2, 3] * 3
-
-
-def test_yardsticks_count_no_weights_between_towers(tmp_path):
-    singles, wide, seen = joined(tmp_path, dynamics=PLAIN)
-    events = events_of(3, samples=4)
-
-    def bench(checkpoint):
-        return yardsticks.measure(checkpoint, seen, events, float_spikes(expand(checkpoint, seen), events)).neurobench
-
-    alone, found = [bench(single) for single in singles], bench(wide)
-    assert found.footprint == sum(each.footprint for each in alone)
-    for name in ("effective_acs", "effective_macs", "dense"):
-        summed = sum(getattr(each.synaptic_operations, name) for each in alone)
-        assert getattr(found.synaptic_operations, name) == pytest.approx(summed, rel=1e-12), name
 
 
 @pytest.fixture(scope="module")

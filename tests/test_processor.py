@@ -76,7 +76,13 @@ def test_the_option(monkeypatch, tmp_path):
     text = run(*words, "--against-processor")[1]
     for telling in ("a microcontroller is cheaper at the sensor's pace", "at no event rate", "static power dominates"):
         assert telling in text
-    assert "against_processor" not in as_json(*words)
+    metrics = as_json(*words, "--neurobench")
+    assert (
+        0
+        < metrics["neurobench"]["synaptic_operations"]["Effective_ACs"]
+        <= metrics["per_inference"]["synaptic_operations"]
+    )
+    assert metrics.keys() - as_json(*words).keys() == {"neurobench"}
     request = EstimateRequest(netlist="net.loom", data=synthetic_split("test", limit=12), against_processor=True)
     with pytest.raises(OptionError, match="needs the training split"):
         estimate.run(request)

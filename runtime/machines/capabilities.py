@@ -192,6 +192,13 @@ def require_explainable(machine: Machine, path: str = "netlist", command: str = 
     return machine
 
 
+def require_comparable(machine: Machine, path: str = "netlist", command: str = "this command") -> Comparable:
+    """The same machine, if a float model can be compared with it; else an OptionError, which names file and command."""
+    if not isinstance(machine, Comparable):
+        raise _lacking(machine, path, command)
+    return machine
+
+
 def require_stoppable(machine: Machine, path: str = "netlist", command: str = "this command") -> Stoppable:
     """The same machine, if recordings can be stopped on it; else an OptionError, which names file and command."""
     if not isinstance(machine, Stoppable):

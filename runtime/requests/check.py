@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from spikeloom.runtime.requests.choices import (
-    CheckpointChoice,
     ComparisonChoice,
     NetlistChoice,
     RecordingsChoice,
@@ -52,10 +51,3 @@ class CertifyRequest(NetlistChoice, RecordingsChoice):
     jobs: int | None = option("recordings at a time (default: one a core)", metavar="N")
     picture: str | None = option("draw how many decisions hang on each taxel", metavar="OUT.png|svg|pdf")
     output: str | None = option("write what --json prints", metavar="OUT.json", flags=("-o", "--output"))
-
-
-@dataclass(frozen=True, kw_only=True)
-class YardsticksRequest(CheckpointChoice, RecordingsChoice):
-    """NeuroBench's metrics of a checkpoint, and arithmetic energy on a processor."""
-
-    checkpoint: str = option("trained network, or pretrained:NAME", positional=True, metavar="CKPT")

@@ -139,6 +139,7 @@ class EstimateRequest(NetlistChoice, RecordingsChoice):
         "train a linear rule for a small processor on the same recordings, and hold its costs beside these",
         default=False,
     )
+    neurobench: bool = option("NeuroBench's metrics of the network as the chip holds it", default=False)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,11 +9,13 @@ from spikeloom.models.training.counters import BITS
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.base import Machine, Price, Run
+from spikeloom.runtime.machines.capabilities import require_comparable
 from spikeloom.runtime.report.console import Progress
-from spikeloom.runtime.report.encode import HIDDEN, INLINE
+from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section
 from spikeloom.runtime.requests.main_job import EstimateRequest
-from spikeloom.runtime.studies import processor
+from spikeloom.runtime.studies import neurobench, processor
+from spikeloom.runtime.studies.neurobench import NeuroBench
 from spikeloom.runtime.studies.processor import Comparison
 
 REQUEST = EstimateRequest
@@ -21,20 +23,26 @@ REQUEST = EstimateRequest
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Compared:
-    """Costs on the chip, and beside them those of a rule on a processor."""
+    """Costs on the chip, and beside them those of a rule on a processor, and the metrics of others."""
 
     costs: Any = field(metadata=INLINE)
-    against_processor: Comparison
+    against_processor: Comparison | None = field(default=None, metadata=OPTIONAL)
+    neurobench: NeuroBench | None = field(default=None, metadata=OPTIONAL)
     price: Price = field(metadata=HIDDEN)
 
 
 def run(request: EstimateRequest) -> Outcome:
     """Run the command."""
     machine, ran, priced = price(request)
-    if not request.against_processor:
+    if not (request.against_processor or request.neurobench):
         return priced.outcome
-    compared = _against_processor(request, machine, ran, priced)
-    return Outcome(Compared(costs=priced.details, against_processor=compared, price=priced), sections)
+    compared = Compared(
+        costs=priced.details,
+        against_processor=_against_processor(request, machine, ran, priced) if request.against_processor else None,
+        neurobench=_neurobench(request, machine) if request.neurobench else None,
+        price=priced,
+    )
+    return Outcome(compared, sections)
 
 
 def price(request: EstimateRequest) -> tuple[Machine, Run, Price]:
@@ -54,7 +62,15 @@ def price(request: EstimateRequest) -> tuple[Machine, Run, Price]:
 
 def sections(found: Compared) -> list[Section]:
     """Both for people."""
-    return [*found.price.sections(), *processor.sections(found.against_processor)]
+    compared = [] if found.against_processor is None else processor.sections(found.against_processor)
+    metrics = [] if found.neurobench is None else neurobench.sections(found.neurobench)
+    return [*found.price.sections(), *compared, *metrics]
+
+
+def _neurobench(request: EstimateRequest, machine: Machine) -> NeuroBench:
+    """Metrics of the same recordings."""
+    network = require_comparable(machine, request.netlist, "--neurobench")
+    return neurobench.measure(network, load_recordings(request.data, request, machine.netlist))
 
 
 def _against_processor(request: EstimateRequest, machine: Machine, ran: Run, priced: Price) -> Comparison:
