@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from spikeloom.compiler.ir import Network
     from spikeloom.models.recordings.evtouch import Recordings
     from spikeloom.runtime.commands.main_job.run import Decisions
-    from spikeloom.runtime.commands.training.finetune import Finetuned
     from spikeloom.runtime.equivalence.verdict import Verdict
     from spikeloom.runtime.machines.base import Price, Stream
     from spikeloom.runtime.machines.netlist_check import NetlistCheck
@@ -51,7 +50,8 @@ if TYPE_CHECKING:
     from spikeloom.runtime.studies.counting import CountersReport
     from spikeloom.runtime.studies.robustness.results import Certificates, Stress
     from spikeloom.runtime.studies.smallest.results import Smallest
-    from spikeloom.runtime.studies.training import TrainingReport
+    from spikeloom.runtime.studies.training.finetuning import Finetuned
+    from spikeloom.runtime.studies.training.results import TrainingReport
 
 Numbers = int | str | Sequence[int]
 """One number for all layers, or one for each."""

@@ -207,7 +207,7 @@ TABLE = [
     (TRAIN.format("--system mlp --parts 3"), "--parts 3: is for --system counters; omit it"),
     (TRAIN.format("--system mlp --hops 2"), "--hops 2: an MLP has no hops to choose; omit it"),
     (TRAIN.format("--system mlp --hidden 0"), "--hidden 0: allowed are 1 to 1024"),
-    (SEEDS.format("-o x.pt --seeds 0"), "--seeds 0: at least 1 is needed"),
+    (SEEDS.format("-o x.pt --seeds 0"), "--seeds 0: allowed are 1 or more"),
     (SEEDS.format("-o x.pt --robust 1"), "--robust 1: allowed are numbers from 0 to below 1"),
     (SEEDS.format(f"-o x.pt --seed {10**22}"), f"--seed {10**22}: allowed are 0 to {2**63 - 1}"),
     (SEEDS.format("-o x.pt --picture none/x.png"), "--picture none/x.png: the folder does not exist"),

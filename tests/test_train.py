@@ -46,9 +46,9 @@ from spikeloom.models.training.record import training_record
 from spikeloom.models.training.robust import worn
 from spikeloom.models.training.train import Epoch, state_files, train, train_both, validation_split
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.commands.training.train import both_splits
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
+from spikeloom.runtime.studies.training.plan import both_splits
 
 GRAPH = build_graph("manual")
 ADJACENCY = normalised_adjacency(GRAPH.edges, 39)

@@ -25,8 +25,8 @@ from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime import cli
 from spikeloom.runtime.studies import jobs as jobs_module
-from spikeloom.runtime.studies import training as trainings
 from spikeloom.runtime.studies.jobs import only_one, sweep
+from spikeloom.runtime.studies.training import seeds as trainings
 
 ROOT = Path(__file__).resolve().parents[1]
 WORDS = ("train", "--data", "data", "--graph", "manual", "--features", "4")

@@ -37,6 +37,7 @@ from spikeloom.runtime.studies.smallest.space import Candidate, counting, networ
 from spikeloom.runtime.studies.smallest.study import LIMITS, smallest
 from spikeloom.runtime.studies.smallest.trained import Sensor
 from spikeloom.runtime.studies.smallest.work import costs_of, some
+from spikeloom.runtime.studies.training.plan import both_splits
 
 SENSOR = ("graph", "taxels", "edges", "directed")
 
@@ -68,7 +69,7 @@ def run(request: SmallestRequest) -> Outcome:
     require_least(vars(request), jobs=1, levels=1)
     budgets = parse_budgets([words for each in request.budget for words in each.split(",")], LIMITS)
     taxels = None if request.taxels is None else len(sensor_places(request.taxels))
-    training, test = train.both_splits(request.data, taxels, request.bin)
+    training, test = both_splits(request.data, taxels, request.bin)
     require_levels(request.levels or 1, int(training.labels.max()) + 1)
     bin_s = training.seconds
     request = replace(request, bin=bin_s)

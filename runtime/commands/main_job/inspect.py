@@ -20,20 +20,13 @@ from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.requests.main_job import InspectRequest
+from spikeloom.runtime.studies.training.joining import LayerSize, tower_line
 
 CLOCKING = ("parts", "bins", "steps", "ramp")
 """What a counting network says of time."""
 
 LONG = 100
 """Letters of a training note that are shown."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LayerSize:
-    """Neurons of a layer."""
-
-    name: str
-    neurons: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -118,12 +111,6 @@ def run(request: InspectRequest) -> Outcome:
         given=given,
     )
     return Outcome(facts, sections)
-
-
-def tower_line(tower: Mapping[str, Any]) -> str:
-    """Where a tower of a joined network is from, in one line."""
-    notes = (f"{key} {tower[key]}" for key in ("weights", "seed", "sha256") if key in tower)
-    return f"{tower.get('file')}, {', '.join(notes)}"
 
 
 def sections(facts: CheckpointFacts) -> Iterator[Section]:

@@ -1,0 +1,1 @@
+"""Networks are trained, fine-tuned and joined."""

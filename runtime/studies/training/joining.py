@@ -1,0 +1,124 @@
+"""Join trained networks into one whose votes add up."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from spikeloom.compiler.checkpoint import Checkpoint
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.files import remove_leftovers, sha256_of
+from spikeloom.compiler.formats.own_checkpoint import save_again
+from spikeloom.compiler.formats.tensors import join as side_by_side
+from spikeloom.compiler.types import JsonObject
+from spikeloom.runtime.inputs.checkpoint import load_checkpoint
+from spikeloom.runtime.inputs.files import require_place, shipped
+from spikeloom.runtime.inputs.recordings import origin_of
+from spikeloom.runtime.report.sections import Section, Text
+from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.requests.choices import CheckpointChoice
+from spikeloom.runtime.requests.training import JoinRequest
+
+KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "bin_s", "test_samples", "fine_tuned_from")
+"""Parts of a network's training record that the joined one keeps, beside what the chosen weights reached."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LayerSize:
+    """Neurons of a layer."""
+
+    name: str
+    neurons: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Joined(Shown):
+    """Networks that were put side by side; `towers` has of each its file, hash and training record."""
+
+    command: str
+    towers: Sequence[Mapping[str, Any]]
+    system: str
+    graph: str | None
+    classes: int
+    layers: Sequence[LayerSize]
+    file: str
+    sha256: str
+
+
+def join(request: JoinRequest) -> Joined:
+    """Join checkpoints and write the one that holds them all."""
+    require_place(request.output, "-o", request, ["pt"])
+    checkpoints = [_network(name, request.weights) for name in request.checkpoints]
+    pairs = zip(request.checkpoints, checkpoints, strict=True)
+    towers = [record for name, checkpoint in pairs for record in _records(name, checkpoint)]
+    if len(towers) < 2:
+        raise OptionError(f"join: {request.checkpoints[0]} is one network already; give two or more")
+    joined = side_by_side(checkpoints, request.checkpoints)
+    origin = _common_origin(towers)
+    output = Path(request.output)
+    remove_leftovers(output)
+    command = _command(request)
+    save_again(output, joined, training={"command": command, "towers": towers} | origin)
+    return Joined(
+        command=command,
+        towers=towers,
+        system=joined.system,
+        graph=joined.graph,
+        classes=joined.classes,
+        layers=[LayerSize(name=name, neurons=count) for name, count in joined.neurons.items()],
+        file=output.name,
+        sha256=sha256_of(output),
+    )
+
+
+def _common_origin(towers: Sequence[Mapping[str, Any]]) -> JsonObject:
+    """What the first was trained on; ModelError if the bins of others are of another width."""
+    origins = [origin_of(tower) for tower in towers]
+    widths = sorted({origin["bin_s"] for origin in origins if "bin_s" in origin})
+    if len(widths) > 1:
+        raise ModelError(f"join: networks of bins of {widths[0]:g} s and {widths[-1]:g} s; give those of one width")
+    return origins[0]
+
+
+def _command(request: JoinRequest) -> str:
+    """The words that ask for the same."""
+    words = [_shown(name) for name in request.checkpoints]
+    words += [f"--weights {request.weights}"] if request.weights else []
+    return f"spikeloom join {' '.join(words)}"
+
+
+def _network(name: str, weights: str | None) -> Checkpoint:
+    checkpoint = load_checkpoint(name, CheckpointChoice(weights=weights))
+    if checkpoint.layout != "spikeloom":
+        raise ModelError(f"{name}: does not say its graph and constants; give checkpoints that spikeloom train wrote")
+    return checkpoint
+
+
+def _shown(name: str) -> str:
+    """Name of a file without its folder, or of a shipped checkpoint."""
+    return name if shipped(name) != name else Path(name).name
+
+
+def _records(name: str, checkpoint: Checkpoint) -> list[dict[str, Any]]:
+    """Where each tower of a checkpoint is from."""
+    training = checkpoint.training or {}
+    records = training.get("towers")
+    if checkpoint.towers > 1 and isinstance(records, list) and len(records) == checkpoint.towers:
+        return records
+    kept = [key for key in (*KEPT, checkpoint.weights) if key in training]
+    origin = {"file": _shown(name), "sha256": checkpoint.sha256, "weights": checkpoint.weights}
+    return [origin | {key: training[key] for key in kept}] * checkpoint.towers
+
+
+def sections(result: Joined) -> Iterable[Section]:
+    """What was joined, for people."""
+    layers = ", ".join(f"{layer.name} {layer.neurons:,}" for layer in result.layers)
+    lines = [result.command, f"  {len(result.towers)} towers: {layers}, {result.classes} classes"]
+    lines += [f"    {index}: {tower_line(tower)}" for index, tower in enumerate(result.towers)]
+    yield Section("Joined", [Text("\n".join([*lines, f"  written: {result.file}"]))])
+
+
+def tower_line(tower: Mapping[str, Any]) -> str:
+    """Where a tower of a joined network is from, in one line."""
+    notes = (f"{key} {tower[key]}" for key in ("weights", "seed", "sha256") if key in tower)
+    return f"{tower.get('file')}, {', '.join(notes)}"
