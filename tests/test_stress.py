@@ -8,6 +8,7 @@ import pytest
 from commands import as_json as answer
 from made_files import CLASSES, STEPS, TAXELS, events, recorded, recordings_folder, ring, small_checkpoint, weights
 from numpy.testing import assert_array_equal
+from scipy import stats
 from timed_networks import events_of, written
 
 from spikeloom.compiler.dynamics import with_clocks
@@ -250,8 +251,9 @@ def test_it_is_the_mean_over_seeds_that_counts():
     low, high = wilson(90, 100)
     assert spread([90], 100) == Spread(mean=0.9, low=low, high=high, values=(0.9,))
     several = spread([80, 90, 100], 100)
+    values = [0.8, 0.9, 1.0]
     assert several.mean == pytest.approx(0.9)
-    assert several.low == pytest.approx(0.9 - 4.302653 * 0.1 / 3**0.5)  # Student's, two degrees of freedom
+    assert several.low == pytest.approx(stats.t.interval(0.95, 2, loc=0.9, scale=stats.sem(values))[0])
     assert several.high == 1.0
 
 

@@ -1,4 +1,7 @@
-"""Numbers as people read them, and their intervals: sixty test samples deserve to say how little they know."""
+"""Numbers as people read them, and their intervals: sixty test samples deserve to say how little they know.
+
+Closed formulas, which tests hold against :mod:`scipy.stats`: to load that takes as long as many a command.
+"""
 
 import math
 import statistics
@@ -48,8 +51,12 @@ def counted(value: float) -> str:
     return f"{value:.3g}"
 
 
-def wilson(successes: float, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
-    """Wilson score interval of a proportion, 95 % by default.
+NORMAL = 1.959963984540054
+"""Standard deviations within which 95 % of a normal variable lie."""
+
+
+def wilson(successes: float, trials: int) -> tuple[float, float]:
+    """Wilson score interval of a proportion, 95 %.
 
     References
     ----------
@@ -63,6 +70,7 @@ def wilson(successes: float, trials: int, z: float = 1.959963984540054) -> tuple
     if not trials:
         return 0.0, 1.0
     share = successes / trials
+    z = NORMAL
     centre = share + z * z / (2 * trials)
     spread = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
     scale = 1 + z * z / trials
@@ -71,8 +79,8 @@ def wilson(successes: float, trials: int, z: float = 1.959963984540054) -> tuple
     return low, (centre + spread) / scale if successes < trials else 1.0
 
 
-def of_mean(values: Sequence[float], level: float = 0.95) -> tuple[float, float]:
-    """Student's confidence interval of the mean of at least two values.
+def of_mean(values: Sequence[float]) -> tuple[float, float]:
+    """Student's 95 % confidence interval of the mean of at least two values.
 
     References
     ----------
@@ -84,6 +92,6 @@ def of_mean(values: Sequence[float], level: float = 0.95) -> tuple[float, float]
     from scipy.special import stdtrit  # a tenth of a second that other commands need not wait
 
     error = statistics.stdev(values) / math.sqrt(len(values))
-    reach = float(stdtrit(len(values) - 1, (1 + level) / 2)) * error
+    reach = float(stdtrit(len(values) - 1, 0.975)) * error
     mean = statistics.fmean(values)
     return mean - reach, mean + reach
