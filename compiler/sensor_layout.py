@@ -19,12 +19,12 @@ def sensor_layout(
 ) -> tuple[Input, IntArray, str]:
     """Sensor of an input of one step, the position in it of each channel, and in words what was read and assumed.
 
-    The `shape` is ``[taxels, polarities]``, flat, or an image ``[polarities, height, width]``, whose taxels count row
-    by row; axes of length 1 in front are the batch's. How many polarities there are, and whether they are the outer
-    axis, the shape says by default; of a flat one there are 2, and they are not.
+    The `shape` is ``[taxels, polarities]``, flat, or an image ``[polarities, height, width]``, whose taxels
+    count row by row; axes of length 1 in front are the batch's. How many polarities there are, and whether
+    they are the outer axis, the shape says by default; of a flat one there are 2, and they are not.
 
-    Raises ModelError if the shape does not say, or says another number than `polarities`; OptionError if there are no
-    such polarities.
+    Raises ModelError if the shape does not say, or says another number than `polarities`; OptionError if
+    there are no such polarities.
 
     >>> sensor_layout([1, 39, 2])[2]
     '39 taxels, 2 polarities, as [taxels, polarities]'

@@ -1,8 +1,8 @@
 """The spiking systems for touch: they differ in what their first layer sees, and in nothing else.
 
-Neuron (place p, feature f) of the first layer gets ``sum_k sum_j M_k[p, j] <g_k[f], x_j> + b_f``, where x_j are the
-polarities of taxel j: a stack of matrices M (filters, places, taxels), here called the *propagation*, and one filter
-g_k (features, channels) for each of them.
+Neuron (place p, feature f) of the first layer gets ``sum_k sum_j M_k[p, j] <g_k[f], x_j> + b_f``, where x_j
+are the polarities of taxel j: a stack of matrices M (filters, places, taxels), here called the
+*propagation*, and one filter g_k (features, channels) for each of them.
 
 ===============  ======================================================  ======================
 system           M_k                                                     places
@@ -28,7 +28,11 @@ import numpy as np
 
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 
-TACTILESGNET, GRID_CNN, MLP, GCN = SYSTEMS = ("tactilesgnet", "grid-cnn", "mlp", "gcn")
+TACTILESGNET = "tactilesgnet"
+GRID_CNN = "grid-cnn"
+MLP = "mlp"
+GCN = "gcn"
+SYSTEMS = (TACTILESGNET, GRID_CNN, MLP, GCN)
 
 GRAPH_SYSTEMS = (TACTILESGNET, GCN)
 """Those that have a taxel graph."""

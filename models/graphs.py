@@ -1,8 +1,8 @@
 """Tactile graphs: which taxels exchange events, and with what weight.
 
 A graph is a list of directed edges over taxels with coordinates. The released code builds three kinds (a
-hand-drawn one, nearest neighbours, a spanning tree with or without all pairs nearer than sigma) and lists some
-edges twice, which changes the normalised weights. Both readings exist here: ``released:NAME`` keeps the
+hand-drawn one, nearest neighbours, a spanning tree with or without all pairs nearer than sigma) and lists
+some edges twice, which changes the normalised weights. Both readings exist here: ``released:NAME`` keeps the
 repeats, plain ``NAME`` collapses them.
 
 The NeuTouch layout is symmetric, so neighbours and spanning trees are full of ties. A checkpoint only works
@@ -88,13 +88,15 @@ def check_edges(edges: ArrayLike, n: int) -> IntArray:
 def build_graph(name: str, coordinates: ArrayLike = NEUTOUCH) -> Graph:
     """Build a graph by name.
 
-    The name is ``manual``, ``knn:K`` or ``mst:SIGMA``, with or without the prefix ``released:``, and becomes the
-    canonical one: ``mst:2.0`` is ``mst:2``. The layout `coordinates` (n, d) is in millimetres; the hand-drawn graph
-    exists for `NEUTOUCH` only. OptionError if the name, K or SIGMA is not one of the choices, or does not suit it.
+    The name is ``manual``, ``knn:K`` or ``mst:SIGMA``, with or without the prefix ``released:``, and becomes
+    the canonical one: ``mst:2.0`` is ``mst:2``. The layout `coordinates` (n, d) is in millimetres; the
+    hand-drawn graph exists for `NEUTOUCH` only. OptionError if the name, K or SIGMA is not one of the
+    choices, or does not suit it.
 
-    ``released:knn:K`` lists a mutual pair twice in each direction, ``released:mst:SIGMA`` repeats the tree edges
-    shorter than sigma; the plain names keep the first of equal rows. Distances are compared after rounding to
-    1e-9 mm, because positions are typed in decimals and equal distances differ in their last bits.
+    ``released:knn:K`` lists a mutual pair twice in each direction, ``released:mst:SIGMA`` repeats the tree
+    edges shorter than sigma; the plain names keep the first of equal rows. Distances are compared after
+    rounding to 1e-9 mm, because positions are typed in decimals and equal distances differ in their last
+    bits.
     """
     layout = check_coordinates(coordinates)
     neutouch = np.array_equal(layout, NEUTOUCH)
@@ -208,8 +210,8 @@ def _mst_edges(distance: FloatArray, sigma: float, *, neutouch: bool) -> IntArra
 def _tree(distance: FloatArray, start: int, first: list[list[int]]) -> IntArray:
     """Minimum spanning tree by Prim's growth from `start`, (n - 1, 2), in the order of growth.
 
-    Equally long pairs are ranked by their place in `first`, then by lower index, then by higher index, so that no
-    two pairs tie and `start` decides the order of growth only.
+    Equally long pairs are ranked by their place in `first`, then by lower index, then by higher index, so
+    that no two pairs tie and `start` decides the order of growth only.
     """
     n = len(distance)
     low, high = np.triu_indices(n, 1)
@@ -231,5 +233,6 @@ def _tree(distance: FloatArray, start: int, first: list[list[int]]) -> IntArray:
         row[:] = origin[end], end
         outside[end] = False
         closer = place[end] < nearest
-        nearest[closer], origin[closer] = place[end][closer], end
+        nearest[closer] = place[end][closer]
+        origin[closer] = end
     return rows

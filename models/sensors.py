@@ -1,7 +1,7 @@
 """Other sensors: taxel positions and hand-drawn edges from CSV files, and the checks that they need.
 
-What makes a graph wrong is an error (a taxel that does not exist, two taxels in one place, an edge from a taxel to
-itself). A graph in parts may be meant but rarely is: a warning, text that the caller shows.
+What makes a graph wrong is an error (a taxel that does not exist, two taxels in one place, an edge from a
+taxel to itself). A graph in parts may be meant but rarely is: a warning, text that the caller shows.
 """
 
 import os
@@ -62,7 +62,8 @@ def read_edges(path: str | os.PathLike[str], n: int | None, *, directed: bool = 
 
     Unless `directed`, each counts in both directions, listed once or twice.
 
-    DataError if the file is not such a table, or an edge names a taxel that does not exist or joins one to itself.
+    DataError if the file is not such a table, or an edge names a taxel that does not exist or joins one to
+    itself.
     """
     table = read_table(path, ("source", "target"))
     ends = np.stack([table.columns["source"], table.columns["target"]], axis=1)
@@ -95,11 +96,11 @@ def sensor_graph(
 ) -> tuple[Graph, str | None]:
     """Build the graph that the command line asks for, by name or from a file, and a warning if it is in parts.
 
-    It is named as in `graph`, or ``edges:FILE``. A sensor given by edges alone has no positions; its taxels then stand
-    on a line in their order, which nothing that is computed from edges uses.
+    It is named as in `graph`, or ``edges:FILE``. A sensor given by edges alone has no positions; its taxels
+    then stand on a line in their order, which nothing that is computed from edges uses.
 
-    OptionError, DataError if the options exclude each other, the graph does not suit the sensor, or a file cannot be
-    used.
+    OptionError, DataError if the options exclude each other, the graph does not suit the sensor, or a file
+    cannot be used.
     """
     if (graph is None) == (edges is None):
         given = "neither was given" if graph is None else "both were given"

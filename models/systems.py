@@ -52,7 +52,8 @@ def sensor_grid(coordinates: FloatArray, padding: str) -> Grid:
     """The smallest grid over a sensor; refuses unknown paddings, and a sensor over which no grid or window fits."""
     if padding not in PADDINGS:
         raise OptionError(f"--padding {padding}: unknown; choose from {', '.join(PADDINGS)}")
-    cells, (stride, empty) = grid_cells(coordinates), PADDINGS[padding]
+    cells = grid_cells(coordinates)
+    stride, empty = PADDINGS[padding]
     rows, columns = (int(most) + 1 for most in cells.max(axis=0))
     grid = Grid(rows=rows, columns=columns, stride=stride, padding=empty, cells=cells)
     if 0 in grid.places(KERNEL):
@@ -71,8 +72,8 @@ def taxels_alone(coordinates: FloatArray) -> Graph:
 def propagation_of(system: str, edges: IntArray, taxels: int, grid: Grid | None, filters: int) -> FloatArray:
     """What the first layer of a system sees, in the form that :func:`expand.stack_of` takes.
 
-    `edges` are unused by systems without a graph, `grid` and the number of `filters`, which says how large its window
-    is, by all but the grid-based CNN.
+    `edges` are unused by systems without a graph, `grid` and the number of `filters`, which says how large
+    its window is, by all but the grid-based CNN.
     """
     match system:
         case "tactilesgnet":

@@ -22,7 +22,7 @@ from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surroga
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.models.training.evaluate import evaluate
-from spikeloom.models.training.recipes import RECIPES, RELEASED, TIMED, Recipe, decays_asked
+from spikeloom.models.training.recipes import RECIPES, RELEASED, TIMED, Recipe, parse_decays
 from spikeloom.models.training.train import train
 from spikeloom.runtime.cli import main
 
@@ -183,7 +183,7 @@ def test_the_released_recipe_is_the_released_code():
 )
 def test_decays_that_are_none_are_refused(words, telling):
     with pytest.raises(OptionError, match=re.escape(f"--current-decay {words}: {telling}")):
-        decays_asked(words, "--current-decay", ("conv1", "fc1"))
+        parse_decays(words, "--current-decay", ("conv1", "fc1"))
 
 
 def grasps(seed, per_class=3, steps=14):

@@ -1,6 +1,7 @@
 """Write the first layer of a system out as synapses: fan-in weights per place and taxel.
 
-A topology adaptive graph convolution (see :mod:`compiler.systems`) gathers the features of its taxels over K hops::
+A topology adaptive graph convolution (see :mod:`compiler.systems`) gathers the features of its taxels over K
+hops::
 
     y = sum_k A^k x W_k + b          x (taxels, channels), W_k (channels, features), k = 0 … K
 
@@ -8,8 +9,8 @@ which is one matrix for all taxels and channels at once, a Kronecker product for
 
     y = W x + b                      W = sum_k A^k ⊗ W_k^T
 
-The other systems differ in what stands for the powers ``A^k``: a stack of matrices (places, taxels), one for each
-filter. Outputs equal those of the factored form up to floating-point rounding (float64 throughout).
+The other systems differ in what stands for the powers ``A^k``: a stack of matrices (places, taxels), one for
+each filter. Outputs equal those of the factored form up to floating-point rounding (float64 throughout).
 """
 
 import numpy as np
@@ -49,8 +50,8 @@ def effective_weight(stack: FloatArray, filters: FloatArray) -> FloatArray:
 def synapses(stack: FloatArray, filters: FloatArray, system: str = TACTILESGNET) -> Sparse:
     """Weights of a first layer, of a stack (filters, places, taxels) and filters (filters, features, channels).
 
-    The stored entries are all pairs of a place and a taxel that some matrix of the stack connects, whatever their
-    weight; rows are in the order of the system's neurons, columns taxel-major.
+    The stored entries are all pairs of a place and a taxel that some matrix of the stack connects, whatever
+    their weight; rows are in the order of the system's neurons, columns taxel-major.
     """
     weight = effective_weight(stack, filters)
     connected: BoolArray = (stack != 0).any(axis=0)
@@ -82,7 +83,8 @@ def expand_first_layer(checkpoint: Checkpoint, convolution: Convolution) -> tupl
 def expand_dense(checkpoint: Checkpoint, layer: int) -> Sparse:
     """Weights of a fully connected layer, (neurons, neurons of the layer before) float64.
 
-    The stored entries are all pairs within a tower, and those from the relays of clocks, whatever their weight.
+    The stored entries are all pairs within a tower, and those from the relays of clocks, whatever their
+    weight.
     """
     weight = checkpoint.dense[layer - 1].weight
     before = towers_of(checkpoint)[layer - 1]
@@ -97,8 +99,9 @@ def expand_dense(checkpoint: Checkpoint, layer: int) -> Sparse:
 def expand(checkpoint: Checkpoint, propagation: FloatArray) -> Network:
     """Lower trained weights to a network of populations and synapses, in float64.
 
-    Spikes equal those of the float64 model up to the rounding of a differently ordered sum. `propagation` as of
-    :class:`ir.Convolution`; ModelError if it disagrees with the weights about the number of taxels, places or filters.
+    Spikes equal those of the float64 model up to the rounding of a differently ordered sum. `propagation` as
+    of :class:`ir.Convolution`; ModelError if it disagrees with the weights about the number of taxels,
+    places or filters.
     """
     _require_fit(checkpoint, propagation.shape)
     dynamics = checkpoint.dynamics

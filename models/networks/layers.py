@@ -1,7 +1,7 @@
 """Layers that compute all time steps at once: a K-hop graph convolution and a leaky integrate-and-fire recurrence.
 
-Time comes first, (steps, samples, …), so that a layer is one matrix product over all steps and samples, followed by a
-recurrence that runs along the first axis only.
+Time comes first, (steps, samples, …), so that a layer is one matrix product over all steps and samples,
+followed by a recurrence that runs along the first axis only.
 
 References
 ----------
@@ -32,11 +32,13 @@ LARGE = 1 << 16
 def tag_convolution(x: Tensor, adjacency: Tensor, hops: Tensor, bias: Tensor) -> Tensor:
     """K-hop filter ``y = sum_k A^k x g_k^T + b`` [1]_, summed in the order of the released operator.
 
-    For `x` (steps, samples, taxels, channels), into which no gradient flows, `adjacency` (taxels, taxels), whose row i
-    gathers into taxel i, and `hops` (K + 1, features, channels); (steps, samples, taxels * features), taxel-major.
+    For `x` (steps, samples, taxels, channels), into which no gradient flows, `adjacency` (taxels, taxels),
+    whose row i gathers into taxel i, and `hops` (K + 1, features, channels); (steps, samples, taxels *
+    features), taxel-major.
     """
     steps, samples, taxels, channels = x.shape
-    # Taxels last: a hop is then one product of a tall matrix with (taxels, taxels), and its result lies as needed next.
+    # Taxels last: a hop is then one product of a tall matrix with (taxels, taxels), and its result lies as
+    # needed next.
     reached = x.new_empty(len(hops), channels * steps * samples, taxels)
     reached[0] = x.permute(3, 0, 1, 2).reshape(-1, taxels)
     for k in range(1, len(hops)):
@@ -67,7 +69,8 @@ class _HopSum(torch.autograd.Function):
 def filter_places(x: Tensor, propagation: Tensor, filters: Tensor, bias: Tensor) -> Tensor:
     """``y = sum_k M_k x g_k^T + b``, in one product: of what every place sees, with all filters side by side.
 
-    As :func:`tag_convolution`; `propagation` (filters, places, taxels) stacks the M_k, the output is place-major.
+    As :func:`tag_convolution`; `propagation` (filters, places, taxels) stacks the M_k, the output is
+    place-major.
     """
     steps, samples, taxels, channels = x.shape
     n_filters, places, _ = propagation.shape
@@ -81,10 +84,10 @@ def filter_places(x: Tensor, propagation: Tensor, filters: Tensor, bias: Tensor)
 def lif(current: Tensor, beta: float, theta: float, surrogate: Surrogate = RECTANGLE) -> tuple[Tensor, Tensor]:
     """Leaky integrate-and-fire neurons along the first axis, from rest.
 
-    ``u_t = beta * u_{t-1} * (1 - s_{t-1}) + current_t`` and ``s_t = u_t > theta``, a strict comparison. The gradient
-    runs through the decay and, where the surrogate says so, through the reset, with the surrogate [2]_ [3]_ for the
-    derivative of the spike. Returns zeros and ones, and the membrane that was compared with `theta`, both (steps, ...);
-    no gradient flows from the membrane.
+    ``u_t = beta * u_{t-1} * (1 - s_{t-1}) + current_t`` and ``s_t = u_t > theta``, a strict comparison. The
+    gradient runs through the decay and, where the surrogate says so, through the reset, with the surrogate
+    [2]_ [3]_ for the derivative of the spike. Returns zeros and ones, and the membrane that was compared
+    with `theta`, both (steps, ...); no gradient flows from the membrane.
     """
     spikes, membrane = _Lif.apply(current, beta, theta, surrogate)  # type: ignore[no-untyped-call]
     return spikes, membrane
@@ -93,7 +96,9 @@ def lif(current: Tensor, beta: float, theta: float, surrogate: Surrogate = RECTA
 class _Lif(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, current: Tensor, beta: float, theta: float, surrogate: Surrogate) -> tuple[Tensor, Tensor]:
-        ctx.beta, ctx.theta, ctx.surrogate = beta, theta, surrogate
+        ctx.beta = beta
+        ctx.theta = theta
+        ctx.surrogate = surrogate
         current = current.contiguous()
         spikes = torch.empty_like(current)
         membrane = torch.empty_like(current)
@@ -120,7 +125,8 @@ class Spike(torch.autograd.Function):
     def forward(ctx: Any, membrane: Tensor, theta: float, surrogate: Surrogate) -> Tensor:
         """Zeros and ones."""
         ctx.save_for_backward(membrane)
-        ctx.theta, ctx.surrogate = theta, surrogate
+        ctx.theta = theta
+        ctx.surrogate = surrogate
         return (membrane > theta).to(membrane.dtype)
 
     @staticmethod
@@ -164,9 +170,9 @@ def _accumulated(steps: Tensor, alpha: float, *, backwards: bool) -> Tensor:
 def spike_linear(spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """Affine layer over zeros and ones, which adds up the weights of the inputs that spiked.
 
-    Costs what the spikes cost (5 to 15 % of a dense product here); only the gradient of `spikes` is dense. The weight
-    is (inputs, outputs), transposed against torch's ``Linear``, so that the weights of one input lie side by side; the
-    bias starts each sum, the inputs follow in ascending order.
+    Costs what the spikes cost (5 to 15 % of a dense product here); only the gradient of `spikes` is dense.
+    The weight is (inputs, outputs), transposed against torch's ``Linear``, so that the weights of one input
+    lie side by side; the bias starts each sum, the inputs follow in ascending order.
     """
     out: Tensor = _SpikeLinear.apply(spikes, weight, bias)  # type: ignore[no-untyped-call]
     return out
@@ -228,7 +234,8 @@ def kind_of(like: Tensor) -> type[np.float32] | type[np.float64]:
     return np.float32 if like.dtype == torch.float32 else np.float64
 
 
-# Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the loops.
+# Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the
+# loops.
 
 
 @numba.njit(cache=True)

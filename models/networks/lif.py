@@ -1,7 +1,7 @@
 """Spiking neurons as a torch module, one step a call.
 
-A network is any ``nn.Module`` with :class:`LIF` layers in it; whatever lies between two of them must be affine to be
-compiled (:func:`module.module_network`). How it is trained is its own affair.
+A network is any ``nn.Module`` with :class:`LIF` layers in it; whatever lies between two of them must be
+affine to be compiled (:func:`module.module_network`). How it is trained is its own affair.
 """
 
 from torch import Tensor, nn
@@ -13,8 +13,8 @@ from spikeloom.models.networks.surrogate import RECTANGLE
 class LIF(nn.Module):
     """Leaky integrate-and-fire neurons: ``u <- beta * u * (1 - s) + current``, ``s = u > theta``.
 
-    Keeps membrane and spikes from call to call, one call a step; :meth:`reset` before each recording. `beta` is the
-    share of the membrane that a step keeps, `theta` the threshold.
+    Keeps membrane and spikes from call to call, one call a step; :meth:`reset` before each recording. `beta`
+    is the share of the membrane that a step keeps, `theta` the threshold.
 
     >>> import torch
     >>> neuron = LIF(beta=0.5, theta=1.0)
@@ -24,7 +24,8 @@ class LIF(nn.Module):
 
     def __init__(self, beta: float = 0.2, theta: float = 0.5) -> None:
         super().__init__()
-        self.beta, self.theta = beta, theta
+        self.beta = beta
+        self.theta = theta
         self.membrane: Tensor | None = None
         self.spikes: Tensor | None = None
 
@@ -39,7 +40,8 @@ class LIF(nn.Module):
         else:
             membrane = self.membrane * self.beta * (1.0 - self.spikes) + current
         spikes: Tensor = Spike.apply(membrane, self.theta, RECTANGLE)  # type: ignore[no-untyped-call]
-        self.membrane, self.spikes = membrane, spikes
+        self.membrane = membrane
+        self.spikes = spikes
         return spikes
 
     def extra_repr(self) -> str:

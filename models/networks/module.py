@@ -1,7 +1,7 @@
 """Lower any torch module made of affine stages and :class:`lif.LIF` layers.
 
-A stage is read in float64, so the compiler need not know its layers: torch's derivative gives its weights, random
-combinations tell whether it is affine at all. New layer types need nothing but a ``forward``.
+A stage is read in float64, so the compiler need not know its layers: torch's derivative gives its weights,
+random combinations tell whether it is affine at all. New layer types need nothing but a ``forward``.
 """
 
 import copy
@@ -78,7 +78,9 @@ class _Stages:
 
     def respond(self, sources: list[Tensor]) -> list[Tensor]:
         """Currents of each layer and then the output, for the input and, if they are given, spikes of each layer."""
-        self.order, self.currents, self.forced = [], [], sources[1:]
+        self.order = []
+        self.currents = []
+        self.forced = sources[1:]
         reset(self.net)
         output = self.net(sources[0])
         if not isinstance(output, Tensor):
@@ -131,10 +133,10 @@ def module_network(
 ) -> Network:
     """Lower a module to a network of populations and synapses, in float64.
 
-    The ``forward`` of `net` takes the input of one step and calls :class:`lif.LIF` layers; it returns the spikes of the
-    last one, or a sum of them for each class. It is copied and brought to rest. The `example` is an input of one step;
-    its first axis may number recordings. For `polarities` and `polarities_first` see
-    :func:`sensor_layout.sensor_layout`.
+    The ``forward`` of `net` takes the input of one step and calls :class:`lif.LIF` layers; it returns the
+    spikes of the last one, or a sum of them for each class. It is copied and brought to rest. The `example`
+    is an input of one step; its first axis may number recordings. For `polarities` and `polarities_first`
+    see :func:`sensor_layout.sensor_layout`.
 
     ModelError if a stage is not affine, or the chip cannot have the network.
 

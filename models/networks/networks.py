@@ -32,8 +32,8 @@ from spikeloom.models.networks.surrogate import RECTANGLE, Surrogate
 from spikeloom.models.systems import HOPS, filters_of
 
 Weights = dict[str, NDArray[np.float32]]
-"""Arrays by name: ``conv1.hops`` (filters, features, channels), ``conv1.bias``, then ``fc1.weight`` (outputs, inputs),
-``fc1.bias`` and so on; see :mod:`compiler.systems`."""
+"""Arrays by name: ``conv1.hops`` (filters, features, channels), ``conv1.bias``, then ``fc1.weight``
+(outputs, inputs), ``fc1.bias`` and so on; see :mod:`compiler.systems`."""
 
 
 class Affine(nn.Module):
@@ -109,15 +109,17 @@ class Architecture(Sizes):
 class SpikingNet(TrainedModule):
     """A first layer, dense layers and a spike-count vote; every layer is one of LIF neurons [1]_.
 
-    `propagation` is what the first layer sees, see :func:`systems.propagation_of`. The `seed` is that of the initial
-    weights: uniform within 1/sqrt(fan-in), as torch and torch_geometric draw them; the bias of a graph convolution
-    starts at zero. The global random state is neither used nor moved. The `surrogate` is the derivative of a spike.
+    `propagation` is what the first layer sees, see :func:`systems.propagation_of`. The `seed` is that of the
+    initial weights: uniform within 1/sqrt(fan-in), as torch and torch_geometric draw them; the bias of a
+    graph convolution starts at zero. The global random state is neither used nor moved. The `surrogate` is
+    the derivative of a spike.
 
-    Neurons of the first layer lie place by place here; exported weights are in the order of the system. The relays of
-    clocks come last.
+    Neurons of the first layer lie place by place here; exported weights are in the order of the system. The
+    relays of clocks come last.
 
-    Where a layer's current outlasts its step, its parameters are ``W / (1 - alpha)``: a spike then brings as much in
-    all as it would without, at the start and by each step of the optimizer. Exported weights are ``W``.
+    Where a layer's current outlasts its step, its parameters are ``W / (1 - alpha)``: a spike then brings as
+    much in all as it would without, at the start and by each step of the optimizer. Exported weights are
+    ``W``.
     """
 
     def __init__(
@@ -129,7 +131,8 @@ class SpikingNet(TrainedModule):
         surrogate: Surrogate = RECTANGLE,
     ) -> None:
         super().__init__()
-        self.architecture, self.surrogate = architecture, surrogate
+        self.architecture = architecture
+        self.surrogate = surrogate
         self.gains = tuple(1 - alpha for alpha in architecture.dynamics.alphas)
         self.places = propagation.shape[-2]
         generator = torch.Generator().manual_seed(seed)
@@ -145,7 +148,8 @@ class SpikingNet(TrainedModule):
     def layers(self, events: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Spikes and membranes of every layer, each (steps, samples, neurons), for (steps, samples, taxels, channels).
 
-        Neurons of ``conv1`` lie place by place, ``place * features + feature``, then come the relays of clocks.
+        Neurons of ``conv1`` lie place by place, ``place * features + feature``, then come the relays of
+        clocks.
         """
         clocks = self.architecture.dynamics.clocks
         spikes, membranes = self._integrate(0, self.conv1, events, self.adjacency)
@@ -153,11 +157,11 @@ class SpikingNet(TrainedModule):
             ticks = relayed(clocks, spikes)
             spikes = torch.cat([spikes, ticks], dim=2)
             membranes = torch.cat([membranes, ticks * (RELAY_WEIGHT * self.architecture.theta)], dim=2)
-        found = {"conv1": (spikes, membranes)}
+        computed = {"conv1": (spikes, membranes)}
         for index, name in enumerate(self.dense, 1):
-            found[name] = self._integrate(index, self.get_submodule(name), spikes)
-            spikes = found[name][0]
-        return found
+            computed[name] = self._integrate(index, self.get_submodule(name), spikes)
+            spikes = computed[name][0]
+        return computed
 
     def _integrate(self, index: int, layer: nn.Module, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Spikes and membranes of one layer; its bias goes past a current that outlasts its step."""
@@ -207,13 +211,14 @@ class SpikingNet(TrainedModule):
                 n: self._scaled(index, p) for n, p in state.items() if n.startswith(f"{layer}.") and "bias" not in n
             }
         arrays = {name: p.numpy() for name, p in state.items()}
-        found = {name: (array.T if name.endswith(".weight") else array) for name, array in arrays.items()}
+        weights = {name: (array.T if name.endswith(".weight") else array) for name, array in arrays.items()}
         if self.architecture.system == MLP:
-            weight = found.pop("conv1.weight")
-            found = {"conv1.hops": weight.reshape(len(weight), self.architecture.taxels, -1).swapaxes(0, 1)} | found
+            weight = weights.pop("conv1.weight")
+            hops = weight.reshape(len(weight), self.architecture.taxels, -1).swapaxes(0, 1)
+            weights = {"conv1.hops": hops} | weights
         if feature_major(self.architecture.system):
-            found["fc1.weight"] = found["fc1.weight"][:, self._order()]
-        return {name: array.copy(order="C") for name, array in found.items()}
+            weights["fc1.weight"] = weights["fc1.weight"][:, self._order()]
+        return {name: array.copy(order="C") for name, array in weights.items()}
 
     def _order(self) -> IntArray:
         """Neuron of ours that is the first, second … one in the order of the system."""

@@ -1,9 +1,9 @@
 """The network on the chip's own integers, as a torch model with gradients: what it computes is what the chip computes.
 
-Weights, biases and thresholds are rounded by the compiler's own rounding. Synaptic sums are sums of
-integers in float32, exact below 2**24, which the 21-bit accumulator guarantees; the recurrence runs in integers.
-Gradients pass the rounding straight through, and a spike by the same surrogate as in training; those of a recurrent
-layer run through its own spikes, too.
+Weights, biases and thresholds are rounded by the compiler's own rounding. Synaptic sums are sums of integers
+in float32, exact below 2**24, which the 21-bit accumulator guarantees; the recurrence runs in integers.
+Gradients pass the rounding straight through, and a spike by the same surrogate as in training; those of a
+recurrent layer run through its own spikes, too.
 """
 
 from collections.abc import Sequence

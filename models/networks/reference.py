@@ -1,9 +1,9 @@
 """The float model of a trained network in the released operator order, as ``verify`` compares the chip with it.
 
 Released order: hop 0 first, then one propagation and one linear map per hop, added up, bias last; then the
-recurrence. In float32 this gives every spike of the released code on the released test recordings. A GCN is mapped
-first and then propagated, as torch_geometric does it; the sums of the others are one product. Towers of a joined
-network run one after the other, so that each has every spike that it has alone.
+recurrence. In float32 this gives every spike of the released code on the released test recordings. A GCN is
+mapped first and then propagated, as torch_geometric does it; the sums of the others are one product. Towers
+of a joined network run one after the other, so that each has every spike that it has alone.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,8 @@ STEPS = 32
 def float_spikes(network: Network, events: EventArray, *, dtype: str = "float32") -> dict[str, BoolArray]:
     """Spikes of every layer, (samples, steps, neurons) by name, on recordings (samples, taxels, channels, steps).
 
-    The network is one with a convolution, whose propagation is rounded to `dtype`; networks are trained in float32.
+    The network is one with a convolution, whose propagation is rounded to `dtype`; networks are trained in
+    float32.
     """
     return _run(network, events, np.dtype(dtype), membranes=False)
 
@@ -54,7 +55,8 @@ def _run(network: Network, events: AnyArray, dtype: np.dtype[Any], *, membranes:
 
 def _run_tower(network: Network, events: AnyArray, dtype: np.dtype[Any], *, membranes: bool) -> list[AnyArray]:
     """Spikes, or membranes, of each layer of a network that is joined of no others."""
-    samples, steps = len(events), events.shape[3]
+    samples = len(events)
+    steps = events.shape[3]
     kind = dtype if membranes else np.bool_
     drives = _drives(network, dtype)
     kept = [np.empty((samples, steps, population.size), kind) for population in network.populations]

@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass
 
-RECTANGULAR, FAST_SIGMOID = SHAPES = ("rectangular", "fast-sigmoid")
+RECTANGULAR = "rectangular"
+FAST_SIGMOID = "fast-sigmoid"
+SHAPES = (RECTANGULAR, FAST_SIGMOID)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,8 +20,8 @@ class EventCounts:
     gaps: int  # Silences longer than `gap_s` between two events of a recording
     gap_s: float = GAP_S
     shorter: int = 0  # Recordings shorter than the longest
-    # What is worth a second look: times that look like another unit, taxels that seem to count from 1, a table of
-    # labels
+    # What is worth a second look: times that look like another unit, taxels that seem to count from 1, a
+    # table of labels
     notes: tuple[str, ...] = field(default=(), metadata={"hidden": True})
 
     def __str__(self) -> str:

@@ -1,7 +1,7 @@
 """Small tables of numbers in CSV files: with or without a header, every fault named by its line.
 
-A line holds numbers between commas. The first line may name the columns, in any order; without names they stand in
-the order that the reader asks for. Blank lines, and what follows a ``#``, do not count.
+A line holds numbers between commas. The first line may name the columns, in any order; without names they
+stand in the order that the reader asks for. Blank lines, and what follows a ``#``, do not count.
 
 A table of labels, ``labels.csv`` beside recordings, has lines ``file,label``.
 """

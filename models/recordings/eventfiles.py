@@ -1,8 +1,8 @@
 """Files of single events: CSV or npz with ``time_s``, ``taxel``, ``polarity`` and perhaps ``label``.
 
-Times are seconds from the start of the recording, in any order. Polarity is 1 for rising and 0 or -1 for falling,
-one code per file. The label is the class of the whole recording: one constant, or part of a file name such as
-``grasp_7_label_3.csv``.
+Times are seconds from the start of the recording, in any order. Polarity is 1 for rising and 0 or -1 for
+falling, one code per file. The label is the class of the whole recording: one constant, or part of a file
+name such as ``grasp_7_label_3.csv``.
 """
 
 import os
@@ -38,8 +38,8 @@ class EventStream:
 def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, where: str | None = None) -> EventStream:
     """Read a ``.csv`` or a ``.npz`` of one-dimensional arrays, whose ``label`` may be one number.
 
-    DataError if the file cannot be read, holds no events, or one that a sensor of so many `taxels` does not send; the
-    message names the event.
+    DataError if the file cannot be read, holds no events, or one that a sensor of so many `taxels` does not
+    send; the message names the event.
     """
     path = Path(path)
     where = where or path.name

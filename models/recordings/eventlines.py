@@ -1,8 +1,8 @@
 """Event lines ``time_s,taxel,polarity`` from a file, a pipe or a terminal, one by one as they arrive.
 
-The form is that of :mod:`eventfiles`, so that any such CSV file can be watched: a header may name the columns
-in another order, a fourth column ``label`` is passed over, and what follows a ``#`` does not count. Here an empty line
-means something, though: the end of a grasp, after which a header may come again.
+The form is that of :mod:`eventfiles`, so that any such CSV file can be watched: a header may name the
+columns in another order, a fourth column ``label`` is passed over, and what follows a ``#`` does not count.
+Here an empty line means something, though: the end of a grasp, after which a header may come again.
 """
 
 import enum

@@ -1,7 +1,8 @@
 """Recordings in any form that we read: the released layout, files of events, single recordings, or a name.
 
-Events are put into time bins of one width. Nothing is corrected silently: what came out of order, what fell on an
-event of the same taxel, polarity and bin, and long silences are counted. Each recording counts for its own length.
+Events are put into time bins of one width. Nothing is corrected silently: what came out of order, what fell
+on an event of the same taxel, polarity and bin, and long silences are counted. Each recording counts for its
+own length.
 """
 
 import math
@@ -32,8 +33,8 @@ UNIT_SPAN_S = 60.0
 SEVERAL = 8
 """Recordings from which on a taxel without any event tells something."""
 
-# Times typed in decimals fall on edges, and 0.58 / 0.02 is 28.999999999999996. Of a bin; three roundings of a
-# quotient below MAX_STEPS are off by a third of it at most.
+# Times typed in decimals fall on edges, and 0.58 / 0.02 is 28.999999999999996. Of a bin; three roundings of
+# a quotient below MAX_STEPS are off by a third of it at most.
 _EDGE = 1e-9
 
 
@@ -59,15 +60,16 @@ def load_data(
 ) -> evtouch.Recordings:
     """Read the first `limit` recordings of a split, files in plain string order.
 
-    The path is a folder or zip in the released layout; a folder of ``.csv``, ``.npz`` and ``.npy`` recordings, flat (it
-    stands for any split) or with ``train/`` and ``test/``; one such file; or the name of a data set that was fetched.
-    `bin_s` is the width of a time bin in seconds, by default `default_bin_s`; the released layout and
-    ``.npy`` files have bins already, see `require_events`. The network expects so many `taxels` and `classes`; without
-    `taxels` the highest taxel with an event decides. Labels are `UNLABELLED` where nothing says them, see
-    `need_labels`. In the released layout all recordings have labels, the same steps and taxels, and no counts.
+    The path is a folder or zip in the released layout; a folder of ``.csv``, ``.npz`` and ``.npy``
+    recordings, flat (it stands for any split) or with ``train/`` and ``test/``; one such file; or the name
+    of a data set that was fetched. `bin_s` is the width of a time bin in seconds, by default
+    `default_bin_s`; the released layout and ``.npy`` files have bins already, see `require_events`. The
+    network expects so many `taxels` and `classes`; without `taxels` the highest taxel with an event decides.
+    Labels are `UNLABELLED` where nothing says them, see `need_labels`. In the released layout all recordings
+    have labels, the same steps and taxels, and no counts.
 
-    DataError if a recording cannot be used, with file and place; OptionError if `bin_s` is not a duration or given for
-    what has bins already, or `limit` is below 1.
+    DataError if a recording cannot be used, with file and place; OptionError if `bin_s` is not a duration or
+    given for what has bins already, or `limit` is below 1.
     """
     _require_options(bin_s, limit)
     place = _place_of(path)
@@ -156,9 +158,9 @@ def _require_alike(read: _Recording, first: _Recording, released: bool) -> None:
         )
 
 
-def require_events(where: str, bin_s: float | None, held: float = BIN_S) -> None:
+def require_events(where: str, bin_s: float | None, width: float = BIN_S) -> None:
     """Refuse a width of bins for what has bins already, of another width."""
-    if bin_s not in (None, held):
+    if bin_s not in (None, width):
         raise OptionError(f"--bin {bin_s:g}: {where} holds bins, not times; omit --bin")
 
 
@@ -185,13 +187,14 @@ def bin_events(
 ) -> tuple[EventArray, EventCounts]:
     """Put the events of one recording into bins.
 
-    Bin ``k`` holds the times from ``k * bin_s`` to before the next; a time less than a billionth of a bin before an
-    edge counts as on it, so that decimals fall where they say. The last bin holds the last event.
+    Bin ``k`` holds the times from ``k * bin_s`` to before the next; a time less than a billionth of a bin
+    before an edge counts as on it, so that decimals fall where they say. The last bin holds the last event.
 
     Returns
     -------
     events : (taxels, 2, steps) uint8
-        1 where there is at least one event; without `taxels` the highest with an event decides how many there are.
+        1 where there is at least one event; without `taxels` the highest with an event decides how many
+        there are.
     counts : EventCounts
         For this recording.
 
@@ -199,7 +202,8 @@ def bin_events(
     """
     latest = int(np.argmax(stream.time_s))
     last = float(stream.time_s[latest])
-    # A sensor that is touched sends several events a second: fewer than one, for a minute, are in a smaller unit.
+    # A sensor that is touched sends several events a second: fewer than one, for a minute, are in a smaller
+    # unit.
     odd = last > UNIT_SPAN_S and len(np.unique(stream.time_s)) < last - stream.time_s.min()
     if last / bin_s >= MAX_STEPS:
         remedy = "write seconds" if odd else "count from the start of the recording or use wider bins"
@@ -283,16 +287,16 @@ def _data_set(path: Path, split: str = "test") -> Iterator[tuple[evtouch.Members
                 raise DataError(f"{path}: not a recording; give a folder, a released zip, or a .csv, .npz or .npy file")
     with evtouch.opened(path) as members:
         plain = {name: member for name, member in members.items() if not is_table(Path(name))}
-        found = evtouch.splits_of(source, plain, {"train", "test", split})
+        splits = evtouch.splits_of(source, plain, {"train", "test", split})
         flat = {name: name for name in plain if "/" not in name and not name.startswith(".")}
-        if not found and flat and path.is_dir():
-            found = {"": flat}
-        if not found:
+        if not splits and flat and path.is_dir():
+            splits = {"": flat}
+        if not splits:
             raise DataError(
                 f"{source}: no recordings (train/ or test/ with .csv, .npz or sample_N_label_L.npy); "
                 "give the folder or zip that holds train/ and test/"
             )
-        yield members, found
+        yield members, splits
 
 
 def _unit_notes(read: Sequence[_Recording]) -> list[str]:

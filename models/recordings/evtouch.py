@@ -1,8 +1,8 @@
 """Recordings in one array, and the layout of the released ones: folders, zips and npy files, checked.
 
 The layout is ``train/`` and ``test/`` with files ``sample_N_label_L.npy``, possibly inside one top folder. A
-recording is (taxels, polarities, steps), values 0 and 1; of two polarities, 1 is the rising one (it leads at first
-contact).
+recording is (taxels, polarities, steps), values 0 and 1; of two polarities, 1 is the rising one (it leads at
+first contact).
 """
 
 import math
@@ -49,15 +49,15 @@ Members = Mapping[str, Callable[[], IO[Any]]]
 class Recordings:
     """Event recordings of one split, in one array: shorter ones are filled up with silence that does not count."""
 
-    # (samples, taxels, polarities, steps) uint8; 1 where a taxel sent an event of that polarity in that step;
-    # C-contiguous, read-only
+    # (samples, taxels, polarities, steps) uint8; 1 where a taxel sent an event of that polarity in that
+    # step; C-contiguous, read-only
     events: EventArray
     labels: IntArray  # (samples,) int64; class of each recording, or `UNLABELLED`; read-only
     files: tuple[str, ...]  # File name of each recording
     split: str  # For example ``test``
     source: str  # Name of the folder, zip or generator
-    # (samples,) int64, or None; steps of each recording; read-only. None where all have as many as the array, as in the
-    # released layout.
+    # (samples,) int64, or None; steps of each recording; read-only. None where all have as many as the
+    # array, as in the released layout.
     lengths: IntArray | None = None
     counts: EventCounts | None = None  # Anomalies of their events; None where they had bins already
     bin_s: float | None = None  # Seconds of a bin, where somebody said so; of those before any were joined

@@ -83,8 +83,8 @@ def fetch_data(name: str, *, url: str | None = None) -> Fetched:
 
     `url` is another address of the same file; the `data_folder` is made if needed.
 
-    OptionError, DataError if there is no such data set, or the address does not serve the released file, after
-    `RETRIES` more attempts.
+    OptionError, DataError if there is no such data set, or the address does not serve the released file,
+    after `RETRIES` more attempts.
     """
     data = _known(name)
     url = url or data.url

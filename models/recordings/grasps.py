@@ -1,8 +1,9 @@
 """Synthetic grasps: simple shapes pressed into a taxel layout and lifted again, as event recordings.
 
-They stand in for real recordings in the demonstration and in tests. A shape is a rigid surface whose gap over the
-skin, at first contact, is a function of place. Pressing it in by a depth loads each taxel in proportion to depth
-less gap. A taxel reports each level of load that it crosses: rising as polarity 1, falling as polarity 0.
+They stand in for real recordings in the demonstration and in tests. A shape is a rigid surface whose gap
+over the skin, at first contact, is a function of place. Pressing it in by a depth loads each taxel in
+proportion to depth less gap. A taxel reports each level of load that it crosses: rising as polarity 1,
+falling as polarity 0.
 
 After the generator drew its numbers, only operations that IEEE 754 rounds exactly touch them (no sine, no
 exponential), so that a seed gives the same bytes wherever numpy draws the same numbers.
@@ -21,9 +22,9 @@ SHAPES = ("sphere", "cylinder", "edge", "ring", "cone", "box")
 
 MIN_STEPS = 10
 
-# Lengths are in radii of the layout (half of what the taxels span), loads in depth; chosen so that events are as
-# dense as in the real recordings (8 to 16 %) and that a linear rule on their counts tells most shapes apart, not
-# all: 0.85 of new grasps after 60 of each class.
+# Lengths are in radii of the layout (half of what the taxels span), loads in depth; chosen so that events
+# are as dense as in the real recordings (8 to 16 %) and that a linear rule on their counts tells most shapes
+# apart, not all: 0.85 of new grasps after 60 of each class.
 _SHIFT = 0.15  # centre of the shape, most, along each axis
 _SIZES = 0.8, 1.2
 _DEPTHS = 0.3, 0.4
@@ -50,8 +51,8 @@ SPLIT_STEPS = 100
 def synthetic_split(split: str, *, limit: int | None = None, coordinates: ArrayLike = NEUTOUCH) -> Recordings:
     """Draw the split of the fixed synthetic data set that the shipped checkpoint was trained and tested on.
 
-    360 training or 144 test recordings of 100 steps, 6 classes, or the first `limit` of them. With `coordinates` the
-    same grasps touch another sensor.
+    360 training or 144 test recordings of 100 steps, 6 classes, or the first `limit` of them. With
+    `coordinates` the same grasps touch another sensor.
     """
     if split not in SPLITS:
         raise OptionError(f"--split {split}: the synthetic grasps have no such split; allowed: {', '.join(SPLITS)}")
@@ -67,10 +68,10 @@ def synthetic_grasps(
 ) -> Recordings:
     """Draw grasps with random place, orientation, size, depth and speed.
 
-    Of the layout `coordinates` (taxels, 2) in any unit only the proportions matter. A recording has `steps`, at least
-    `MIN_STEPS`. Each grasp has a stream of its own: those of a smaller `per_class` come first in a larger one, and the
-    choice of `classes` among `SHAPES`, along which labels count, does not change them. Classes come in turn, so that
-    the first recordings hold all of them.
+    Of the layout `coordinates` (taxels, 2) in any unit only the proportions matter. A recording has `steps`,
+    at least `MIN_STEPS`. Each grasp has a stream of its own: those of a smaller `per_class` come first in a
+    larger one, and the choice of `classes` among `SHAPES`, along which labels count, does not change them.
+    Classes come in turn, so that the first recordings hold all of them.
 
     Examples
     --------

@@ -26,8 +26,8 @@ SOURCES = "sources.csv"
 def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings], bin_s: float | None = None) -> None:
     """Write splits, of bins of so many seconds, into a new folder, or a zip if the name ends so; all or nothing.
 
-    A zip that exists is replaced, a folder must not exist. Numbers have leading zeros, so that the plain order of the
-    files is the order of the recordings.
+    A zip that exists is replaced, a folder must not exist. Numbers have leading zeros, so that the plain
+    order of the files is the order of the recordings.
 
     OptionError, DataError if there is no place for it, or a recording has no label.
     """

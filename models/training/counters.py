@@ -1,8 +1,8 @@
 """Train counting networks: a linear rule on what counters say, rounded to whole weights.
 
-Every recording becomes the spikes of a few hundred counters (:mod:`formats.counters`); a linear support vector machine
-(one class against the rest, squared hinge [1]_, by Newton steps [2]_) on these is the weights of the sums. Its
-strength is chosen by cross-validation inside the training recordings.
+Every recording becomes the spikes of a few hundred counters (:mod:`formats.counters`); a linear support
+vector machine (one class against the rest, squared hinge [1]_, by Newton steps [2]_) on these is the weights
+of the sums. Its strength is chosen by cross-validation inside the training recordings.
 
 References
 ----------
@@ -45,7 +45,8 @@ MOST = 64
 THING = 3
 """Gain of the rules for objects over those for boundaries between their levels."""
 
-NEWTON_STEPS, LEAST_STEP = 100, 1e-6
+NEWTON_STEPS = 100
+LEAST_STEP = 1e-6
 """Steps at most, of which a class takes three to ten, and the least part of one that is tried."""
 
 BITS = range(2, 9)
@@ -166,9 +167,10 @@ def require_levels(levels: int, classes: int) -> None:
 def linear_rules(data: Counted, classes: int, strengths: Iterable[float]) -> dict[float, Rule]:
     """For each strength a support vector machine without bias, one class against the rest.
 
-    It looks at the counters that spike now and then. Weights are sums of recordings, of which each class has shares.
-    Where classes are levels, the first of each thing is trained as the thing against the rest, and the others as the
-    boundary below them, on recordings of the thing alone; what a class weighs is the sum of all up to it.
+    It looks at the counters that spike now and then. Weights are sums of recordings, of which each class has
+    shares. Where classes are levels, the first of each thing is trained as the thing against the rest, and
+    the others as the boundary below them, on recordings of the thing alone; what a class weighs is the sum
+    of all up to it.
     """
     levels = data.plan.levels
     require_levels(levels, classes)
@@ -243,11 +245,12 @@ def folds(labels: IntArray, parts: int, rng: np.random.Generator) -> IntArray:
 def held_out(data: Counted, classes: int, *, seed: int = 0) -> dict[float, FloatArray]:
     """For each strength of the plan sums of each class, (samples, classes), by rules that did not see the recording."""
     fold = folds(data.labels, FOLDS, np.random.default_rng(seed))
-    found = {strength: np.zeros((len(fold), classes)) for strength in sorted(data.plan.strengths)}
-    for held in range(FOLDS):
-        for strength, rule in linear_rules(data.part(fold != held), classes, found).items():
-            found[strength][fold == held] = rule.sums(data.part(fold == held))
-    return found
+    sums = {strength: np.zeros((len(fold), classes)) for strength in sorted(data.plan.strengths)}
+    for left_out in range(FOLDS):
+        outside = fold == left_out
+        for strength, rule in linear_rules(data.part(~outside), classes, sums).items():
+            sums[strength][outside] = rule.sums(data.part(outside))
+    return sums
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -272,8 +275,8 @@ def fit(data: Counted, classes: int) -> Fitted:
 def rounded(weight: FloatArray, spikes: FloatArray, most: int) -> FloatArray:
     """Whole weights (classes, counters) of at most a magnitude, whose sums over spikes (samples, counters) stay.
 
-    One counter after the other is rounded, those that spike most first, and the weights of those to come make up for
-    what its rounding does to the sums [3]_.
+    One counter after the other is rounded, those that spike most first, and the weights of those to come
+    make up for what its rounding does to the sums [3]_.
     """
     alike = spikes.T @ spikes
     order = np.argsort(-np.diag(alike), kind="stable")
@@ -297,8 +300,8 @@ def spikes_of(made: Counters, data: Counted) -> NDArray[np.int8]:
 def counters_of(data: Counted, fitted: Fitted, recordings: Recordings, classes: int) -> Counters:
     """The network of a rule in whole weights; counters whose weights are all zero are left out.
 
-    Half of its ramp leads from the largest sum that the training recordings ever reach down to the lowest that may win.
-    The other half is for lower ones: noise lowers all sums.
+    Half of its ramp leads from the largest sum that the training recordings ever reach down to the lowest
+    that may win. The other half is for lower ones: noise lowers all sums.
     """
     plan = data.plan
     most = (1 << (data.plan.bits - 1)) - 1

@@ -63,8 +63,9 @@ def one_thread() -> Iterator[None]:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
-    # glibc hands large blocks back to the system when they are freed, and each step would fault them in anew.
-    # Having freed one of 30 MB it keeps blocks up to that size, see "dynamic mmap threshold" in mallopt(3).
+    # glibc hands large blocks back to the system when they are freed, and each step would fault them in
+    # anew. Having freed one of 30 MB it keeps blocks up to that size, see "dynamic mmap threshold" in
+    # mallopt(3).
     torch.empty(30 << 20, dtype=torch.uint8)
     try:
         yield
@@ -76,8 +77,8 @@ def one_thread() -> Iterator[None]:
 def require_finite(network: torch.nn.Module, loss: float, epoch: int, step: int) -> None:
     """Stop before the weights are touched.
 
-    Spikes hide a weight that is no number, since it exceeds no threshold and leaves the loss finite; the gradients of
-    the layers before it show it.
+    Spikes hide a weight that is no number, since it exceeds no threshold and leaves the loss finite; the
+    gradients of the layers before it show it.
     """
     gradients = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
     for name, found in (("loss", loss), ("gradient", sum(float(each.sum()) for each in gradients))):

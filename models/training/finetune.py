@@ -1,9 +1,10 @@
 """Quantisation-aware fine-tuning: train a network on the very integers that the chip will hold.
 
-The storage of each layer is fixed first, and the integers to begin with: the compiler's. Then the network is trained
-on, with every weight rounded in the forward pass [1]_. A checkpoint with the released dynamics learns by its own loss,
-the squared error of its rates; of any other network nobody knows how it was trained, so that it learns to decide as it
-does in floats [2]_. Everything runs on one thread and from one seed, so the same input gives the same weights.
+The storage of each layer is fixed first, and the integers to begin with: the compiler's. Then the network is
+trained on, with every weight rounded in the forward pass [1]_. A checkpoint with the released dynamics
+learns by its own loss, the squared error of its rates; of any other network nobody knows how it was trained,
+so that it learns to decide as it does in floats [2]_. Everything runs on one thread and from one seed, so
+the same input gives the same weights.
 
 References
 ----------
@@ -65,7 +66,7 @@ class Tuned:
 
     net: QuantisedNet  # With its weights in floats; rounded to its forms they are the chip's
     history: tuple[TunedEpoch, ...]
-    # before, after: Test recordings decided right on the chip's integers, before the first epoch and after the last
+    # before, after: Test recordings that the chip's integers decide right, before and after training
     before: int
     after: int
 
@@ -87,13 +88,13 @@ def finetune(
 ) -> Tuned:
     """Train a network on chip integers: `bits` wide, one or one a layer, with at most so many `groups` of scales.
 
-    Without `bits` the storage is what the compiler chooses on held-out training recordings. Training starts from the
-    compiler's integers; filters that a first layer shares start from its scales alone. Nothing is chosen on `test`,
-    which is read before the first epoch and after the last. The `seed` orders the recordings, and draws what of them
-    is lost (`robust`, see :func:`robust.worn`). `state` and `resume` as of :func:`train.train`.
+    Without `bits` the storage is what the compiler chooses on held-out training recordings. Training starts
+    from the compiler's integers; shared filters of a first layer start from its scales alone. Nothing is chosen
+    on `test`. The `seed` orders the recordings, and draws what is lost of them (`robust`, see
+    :func:`robust.worn`). `state` and `resume` as of :func:`train.train`.
 
-    OptionError, ModelError, CapacityError or DataError if options, network or recordings cannot be used, or the loss
-    is no longer a number.
+    OptionError, ModelError, CapacityError or DataError if options, network or recordings cannot be used, or
+    the loss is no longer a number.
     """
     require_least({"epochs": epochs, "seed": seed}, epochs=1, seed=0)
     require_chance(robust)

@@ -1,7 +1,7 @@
 """How a network is trained, as data: the released way, and one for networks that tell the time.
 
-A recipe is what ``train --recipe`` names; single values may be overridden there. It says nothing of the data, the
-system or the graph, and nothing of how a training is reported (:mod:`training.train`).
+A recipe is what ``train --recipe`` names; single values may be overridden there. It says nothing of the
+data, the system or the graph, and nothing of how a training is reported (:mod:`training.train`).
 """
 
 import math
@@ -22,9 +22,12 @@ DECAY_EPOCHS = 40
 HIDDEN = (128, 256)
 """Dense layers of the released networks."""
 
-MSE, CROSS_ENTROPY = ("mse", "cross-entropy")
-ADAM, ADAMW = ("adam", "adamw")
-STEPS, COSINE = ("steps", "cosine")
+MSE = "mse"
+CROSS_ENTROPY = "cross-entropy"
+ADAM = "adam"
+ADAMW = "adamw"
+STEPS = "steps"
+COSINE = "cosine"
 
 Decays = tuple[tuple[str, float], ...]
 """Pairs of a layer's name and its decay."""
@@ -37,8 +40,8 @@ class Recipe:
     name: str  # Which of ``RECIPES`` it is, or came from
     epochs: int = 100  # Unless the user says otherwise
     batch: int = 1  # Recordings to a step of the optimizer
-    # {"mse", "cross-entropy"}; squared error of the spike rates against zeros and a one, or cross-entropy of `gain`
-    # times the rates
+    # {"mse", "cross-entropy"}; squared error of the spike rates against zeros and a one, or cross-entropy of
+    # `gain` times the rates
     loss: str = MSE
     gain: float = 1.0  # Of the cross-entropy: factor before the softmax
     smoothing: float = 0.0  # Of the cross-entropy: share of the label that goes to all classes alike
@@ -53,13 +56,13 @@ class Recipe:
     features: int = 64
     hops: int = HOPS
     hidden: tuple[int, ...] = HIDDEN  # Neurons of each dense layer but the last
-    # betas, alphas: Membrane decays of single layers, all others have the common one; current decays that are not zero.
-    # With the first, every layer's is rounded to what the chip holds.
+    # betas, alphas: Membrane decays of single layers, all others have the common one; current decays that
+    # are not zero. With the first, every layer's is rounded to what the chip holds.
     betas: Decays = ()
     alphas: Decays = ()
     clocks: int = 0  # Clock channels, see :mod:`compiler.dynamics`
-    # Added to the loss for each synapse that carries a spike in every step: this times the share of the synapses behind
-    # neurons that do so, mean over steps and recordings
+    # Added to the loss for each synapse that carries a spike in every step: this times the share of the
+    # synapses behind neurons that do so, mean over steps and recordings
     penalty: float = 0.0
     robust: float = 0.0  # Chance of an event and of a taxel to be lost, see :func:`robust.worn`
 
@@ -121,13 +124,13 @@ def held_decays(beta: float, alpha: float) -> tuple[float, float]:
     return held_beta, held_alpha
 
 
-def decays_asked(words: str, option: str, layers: tuple[str, ...]) -> Decays:
-    """Decays by layer, from the words of an option; layers of decay zero are left out.
+def parse_decays(words: str, option: str, layers: tuple[str, ...]) -> Decays:
+    """Decays by layer, from the words of an option.
 
-    >>> decays_asked("fc1=0.95,fc3=0.5", "--current-decay", ("conv1", "fc1", "fc2", "fc3"))
+    >>> parse_decays("fc1=0.95,fc3=0.5", "--current-decay", ("conv1", "fc1", "fc2", "fc3"))
     (('fc1', 0.95), ('fc3', 0.5))
     """
-    found: dict[str, float] = {}
+    decays: dict[str, float] = {}
     for word in words.split(","):
         layer, _, number = word.strip().partition("=")
         try:
@@ -140,13 +143,14 @@ def decays_asked(words: str, option: str, layers: tuple[str, ...]) -> Decays:
             )
         if layer not in layers:
             raise OptionError(f"{option} {words}: no layer {layer!r}; the layers are {', '.join(layers)}")
-        if layer in found:
+        if layer in decays:
             raise OptionError(f"{option} {words}: names {layer} twice; give it once")
-        found[layer] = decay
-    return tuple(found.items())
+        decays[layer] = decay
+    return tuple(decays.items())
 
 
-MOST_SIZE, MOST_HOPS = 1024, 16
+MOST_SIZE = 1024
+MOST_HOPS = 16
 
 
 def check_recipe(recipe: Recipe) -> None:

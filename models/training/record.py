@@ -41,8 +41,8 @@ class Held:
 class TrainingRecord:
     """Everything needed to repeat a training, and what it reached; the fields are the keys in the checkpoint.
 
-    `history` has training loss, test loss and correct test recordings of each epoch; `recipe` is missing where it is
-    the released one, and `bin_s`, the seconds of a bin, where the recordings had bins already.
+    `history` has training loss, test loss and correct test recordings of each epoch; `recipe` is missing
+    where it is the released one, and `bin_s`, the seconds of a bin, where the recordings had bins already.
     """
 
     command: str
@@ -86,8 +86,8 @@ def training_record(
 ) -> TrainingRecord:
     """Record of a training; `recipe` where it is not the released one.
 
-    The best epoch is chosen on the test split, as the published figures are; the clean one on a part of the training
-    split; the last one is not chosen at all.
+    The best epoch is chosen on the test split, as the published figures are; the clean one on a part of the
+    training split; the last one is not chosen at all.
     """
     import torch  # two seconds that whoever reads records need not wait
 

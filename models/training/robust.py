@@ -24,5 +24,5 @@ def worn(events: EventArray, chance: float, draw: np.random.Generator) -> EventA
     dropped = draw.random(events.shape) < chance
     come = draw.random(events.shape) < chance * events.mean(axis=(1, 2, 3), keepdims=True)
     alive = draw.random(events.shape[:2]) >= chance
-    found: EventArray = ((events & ~dropped) | come) & alive[:, :, None, None]
-    return found
+    left: EventArray = ((events & ~dropped) | come) & alive[:, :, None, None]
+    return left

@@ -2,16 +2,16 @@
 
 :mod:`training.recipes` has another way, as data.
 
-The released script reads recordings in the order that the folder lists them, unshuffled, which differs from machine
-to machine. Here each epoch shuffles them anew, from the seed.
+The released script reads recordings in the order that the folder lists them, unshuffled, which differs from
+machine to machine. Here each epoch shuffles them anew, from the seed.
 
-Everything runs on one thread: at one recording per step a second thread gains little, and so a seed gives the same
-weights whatever the number of cores.
+Everything runs on one thread: at one recording per step a second thread gains little, and so a seed gives
+the same weights whatever the number of cores.
 
-A training is reported at three epochs, side by side. *Last*: nothing is chosen. *Best epoch on test*: the maximum
-over epochs, chosen on the test split. *Clean*: a first training leaves a fifth of the training split out and says which
-epoch does best on it; a second one, on the whole training split, is read on the test split at that epoch only. Which
-epoch the published figures [1]_ are of their text does not say.
+A training is reported at three epochs, side by side. *Last*: nothing is chosen. *Best epoch on test*: the
+maximum over epochs, chosen on the test split. *Clean*: a first training leaves a fifth of the training split
+out and says which epoch does best on it; a second one, on the whole training split, is read on the test
+split at that epoch only. Which epoch the published figures [1]_ are of their text does not say.
 
 References
 ----------
@@ -93,11 +93,11 @@ def train(
 ) -> Trained:
     """Train a network from scratch, or go on with an interrupted training; `test` is only looked at.
 
-    `propagation` is what the first layer sees, see :func:`systems.propagation_of`; the sizes and dynamics of the
-    `recipe` are already in the architecture. The `seed` is that of the initial weights and of the order of recordings.
-    The weights after epoch `keep_epoch`, counted from 1, are kept too. The file `state` holds the state after each
-    epoch, which the caller removes when the result is safe; `resume` goes on from it, to the same weights as
-    without interruption. `label` and `position` are name and row of the progress bar.
+    `propagation` is what the first layer sees, see :func:`systems.propagation_of`; the sizes and dynamics of
+    the `recipe` are already in the architecture. The `seed` is that of the initial weights and of the order
+    of recordings. The weights after epoch `keep_epoch`, counted from 1, are kept too. The file `state` holds
+    the state after each epoch, which the caller removes when the result is safe; `resume` goes on from it,
+    to the same weights as without interruption. `label` and `position` are name and row of the progress bar.
 
     OptionError if a number is too small, or `state` is another training's. DataError if
     recordings and architecture disagree, or the loss is no longer a number.

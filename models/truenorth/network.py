@@ -1,12 +1,13 @@
 """A TactileSGNet that TrueNorth holds: whole weights of few levels, blocks of few inputs, neurons that only add.
 
-The graph convolution sees the sensor as ever: its filters are shared by all taxels, and expanded to a weight for each
-channel and neuron. Its features are dealt to groups, so that every group of the first dense layer sees the whole skin
-in a few of them; each group of the second receives a share of every group of the first; the output neurons vote,
-several for each class in every group. The dense layers receive the clocks, which the chip gives them from outside.
+The graph convolution sees the sensor as ever: its filters are shared by all taxels, and expanded to a weight
+for each channel and neuron. Its features are dealt to groups, so that every group of the first dense layer
+sees the whole skin in a few of them; each group of the second receives a share of every group of the first;
+the output neurons vote, several for each class in every group. The dense layers receive the clocks, which
+the chip gives them from outside.
 
-What the chip rounds is rounded in every pass, and the gradient goes past the rounding as if it were not there: what is
-trained is what the chip computes, :class:`native.NativeNetwork`.
+What the chip rounds is rounded in every pass, and the gradient goes past the rounding as if it were not
+there: what is trained is what the chip computes, :class:`native.NativeNetwork`.
 """
 
 from __future__ import annotations
@@ -36,9 +37,10 @@ from spikeloom.models.networks.networks import Sizes, TrainedModule
 from spikeloom.models.networks.surrogate import RECTANGLE, Surrogate
 from spikeloom.models.truenorth.neurons import block_sums, integrate
 
-CONV_GAIN, GAIN = 4.0, 2.7
-"""Initial weights lie within this over the root of a neuron's inputs (of one taxel's channels in the convolution),
-thresholds being 1: membranes that only add reach them every ten to twenty steps."""
+CONV_GAIN = 4.0
+GAIN = 2.7
+"""Initial weights lie within this over the root of a neuron's inputs (of one taxel's channels in the
+convolution), thresholds being 1: membranes that only add reach them every ten to twenty steps."""
 
 LEAST_THRESHOLD = 8
 """In a threshold of fewer whole numbers no weight and no drift has room."""
@@ -124,8 +126,9 @@ def sized(
 class NativeNet(TrainedModule):
     """See the module docstring; neurons of the convolution lie taxel by taxel, of the others group by group.
 
-    `propagation` (taxels, taxels) is the normalised adjacency; the `seed` is that of the initial weights: the global
-    random state is neither used nor moved. The width of the surrogate, the derivative of a spike, is in thresholds.
+    `propagation` (taxels, taxels) is the normalised adjacency; the `seed` is that of the initial weights:
+    the global random state is neither used nor moved. The width of the surrogate, the derivative of a spike,
+    is in thresholds.
     """
 
     def __init__(
@@ -137,7 +140,8 @@ class NativeNet(TrainedModule):
         surrogate: Surrogate = RECTANGLE,
     ) -> None:
         super().__init__()
-        self.architecture, self.surrogate = architecture, surrogate
+        self.architecture = architecture
+        self.surrogate = surrogate
         generator = torch.Generator().manual_seed(seed)
         powers = np.stack([np.linalg.matrix_power(propagation, k) for k in range(architecture.hops + 1)])
         self.adjacency: Tensor
@@ -145,7 +149,8 @@ class NativeNet(TrainedModule):
         shape = (architecture.hops + 1, architecture.features, architecture.channels)
         self.hops = nn.Parameter(_uniform(shape, CONV_GAIN / math.sqrt(architecture.channels), generator))
         self.bias = nn.Parameter(torch.zeros(architecture.features))
-        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
         clocks = architecture.clocks.channels
         sizes = (*architecture.hidden, architecture.voters * architecture.classes)
         self.inputs = architecture.inputs()
@@ -163,11 +168,11 @@ class NativeNet(TrainedModule):
         most = highest_level(architecture.copies)
         # the weights of a filter over the graph differ by orders of magnitude: the largest decides
         step = dense.detach().abs().amax(1, keepdim=True) / (most + 0.5)
-        found = [self._round(dense, self.bias.repeat(architecture.taxels), 0, step)]
+        layers = [self._round(dense, self.bias.repeat(architecture.taxels), 0, step)]
         for depth, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True), 1):
             step = SPREADS[architecture.copies] * weight.detach().abs().mean(1, keepdim=True)
-            found.append(self._round(weight, bias.reshape(-1), depth, step))
-        return found
+            layers.append(self._round(weight, bias.reshape(-1), depth, step))
+        return layers
 
     def _round(self, weight: Tensor, bias: Tensor, depth: int, step: Tensor) -> Rounded:
         """Whole numbers for weights (blocks, inputs, size), whose levels shall be a `step` (blocks, 1, size) apart."""
@@ -198,12 +203,12 @@ class NativeNet(TrainedModule):
 
     def export_weights(self) -> Arrays:
         """Whole numbers of every layer: ``level``, ``threshold``, ``floor`` and ``leak`` after the layer's name."""
-        found: Arrays = {}
+        arrays: Arrays = {}
         with torch.no_grad():
             for name, layer in zip(self.architecture.layers, self.rounded(), strict=True):
                 whole = {"level": layer.weight / UNIT} | {each: getattr(layer, each) for each in VECTORS}
-                found |= {f"{name}.{what}": np.round(values.numpy()) for what, values in whole.items()}
-        return found
+                arrays |= {f"{name}.{what}": np.round(values.numpy()) for what, values in whole.items()}
+        return arrays
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -226,8 +231,8 @@ def run_layers(
 ) -> list[Tensor]:
     """Spikes of every layer, each (steps, samples, neurons), for (steps, samples, taxels, channels).
 
-    The first of the layers receives the sensor in one block; `inputs` (blocks, width) are what each block of the others
-    receives from the layer before.
+    The first of the layers receives the sensor in one block; `inputs` (blocks, width) are what each block of
+    the others receives from the layer before.
     """
     steps, samples = events.shape[:2]
     ticks = torch.from_numpy(clocks.events(steps).T.astype(np.float32))
@@ -284,9 +289,9 @@ def run_network(network: NativeNetwork, events: EventArray) -> dict[str, BoolArr
         for stage in network.stages
     ]
     with torch.no_grad():
-        found = run_layers(layers, [stage.inputs for stage in network.stages[1:]], network.clocks, given)
-    spikes = zip(network.stages, found, strict=True)
-    return {stage.name: held.numpy().astype(np.bool_).swapaxes(0, 1) for stage, held in spikes}
+        computed = run_layers(layers, [stage.inputs for stage in network.stages[1:]], network.clocks, given)
+    pairs = zip(network.stages, computed, strict=True)
+    return {stage.name: spikes.numpy().astype(np.bool_).swapaxes(0, 1) for stage, spikes in pairs}
 
 
 def _past(real: Tensor, whole: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """Integrate-and-fire neurons as the chip has them, and sums over blocks of their spikes, for training.
 
-All numbers that reach a membrane are whole, below 2**24, and so exact in float32 in whatever order they are added.
+All numbers that reach a membrane are whole, below 2**24, and so exact in float32 in whatever order they are
+added.
 """
 
 from typing import Any
@@ -18,9 +19,10 @@ def integrate(current: Tensor, threshold: Tensor, floor: Tensor, surrogate: Surr
     """Spikes of neurons that keep all they are given, from rest.
 
     ``m_t = c_{t-1} + current_t`` and ``s_t = m_t >= threshold``; then ``c_t`` is 0 after a spike, and
-    ``max(m_t, -floor)`` otherwise. The gradient runs back through the membrane until a spike or the floor cuts it, and
-    not through the reset; the surrogate, whose width is in thresholds, is taken at ``m / threshold - 1``. Currents and
-    spikes are (steps, samples, neurons), thresholds and floors (neurons,), which have no gradient; all float32.
+    ``max(m_t, -floor)`` otherwise. The gradient runs back through the membrane until a spike or the floor
+    cuts it, and not through the reset; the surrogate, whose width is in thresholds, is taken at ``m /
+    threshold - 1``. Currents and spikes are (steps, samples, neurons), thresholds and floors (neurons,),
+    which have no gradient; all float32.
     """
     spikes: Tensor = _Integrate.apply(current, threshold, floor, surrogate)  # type: ignore[no-untyped-call]
     return spikes
@@ -47,19 +49,20 @@ class _Integrate(torch.autograd.Function):
         return out, None, None, None
 
 
-# Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the loops.
+# Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the
+# loops.
 
 
 @numba.njit(cache=True)
-def _run_step(current: Any, held: Any, threshold: Any, floor: Any, spikes: Any, membrane: Any) -> None:
+def _run_step(current: Any, state: Any, threshold: Any, floor: Any, spikes: Any, membrane: Any) -> None:
     zero = np.float32(0)
     one = np.float32(1)
-    for i in range(len(held)):
-        m = held[i] + current[i]
+    for i in range(len(state)):
+        m = state[i] + current[i]
         fires = m >= threshold[i]
         membrane[i] = m
         spikes[i] = one if fires else zero
-        held[i] = zero if fires else max(m, -floor[i])
+        state[i] = zero if fires else max(m, -floor[i])
 
 
 @numba.njit(cache=True)
@@ -98,8 +101,8 @@ def _differentiate(above: Any, membrane: Any, threshold: Any, floor: Any, width:
 def block_sums(spikes: Tensor, weight: Tensor) -> Tensor:
     """Sums of the weights of the inputs that spiked, block by block: a matrix product of matrices on a diagonal.
 
-    `spikes` (steps, samples, blocks * width) are zeros and ones, the inputs of a block side by side; with `weight`
-    (blocks, width, size) they give (steps, samples, blocks * size).
+    `spikes` (steps, samples, blocks * width) are zeros and ones, the inputs of a block side by side; with
+    `weight` (blocks, width, size) they give (steps, samples, blocks * size).
     """
     blocks = spikes.chunk(len(weight), dim=2)
     nothing = torch.zeros(weight.shape[2])

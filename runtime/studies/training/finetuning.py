@@ -225,7 +225,8 @@ def _require_storage(request: FinetuneRequest, widths: list[int] | None, layers:
 
 def _require_trainable(request: FinetuneRequest, loaded: LoadedNetwork, output: Path) -> None:
     """Refuse networks that cannot be trained on, and a place whose name says another format."""
-    path, checkpoint = request.checkpoint, loaded.checkpoint
+    path = request.checkpoint
+    checkpoint = loaded.checkpoint
     if loaded.network.forms is not None:
         raise ModelError(f"{path}: was fine-tuned already; give the network that it was made from")
     if loaded.format == "counting":
@@ -291,7 +292,9 @@ def _words(request: FinetuneRequest, source: str) -> list[str]:
 def sections(result: Finetuned) -> Iterable[Section]:
     """A finished fine-tuning for people."""
     record = result.record
-    total, first, last = record.test_samples, record.history[0], record.history[-1]
+    total = record.test_samples
+    first = record.history[0]
+    last = record.history[-1]
     rows = [
         ["rounded", "", "", percent(record.before.correct, total)],
         *([["epoch 1", f"{first[0]:.5f}", f"{first[1]:,}", ""]] if record.epochs > 1 else []),

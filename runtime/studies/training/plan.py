@@ -15,7 +15,7 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.models.systems import sensor_grid, taxels_alone
 from spikeloom.models.training.plan import Plan
-from spikeloom.models.training.recipes import RELEASED, STEPS, Recipe, check_recipe, decays_asked
+from spikeloom.models.training.recipes import RELEASED, STEPS, Recipe, check_recipe, parse_decays
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.checkpoint import load_graph, sensor_places
 from spikeloom.runtime.inputs.compilation import whole_numbers
@@ -109,10 +109,10 @@ def recipe_of(request: TrainRequest) -> Recipe:
             "omit it"
         )
     if request.current_decay is not None:
-        alphas = decays_asked(request.current_decay, "--current-decay", recipe.layers)
+        alphas = parse_decays(request.current_decay, "--current-decay", recipe.layers)
         recipe = replace(recipe, alphas=alphas)
     if request.membrane_decay is not None:
-        betas = decays_asked(request.membrane_decay, "--membrane-decay", recipe.layers)
+        betas = parse_decays(request.membrane_decay, "--membrane-decay", recipe.layers)
         recipe = replace(recipe, betas=betas)
     if request.hops is not None and request.system not in (None, TACTILESGNET):
         raise OptionError(f"--hops {request.hops}: {TITLES[request.system]} has no hops to choose; omit it")

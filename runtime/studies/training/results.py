@@ -70,7 +70,8 @@ def training_sections(result: TrainingReport) -> Iterable[Section]:
             accuracy = f"{100 * epoch.correct / total:.2f} %"
             rows.append([name, str(epoch.epoch), f"{epoch.correct} of {total}", accuracy, interval])
     command, seed = result.runs[0].command.rsplit(" --seed ", 1)
-    typed, lines = f"{command} --seed {seed}", []
+    typed = f"{command} --seed {seed}"
+    lines = []
     if len(result.runs) > 1:
         typed += f" --seeds {len(result.runs)}"
         last, best, clean = (f"{100 * s.mean:.2f} % ± {100 * (s.std or 0.0):.2f}" for s in result.protocols.values())
@@ -89,7 +90,8 @@ def picture(records: Sequence[Finished]) -> Drawing:
     for index, record in enumerate(records):
         training, test, correct = np.array(record.history).T
         epochs = np.arange(1, len(correct) + 1)
-        colour, marker = COLOURS[index % len(COLOURS)], "." if len(epochs) == 1 else ""  # a line of one point is none
+        colour = COLOURS[index % len(COLOURS)]
+        marker = "." if len(epochs) == 1 else ""  # a line of one point is none
         left.semilogy(epochs, training, marker=marker, color=colour)
         left.semilogy(epochs, test, marker=marker, color=colour, linestyle="--")
         right.plot(epochs, 100 * correct / record.test_samples, color=colour, label=f"seed {record.seed}")

@@ -62,7 +62,8 @@ def run_job(job: Job) -> Finished:
     from spikeloom.models.training.record import training_record
     from spikeloom.models.training.train import train_both
 
-    plan, kind = job.plan, kind_of(job.plan.system)
+    plan = job.plan
+    kind = kind_of(plan.system)
     reported = train_both(
         joined_bins(job.training, plan.bins),
         joined_bins(job.test, plan.bins),
@@ -85,8 +86,8 @@ def run_job(job: Job) -> Finished:
     )
     trained = reported.trained
     assert trained.kept is not None, "the clean epoch is one of the epochs"
-    held = {"last": trained.last, "best": trained.best, "clean": trained.kept}
-    kept = {which: held[which] for which in WEIGHTS if which in job.keep}
+    weights = {"last": trained.last, "best": trained.best, "clean": trained.kept}
+    kept = {which: weights[which] for which in WEIGHTS if which in job.keep}
     kind.save(job.output, kept, plan, record.to_json())
     for file in state_of(job):
         file.unlink(missing_ok=True)
@@ -99,19 +100,19 @@ def recall(job: Job) -> Finished:
     from spikeloom.models.training.record import read_record
 
     kind = kind_of(job.plan.system)
-    found = kind.read(job.output)
-    record = dict(found.training or {})
+    stored = kind.read(job.output)
+    record = dict(stored.training or {})
     wanted = {"epochs": job.epochs, "seed": job.seed, "data_sha256": data_digest(job.training, job.test)}
     differing = [name.removesuffix("_sha256") for name, value in wanted.items() if record.get(name) != value]
-    differing += kind.differing(found, job.plan)
+    differing += kind.differing(stored, job.plan)
     if record.get("recipe", RELEASED.to_json()) != job.plan.recipe.to_json():
         differing.append("recipe")
     if differing:
         raise OptionError(
             f"{job.output}: holds another training (other {', '.join(differing)}); give its options, or another -o"
         )
-    if not set(job.keep) <= set(found.sets):
-        words = " ".join(f"--keep {which}" for which in found.sets)
+    if not set(job.keep) <= set(stored.sets):
+        words = " ".join(f"--keep {which}" for which in stored.sets)
         raise OptionError(f"{job.output}: holds only what {words} kept; give these, or another -o")
     return _finished(job, read_record(record))
 
@@ -124,8 +125,9 @@ def _finished(job: Job, record: Any) -> Finished:
 def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
     """Train several seeds, side by side on the cores where there are several; results are those of `run_job`.
 
-    With `resume`, finished seeds are left alone, interrupted ones go on, and the rest is started; OptionError if there
-    is something to resume and `resume` is false, or the reverse. The text of a KeyboardInterrupt says what is kept.
+    With `resume`, finished seeds are left alone, interrupted ones go on, and the rest is started;
+    OptionError if there is something to resume and `resume` is false, or the reverse. The text of a
+    KeyboardInterrupt says what is kept.
     """
     with ExitStack() as locks:
         for job in jobs:
