@@ -18,8 +18,8 @@ Sources = tuple[tuple[tuple[int, BoolArray], ...], ...]
 class Memories:
     """Neurons of one population and what they remember: the steps from `begin` to `step`, the longest come first.
 
-    In these steps `arrived` (steps, sources) reached them, of :meth:`Deviations.sources_into`, and float network and
-    chip both `fired`, (steps, neurons).
+    In these steps `arrived` (steps, sources) reached them, of :meth:`Deviations.sources_into`, and float
+    network and chip both `fired`, (steps, neurons).
     """
 
     neurons: IntArray

@@ -37,8 +37,8 @@ def mesh(cores: CoreMap) -> Drawing:
         axes.text(0, y - 0.08, f"chip {chip}", fontsize=8)
     wide, high = size
     for core in cores.cores:
-        (x, y), fill = places[core.core], core.fill[core.fullest]
-        level = high * min(fill.share, 1.0)
+        x, y = places[core.core]
+        level = high * min(core.fill[core.fullest].share, 1.0)
         axes.add_patch(Rectangle((x, y + high - level), wide, level, facecolor=CHIP, alpha=0.25))
         axes.add_patch(Rectangle((x, y), wide, high, fill=False, edgecolor=GREY))
         label = f"{core.core}: {' '.join(core.layers)}" if across <= 4 and wide > 0.3 else str(core.core)
@@ -55,24 +55,27 @@ def _places(cores: CoreMap) -> tuple[dict[int, Place], Place, dict[Place, int], 
     """Place of each core, the size of all, tiles by place, and chips by their upper end, from top to bottom."""
     fullest = max(Counter(core.tile for core in cores.cores).values())
     columns = min(fullest, 2)
-    wide, high = 0.88 / columns - 0.04, 0.76 / -(-fullest // columns) - 0.03
+    wide = 0.88 / columns - 0.04
+    high = 0.76 / -(-fullest // columns) - 0.03
     places: dict[int, Place] = {}
     tiles: dict[Place, int] = {}
     chips: dict[float, int] = {}
     top = 0.0
     numbers = sorted({core.chip for core in cores.cores})
     for chip in numbers:
-        held = [core for core in cores.cores if core.chip == chip]
-        left, upper = min(core.x for core in held), min(core.y for core in held)
+        on_chip = [core for core in cores.cores if core.chip == chip]
+        left = min(core.x for core in on_chip)
+        upper = min(core.y for core in on_chip)
         chips |= {top: chip} if len(numbers) > 1 else {}
         slots: Counter[int] = Counter()
-        for core in held:
-            x, y = float(core.x - left), top + core.y - upper
+        for core in on_chip:
+            x = float(core.x - left)
+            y = top + core.y - upper
             tiles[x, y] = core.tile
             row, column = divmod(slots[core.tile], columns)
             slots[core.tile] += 1
             places[core.core] = x + 0.03 + column * (wide + 0.03), y + 0.12 + row * (high + 0.02)
-        top += max(core.y for core in held) - upper + 1.2
+        top += max(core.y for core in on_chip) - upper + 1.2
     return places, (wide, high), tiles, chips
 
 
@@ -89,7 +92,8 @@ def fingertip(taxels: Taxels) -> Drawing:
         panels[f"{taxels.layer} spikes on the chip"] = taxels.spikes
     drawing = sheet("Taxels, the graph over them and their activity", 4.6)
     largest = _reach(points)
-    for axes, (name, values) in zip(np.ravel(drawing.figure.subplots(1, len(panels))), panels.items(), strict=True):
+    axes_of = np.ravel(drawing.figure.subplots(1, len(panels)))
+    for axes, (name, values) in zip(axes_of, panels.items(), strict=True):
         if n <= DETAILED:
             for a, b in sorted({(min(pair), max(pair)) for pair in taxels.edges.tolist()}):
                 axes.plot(points[[a, b], 0], points[[a, b], 1], color=GREY, lw=0.8, alpha=0.6, zorder=1)

@@ -62,8 +62,8 @@ class LayerRaster:
 class Trace:
     """Membranes of a neuron, called `of`, in the float model's units around a step.
 
-    There its spikes differ or, if it does not diverge, its membranes lie furthest apart. Without it on the chip it is
-    not held.
+    There its spikes differ or, if it does not diverge, its membranes lie furthest apart. Without it on the
+    chip it is not held.
     """
 
     layer: str
@@ -86,7 +86,8 @@ class Trace:
         where = f"{self.layer} {self.of}, step {self.step}"
         if not self.diverges:
             return f"no spike differs; the membranes lie furthest apart at {where}"
-        return f"first spike of {self.layer} that differs: {where}{'' if self.held else ' (not on the chip)'}"
+        absent = "" if self.held else " (not on the chip)"
+        return f"first spike of {self.layer} that differs: {where}{absent}"
 
     def fires(self, step: int) -> str:
         """Who fires in a step."""
@@ -172,7 +173,9 @@ def _traces(
         places = [(int(most[0]), widest, int(most[1]))]
     traces = []
     for step, layer, neuron in sorted(places):
-        population, held = machine.integer.populations[layer], not machine.absent[layer][neuron]
+        population = machine.integer.populations[layer]
+        on_chip = not machine.absent[layer][neuron]
+        threshold = float(population.threshold[neuron] / population.scale[neuron])
         first = max(0, step - AROUND)
         window = slice(first, step + AROUND + 1), neuron
         taxel, feature = taxel_and_feature(loaded.network, layer, neuron)
@@ -182,10 +185,10 @@ def _traces(
                 neuron=neuron,
                 of=f"neuron {neuron}" if taxel is None else f"taxel {taxel}, feature {feature}",
                 step=step,
-                held=held,
+                held=on_chip,
                 first_step=first,
                 theta=population.theta,
-                chip_theta=float(population.threshold[neuron] / population.scale[neuron]) if held else population.theta,
+                chip_theta=threshold if on_chip else population.theta,
                 model=ours[layer][window],
                 chip=chip[layer][window],
                 float_spikes=np.flatnonzero(spikes[0][layer][window]) + first,

@@ -50,10 +50,10 @@ class Decisions:
     @property
     def matrices(self) -> Mapping[str, IntArray]:
         """Of each side how often a label (rows) is decided as a class, (classes, classes)."""
-        found = {side: np.zeros((self.classes, self.classes), np.int64) for side in ("float", "chip")}
-        np.add.at(found["float"], (self.labels, self.model), 1)
-        np.add.at(found["chip"], (self.labels, self.chip), 1)
-        return found
+        counts = {side: np.zeros((self.classes, self.classes), np.int64) for side in ("float", "chip")}
+        np.add.at(counts["float"], (self.labels, self.model), 1)
+        np.add.at(counts["chip"], (self.labels, self.chip), 1)
+        return counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -156,7 +156,11 @@ def provenance(
     file = Path(request.checkpoint).name if isinstance(request.checkpoint, str) else loaded.format
     facts: JsonObject = dict.fromkeys(("system", "weights", "dynamics", "training"))
     if checkpoint is not None:
-        facts |= {"system": checkpoint.system, "weights": checkpoint.weights, "training": checkpoint.training}
+        facts |= {
+            "system": checkpoint.system,
+            "weights": checkpoint.weights,
+            "training": checkpoint.training,
+        }
         facts |= {"dynamics": None if checkpoint.dynamics.is_plain else checkpoint.dynamics.to_json()}
     facts |= {"graph": loaded.graph, "bins": netlist.bins}
     recorded = {"split": data.split, "samples": len(data), "bin_s": data.seconds}

@@ -17,7 +17,17 @@ from spikeloom.runtime.page.recording import LayerRaster, Recording, Trace
 from spikeloom.runtime.page.results import Decisions, Provenance, Report, Taxels
 from spikeloom.runtime.report import drawing
 from spikeloom.runtime.report.numbers import percent, si
-from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Outcome, Section, Table, Text
+from spikeloom.runtime.report.sections import (
+    Block,
+    Code,
+    Details,
+    Facts,
+    Figure,
+    Outcome,
+    Section,
+    Table,
+    Text,
+)
 from spikeloom.runtime.studies.robustness.stress_sections import overview
 
 LISTED = 10
@@ -49,7 +59,8 @@ def sections(report: Report) -> list[Section]:
     """Chapters of the page."""
     chapters = [
         Section(
-            "Verdict", [Text(in_a_sentence(report.verify)), Facts(_cards(report)), *verdict_sections(report.verify)]
+            "Verdict",
+            [Text(in_a_sentence(report.verify)), Facts(_cards(report)), *verdict_sections(report.verify)],
         ),
         Section("Decisions", _decisions(report.decisions)),
         Section("Cores", [*_of_chip(report.described), *([] if report.cores is None else _cores(report.cores))]),
@@ -78,7 +89,8 @@ def about(report: Report) -> str:
 
 
 def _cards(report: Report) -> dict[str, tuple[str, str]]:
-    verdict, price = report.verify, report.price
+    verdict = report.verify
+    price = report.price
     cards = {}
     for side, share in verdict.accuracy.items():
         value, _, note = percent(round(share * verdict.samples), verdict.samples).partition(" (")
@@ -89,33 +101,32 @@ def _cards(report: Report) -> dict[str, tuple[str, str]]:
     cards["specification = engine"] = "yes" if verdict.spec_equals_engine else "NO", exact
     energy = {name: float(each.mean()) for name, each in price.dynamic_j.items()}
     static = "static power, not in that energy"
-    for name, unit, found in (("dynamic energy an inference", "J", energy), (static, "W", price.static_w)):
-        if found:
-            rising = sorted(found, key=found.__getitem__)
-            ends = dict.fromkeys(si(found[table], unit) for table in (rising[0], rising[-1]))
+    for name, unit, values in (("dynamic energy an inference", "J", energy), (static, "W", price.static_w)):
+        if values:
+            rising = sorted(values, key=values.__getitem__)
+            ends = dict.fromkeys(si(values[table], unit) for table in (rising[0], rising[-1]))
             cards[name] = " … ".join(ends), ", ".join(rising)
     for table, seconds in list(price.time_s.items())[:1]:
         cards["time an inference"] = si(float(seconds.mean()), "s"), f"at full speed, {table}, simple model"
     if report.cores is None:
         return cards
-    held = sum(core.compartments for core in report.cores.cores)
-    return cards | {"cores": (str(len(report.cores.cores)), f"{held:,} neurons on the chip")}
+    neurons = sum(core.compartments for core in report.cores.cores)
+    return cards | {"cores": (str(len(report.cores.cores)), f"{neurons:,} neurons on the chip")}
 
 
-def _decisions(found: Decisions) -> list[Block]:
-    ours, chip = found.matrices.values()
+def _decisions(decisions: Decisions) -> list[Block]:
+    ours, chip = decisions.matrices.values()
     pairs = sorted(np.argwhere(ours + chip).tolist(), key=lambda pair: -int(ours[*pair] + chip[*pair]))
     wrong = [
         [f"{label} as {decided}", str(ours[label, decided]), str(chip[label, decided])]
         for label, decided in pairs
         if label != decided
     ]
-    classes = [
-        [str(k), str(ours[k].sum()), str(ours[k, k]), str(chip[k, k])] for k in range(found.classes) if ours[k].any()
-    ]
+    present = np.flatnonzero(ours.any(axis=1)).tolist()
+    classes = [[str(k), str(ours[k].sum()), str(ours[k, k]), str(chip[k, k])] for k in present]
     moved = [
         [file, *map(str, decided)]
-        for file, *decided in zip(found.files, found.labels, found.model, found.chip, strict=True)
+        for file, *decided in zip(decisions.files, decisions.labels, decisions.model, decisions.chip, strict=True)
         if decided[1] != decided[2]
     ]
     tables = [
@@ -138,8 +149,8 @@ def _decisions(found: Decisions) -> list[Block]:
     ]
 
 
-def _cores(found: CoreMap) -> list[Block]:
-    limits = list(dict.fromkeys(name for core in found.cores for name in core.fill))
+def _cores(cores: CoreMap) -> list[Block]:
+    limits = list(dict.fromkeys(name for core in cores.cores for name in core.fill))
     short = [name.removeprefix("core.").replace("_", " ") for name in limits]
     places = [
         [
@@ -150,11 +161,14 @@ def _cores(found: CoreMap) -> list[Block]:
             core.fullest,
             f"{100 * core.fill[core.fullest].share:.0f} %",
         ]
-        for core in found.cores
+        for core in cores.cores
     ]
     fill = [
-        [str(core.core), *(f"{core.fill[name].used:,} ({100 * core.fill[name].share:.0f} %)" for name in limits)]
-        for core in found.cores
+        [
+            str(core.core),
+            *(f"{core.fill[name].used:,} ({100 * core.fill[name].share:.0f} %)" for name in limits),
+        ]
+        for core in cores.cores
     ]
     ways = [
         [
@@ -164,82 +178,90 @@ def _cores(found: CoreMap) -> list[Block]:
             f"{way.axons:,}",
             "" if way.hops is None else str(way.hops),
         ]
-        for way in sorted(found.traffic, key=lambda way: -way.packets)
+        for way in sorted(cores.traffic, key=lambda way: -way.packets)
     ]
-    mesh, tiles, chips = found.mesh, {core.tile for core in found.cores}, {core.chip for core in found.cores}
+    mesh, tiles, chips = cores.mesh, {core.tile for core in cores.cores}, {core.chip for core in cores.cores}
     figure = Figure(
         "cores-map",
-        partial(pictures.mesh, found),
+        partial(pictures.mesh, cores),
         "A core is filled as far as the fullest of its compartments, synaptic memory and axons.",
         [
             Table(["core", "tile", "layers", "compartments", "fullest limit", "fill"], places, "Cores"),
             Table(["core", *short], fill, "What each core uses of each limit", most=0),
             Table(
-                ["from core", "to core", "packets", "axons", "hops"], ways, "Packets in a mean recording", most=LISTED
+                ["from core", "to core", "packets", "axons", "hops"],
+                ways,
+                "Packets in a mean recording",
+                most=LISTED,
             ),
         ],
     )
     used = (
-        f"{len(found.cores)} cores on {len(tiles)} of {len(chips) * mesh.width * mesh.height} tiles (a chip has "
+        f"{len(cores.cores)} cores on {len(tiles)} of {len(chips) * mesh.width * mesh.height} tiles (a chip has "
         f"{mesh.width} by {mesh.height}, of {mesh.tile_cores} cores each); only the used part is drawn"
     )
     return [Section("", [Text(used), figure])]
 
 
-def _taxels(found: Taxels) -> list[Block]:
-    order = np.argsort(-found.events, kind="stable").tolist()
-    edges = found.edges.tolist()
-    head = ["taxel", "neighbours", "events (mean)", *([] if found.spikes is None else [f"{found.layer} spikes (mean)"])]
+def _taxels(taxels: Taxels) -> list[Block]:
+    order = np.argsort(-taxels.events, kind="stable").tolist()
+    edges = taxels.edges.tolist()
+    head = [
+        "taxel",
+        "neighbours",
+        "events (mean)",
+        *([] if taxels.spikes is None else [f"{taxels.layer} spikes (mean)"]),
+    ]
     rows = []
     for taxel in order[: pictures.DETAILED]:
         near = len({b for a, b in edges if a == taxel})
-        spikes = [] if found.spikes is None else [f"{found.spikes[taxel]:,.1f}"]
-        rows.append([str(taxel), str(near), f"{found.events[taxel]:,.1f}", *spikes])
-    graph = "no taxel graph" if found.graph is None else f"graph {found.graph} with {len(edges)} edges"
+        spikes = [] if taxels.spikes is None else [f"{taxels.spikes[taxel]:,.1f}"]
+        rows.append([str(taxel), str(near), f"{taxels.events[taxel]:,.1f}", *spikes])
+    graph = "no taxel graph" if taxels.graph is None else f"graph {taxels.graph} with {len(edges)} edges"
     unknown = (
         "; drawn on a circle, as their positions are not known: add --taxels COORDS.csv and the --graph of training"
     )
-    where = unknown if found.positions_mm is None else ""
+    where = unknown if taxels.positions_mm is None else ""
     caption = "Discs grow with what a taxel sends, and with what its first-layer neurons fire where there is a graph."
     table = Table(head, rows, "Activity in a mean recording, the busiest first", most=LISTED)
     return [
-        Text(f"{found.sensor or 'sensor'}: {len(order)} taxels, {graph}{where}"),
-        Figure("taxels-map", partial(pictures.fingertip, found), caption, [table]),
+        Text(f"{taxels.sensor or 'sensor'}: {len(order)} taxels, {graph}{where}"),
+        Figure("taxels-map", partial(pictures.fingertip, taxels), caption, [table]),
     ]
 
 
-def _recording(found: Recording) -> list[Block]:
-    sides = zip(found.votes["float"], found.votes["chip"], strict=True)
+def _recording(recording: Recording) -> list[Block]:
+    sides = zip(recording.votes["float"], recording.votes["chip"], strict=True)
     votes = [[str(k), str(ours), str(chip)] for k, (ours, chip) in enumerate(sides) if ours or chip]
     counts = [
         [layer.name, f"{len(layer.active):,} of {layer.neurons:,}"]
         + [f"{count:,}" for count in (layer.float_spikes, layer.chip_spikes, layer.different)]
-        for layer in found.layers
+        for layer in recording.layers
     ]
     nothing = np.zeros((0, 2), np.int64)
-    sent = LayerRaster(name="input", neurons=0, both=found.input, float_only=nothing, chip_only=nothing)
-    shown = next((layer for layer in found.layers if layer.different), found.layers[0])
+    sent = LayerRaster(name="input", neurons=0, both=recording.input, float_only=nothing, chip_only=nothing)
+    shown = next((layer for layer in recording.layers if layer.different), recording.layers[0])
     rasters = [
-        Details(layer.name, [_raster(layer, found.steps, place)], "raster", layer is shown)
-        for place, layer in enumerate((sent, *found.layers))
+        Details(layer.name, [_raster(layer, recording.steps, place)], "raster", layer is shown)
+        for place, layer in enumerate((sent, *recording.layers))
     ]
     head = ["layer", "neurons that fire", "float spikes", "chip spikes", "different"]
-    decided = f"decided {found.decision['float']} by the float model and {found.decision['chip']} by the chip"
+    decided = f"decided {recording.decision['float']} by the float model and {recording.decision['chip']} by the chip"
     return [
-        Text(f"{found.file}, {found.steps} steps: label {found.label}, {decided}"),
+        Text(f"{recording.file}, {recording.steps} steps: label {recording.label}, {decided}"),
         Table(head, counts, "Spikes by layer"),
         Details("Votes", [Table(["class", "float", "chip"], votes, "Votes")]),
         Section("Spikes", rasters),
         Section(
             "Membranes",
             [
-                Text(found.membranes[0].title),
+                Text(recording.membranes[0].title),
                 Figure(
                     "membranes",
-                    partial(pictures.membranes, found.membranes),
+                    partial(pictures.membranes, recording.membranes),
                     "Membranes before the reset, in the float model's units, around the first spike of each layer that "
                     "differs, which is shaded. Where none differs: of the neuron whose membranes lie furthest apart.",
-                    [_membrane_table(trace) for trace in found.membranes],
+                    [_membrane_table(trace) for trace in recording.membranes],
                 ),
             ],
         ),
@@ -275,6 +297,11 @@ def _raster(layer: LayerRaster, steps: int, place: int) -> Figure:
     )
 
 
+def _plain(value: Any) -> str:
+    """A word as it is, anything else as JSON."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
 def _provenance(made: Provenance) -> list[Block]:
     """Files, hashes, versions, options, seeds; and what to type to get all of it again."""
     files = [
@@ -294,18 +321,23 @@ def _provenance(made: Provenance) -> list[Block]:
     tables = [
         Table(
             ["", "value"],
-            [[name, value if isinstance(value, str) else json.dumps(value)] for name, value in found.items()],
+            [[name, _plain(value)] for name, value in values.items()],
             caption,
             words=True,
             most=0,
         )
-        for caption, found in facts.items()
-        if found
+        for caption, values in facts.items()
+        if values
     ]
     versions = ", ".join(f"{name} {number}" for name, number in made.versions.items())
     commands = [block for what, line in made.commands.items() for block in (Text(f"{what}:"), Code([line]))]
     return [
-        Table(["", "name", "sha256"], files, "Files; the hash of recordings is over events and labels", words=True),
+        Table(
+            ["", "name", "sha256"],
+            files,
+            "Files; the hash of recordings is over events and labels",
+            words=True,
+        ),
         *tables,
         Text(f"versions: {versions}"),
         Section("Commands that repeat this page", commands),

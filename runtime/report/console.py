@@ -20,10 +20,11 @@ def tell(text: str) -> None:
 
 
 class Progress:
-    """Says on a terminal how many of `total` parts of some work are done, and what time the others will take."""
+    """Says on a terminal how many of `total` parts of some work are done, and how long the others will take."""
 
     def __init__(self, total: int) -> None:
-        self._total, self._begun = total, time.perf_counter()
+        self._total = total
+        self._begun = time.perf_counter()
 
     def __call__(self, done: int, label: str = "running") -> None:
         """So many are done; the `label` is of the next."""
@@ -36,8 +37,8 @@ class Progress:
 def show(text: str) -> None:
     """Write a result to standard output; a reader that goes away early (``| head``) is no mistake.
 
-    Control characters are escaped, letters that the terminal's encoding lacks become question marks. Raises OSError if
-    the output cannot take the text, for example on a full disk.
+    Control characters are escaped, letters that the terminal's encoding lacks become question marks.
+    Raises OSError if the output cannot take the text, for example on a full disk.
     """
     encoding = sys.stdout.encoding or "utf-8"
     try:

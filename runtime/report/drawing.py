@@ -1,7 +1,7 @@
 """All figures, in Matplotlib: inline on pages, where pointer and arrow keys read values, or as files to print.
 
-Series differ in shape or dash as well as in colour. Colours are Okabe and Ito's, which people with any colour vision
-tell apart; on pages the style sheet chooses them for light and dark.
+Series differ in shape or dash as well as in colour. Colours are Okabe and Ito's, which people with any
+colour vision tell apart; on pages the style sheet chooses them for light and dark.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#5b5b5b", "#b8a800")
-CHIP, FLOAT = COLOURS[0], COLOURS[4]
+CHIP = COLOURS[0]
+FLOAT = COLOURS[4]
 GREY = "#808890"
 DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 2)), (0, (8, 2, 2, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "<", ">")
@@ -84,16 +85,20 @@ class Drawing:
             right, up = axes.transData.transform((x, y)) * 72 / self.figure.dpi
             return [round(float(right), 1), round(height - float(up), 1)]
 
-        found: dict[str, Any] = {
+        values: dict[str, Any] = {
             "along": self.along,
             "tips": [[*place(axes, x, y), tip] for axes, x, y, tip in self.tips],
         }
         if self.cells is not None:
             axes, names = self.cells
             (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-            found["cells"] = {"from": place(axes, left, top), "to": place(axes, right, bottom), "rows": list(names)}
-            found["cells"]["columns"] = round(right - left)
-        return found
+            values["cells"] = {
+                "from": place(axes, left, top),
+                "to": place(axes, right, bottom),
+                "rows": list(names),
+            }
+            values["cells"]["columns"] = round(right - left)
+        return values
 
     def file(self, kind: str, **options: Any) -> bytes:
         """As one of `PICTURES`; the same bytes for the same drawing."""
@@ -158,12 +163,14 @@ def matrices(title: str, panels: Mapping[str, IntArray]) -> Drawing:
     from matplotlib.patches import Rectangle
 
     drawing = sheet(title, 4.6)
-    for axes, (side, counts) in zip(np.ravel(drawing.figure.subplots(1, len(panels))), panels.items(), strict=True):
+    axes_of = np.ravel(drawing.figure.subplots(1, len(panels)))
+    for axes, (side, counts) in zip(axes_of, panels.items(), strict=True):
         totals = np.maximum(counts.sum(axis=1), 1)
         size = min(9.0, 150 / len(counts))
         for label, decided in np.argwhere(counts).tolist():
             count = int(counts[label, decided])
-            colour, alpha = (CHIP if label == decided else FLOAT), 0.2 + 0.4 * count / totals[label]
+            colour = CHIP if label == decided else FLOAT
+            alpha = 0.2 + 0.4 * count / totals[label]
             corner = decided - 0.5, label - 0.5
             axes.add_patch(Rectangle(corner, 1, 1, facecolor=colour, alpha=alpha, edgecolor="none"))
             axes.text(decided, label, str(count), ha="center", va="center", fontsize=size)
@@ -189,23 +196,30 @@ def raster(
     row = {neuron: index for index, neuron in enumerate(neurons)}
 
     def places(side: str) -> IntArray:
-        found = [(step, row[neuron]) for step, neuron in spikes[side].tolist() if neuron in row]
-        return np.array(sorted(found), np.int64).reshape(-1, 2)
+        shown = [(step, row[neuron]) for step, neuron in spikes[side].tolist() if neuron in row]
+        return np.array(sorted(shown), np.int64).reshape(-1, 2)
 
     image = np.zeros((max(len(neurons), 1), max(steps, 1), 4))
     both = places("both")
     image[both[:, 1], both[:, 0]] = (0.5, 0.53, 0.56, 0.9)
-    axes.imshow(image, aspect="auto", interpolation="nearest", extent=(-0.5, steps - 0.5, len(image) - 0.5, -0.5))
+    extent = (-0.5, steps - 0.5, len(image) - 0.5, -0.5)
+    axes.imshow(image, aspect="auto", interpolation="nearest", extent=extent)
     axes.plot([], [], "s", color=GREY, ms=4, label="both fire")
-    found = []
+    tips = []
     for side, colour, marker in (("float", FLOAT, "_"), ("chip", CHIP, "|")):
-        own = places(side)
+        alone = places(side)
         name = "float model" if side == "float" else side
         axes.plot(
-            own[:, 0], own[:, 1], marker, color=colour, ms=3 if len(neurons) > 150 else 6, mew=1.2, label=f"{name} only"
+            alone[:, 0],
+            alone[:, 1],
+            marker,
+            color=colour,
+            ms=3 if len(neurons) > 150 else 6,
+            mew=1.2,
+            label=f"{name} only",
         )
-        found += [(x, y, f"{kind} {neurons[y]}, step {x}: only the {name} fires") for x, y in own.tolist()]
-    drawing.tips += [(axes, x, y, tip) for x, y, tip in sorted(found)]
+        tips += [(x, y, f"{kind} {neurons[y]}, step {x}: only the {name} fires") for x, y in alone.tolist()]
+    drawing.tips += [(axes, x, y, tip) for x, y, tip in sorted(tips)]
     drawing.cells = axes, [f"{kind} {neuron}" for neuron in neurons]
     if not neurons:
         axes.text(0.02, 0.5, "silent", transform=axes.transAxes, va="center")

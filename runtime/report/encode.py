@@ -69,10 +69,12 @@ def encode(value: Any) -> Any:
 def decode(kind: Any, value: Any) -> Any:  # noqa: PLR0911 - one for each kind
     """A value of a type hint from what :func:`encode` made of it; keys without a field are passed over.
 
-    Hints are dataclasses, tuples, sequences, mappings, plain types, one of these or None, or Any. Raises TypeError,
-    ValueError or KeyError if the value is not of this kind, for instance since another version wrote it.
+    Hints are dataclasses, tuples, sequences, mappings, plain types, one of these or None, or Any. Raises
+    TypeError, ValueError or KeyError if the value is not of this kind, for instance since another version
+    wrote it.
     """
-    origin, inner = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    inner = get_args(kind)
     if kind is Any:
         return value
     if origin in (Union, UnionType):
@@ -83,7 +85,8 @@ def decode(kind: Any, value: Any) -> Any:  # noqa: PLR0911 - one for each kind
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return {inner[0](name): decode(inner[1], each) for name, each in _plain(dict, value).items()}
     if isinstance(origin, type) and issubclass(origin, Sequence):
-        kinds = inner[:1] * len(_plain(list, value)) if origin is not tuple or inner[-1] is Ellipsis else inner
+        alike = origin is not tuple or inner[-1] is Ellipsis
+        kinds = inner[:1] * len(_plain(list, value)) if alike else inner
         return tuple(decode(each, part) for each, part in zip(kinds, value, strict=True))
     if kind is float and type(value) in (int, float) and math.isfinite(number := float(value)):
         return number
@@ -97,7 +100,8 @@ def _plain(kind: Any, value: Any) -> Any:
 
 
 def _dataclass(kind: Any, value: Any) -> Any:
-    entries, hints = {}, get_type_hints(kind)
+    entries = {}
+    hints = get_type_hints(kind)
     for field in fields(kind):
         name = field.metadata.get("key", field.name)
         if name in _plain(dict, value):

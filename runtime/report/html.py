@@ -25,7 +25,11 @@ def page(title: str, about: str, sections: Iterable[Section]) -> str:
 
 
 def _environment() -> Any:
-    from jinja2 import Environment, PackageLoader, StrictUndefined  # a tenth of a second that other commands save
+    from jinja2 import (
+        Environment,
+        PackageLoader,
+        StrictUndefined,
+    )  # a tenth of a second that other commands save
 
     environment = Environment(
         loader=PackageLoader("spikeloom.runtime.report", "."),

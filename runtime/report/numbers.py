@@ -32,10 +32,12 @@ def si(value: float, unit: str) -> str:
 
 def dominant(static_j: Iterable[float], dynamic_j: Iterable[float]) -> str:
     """Which term of a decision is the larger at the pace of a sensor, by any source; joules."""
-    (least, *_, most), high = sorted([*static_j] * 2), max(dynamic_j)
+    least, *_, most = sorted([*static_j] * 2)
+    high = max(dynamic_j)
+    static = f"{si(least, 'J')} to {si(most, 'J')}"
     if least <= high:
-        return f"at the sensor's pace events take {si(high, 'J')}, static power {si(least, 'J')} to {si(most, 'J')}"
-    more = f"{si(least, 'J')} to {si(most, 'J')}, {least / high:,.0f} times what events take or more"
+        return f"at the sensor's pace events take {si(high, 'J')}, static power {static}"
+    more = f"{static}, {least / high:,.0f} times what events take or more"
     return f"at the sensor's pace static power dominates: {more}"
 
 

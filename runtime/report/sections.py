@@ -1,7 +1,7 @@
 """What a result has to say, laid out once: sections of text, tables, figures and commands; and these as text.
 
-A study returns a frozen dataclass; a function beside it turns that into sections. :func:`terminal` prints them,
-:mod:`report.html` makes a page of them. The first heading of a table is its name.
+A study returns a frozen dataclass; a function beside it turns that into sections. :func:`terminal` prints
+them, :mod:`report.html` makes a page of them. The first heading of a table is its name.
 """
 
 from __future__ import annotations

@@ -38,8 +38,9 @@ class SynapticOperations:
 class NeuroBench:
     """Metrics of the neurons that the chip holds, means over recordings as the harness gives them for batches of one.
 
-    The footprint is bytes of weights and biases as stored; sparsities are shares of weights that are zero between
-    connected layers (to four digits, as the package does), and of neurons and steps without a spike.
+    The footprint is bytes of weights and biases as stored; sparsities are shares of weights that are zero
+    between connected layers (to four digits, as the package does), and of neurons and steps without a
+    spike.
     """
 
     footprint: int
@@ -79,7 +80,10 @@ def _spike_counts(machine: Comparable, data: Recordings) -> dict[int, IntArray]:
     for part in machine.parts(len(data), data.steps):
         lengths = data.step_counts[part]
         ran = machine.run(data.events[part], lengths=lengths, spikes=True)
-        trains: list[BoolArray] = [channels_last(data.events[part], machine.netlist.clocks), *ran.spikes.values()]
+        trains: list[BoolArray] = [
+            channels_last(data.events[part], machine.netlist.clocks),
+            *ran.spikes.values(),
+        ]
         for population, spikes in enumerate(trains, INPUT):
             counts.setdefault(population, []).append(cut(spikes, lengths).sum(axis=1))
     return {population: np.concatenate(parts) for population, parts in counts.items()}

@@ -1,7 +1,7 @@
 """The command ``explain``: why chip and float model differ on one recording.
 
-The reference is the float model in float64, run from the synapses that the compiler expands; ``verify`` compares with
-float32, as the model was trained.
+The reference is the float model in float64, run from the synapses that the compiler expands; ``verify``
+compares with float32, as the model was trained.
 """
 
 from dataclasses import replace

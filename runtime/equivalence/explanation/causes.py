@@ -1,9 +1,9 @@
 """Name the cause of every root: which deviation, if it alone were gone, would give the float model's spike.
 
-A root's neuron remembers the steps since its last common reset, in which it got the same spikes in the float model
-and on the chip. It is run again over these steps, from rest, with one deviation taken away at a time. There it fires
-where both did, which resets a membrane but no current; at any other step but the last it does not, or the replay says
-that it would. The cause is, in this order,
+A root's neuron remembers the steps since its last common reset, in which it got the same spikes in the
+float model and on the chip. It is run again over these steps, from rest, with one deviation taken away at
+a time. There it fires where both did, which resets a membrane but no current; at any other step but the
+last it does not, or the replay says that it would. The cause is, in this order,
 
 1. a tie, where the float model's membrane is at its threshold up to the rounding of float64;
 2. of the deviations without which the spike is the float model's, the one that moved the membrane most;
@@ -22,7 +22,15 @@ from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.equivalence.explanation import results
 from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots
 from spikeloom.runtime.equivalence.reference import taxel_and_feature
-from spikeloom.runtime.machines.deviations import LEFT_OUT, TIE, UNKNOWN, WEIGHTS, Deviations, Memories, Replays
+from spikeloom.runtime.machines.deviations import (
+    LEFT_OUT,
+    TIE,
+    UNKNOWN,
+    WEIGHTS,
+    Deviations,
+    Memories,
+    Replays,
+)
 
 UNDECIDED = 256 * float(np.finfo(np.float64).eps)
 """Distance to threshold, as a share of all that the neuron adds up, that the order of a sum decides."""
@@ -46,10 +54,10 @@ def explain(
 ) -> results.Explanation:
     """Find the roots of all differences between float64 model and chip on one recording, and their causes.
 
-    `deviations` are those of the netlist from `network`, `events` are (steps, channels) bool, and `observed` is what
-    the chip did on this recording. The chip does not hold the `absent` neurons of each population, of which the
-    `unread` reach no neuron and are not compared; they were `pruned` on evidence, or cannot fire with their rounded
-    weights.
+    `deviations` are those of the netlist from `network`, `events` are (steps, channels) bool, and
+    `observed` is what the chip did on this recording. The chip does not hold the `absent` neurons of each
+    population, of which the `unread` reach no neuron and are not compared; they were `pruned` on evidence,
+    or cannot fire with their rounded weights.
     """
     none = [np.zeros(population.size, np.bool_) for population in network.populations]
     both = _Sides(

@@ -43,10 +43,11 @@ class CauseRoots:
 class RootCause:
     """A root, why it differs, and what would change that.
 
-    Membranes before the comparison and their distance to the threshold are in the float model's units, registers as the
-    chip compares them; what the chip has is None where it does not hold the neuron. Each of the `sufficient` causes, if
-    it alone were gone, would give the float model's spike, and so would weights that the range does not cut off if
-    `clipped_weights`. `moved` says how far each cause moved the chip's membrane against its threshold, largest first.
+    Membranes before the comparison and their distance to the threshold are in the float model's units,
+    registers as the chip compares them; what the chip has is None where it does not hold the neuron. Each
+    of the `sufficient` causes, if it alone were gone, would give the float model's spike, and so would
+    weights that the range does not cut off if `clipped_weights`. `moved` says how far each cause moved the
+    chip's membrane against its threshold, largest first.
     """
 
     layer: str
@@ -117,8 +118,8 @@ class Explanation:
 class Explained(Shown):
     """The explanation of one recording, its number counted from 0.
 
-    So many recordings were `searched` for a difference. `faults` says where the netlist is not the rounding of the
-    checkpoint at all; `top` are the roots that drag most along.
+    So many recordings were `searched` for a difference. `faults` says where the netlist is not the
+    rounding of the checkpoint at all; `top` are the roots that drag most along.
     """
 
     sample: str
@@ -137,13 +138,17 @@ WIDTH = 116
 """Columns of a line of text."""
 
 
-def sections(found: Explained) -> list[Section]:
+def sections(explained: Explained) -> list[Section]:
     """Where they differ, why, and the roots that drag most along."""
-    where = f"{found.sample} ({found.split} split, recording {found.recording} counted from 0)"
-    faults = [Text("\n".join(wrap(f"FAULT of the netlist: {fault}", WIDTH))) for fault in found.faults]
-    why = found.explanation
+    where = f"{explained.sample} ({explained.split} split, recording {explained.recording} counted from 0)"
+    faults = [Text("\n".join(wrap(f"FAULT of the netlist: {fault}", WIDTH))) for fault in explained.faults]
+    why = explained.explanation
     if not why.different:
-        what = where if found.searched == 1 else f"the first {found.searched} recordings of the {found.split} split"
+        what = (
+            where
+            if explained.searched == 1
+            else f"the first {explained.searched} recordings of the {explained.split} split"
+        )
         equal = Text(f"{what}: every spike of the chip is the float64 model's; nothing to explain")
         return [Section("", [equal, *faults])]
     columns = ("float_spikes", "chip_spikes", "different", "roots", "propagated")
@@ -158,7 +163,9 @@ def sections(found: Explained) -> list[Section]:
     )
     clipped = sum(cause.from_clipped_weights for cause in why.causes)
     line = f"  {clipped:,} of these roots would go if no large weight were cut off by its range"
-    shown = f" ({len(found.top):,} of {why.roots:,} shown, --top shows more)" if why.roots > len(found.top) else ""
+    shown = (
+        f" ({len(explained.top):,} of {why.roots:,} shown, --top shows more)" if why.roots > len(explained.top) else ""
+    )
     entries = (
         f"{why.different:,} entries (neuron and step) differ from the float64 model: {why.roots:,} are roots, "
         f"{why.different - why.roots:,} follow from them"
@@ -169,7 +176,7 @@ def sections(found: Explained) -> list[Section]:
         Section("Causes", [causes, *([Text(line)] if clipped else []), *faults]),
         Section("Diagnosis", [Text(f"diagnosis: {why.diagnosis}")]),
         Section("Roots", [Text(f"roots, those first that drag most along{shown}:")]),
-        *(Section("", [Text("\n".join(_root(number, root)))]) for number, root in enumerate(found.top, 1)),
+        *(Section("", [Text("\n".join(_root(number, root)))]) for number, root in enumerate(explained.top, 1)),
     ]
 
 

@@ -1,14 +1,14 @@
 """Divergences that arise by themselves, and those that only follow: the difference graph of one recording.
 
-An *entry* is one neuron in one step, in aligned time; it *diverges* if float model and chip disagree about its spike.
-A neuron remembers what happened since its last *common reset*, the last step in which both fired: both membranes are
-zero after it. So an entry follows from
+An *entry* is one neuron in one step, in aligned time; it *diverges* if float model and chip disagree about
+its spike. A neuron remembers what happened since its last *common reset*, the last step in which both
+fired: both membranes are zero after it. So an entry follows from
 
 * the diverging entries of its presynaptic neurons, those of its own layer in the step before, and
 * the earlier diverging entries of its own neuron,
 
-in the steps that the neuron remembers. An entry that follows from none is a *root*: all its inputs agreed, and yet it
-differs. Every diverging entry inherits the roots of what it follows from, and may have several.
+in the steps that the neuron remembers. An entry that follows from none is a *root*: all its inputs agreed,
+and yet it differs. Every diverging entry inherits the roots of what it follows from, and may have several.
 """
 
 from collections.abc import Sequence
@@ -24,8 +24,9 @@ from spikeloom.runtime.machines.deviations import Sources
 class Root:
     """A divergence that arises although all inputs of the neuron agreed.
 
-    The step counts data steps; the neuron remembers from step `begin`, the one after its last common reset. Of later
-    entries `dragged` follow from it, perhaps among others, and `alone` of them from nothing else.
+    The step counts data steps; the neuron remembers from step `begin`, the one after its last common
+    reset. Of later entries `dragged` follow from it, perhaps among others, and `alone` of them from
+    nothing else.
     """
 
     layer: int
@@ -39,12 +40,12 @@ class Root:
 def find_roots(differs: Sequence[BoolArray], resets: Sequence[BoolArray], sources: Sources) -> tuple[Root, ...]:
     """Separate roots from what follows, in one pass over steps and layers; those that drag most along come first.
 
-    `differs` are the diverging entries of each population, (steps, neurons) bool, aligned with the data, populations in
-    order of depth; `resets` entries after which a neuron remembers nothing: both fired, and its current does not
-    outlast a step.
+    `differs` are the diverging entries of each population, (steps, neurons) bool, aligned with the data,
+    populations in order of depth; `resets` entries after which a neuron remembers nothing: both fired, and
+    its current does not outlast a step.
 
-    Sets of roots are Python integers, one bit a root: a layer that is densely connected needs one union a step, and as
-    many additions to its neurons' sets.
+    Sets of roots are Python integers, one bit a root: a layer that is densely connected needs one union a
+    step, and as many additions to its neurons' sets.
     """
     remembered = [[0] * array.shape[1] for array in differs]
     begin = [np.zeros(array.shape[1], np.int64) for array in differs]

@@ -1,4 +1,4 @@
-"""What ``stress`` works on: netlist and float network, sensor and recordings; and how recordings become inputs."""
+"""What ``stress`` works on: netlist and float network, sensor and recordings, and inputs made of them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,10 +27,11 @@ class Bench:
     """What is stressed, and on what."""
 
     pair: Pair  # As compiled
-    # Between taxels, (taxels, taxels) float64; in millimetres, or in steps on the graph where positions are not known
+    # Between taxels, (taxels, taxels) float64; in millimetres, or in steps on the graph where positions
+    # are not known
     distance: FloatArray
-    # (recordings, taxels, polarities, T) uint8; in the bins of the recordings, which are disturbed before a network
-    # joins them
+    # (recordings, taxels, polarities, T) uint8; in the bins of the recordings, which are disturbed before
+    # a network joins them
     events: Events
     labels: IntArray  # (recordings,) int64
     files: tuple[str, ...]
@@ -39,7 +40,8 @@ class Bench:
 
 def in_steps(events: Events, lengths: IntArray, netlist: Netlist) -> tuple[Events, IntArray]:
     """Recordings in steps of a network, and how many steps of each count."""
-    joined, steps = join_bins(events, netlist.bins), netlist.clocks.length
+    joined = join_bins(events, netlist.bins)
+    steps = netlist.clocks.length
     if steps is None:
         return joined, -(-lengths // netlist.bins)
     return fitted(joined, steps), np.full_like(lengths, steps)
@@ -51,7 +53,8 @@ def whole(events: Events, netlist: Netlist, lengths: IntArray) -> Inputs:
     def channels(rows: slice) -> Events:
         return channels_of(events[rows], netlist)
 
-    return Inputs(channels=channels, lengths=in_steps(events[:1], lengths, netlist)[1], begin=np.zeros_like(lengths))
+    steps = in_steps(events[:1], lengths, netlist)[1]
+    return Inputs(channels=channels, lengths=steps, begin=np.zeros_like(lengths))
 
 
 def by_length(events: Events, lengths: IntArray, change: Callable[[Events], Events]) -> Events:
@@ -106,13 +109,14 @@ def _distances(request: StressRequest, checkpoint: Checkpoint | None, taxels: in
     if taxels == len(NEUTOUCH) and not request.edges:
         return distances(taxels, NEUTOUCH, None)
     graph = None if checkpoint is None else checkpoint.edges
-    if graph is None and checkpoint is not None and (given := load_graph(request, checkpoint.system)) is not None:
-        graph = given.edges
+    if graph is None and checkpoint is not None:
+        given = load_graph(request, checkpoint.system)
+        graph = None if given is None else given.edges
     return distances(taxels, None, graph)
 
 
 def distances(taxels: int, places: FloatArray | None, edges: IntArray | None) -> FloatArray:
-    """Distances between taxels: of their positions, else on their graph, else of their numbers; (taxels, taxels).
+    """Distances between taxels by their positions, else on their graph, else by their numbers, (taxels, taxels).
 
     >>> distances(3, None, None)[0].tolist(), distances(3, None, np.array([[0, 2], [2, 1]]))[0].tolist()
     ([0.0, 1.0, 2.0], [0.0, 2.0, 1.0])

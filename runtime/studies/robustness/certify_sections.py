@@ -21,8 +21,8 @@ SHOWN = 20
 PANELS = {"dead": "dies", "stuck": "is stuck", "event": "sends one event more or less"}
 
 KEY = (
-    "at least: no change of so many events alters the decision, proven; at most: smallest change known to alter it; "
-    "taxels: on which a decision hangs"
+    "at least: no change of so many events alters the decision, proven; at most: smallest change known to "
+    "alter it; taxels: on which a decision hangs"
 )
 
 
@@ -59,7 +59,8 @@ def sections(result: Certificates) -> Iterator[Section]:
         yield Section("When single events alter", [Table(head, [["of them", *cells]])])
     fragile = sorted(certificates, key=lambda each: (each.at_least, each.ahead))
     head = ["recording", "label", "decided", "ahead", "at least", "at most", "alters"]
-    yield Section("The least stable", [Table(head, [_row(each) for each in fragile], words=True, most=SHOWN)])
+    rows = [_row(each) for each in fragile]
+    yield Section("The least stable", [Table(head, rows, words=True, most=SHOWN)])
 
 
 def _size(least: list[int | None]) -> str:
@@ -116,13 +117,16 @@ def taxel_map(result: Certificates) -> Drawing:
     drawing = sheet(title, 4.2)
     drawing.figure.suptitle(title, fontsize=10)
     points = _places(result.taxels)
-    for axes, (kind, values) in zip(drawing.figure.subplots(1, len(PANELS)), hanging_on(result).items(), strict=True):
+    panels = drawing.figure.subplots(1, len(PANELS))
+    for axes, (kind, values) in zip(panels, hanging_on(result).items(), strict=True):
         colours = ScalarMappable(Normalize(0, max(int(values.max()), 1)), "YlOrRd")
         axes.scatter(*points.T, s=190, c=colours.to_rgba(values), edgecolors=GREY, linewidths=0.6)
         for taxel, ((x, y), value) in enumerate(zip(points.tolist(), values.tolist(), strict=True)):
             dark = value > 0.6 * max(int(values.max()), 1)
-            axes.text(x, y, str(value), ha="center", va="center", fontsize=6, color="white" if dark else "black")
-            drawing.tips.append((axes, x, y, f"taxel {taxel} {PANELS[kind]}: {value} of {count} decisions change"))
+            colour = "white" if dark else "black"
+            axes.text(x, y, str(value), ha="center", va="center", fontsize=6, color=colour)
+            tip = f"taxel {taxel} {PANELS[kind]}: {value} of {count} decisions change"
+            drawing.tips.append((axes, x, y, tip))
         axes.set(title=f"… {PANELS[kind]}", aspect="equal")
         axes.margins(0.12)
         axes.axis("off")

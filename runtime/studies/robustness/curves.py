@@ -1,10 +1,12 @@
 """What the runs of a battery say: curves with intervals, where they break, whether on both sides, and why.
 
-*Intervals.* Over several seeds the 95 % interval of Student for the mean; of a single run Wilson's. *Leaves*: the first
-level at which the mean accuracy is below Wilson's interval of the clean one. *Chance*: the first of these at which
-Wilson's interval, for as many recordings as there are, holds one in as many as there are classes. *Verdict*, from the
-chip: *robust* if it never leaves, *breaks* if it comes down to chance, else *degrades*. Both sides break at the *same
-place* if the second has left, or has an interval that overlaps the other's, at the first level at which one leaves.
+*Intervals.* Over several seeds the 95 % interval of Student for the mean; of a single run Wilson's.
+*Leaves*: the first level at which the mean accuracy is below Wilson's interval of the clean one.
+*Chance*: the first of these at which Wilson's interval, for as many recordings as there are, holds one in as many as
+there are classes.
+*Verdict*, from the chip: *robust* if it never leaves, *breaks* if it comes down to chance, else *degrades*.
+Both sides break at the *same place* if the second has left, or has an interval that overlaps the other's, at the first
+level at which one leaves.
 """
 
 import math
@@ -20,7 +22,9 @@ from spikeloom.runtime.studies.robustness.pair import SIDES
 from spikeloom.runtime.studies.robustness.perturbations import SAMPLED
 from spikeloom.runtime.studies.robustness.results import Breaks, Curve, Point, Run, Spread, shown
 
-ROBUST, DEGRADES, BREAKS = "robust", "degrades", "breaks"
+ROBUST = "robust"
+DEGRADES = "degrades"
+BREAKS = "breaks"
 
 # From what on something is named as a reason:
 FULL = 0.5  # Share of all entries (neuron, step): a layer is saturated
@@ -89,13 +93,15 @@ def curve(name: str, runs: Mapping[Level, Sequence[Run]], clean: Run, recordings
     breaks = {}
     for side in SIDES:
         floor = wilson(clean.right[side], recordings)[0]
-        out = [point for point in levels if point.spread(side).mean < floor]
-        lost = [p for p in out if wilson(round(p.spread(side).mean * recordings), recordings)[0] <= 1 / classes]
-        breaks[side] = Breaks(leaves=out[0].level if out else None, chance=lost[0].level if lost else None)
+        below = {point.level: point.spread(side).mean for point in levels if point.spread(side).mean < floor}
+        chance = (
+            level for level, mean in below.items() if wilson(round(mean * recordings), recordings)[0] <= 1 / classes
+        )
+        breaks[side] = Breaks(leaves=next(iter(below), None), chance=next(chance, None))
     chip = breaks["chip"]
     left = {each.leaves for each in breaks.values()}
     first = next((point for point in levels if point.level in left), None)
-    overlap = first is not None and max(first.model.low, first.chip.low) <= min(first.model.high, first.chip.high)
+    overlap = first is not None and _overlap(first.model, first.chip)
     return Curve(
         what=SAMPLED[name].what,
         unit=SAMPLED[name].unit,
@@ -107,8 +113,13 @@ def curve(name: str, runs: Mapping[Level, Sequence[Run]], clean: Run, recordings
     )
 
 
+def _overlap(one: Spread, other: Spread) -> bool:
+    """Whether two intervals have anything in common."""
+    return max(one.low, other.low) <= min(one.high, other.high)
+
+
 def _point(level: Level, runs: Sequence[Run], clean: Run, recordings: int) -> Point:
-    layers = {name: tuple(sum(run.layers[name][i] for run in runs) for i in range(4)) for name in clean.layers}
+    layers = {name: tuple(map(sum, zip(*(run.layers[name] for run in runs), strict=True))) for name in clean.layers}
     accuracy = {side: spread([run.right[side] for run in runs], recordings) for side in SIDES}
     return Point(
         level=level,
@@ -131,19 +142,22 @@ def reasons(
 
     Counts of `layers` are as in a run, over all seeds; `recordings` are those of one run.
     """
-    total, column = recordings * len(runs), SIDES.index(side)
+    total = recordings * len(runs)
+    column = SIDES.index(side)
     seen = []
     stopped = sum(run.stopped for run in runs)
     if side == "chip" and stopped >= WITHOUT * total:
         seen.append(f"a register overflows in {stopped} of {total} recordings")
     ratio: dict[str, float] = {}
     for name, counts in layers.items():
-        before, after = clean.layers[name][column] * len(runs), counts[column]
+        before = clean.layers[name][column] * len(runs)
+        after = counts[column]
         ratio[name] = (after + 1) / (before + 1)
         if before >= OFTEN and not after:
             seen.append(f"{name} is silent")
         elif after >= FULL * counts[3] and after >= TWICE * before:
-            seen.append(f"{name} is saturated: fires in {100 * after / max(counts[3], 1):.0f} % of all steps")
+            share = 100 * after / max(counts[3], 1)
+            seen.append(f"{name} is saturated: fires in {share:.0f} % of all steps")
     without = sum(run.signs[side].get("no vote", 0) for run in runs)
     if without >= WITHOUT * total:
         seen.append(f"no vote in {without} of {total}")

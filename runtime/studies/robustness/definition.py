@@ -1,4 +1,4 @@
-"""What a perturbation is: a function with a name, a unit and a line for people; drawn by chance, or all its cases."""
+"""What a perturbation is: a function with a name, a unit and a line for people; drawn, or all its cases."""
 
 import inspect
 from collections.abc import Callable, Iterator, Sequence
@@ -58,11 +58,11 @@ class Perturbation:
 
 @dataclass(frozen=True, slots=True)
 class Sampled(Perturbation):
-    """One that is drawn by chance, or has one case a level: its levels from mild to harsh, and which others make sense.
+    """One that is drawn by chance, or has one case a level; its levels from mild to harsh.
 
-    Its function takes what it is done to, first: `events`, a `memory` of a chip, or a `bench` of which recordings
-    follow each other in another way; then the level; then, if it needs them, `distance` between taxels, (taxels,
-    taxels), and `rng`, a source of chance.
+    Its function takes what it is done to, first: `events`, a `memory` of a chip, or a `bench` of which
+    recordings follow each other in another way; then the level; then, if it needs them, `distance` between
+    taxels, (taxels, taxels), and `rng`, a source of chance.
     """
 
     levels: tuple[Level, ...]
@@ -114,9 +114,9 @@ class Sampled(Perturbation):
 class Exhaustive(Perturbation):
     """One of which every case is decided.
 
-    Its function takes one recording, `events` (taxels, polarities, bins), and if it needs it `shift`, how many bins
-    that is moved by at most; it gives all cases, the smallest first. Or it takes `there`, which entries of a recording
-    hold an event, and gives those that are flipped, each alone.
+    Its function takes one recording, `events` (taxels, polarities, bins), and if it needs it `shift`, how
+    many bins that is moved by at most; it gives all cases, the smallest first. Or it takes `there`, which
+    entries of a recording hold an event, and gives those that are flipped, each alone.
     """
 
     @property
@@ -141,11 +141,17 @@ class Exhaustive(Perturbation):
 
 
 def sampled(
-    unit: str, levels: tuple[Level, ...], *, least: float = 0, most: float = 1, unless: Obstacle | None = None
+    unit: str,
+    levels: tuple[Level, ...],
+    *,
+    least: float = 0,
+    most: float = 1,
+    unless: Obstacle | None = None,
 ) -> Callable[[Callable[..., Any]], Sampled]:
     """Make a function a perturbation that is drawn.
 
-    Levels are counted in `unit` and lie between `least` and `most`; `unless` says why it makes no sense for a network.
+    Levels are counted in `unit` and lie between `least` and `most`; `unless` says why it makes no sense
+    for a network.
     """
     return partial(Sampled, unit=unit, levels=levels, least=least, most=most, obstacle=unless)
 

@@ -19,7 +19,12 @@ from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
 from spikeloom.runtime.studies.robustness.proofs.attack import attack
 from spikeloom.runtime.studies.robustness.proofs.bounds import lower_bound, needed
 from spikeloom.runtime.studies.robustness.proofs.counting import Tally, least, tally_of
-from spikeloom.runtime.studies.robustness.proofs.entries import Cells, Events, cells_of, channels_of, words_of
+from spikeloom.runtime.studies.robustness.proofs.entries import (
+    Cells,
+    Events,
+    cells_of,
+    channels_of,
+)
 from spikeloom.runtime.studies.robustness.results import PHASES, Certificate, Certificates, Decided
 
 SHIFT = 25
@@ -62,7 +67,14 @@ def certify(
 
 
 def certificate(
-    machine: Machine, events: Events, label: int, file: str, *, shift: int, most: int, tally: Tally | None = None
+    machine: Machine,
+    events: Events,
+    label: int,
+    file: str,
+    *,
+    shift: int,
+    most: int,
+    tally: Tally | None = None,
 ) -> Certificate:
     """What is known of one recording (taxels, polarities, bins); `tally` is that of a counting network."""
     singles = _flip_each(machine, events, most, tally)
@@ -90,7 +102,7 @@ def certificate(
         at_least=at_least,
         at_most=at_most,
         exact=at_most == at_least + 1,
-        attack=tuple(words_of(cells.cells[flip], bool(cells.there[flip]), machine.netlist) for flip in flips),
+        attack=tuple(cells.words_of(flip, machine.netlist) for flip in flips),
         taxels=taxels,
         phases=tuple(np.bincount(phase, minlength=PHASES).tolist()),
     )
@@ -142,7 +154,7 @@ def _decide_flips(machine: Machine, kind: Exhaustive, singles: _Singles) -> tupl
     if not len(altering):
         return Decided(tried, 0), ()
     first = altering[0]
-    words = words_of(cells.cells[first], bool(cells.there[first]), machine.netlist)
+    words = cells.words_of(first, machine.netlist)
     taxels = np.unique(cells.cells[altering, 0] // machine.netlist.polarities)
     return Decided(tried, len(altering), words, int(singles.decided[first])), tuple(taxels.tolist())
 
@@ -163,11 +175,12 @@ def _decide_cases(
         return Decided(tried, 0), ()
     numbers, to = altering[0]
     size = abs(numbers[0]) if kind.sized else None
-    return Decided(tried, len(altering), kind.words(numbers), to, size), tuple(each[0] for each, _ in altering)
+    decided_first = Decided(tried, len(altering), kind.words(numbers), to, size)
+    return decided_first, tuple(each[0] for each, _ in altering)
 
 
 def _bounds(machine: Machine, singles: _Singles, most: int) -> tuple[int, IntArray]:
-    """How many changed events alter nothing, and entries whose flips together alter the decision, none if unknown."""
+    """How many changed events alter nothing, and entries whose flips alter the decision, none if unknown."""
     cells = singles.cells
     flips = singles.altering[:1]
     if len(flips):
@@ -191,5 +204,5 @@ def share_robust_to_one_event(machine: Machine, data: Recordings) -> float:
     """Share of recordings, in their own bins, whose decision no single event alters."""
     tally = tally_of(machine)
     recordings = zip(data.events, data.step_counts.tolist(), strict=True)
-    altered = (len(_flip_each(machine, events[..., :length], 1, tally).altering) for events, length in recordings)
-    return sum(not count for count in altered) / len(data)
+    singles = (_flip_each(machine, events[..., :length], 1, tally) for events, length in recordings)
+    return sum(not len(each.altering) for each in singles) / len(data)

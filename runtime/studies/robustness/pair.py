@@ -88,10 +88,11 @@ class Outcome:
 
 def evaluate(pair: Pair, inputs: Inputs) -> Outcome:
     """Run both sides from rest, so many recordings at a time that memory does not grow with their number."""
-    held = int(inputs.lengths.max()) * pair.netlist.n_compartments
-    size, parts = max(1, HELD // held), []
+    entries = int(inputs.lengths.max()) * pair.netlist.n_compartments
+    size = max(1, HELD // entries)
+    parts: list[Outcome] = []
     for first in range(0, len(inputs.lengths), size):
-        with _ALONE if held > LONG else nullcontext():
+        with _ALONE if entries > LONG else nullcontext():
             parts += _part(pair, inputs, slice(first, min(first + size, len(inputs.lengths))))
     return Outcome(
         votes={side: np.concatenate([part.votes[side] for part in parts]) for side in SIDES},
@@ -103,25 +104,35 @@ def evaluate(pair: Pair, inputs: Inputs) -> Outcome:
 
 def _part(pair: Pair, inputs: Inputs, rows: slice) -> list[Outcome]:
     """Some recordings together, or one by one if the simulator stops."""
-    netlist, readout, events = pair.netlist, pair.network.readout, inputs.channels(rows)
-    lengths, begin = inputs.lengths[rows], inputs.begin[rows]
-    stopped, first = np.zeros(len(events), np.bool_), int(begin.min())
+    netlist = pair.netlist
+    readout = pair.network.readout
+    events = inputs.channels(rows)
+    lengths = inputs.lengths[rows]
+    begin = inputs.begin[rows]
+    stopped = np.zeros(len(events), np.bool_)
+    first = int(begin.min())
     try:
         chip, saturated = pair.chip.on_a_thread(events, lengths, first)
     except NumericRangeError:
         if len(events) > 1:
-            return [each for i in range(rows.start, rows.stop) for each in _part(pair, inputs, slice(i, i + 1))]
+            singly = (slice(row, row + 1) for row in range(rows.start, rows.stop))
+            return [each for one in singly for each in _part(pair, inputs, one)]
         chip = [np.zeros((1, events.shape[2] - first, layer.neurons), np.bool_) for layer in netlist.layers]
-        stopped[:], saturated = True, np.zeros(1, np.int64)
-    spikes, votes, compared = np.zeros((len(netlist.layers), 3), np.int64), {}, pair.chip.compared()
+        stopped[:] = True
+        saturated = np.zeros(1, np.int64)
+    spikes = np.zeros((len(netlist.layers), 3), np.int64)
+    votes = {}
+    compared = pair.chip.compared()
     step = np.arange(first, events.shape[2])
     counts = ((step >= begin[:, None]) & (step < lengths[:, None]))[:, :, None]
     for index, (fired, chip_fired) in enumerate(zip(float_layers(pair, events, lengths), chip, strict=True)):
-        ours, theirs = fired[:, first:] & counts, chip_fired & counts
+        ours = fired[:, first:] & counts
+        theirs = chip_fired & counts
         if index == readout.population:
             sides = zip(SIDES, (ours, theirs), strict=True)
             votes = {side: readout_counts(readout, netlist.classes, spiked) for side, spiked in sides}
-        left, right = ours[..., compared[index]], theirs[..., compared[index]]
+        left = ours[..., compared[index]]
+        right = theirs[..., compared[index]]
         spikes[index] = np.count_nonzero(left), np.count_nonzero(right), np.count_nonzero(left != right)
     return [Outcome(votes=votes, spikes=spikes, stopped=stopped, saturated=saturated)]
 

@@ -1,10 +1,11 @@
-"""The one list of perturbations: of recordings, of the state that they find, of what the chip stores of a network.
+"""The one list of perturbations: of recordings, of the state that they find, of what the chip stores.
 
-Those above are drawn by ``stress``, at several levels; of those at the end ``certify`` decides every case. All are pure
-functions. Those of events take and give (recordings, taxels, 2, T) uint8, zeros and ones, in the recordings' own bins,
-before a network joins them; clocks are no taxels and not among them. For one seed a stronger perturbation contains the
-weaker one wherever that makes sense: five dead taxels are the three and two more, an event that is lost at a rate of
-0.1 is lost at 0.2.
+Those above are drawn by ``stress``, at several levels; of those at the end ``certify`` decides every case. All are
+pure functions. Those of events take and give (recordings, taxels, 2, T) uint8, zeros and ones, in the recordings' own
+bins, before a network joins them; clocks are no taxels and not among them.
+
+For one seed a stronger perturbation contains the weaker one wherever that makes sense: five dead taxels are the three
+and two more, an event that is lost at a rate of 0.1 is lost at 0.2.
 """
 
 from collections.abc import Callable, Iterator
@@ -98,7 +99,7 @@ def events_spurious(events: Events, share: float, rng: np.random.Generator) -> E
 
 
 def _one_by_one(events: Events, change: Callable[[Events], Events]) -> Events:
-    """Change each recording on its own: numbers that are drawn for all entries of all would fill the memory."""
+    """Change each recording on its own: numbers drawn for all entries of all would fill the memory."""
     changed = np.empty_like(events)
     for one, to in zip(events, changed, strict=True):
         to[...] = change(one)
@@ -112,7 +113,11 @@ def time_jitter(events: Events, sigma: float, rng: np.random.Generator) -> Event
     Not beyond the ends; what meets becomes one event.
     """
     last = events.shape[3] - 1
-    return move_events(events, lambda step: np.clip(step + np.rint(sigma * rng.standard_normal(len(step))), 0, last))
+
+    def jittered(step: IntArray) -> FloatArray:
+        return np.clip(step + np.rint(sigma * rng.standard_normal(len(step))), 0, last)
+
+    return move_events(events, jittered)
 
 
 @sampled("steps", STEPS, most=MOST_STEPS)
@@ -197,9 +202,11 @@ def _filled(events: Events, density: float, rng: np.random.Generator, *, keep: b
     wanted = int(np.floor(density * flat.shape[1]) if keep else np.ceil(density * flat.shape[1]))
 
     def filled(before: Events) -> Events:
-        # entries that hold an event come first, each kind in random order: the first `wanted` ones hold an event then
+        # entries that hold an event come first, each kind in random order: the first `wanted` ones hold an
+        # event then
         ranked = np.argsort(rng.random(before.shape, np.float32) - before, kind="stable")
-        there, changed = int(np.count_nonzero(before)), np.zeros_like(before)
+        there = int(np.count_nonzero(before))
+        changed = np.zeros_like(before)
         changed[ranked[: min(there, wanted) if keep else max(there, wanted)]] = 1
         return changed
 
@@ -236,7 +243,8 @@ def weight_bit_flips(memory: Memory, share: float, rng: np.random.Generator) -> 
 
     Of synaptic memory; weights in two's complement.
     """
-    code, bits = memory.codes, memory.widths
+    code = memory.codes
+    bits = memory.widths
     last = np.cumsum(bits)
     total = int(last[-1]) if len(last) else 0
     bit = np.unique(rng.integers(0, max(total, 1), rng.binomial(total, share)))
@@ -307,20 +315,24 @@ def no_windows(pair: Pair) -> str | None:
 def layers_late(memory: Memory, steps: int) -> Memory:
     """Layers after the first open their windows late, off by one and more.
 
-    They miss the first steps of their input. The float network needs no change: it takes depths from the netlist.
+    They miss the first steps of their input. The float network needs no change: it takes depths from the
+    netlist.
     """
     return memory.with_late_layers(steps)
 
 
 def several_planes(pair: Pair) -> str | None:
     """Why a stored weight has no bits of its own."""
-    return "weights are stored in several planes" if pair.memory is not None and pair.memory.planes > 1 else None
+    if pair.memory is None or pair.memory.planes == 1:
+        return None
+    return "weights are stored in several planes"
 
 
 @sampled("bits", (6, 5, 4, 3, 2), least=2, most=8, unless=several_planes)
 def fewer_bits(memory: Memory, width: int) -> Memory:
     """Weights keep fewer bits on the scale that they have."""
-    code, bits = memory.codes, memory.widths
+    code = memory.codes
+    bits = memory.widths
     factor = np.int64(1) << np.maximum(bits - width, 0)
     most = (np.int64(1) << (np.minimum(bits, width) - 1)) - 1
     return memory.with_codes(np.clip(np.rint(code / factor).astype(np.int64), -most, most) * factor)

@@ -141,9 +141,9 @@ class Decided:
 class Certificate:
     """What is proven and known of one recording.
 
-    No change of up to `at_least` events alters its decision; the change `attack` of `at_most` events does, if one was
-    found. `taxels` are those on which the decision hangs, by kind of change; `phases` the single events that alter it,
-    by tenth of the recording.
+    No change of up to `at_least` events alters its decision; the change `attack` of `at_most` events does,
+    if one was found. `taxels` are those on which the decision hangs, by kind of change; `phases` the
+    single events that alter it, by tenth of the recording.
     """
 
     file: str

@@ -26,7 +26,9 @@ from spikeloom.runtime.studies.robustness.results import ComparedProvenance, Run
 def stress(request: StressRequest, names: Sequence[str], requirements: Sequence[Requirement]) -> Stress:
     """Measure perturbations on the files that a command's options name, and judge them."""
     bench, loaded, data = bench_of(request)
-    recordings, classes, taxels = len(bench.labels), bench.pair.netlist.classes, bench.events.shape[1]
+    recordings = len(bench.labels)
+    classes = bench.pair.netlist.classes
+    taxels = bench.events.shape[1]
     reasons = {name: SAMPLED[name].why_not(bench.pair) for name in names}
     for wanted in requirements:
         if reasons[wanted.name] is not None:
@@ -73,7 +75,8 @@ def stress(request: StressRequest, names: Sequence[str], requirements: Sequence[
 def _runs(points: Sequence[tuple[str, Level, int]], bench: Bench, reference: Outcome, jobs: int | None) -> list[Run]:
     """The run of each point, several at a time in threads: kernels let go of the interpreter's lock."""
     work = Parallel(jobs or os.cpu_count(), backend="threading", return_as="generator")
-    runs, progress = [], Progress(len(points))
+    runs = []
+    progress = Progress(len(points))
     for done, run in enumerate(work(delayed(measure)(bench, *point, reference) for point in points), 1):
         runs.append(run)
         progress(done, "stress")
@@ -81,7 +84,7 @@ def _runs(points: Sequence[tuple[str, Level, int]], bench: Bench, reference: Out
 
 
 def generator(name: str, seed: int) -> np.random.Generator:
-    """Source of a perturbation's chance: the same for all levels, so that a harsher one contains a milder one."""
+    """A perturbation's chance: the same for all levels, so that a harsher one contains a milder one."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
@@ -94,7 +97,9 @@ def clean(bench: Bench) -> tuple[Outcome, Run]:
 
 def measure(bench: Bench, name: str, level: Level, seed: int, reference: Outcome) -> Run:
     """One perturbation at one level under one seed; `reference` is of the clean recordings."""
-    trouble, rng, pair = SAMPLED[name], generator(name, seed), bench.pair
+    trouble = SAMPLED[name]
+    rng = generator(name, seed)
+    pair = bench.pair
     if trouble.to == "bench":
         inputs: Inputs = trouble.done(bench, level, bench.distance, rng)
     elif trouble.to == "memory":
@@ -113,7 +118,7 @@ def _run(bench: Bench, outcome: Outcome, seed: int | None, inputs: Inputs, refer
     decided = {side: outcome.decisions(side) for side in SIDES}
     spikes = outcome.spikes.tolist()
     steps = int((inputs.lengths - inputs.begin).sum())
-    held = np.bincount(netlist.layer, minlength=len(netlist.layers)).tolist()
+    neurons_of = np.bincount(netlist.layer, minlength=len(netlist.layers)).tolist()
     kinds = {side: np.unique_counts(values) for side, values in decided.items()}
     signs = {side: undecided(reference.votes[side], outcome.votes[side], bench.files) for side in SIDES}
     return Run(
@@ -122,7 +127,7 @@ def _run(bench: Bench, outcome: Outcome, seed: int | None, inputs: Inputs, refer
         equal=int(np.count_nonzero(decided["float"] == decided["chip"])),
         layers={
             layer.name: (*counts, neurons * steps)
-            for layer, counts, neurons in zip(netlist.layers, spikes, held, strict=True)
+            for layer, counts, neurons in zip(netlist.layers, spikes, neurons_of, strict=True)
         },
         signs={side: {sign.kind: sign.count for sign in each} for side, each in signs.items()},
         most={side: (int(k.values[np.argmax(k.counts)]), int(k.counts.max())) for side, k in kinds.items()},

@@ -8,6 +8,7 @@ import numpy as np
 
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.files import reading
+from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.report.drawing import CHIP, FLOAT, GREY, WIDTH, Drawing, sheet, styled
 from spikeloom.runtime.report.encode import read_json
 from spikeloom.runtime.report.numbers import percent, wilson
@@ -47,7 +48,8 @@ def sections(result: Stress) -> list[Section]:
 
 def overview(result: Stress) -> list[Section]:
     """Clean accuracy, verdicts, the curves as a figure with their numbers, and what was not measured."""
-    clean, recordings = result.clean, result.recordings
+    clean = result.clean
+    recordings = result.recordings
     lines = [f"{side} accuracy, clean: {percent(clean.right[side], recordings)}" for side in SIDES]
     lines.append(f"decisions equal, clean: {clean.equal} of {recordings}; chance {100 / result.classes:.1f} %")
     title = "Accuracy under each perturbation"
@@ -83,7 +85,12 @@ def figure(result: Stress, title: str = "", *, across: int = 3) -> Drawing:
         for side in SIDES:
             _curve(drawing, axes, name, curve, side)
         axes.set_xticks(range(len(curve.levels)), [shown(point.level) for point in curve.levels], fontsize=7)
-        axes.set(xlim=(-0.5, len(curve.levels) - 0.5), ylim=(-3, 103), title=_heading(name, curve), xlabel=curve.unit)
+        axes.set(
+            xlim=(-0.5, len(curve.levels) - 0.5),
+            ylim=(-3, 103),
+            title=_heading(name, curve),
+            xlabel=curve.unit,
+        )
         axes.grid(axis="y")
     handles, labels = rows.flat[0].get_legend_handles_labels()
     drawing.figure.legend(handles, labels, loc="outside upper left", ncols=2)
@@ -97,7 +104,15 @@ def _curve(drawing: Drawing, axes: Any, name: str, curve: Curve, side: str) -> N
     low, mean, high = 100 * np.array([(spread.low, spread.mean, spread.high) for spread in spreads]).T
     at = np.arange(len(spreads)) + shift
     reach = np.maximum([mean - low, high - mean], 0)
-    look = {"color": colour, "marker": marker, "ls": dash, "ms": 3.5, "lw": 1.3, "elinewidth": 1, "capsize": 2}
+    look = {
+        "color": colour,
+        "marker": marker,
+        "ls": dash,
+        "ms": 3.5,
+        "lw": 1.3,
+        "elinewidth": 1,
+        "capsize": 2,
+    }
     axes.errorbar(at, mean, yerr=reach, label="float model" if side == "float" else side, **look)
     order = [point.level for point in curve.levels]
     if (leaves := curve.breaks[side].leaves) is not None:
@@ -109,7 +124,8 @@ def _curve(drawing: Drawing, axes: Any, name: str, curve: Curve, side: str) -> N
 
 def picture(result: Stress) -> Drawing:
     """The figure as a file has it: it says by itself what it is of."""
-    about, seeds = result.provenance, f"{result.seeds} seed{'s' if result.seeds > 1 else ''}"
+    about = result.provenance
+    seeds = number(result.seeds, "seed")
     title = f"{about.netlist} on {result.recordings} recordings of {about.data}, {seeds}; accuracy in per cent"
     drawn = figure(result, title, across=5)
     drawn.figure.supxlabel(title, fontsize=9)
@@ -130,8 +146,9 @@ def verdicts(result: Stress) -> Table:
 
 
 def why(curve: Curve) -> str:
-    """What is to be seen on the chip where it leaves, or at chance where that says more; on which side it breaks."""
-    chip, words = curve.breaks["chip"], []
+    """What is to be seen on the chip where it leaves, or at chance where that says more; which side is first."""
+    chip = curve.breaks["chip"]
+    words = []
     if not curve.same_place:
         order = [point.level for point in curve.levels]
         places = {side: curve.breaks[side].leaves for side in SIDES}

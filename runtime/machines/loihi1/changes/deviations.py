@@ -1,7 +1,7 @@
 """What Loihi 1 does otherwise than a float network, one deviation taken away at a time.
 
-A netlist is entitled to round weights, biases, decays and membranes, and to the limits of its registers; whether what
-it stores is the rounding of its checkpoint at all is for :mod:`loihi1.rounding` to say.
+A netlist is entitled to round weights, biases, decays and membranes, and to the limits of its registers;
+whether what it stores is the rounding of its checkpoint at all is for :mod:`loihi1.rounding` to say.
 """
 
 from __future__ import annotations
@@ -13,7 +13,13 @@ import numpy as np
 
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
-from spikeloom.compiler.targets.loihi1.registers import DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, reach, step_units
+from spikeloom.compiler.targets.loihi1.registers import (
+    DECAY_BITS,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+    reach,
+    step_units,
+)
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.deviations import (
     BETA,
@@ -39,8 +45,9 @@ BOUND = ", as far as the accumulator lets it"
 class Variant:
     """A replay: the stored neurons without the deviation `cause`.
 
-    Weights are STORED, UNROUNDED or UNCLIPPED; bias (neurons,) and the membrane's limit are in membrane units; `keep_u`
-    and `keep_v` are what a step keeps of current and membrane, rounded toward zero if `rounds`.
+    Weights are STORED, UNROUNDED or UNCLIPPED; bias (neurons,) and the membrane's limit are in membrane
+    units; `keep_u` and `keep_v` are what a step keeps of current and membrane, rounded toward zero if
+    `rounds`.
     """
 
     cause: str
@@ -72,7 +79,8 @@ class LoihiDeviations(Deviations):
                 if projection.pre != INPUT:
                     connected = (projection.weight != 0).toarray().T
                     known = connections[projection.post].get(projection.pre)
-                    connections[projection.post][projection.pre] = connected if known is None else connected | known
+                    either = connected if known is None else connected | known
+                    connections[projection.post][projection.pre] = either
         return tuple(tuple(sorted(pres.items(), key=lambda item: item[0])) for pres in connections)
 
     def sources_into(self, post: int) -> tuple[int, ...]:
@@ -178,9 +186,9 @@ def run_variants(
 ) -> tuple[FloatArray, BoolArray]:
     """Run neurons from rest over what they remember.
 
-    Of the variants the last one, and only it, does not round. `inflows` (3, steps, neurons) are shifted synaptic sums
-    by ``Variant.weights``. Gives (variants, neurons): membrane minus threshold in the last step, and whether the neuron
-    fired before it, where it should not.
+    Of the variants the last one, and only it, does not round. `inflows` (3, steps, neurons) are shifted
+    synaptic sums by ``Variant.weights``. Gives (variants, neurons): membrane minus threshold in the last
+    step, and whether the neuron fired before it, where it should not.
     """
 
     def column(values: list[float]) -> FloatArray:

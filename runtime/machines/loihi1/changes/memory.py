@@ -112,7 +112,8 @@ class LoihiMemory(Memory):
     def with_thresholds(self, thresholds: IntArray) -> LoihiMemory:
         """Change mantissas; in the float network thresholds change by the same factor.
 
-        A neuron with another threshold fires as one with the old one whose weights and bias are divided by the factor.
+        A neuron with another threshold fires as one with the old one whose weights and bias are divided by
+        the factor.
         """
         before = self.netlist.threshold
         most = registers.THRESHOLD_MANTISSA_MAX

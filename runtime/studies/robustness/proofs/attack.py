@@ -17,19 +17,19 @@ ROUNDS = 6
 
 
 def attack(machine: Machine, channels: EventArray, votes: IntArray, cells: Cells, effects: Effects) -> IntArray:
-    """Entries whose flips together alter the decision of a recording (channels, steps); none if none were found.
+    """Entries whose flips together alter the decision of a recording (channels, steps); empty if none do.
 
-    Those that cost the decision most votes against one class are taken, none while another still has an effect; then,
-    in the changed recording, further ones. Those that turn out not to be needed are dropped. `votes` (classes,) are of
-    the recording, `effects` of each entry alone.
+    Those that cost the decision most votes against one class are taken, none while another still has an
+    effect; then, in the changed recording, further ones. Those that turn out not to be needed are dropped.
+    `votes` (classes,) are of the recording, `effects` of each entry alone.
     """
     decision, gaps = needed(votes)
-    found = []
+    attacks = []
     for other in _easiest(gaps, decision, cells, effects):
         taken = _against(machine, channels, votes, cells, effects, (decision, other))
         if taken is not None:
-            found.append(_without_idle(machine, channels, votes, cells, taken))
-    return min(found, key=lambda taken: int(cells.cost[taken].sum()), default=np.zeros(0, np.int64))
+            attacks.append(_without_idle(machine, channels, votes, cells, taken))
+    return min(attacks, key=lambda taken: int(cells.cost[taken].sum()), default=np.zeros(0, np.int64))
 
 
 def _easiest(gaps: IntArray, decision: int, cells: Cells, effects: Effects) -> list[int]:
@@ -51,7 +51,9 @@ def _against(
 ) -> IntArray | None:
     """Entries whose flips make one class win, or any other, over the decision."""
     decision, other = sides
-    changed, now, taken = channels.copy(), votes, np.zeros(0, np.int64)
+    changed = channels.copy()
+    now = votes
+    taken = np.zeros(0, np.int64)
     those = np.arange(len(cells.cells))
     for _ in range(ROUNDS):
         gap = needed(now)[1][other] if int(np.argmax(now)) == decision else 0
@@ -60,7 +62,8 @@ def _against(
         busy = np.zeros(int(effects.end.max(initial=0)) + 2, np.bool_)
         chosen: list[int] = []
         for e in order[worth[order] > 0].tolist():
-            begin, end = cells.cells[those[e], 1], effects.end[e]
+            begin = cells.cells[those[e], 1]
+            end = effects.end[e]
             if gap <= 0:
                 break
             if not busy[begin:end].any():
@@ -85,8 +88,8 @@ def _without_idle(machine: Machine, channels: EventArray, votes: IntArray, cells
     """Entries whose flips still alter the decision when none can be dropped alone."""
     while len(taken) > 1:
         fewer = [np.delete(taken, place) for place in range(len(taken))]
-        found = machine.effects(channels, joined([cells.cells[each] for each in fewer])).votes + votes
-        idle = np.flatnonzero(found.argmax(axis=1) != votes.argmax())
+        changed = machine.effects(channels, joined([cells.cells[each] for each in fewer])).votes + votes
+        idle = np.flatnonzero(changed.argmax(axis=1) != votes.argmax())
         if not len(idle):
             break
         taken = fewer[max(idle.tolist(), key=lambda place: int(cells.cost[taken[place]]))]

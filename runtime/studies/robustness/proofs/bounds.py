@@ -1,9 +1,10 @@
 """How many events must at least change until a decision does: a sound lower bound, by what the chip forgets.
 
-Changes of events come one after another. As soon as the chip is in the state that it would be in anyway, what follows
-is as if nothing had been: effects of events so far apart add up, and each of them is known exactly. Where a further
-event changes before that, nothing is assumed but what :class:`Forgetting` knows: every vote that is open may go the
-wrong way. A dynamic program over steps and events finds the worst of all. Votes may be lost
+Changes of events come one after another. As soon as the chip is in the state that it would be in anyway,
+what follows is as if nothing had been: effects of events so far apart add up, and each of them is known
+exactly. Where a further event changes before that, nothing is assumed but what :class:`Forgetting` knows:
+every vote that is open may go the wrong way. A dynamic program over steps and events finds the worst of
+all. Votes may be lost
 
 *exactly*: by a change whose run is the known one before the next change;
 *in a cluster*: by its first change at most as many as its own effects hold, until the second shows; by each further one
@@ -26,9 +27,9 @@ def needed(votes: IntArray) -> tuple[int, IntArray]:
     (1, array([2, 0, 1]))
     """
     decision = int(np.argmax(votes))
-    found = votes[decision] - votes + (np.arange(len(votes)) > decision)
-    found[decision] = 0
-    return decision, found
+    gaps = votes[decision] - votes + (np.arange(len(votes)) > decision)
+    gaps[decision] = 0
+    return decision, gaps
 
 
 def lower_bound(votes: IntArray, cells: Cells, effects: Effects, known: Forgetting, most: int) -> int:
@@ -37,7 +38,9 @@ def lower_bound(votes: IntArray, cells: Cells, effects: Effects, known: Forgetti
     `votes` (classes,) are those of the known run, `effects` those of each entry flipped alone.
     """
     from spikeloom.compiler.layer_kernel import require_below
-    from spikeloom.runtime.studies.robustness.proofs.worst import most_lost  # with numba, which help need not wait for
+    from spikeloom.runtime.studies.robustness.proofs.worst import (
+        most_lost,
+    )  # with numba, which help need not wait for
 
     decision, gaps = needed(votes)
     steps = len(known.back) - 1
@@ -52,7 +55,16 @@ def lower_bound(votes: IntArray, cells: Cells, effects: Effects, known: Forgetti
         partly = effects.come[:, other] + effects.gone[:, decision]
         opened = known.come[:, :, other].astype(np.int64) + known.gone[:, :, decision]
         lost = most_lost(
-            first, end, cells.cost, alone, partly, known.quiet, known.back, opened, known.lag, min(certified, most)
+            first,
+            end,
+            cells.cost,
+            alone,
+            partly,
+            known.quiet,
+            known.back,
+            opened,
+            known.lag,
+            min(certified, most),
         )
         certified = min(certified, int(np.searchsorted(lost, gaps[other])) - 1)
         if certified <= 0:

@@ -1,11 +1,11 @@
 """How few events alter a decision of a counting network: the least number, by what its counters and sums are.
 
-A count of events in a channel, in a part of the recording, says which counters have spiked, and how often; a class is
-decided by the first sum above the threshold, which a ramp lifts: the sums after the last event decide. To change a
-count by so many events costs as many, whichever they are. So the fewest events with which a class overtakes the
-decision are found by a dynamic program over channels and parts: for each number of them and each sum of the decision
-the largest sum of the other class. Sums that cross the threshold before the last event are bounded: an event more or
-less alters one count by one.
+A count of events in a channel, in a part of the recording, says which counters have spiked, and how often;
+a class is decided by the first sum above the threshold, which a ramp lifts: the sums after the last event
+decide. To change a count by so many events costs as many, whichever they are. So the fewest events with
+which a class overtakes the decision are found by a dynamic program over channels and parts: for each
+number of them and each sum of the decision the largest sum of the other class. Sums that cross the
+threshold before the last event are bounded: an event more or less alters one count by one.
 """
 
 from __future__ import annotations
@@ -44,8 +44,7 @@ class Tally:
         """What some counters add to the sums after so many events of each, (…, counters); (…, classes)."""
         count = self.count[those]
         times = np.where(events < count, 0, 1 + (events - count) // (count + BLOCK))
-        found: IntArray = times @ self.weight[:, those].T
-        return found
+        return np.asarray(times @ self.weight[:, those].T)
 
     def groups(self, channel: IntArray, step: IntArray) -> IntArray:
         """Groups of entries."""
@@ -54,11 +53,11 @@ class Tally:
     def events(self, recording: BoolArray) -> IntArray:
         """Events of each group after each step of a recording (channels, steps); (steps of the network, groups)."""
         channel, step = np.nonzero(recording)
-        found = np.zeros((self.steps, int(self.group.max()) + self.channels), np.int64)
+        arrived = np.zeros((self.steps, int(self.group.max()) + self.channels), np.int64)
         group = self.groups(channel, step)
-        inside = group < found.shape[1]
-        np.add.at(found, (step[inside], group[inside]), 1)
-        return found.cumsum(axis=0)
+        inside = group < arrived.shape[1]
+        np.add.at(arrived, (step[inside], group[inside]), 1)
+        return arrived.cumsum(axis=0)
 
 
 def tally_of(machine: Machine) -> Tally | None:
@@ -72,15 +71,17 @@ def tally_of(machine: Machine) -> Tally | None:
     for post in range(len(names)):
         into[post] = added_up((p.pre, p.effective()) for p in network.projections if p.post == post)
     sums = len(names) - 2
-    group, count, weight = [], [], []
+    group = []
+    count = []
+    weight = []
     for pre, weights in into[sums].items():
         ones = next(each for source, each in into[pre].items() if source != pre).tocoo()
         place = np.full(network.populations[pre].size, -1)
-        place[ones.row] = ones.col  # a channel, or the gate of a channel in a part, which are numbered as groups are
-        held = np.flatnonzero(place >= 0)
-        group.append(place[held])
-        count.append(network.populations[pre].threshold[held] // int(ones.data.max(initial=1)) + 1)
-        weight.append(weights.toarray()[:, held].astype(np.int64) << MEMBRANE_SHIFT)
+        place[ones.row] = ones.col  # a channel, or the gate of a channel in a part: numbered as groups are
+        counters = np.flatnonzero(place >= 0)
+        group.append(place[counters])
+        count.append(network.populations[pre].threshold[counters] // int(ones.data.max(initial=1)) + 1)
+        weight.append(weights.toarray()[:, counters].astype(np.int64) << MEMBRANE_SHIFT)
     last = network.populations[sums]
     return Tally(
         group=np.concatenate(group),
@@ -108,37 +109,41 @@ def least(
 ) -> tuple[int, IntArray | None] | None:
     """How many events, up to `most`, do not alter the decision of a recording, whichever they are.
 
-    The recording is (channels, steps), its votes (classes,). Also entries whose flips alter it, the fewest if there are
-    one more of them. None where the chip does not follow the counts alone; where it does, entries of one group that
-    hold events, and those that hold none, do the same.
+    The recording is (channels, steps), its votes (classes,). Also entries whose flips alter it, the fewest
+    if there are one more of them. None where the chip does not follow the counts alone; where it does,
+    entries of one group that hold events, and those that hold none, do the same.
     """
     recording = recording[: tally.channels]  # without clocks
     ramp = tally.slope * np.arange(1, tally.steps + 1)
     membranes = tally.of(slice(None), tally.events(recording)[:, tally.group]) + ramp[:, None]  # without a reset
     above = membranes > tally.threshold
     crossing = np.where(above.any(axis=0), above.argmax(axis=0), tally.steps)
-    last, decision = int(cells.cells[-1, 1]), int(np.argmax(votes))
+    last = int(cells.cells[-1, 1])
+    decision = int(np.argmax(votes))
     early = _early(tally, recording, np.delete(membranes, decision, axis=1)[: last + 1], decision, most)
     if np.any(tally.steps - crossing != votes) or crossing[decision] <= last or early < 2:
         return None
     options = _options(tally, recording, cells, most)
     sums = membranes[-1] - tally.slope * tally.steps
-    best, taken = most + 1, None
+    best = most + 1
+    taken = None
     for other in sorted(set(range(len(votes))) - {decision}, key=lambda other: -sums[other]):
-        found = _against(tally, options, sums, decision, other, last, best - 1)
-        if found is not None:
-            best, taken = found
+        attack = _against(tally, options, sums, decision, other, last, best - 1)
+        if attack is not None:
+            best, taken = attack
     return min(best, early) - 1, taken
 
 
 def _options(tally: Tally, recording: BoolArray, cells: Cells, most: int) -> list[list[_Option]]:
     """What can become of the events of each group that has counters, for up to `most` of them."""
-    found = []
-    events, group = tally.events(recording)[-1], tally.groups(*cells.cells.T)
+    by_group = []
+    events = tally.events(recording)[-1]
+    group = tally.groups(*cells.cells.T)
     for each in np.unique(tally.group).tolist():
-        own = np.flatnonzero(tally.group == each)
+        counters = np.flatnonzero(tally.group == each)
         here = np.flatnonzero(group == each)
-        known, options = tally.of(own, events[each]), []
+        known = tally.of(counters, events[each])
+        options = []
         before = known
         there = cells.there[here]
         gone = here[there][np.argsort(cells.cost[here[there]], kind="stable")]
@@ -146,12 +151,12 @@ def _options(tally: Tally, recording: BoolArray, cells: Cells, most: int) -> lis
             costs = np.cumsum(cells.cost[flips])
             sign = -1 if flips is gone else 1
             for n in range(int(np.searchsorted(costs, most, side="right"))):
-                after = tally.of(own, events[each] + sign * (n + 1))
+                after = tally.of(counters, events[each] + sign * (n + 1))
                 if np.any(after != (before if n else known)):
                     options.append(_Option(int(costs[n]), after - known, flips[: n + 1]))
                 before = after
-        found.append(options)
-    return found
+        by_group.append(options)
+    return by_group
 
 
 def _early(tally: Tally, recording: BoolArray, membranes: IntArray, decision: int, most: int) -> int:
@@ -160,17 +165,18 @@ def _early(tally: Tally, recording: BoolArray, membranes: IntArray, decision: in
     `membranes` (steps, other classes) are those of the steps up to the last with events.
     """
     others = np.delete(np.arange(len(tally.weight)), decision)
-    events, weight = tally.events(recording)[: len(membranes)], tally.weight[others]
-    step = most * int(np.abs(weight).max())  # by the largest weight of all
+    events = tally.events(recording)[: len(membranes)]
+    step = most * int(np.abs(tally.weight[others]).max())  # by the largest weight of all
     near = np.flatnonzero((membranes + step > tally.threshold).any(axis=1))
     lead = np.zeros((most + 1, len(near), len(others)), np.int64)
     for each in np.unique(tally.group).tolist():
-        own, before = np.flatnonzero(tally.group == each), lead.copy()
+        counters = np.flatnonzero(tally.group == each)
+        before = lead.copy()
         seen = events[near, each][:, None]
-        known = tally.of(own, seen)[:, others]
+        known = tally.of(counters, seen)[:, others]
         for count in range(1, most + 1):
             for sign in (-1, 1):
-                gain = tally.of(own, seen + sign * count)[:, others] - known
+                gain = tally.of(counters, seen + sign * count)[:, others] - known
                 if gain.any():
                     lead[count:] = np.maximum(lead[count:], before[: most + 1 - count] + gain)
     above = (lead + membranes[near] > tally.threshold).any(axis=(1, 2))
@@ -178,7 +184,13 @@ def _early(tally: Tally, recording: BoolArray, membranes: IntArray, decision: in
 
 
 def _against(
-    tally: Tally, options: list[list[_Option]], sums: IntArray, decision: int, other: int, last: int, most: int
+    tally: Tally,
+    options: list[list[_Option]],
+    sums: IntArray,
+    decision: int,
+    other: int,
+    last: int,
+    most: int,
 ) -> tuple[int, IntArray] | None:
     """Fewest events, up to `most`, with which a class overtakes the decision after the step `last`, and which."""
     wanted = [(option.cost, int(option.gain[decision]), int(option.gain[other])) for each in options for option in each]
@@ -199,7 +211,8 @@ def _against(
     best[0, reach] = 0
     trail: list[NDArray[np.int16]] = []
     for each in options:
-        table, choice = best.copy(), np.full(best.shape, -1, np.int16)
+        table = best.copy()
+        choice = np.full(best.shape, -1, np.int16)
         for index, option in enumerate(each):
             if option.cost <= most:
                 by = int(option.gain[decision]) // unit
@@ -214,7 +227,8 @@ def _against(
     level = tally.threshold - tally.slope * (np.arange(last, tally.steps) + 1)  # of a sum that crosses in each step
     for count in range(1, most + 1):
         hit = best[count] > -FAR // 2
-        # the first step in which the decision crosses; before it, or with it for a lower class, the other one must
+        # the first step in which the decision crosses; before it, or with it for a lower class, the other
+        # one must
         steps = np.searchsorted(-level, -ours, side="right")
         place = steps - (0 if other < decision else 1)
         due = np.where(place < 0, FAR, level[np.clip(place, 0, len(level) - 1)])
@@ -225,7 +239,12 @@ def _against(
 
 
 def _flips(
-    options: list[list[_Option]], trail: list[NDArray[np.int16]], count: int, place: int, decision: int, unit: int
+    options: list[list[_Option]],
+    trail: list[NDArray[np.int16]],
+    count: int,
+    place: int,
+    decision: int,
+    unit: int,
 ) -> IntArray:
     """Entries to flip for a cell of the last table."""
     taken = [np.zeros(0, np.int64)]
@@ -233,5 +252,6 @@ def _flips(
         index = int(choice[count, place])
         if index >= 0:
             taken.append(each[index].flips)
-            count, place = count - each[index].cost, place - int(each[index].gain[decision]) // unit
+            count -= each[index].cost
+            place -= int(each[index].gain[decision]) // unit
     return np.concatenate(taken)

@@ -25,10 +25,19 @@ class Cells:
     there: BoolArray  # (entries,) bool; whether there is an event
     cost: IntArray  # (entries,) int64; events of the recording that must come or go
 
+    def words_of(self, entry: int, netlist: Netlist) -> str:
+        """An entry that is flipped."""
+        channel, step = self.cells[entry].tolist()
+        taxel, polarity = divmod(channel, netlist.polarities)
+        joined = f", bins of {netlist.bins}" if netlist.bins > 1 else ""
+        change = "removed" if self.there[entry] else "added"
+        return f"taxel {taxel}, polarity {polarity}, step {step}{joined}: {change}"
+
 
 def channels_of(events: Events, netlist: Netlist) -> Events:
     """Input channels (samples, channels, steps) of changed recordings (samples, taxels, polarities, bins)."""
-    joined, length = join_bins(events, netlist.bins), netlist.clocks.length
+    joined = join_bins(events, netlist.bins)
+    length = netlist.clocks.length
     return with_clocks(joined if length is None else fitted(joined, length), netlist.clocks)
 
 
@@ -38,12 +47,5 @@ def cells_of(events: Events, netlist: Netlist) -> Cells:
     counts = np.add.reduceat(flat, np.arange(0, flat.shape[1], netlist.bins), axis=1, dtype=np.int64)
     counts = counts[:, : netlist.clocks.length]
     step, channel = np.indices(counts.T.shape).reshape(2, -1)
-    found = counts.T.ravel()
-    return Cells(cells=np.stack([channel, step], axis=1), there=found > 0, cost=np.maximum(found, 1))
-
-
-def words_of(cell: IntArray, there: bool, netlist: Netlist) -> str:
-    """An entry that is flipped."""
-    taxel, polarity = divmod(int(cell[0]), netlist.polarities)
-    joined = f", bins of {netlist.bins}" if netlist.bins > 1 else ""
-    return f"taxel {taxel}, polarity {polarity}, step {int(cell[1])}{joined}: {'removed' if there else 'added'}"
+    events_in = counts.T.ravel()
+    return Cells(cells=np.stack([channel, step], axis=1), there=events_in > 0, cost=np.maximum(events_in, 1))

@@ -16,7 +16,8 @@ NEVER = -(1 << 40)
 def _begin(cluster: Any, exact: Any, begun: Any, t: int, last: int) -> None:
     """Begin clusters at a step: the second event changes before the effects of the first have ended.
 
-    `begun` (steps + 1,) are the most votes that first events turn, by where they end, at `last` at the latest.
+    `begun` (steps + 1,) are the most votes that first events turn, by where they end, at `last` at the
+    latest.
     """
     worst = NEVER
     for second in range(last - 1, t - 1, -1):
@@ -57,8 +58,8 @@ def most_lost(
 ) -> Any:
     """Most votes that so many changed events can turn against a decision, (most + 1,).
 
-    `exact` holds them by step where the chip is in the known state, `still` where only its spikes are known, `cluster`
-    where the last event changed in that step and what it can alter is not counted yet.
+    `exact` holds them by step where the chip is in the known state, `still` where only its spikes are
+    known, `cluster` where the last event changed in that step and what it can alter is not counted yet.
     """
     steps = len(back) - 1
     exact, still, cluster = np.full((3, steps + 1, most + 1), NEVER)
