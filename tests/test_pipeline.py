@@ -32,6 +32,7 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.bounds import prove_ranges
 from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
+from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import PASSES, compile_network, start
 from spikeloom.compiler.targets.loihi1.remove import compact, removable, removals
@@ -74,11 +75,22 @@ def test_the_table_of_passes_in_the_docs():
         assert f"| {step.name} | {step.does} | {step.keeps} |" in docs
 
 
+NOWHERE = Placement(tiles=(-1,), spike_hops=0)
+
+
 @pytest.mark.parametrize(
     ("name", "change"),
     [
         ("calibrate", lambda done: replace(done, network=replace(done.network, classes=0))),
+        ("disconnect", lambda done: replace(done, connected=replace(done.connected, classes=0))),
         ("quantize", lambda done: replace(done, integer=replace(done.integer, classes=0))),
+        ("remove", lambda done: replace(done, held=replace(done.held, classes=0))),
+        ("place", lambda done: replace(done, layout=replace(done.layout, cores=done.layout.cores[1:]))),
+        ("place", lambda done: replace(done, layout=replace(done.layout, cores=2 * done.layout.cores))),
+        (
+            "place",
+            lambda done: replace(done, layout=replace(done.layout, placement=Placement(tiles=(-1,), spike_hops=0))),
+        ),
         ("emit", lambda done: replace(done, netlist=replace(done.netlist, layer=done.netlist.layer + 9))),
     ],
 )

@@ -7,9 +7,10 @@ import pytest
 import random_crossbars as cores
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles import refused
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, with_clocks
-from spikeloom.compiler.errors import CapacityError
+from spikeloom.compiler.errors import CapacityError, VerifyError
 from spikeloom.compiler.targets.truenorth import legalize, native
 from spikeloom.compiler.targets.truenorth.builder import crossing_points
 from spikeloom.compiler.targets.truenorth.native import lower
@@ -108,6 +109,8 @@ def test_what_contradicts_itself_is_named():
     assert native.faults(replace(network, copies=5)) == ["5 copies of an input, allowed are 2, 3, 4"]
     assert native.faults(replace(network, stages=())) == ["8 voting neurons for 3 classes"]
     assert wrong(level=first.level * 4)[0] == "conv1: levels beyond 3, the most of 3 copies"
+    loud = replace(network, stages=(replace(first, level=first.level * 4), *rest))
+    refused(VerifyError, "conv1: levels beyond 3", compile_crossbars, loud)
     assert wrong(threshold=0 * first.threshold)[0].endswith("outside 1 <= threshold <= floor <= 131072")
     assert wrong(leak=first.leak + 300) == ["conv1: leaks that the ticks before the first data cannot undo"]
     assert wrong(leak=first.leak[1:]) == ["conv1: 7 values of leak for 8 neurons"]

@@ -23,6 +23,7 @@ from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.idle import forgotten
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.targets.loihi1.layout.choose import Layout, lay_out
+from spikeloom.compiler.targets.loihi1.layout.choose import faults as layout_faults
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, require_legal
 from spikeloom.compiler.targets.loihi1.netlist import FILE, Netlist
@@ -79,7 +80,9 @@ class Compilation:
             invariants.verify(newest)
         elif isinstance(newest, IntegerNetwork):
             integers.verify(newest)
-        elif isinstance(newest, Netlist):
+        elif isinstance(newest, Layout):
+            invariants.require_none([*layout_faults(newest, self.held, self.target)])
+        else:
             FILE.verify(newest)
 
 

@@ -10,12 +10,13 @@ from typing import Any
 
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import CapacityError, ModelError
+from spikeloom.compiler.invariants import require_none
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.pipeline import LATER, run, step
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.truenorth.counting import lower_counters
 from spikeloom.compiler.targets.truenorth.legalize import needs, require_legal
-from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork, lower
+from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork, faults, lower
 from spikeloom.compiler.targets.truenorth.netlist import FILE, CrossbarNetlist
 
 WAYS = (
@@ -44,13 +45,16 @@ class Compilation:
     netlist: CrossbarNetlist = LATER  # By `place`
 
     @property
-    def newest(self) -> CrossbarNetlist:
-        """The netlist."""
-        return self.netlist
+    def newest(self) -> Source | CrossbarNetlist:
+        """What the last pass made that changed anything."""
+        return self.source if self.netlist is LATER else self.netlist
 
     def verify(self) -> None:
-        """Check every rule of the netlist; VerifyError if a pass broke one."""
-        FILE.verify(self.newest)
+        """Check every rule of the newest artefact; VerifyError if one is broken."""
+        if self.netlist is not LATER:
+            FILE.verify(self.netlist)
+        elif isinstance(self.source, NativeNetwork):
+            require_none(faults(self.source))
 
 
 @step(
@@ -86,6 +90,7 @@ def compile_crossbars(
     if not isinstance(source, NativeNetwork | Counters):
         raise _unfit(source, chip)
     work = Compilation(source=source, options=Options() if options is None else options, target=chip)
+    work.verify()
     return run(PASSES, work, after)
 
 

@@ -4,8 +4,10 @@ The integer network is not changed: which neuron sits where has no influence on 
 swept and fed in parallel, but each of its spikes, and each spike that it receives, is sent to more of them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+
+import numpy as np
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
@@ -22,6 +24,21 @@ class Layout:
 
     cores: Cores
     placement: Placement
+
+
+def faults(layout: Layout, network: IntegerNetwork, target: Target) -> Iterator[str]:
+    """Rules that the layout of a network breaks: every neuron sits on one core, every core on a tile with room."""
+    for post, population in enumerate(network.populations):
+        chunks = sorted(chunk for core in layout.cores for chunk in core if chunk.population == post)
+        begins = [0, *(chunk.last for chunk in chunks)]
+        ends = [*(chunk.first for chunk in chunks), population.size]
+        if begins != ends or any(chunk.size < 1 for chunk in chunks):
+            yield f"the cores do not divide the {population.size} neurons of {population.name} among them"
+    tiles = np.array(layout.placement.tiles, np.int64)
+    if len(tiles) != len(layout.cores):
+        yield f"{len(layout.cores)} cores are on {len(tiles)} tiles"
+    if np.any(tiles < 0) or np.any(np.bincount(np.maximum(tiles, 0)) > target.limit("mesh.tile_cores")):
+        yield f"a tile holds more than {target.limit('mesh.tile_cores')} cores, or is none"
 
 
 def least_cores(
