@@ -72,7 +72,7 @@ def test_gradients_run_through_own_spikes_and_currents(surrogate):
         fired.append(spikes)
     (torch.stack(fired).mean(0) * wanted).sum().backward()
     theirs = torch.cat([torch.cat([given.grad, own.grad], dim=1).flatten(), bias.grad])
-    ours = torch.cat([model.weights[0].grad, model.biases[0].grad])
+    ours = torch.cat([model.layers[0].weight.grad, model.layers[0].bias.grad])
     assert 0.1 < torch.stack(fired).mean() < 0.9
     assert torch.equal(torch.stack(fired), model.spikes_of(events)[0])
     torch.testing.assert_close(ours, theirs, rtol=0.01, atol=0.005)

@@ -299,10 +299,10 @@ def test_gradients_are_those_of_the_rounded_float_model(tmp_path):
     load_weights(plain, model.tensors())
     events = torch.tensor(data.events.transpose(3, 0, 1, 2), dtype=torch.float32)
     plain(events).square().sum().backward()
-    ours, theirs = model.hops.grad, plain.conv1.hops.grad
+    ours, theirs = model.layers[0].filters.grad, plain.conv1.hops.grad
     assert theirs.abs().max() > 0
     assert torch.nn.functional.cosine_similarity(ours.flatten(), theirs.flatten(), dim=0) > 0.9
-    last, reference = model.weights[-1].grad, getattr(plain, plain.dense[-1]).weight.grad.t()
+    last, reference = model.layers[-1].weight.grad, getattr(plain, plain.dense[-1]).weight.grad.t()
     assert torch.nn.functional.cosine_similarity(last.flatten(), reference.flatten(), dim=0) > 0.9
 
 
@@ -312,9 +312,9 @@ def test_weights_that_would_overflow_are_shrunk(tmp_path):
     forms = tuned_forms(checkpoint, adjacency, data.events, 8)
     model = QuantisedNet(expand(checkpoint, adjacency), forms)
     with torch.no_grad():
-        model.hops *= 40
-        model.weights[0] *= 40
-        model.biases[0] += 1e9
+        model.layers[0].filters *= 40
+        model.layers[1].weight *= 40
+        model.layers[1].bias += 1e9
     model.make_legal()
     for integers in model.integers:
         assert integers.full.max() <= ONE_STEP_SUM_MAX

@@ -264,7 +264,7 @@ def _write_nir(request: FinetuneRequest, loaded: LoadedNetwork, net: QuantisedNe
     """Write the network, and the netlist that it compiles to; the name of that."""
     from spikeloom.compiler.formats.nir import writer
 
-    integer, _ = round_to_forms(net.learned(), net.forms)
+    integer, _ = round_to_forms(net.expanded(), net.forms)
     dt = loaded.read_as.get("dt", (record.bin_s or BIN_S) * integer.input.bins)
     content = writer.export(integer, dt, training=json.dumps(record.to_json()))
     with write_atomically(request.output) as file:
