@@ -28,8 +28,8 @@ class ExplainRequest(ComparisonChoice, RecordingsChoice):
 class StressRequest(ComparisonChoice, RecordingsChoice):
     """Where float network and chip break: a seeded battery of perturbations, with verdicts and reasons."""
 
-    only: str | None = option("some perturbations (default: all)", metavar="NAME[,…]")
-    seeds: int = option("draws of each", default=5, metavar="N")
+    only: str | None = option("perturbations to measure (default: all)", metavar="NAME[,…]")
+    seeds: int = option("random draws of each perturbation", default=5, metavar="N")
     require: tuple[str, ...] = option(
         "accuracy that the chip must keep, as in taxels_dead:3>=0.85; else exit code 1; may be repeated",
         default=(),
@@ -46,8 +46,8 @@ class StressRequest(ComparisonChoice, RecordingsChoice):
 class CertifyRequest(NetlistChoice, RecordingsChoice):
     """Which decisions no small change of a recording alters: proven, not sampled."""
 
-    shift: int = option("furthest shift", default=25, metavar="BINS")
-    most: int = option("changed events to look for a proof of", default=16, metavar="N")
+    shift: int = option("largest shift to try", default=25, metavar="BINS")
+    most: int = option("largest number of changed events to look for a proof of", default=16, metavar="N")
     jobs: int | None = option("recordings at a time (default: one a core)", metavar="N")
     picture: str | None = option("draw how many decisions hang on each taxel", metavar="OUT.png|svg|pdf")
     output: str | None = option("write what --json prints", metavar="OUT.json", flags=("-o", "--output"))

@@ -24,8 +24,8 @@ from spikeloom.runtime.studies.robustness.results import Provenance
 KINDS = "; ".join(kind.what for kind in EXHAUSTIVE.values())
 
 NOTES = f"""\
-On each recording every one of these changes is decided, none is sampled: {KINDS}.
-For several changed events it says how many are proven to be harmless and how many are shown to suffice.
+On each recording every change of these kinds is tried, none is sampled: {KINDS}.
+For several changed events it reports how many are proven to alter nothing, and how many are shown to suffice.
 """
 
 

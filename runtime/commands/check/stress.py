@@ -12,8 +12,8 @@ from spikeloom.runtime.studies.robustness.stress_sections import picture, sectio
 
 NOTES = f"""\
 Perturbations: {", ".join(SAMPLED)}.
-Accuracies are means over the seeds with a 95 % interval; a level leaves where the mean is below the interval of the
-clean accuracy.
+Accuracies are means over the seeds with a 95 % interval. A side leaves at the first level whose mean is below the
+interval of the clean accuracy.
 """
 
 

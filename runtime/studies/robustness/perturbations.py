@@ -346,13 +346,13 @@ def shorter_decay(memory: Memory, factor: float) -> Memory:
 
 @exhaustive("events")
 def removed(there: BoolArray) -> BoolArray:
-    """One event less."""
+    """One event removed."""
     return there
 
 
 @exhaustive("events")
 def added(there: BoolArray) -> BoolArray:
-    """One event more."""
+    """One event added."""
     return ~there
 
 
