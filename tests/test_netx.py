@@ -13,7 +13,7 @@ from oracles import refused
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats import hdf5
 from spikeloom.compiler.formats.netx.reader import integers_of, read_netx
-from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.formats.sensor_layout import sensor_layout
 from spikeloom.compiler.targets.loihi1.integers import run_integer, verify
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.passes import compile_network

@@ -21,7 +21,7 @@ from spikeloom.compiler.formats.onnx.atoms import INPUT_ATOM, Table
 from spikeloom.compiler.formats.onnx.file import Node
 from spikeloom.compiler.formats.onnx.operators import apply
 from spikeloom.compiler.formats.onnx.reader import read_onnx
-from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.formats.sensor_layout import sensor_layout
 from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist

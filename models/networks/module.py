@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.assemble import Layer, assemble, class_of_each
 from spikeloom.compiler.formats.names import unique_names
+from spikeloom.compiler.formats.sensor_layout import sensor_layout
 from spikeloom.compiler.ir import INPUT, Network, Sparse
-from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.types import FloatArray
 from spikeloom.models.networks.lif import LIF, reset
 

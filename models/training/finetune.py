@@ -29,8 +29,7 @@ from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.storage import KEEP, Packing
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.compartments import Options
-from spikeloom.compiler.targets.loihi1.passes import compile_network
+from spikeloom.compiler.targets.compartments import Options, compile_network
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.quantised import QuantisedNet

@@ -26,7 +26,7 @@ from spikeloom.compiler.formats.affine import convolution
 from spikeloom.compiler.formats.assemble import ReadNetwork
 from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, entry_of, read_hdf5
 from spikeloom.compiler.formats.names import named, printable
-from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.formats.sensor_layout import sensor_layout
 from spikeloom.compiler.targets.loihi1.integers import MANTISSA, IntegerNetwork, IntegerPopulation, IntegerProjection
 from spikeloom.compiler.targets.loihi1.registers import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, kept_shares
 from spikeloom.compiler.types import IntArray

@@ -24,8 +24,8 @@ from spikeloom.compiler.formats.names import named, printable, unique_names
 from spikeloom.compiler.formats.nir import CONVENTIONS, stages
 from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, graph_of, loops, only
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
+from spikeloom.compiler.formats.sensor_layout import sensor_layout
 from spikeloom.compiler.ir import INPUT, Form, Input, Network, Sparse
-from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.targets.loihi1.registers import (
     THRESHOLD_MANTISSA_MAX,
     decay_registers,

@@ -22,8 +22,8 @@ from spikeloom.compiler.formats.onnx.atoms import INPUT_ATOM, Table, as_affine, 
 from spikeloom.compiler.formats.onnx.file import BOOL, DOUBLE, Declared, Graph, read_graph
 from spikeloom.compiler.formats.onnx.lif import Neurons, Unrolled, group, is_output, neurons_of, readout
 from spikeloom.compiler.formats.onnx.operators import run
+from spikeloom.compiler.formats.sensor_layout import sensor_layout
 from spikeloom.compiler.ir import INPUT, Network
-from spikeloom.compiler.sensor_layout import sensor_layout
 
 
 def read_onnx(

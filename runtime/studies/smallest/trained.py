@@ -13,8 +13,7 @@ import numpy as np
 from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.compartments import Options
-from spikeloom.compiler.targets.loihi1.passes import compile_network
+from spikeloom.compiler.targets.compartments import Options, compile_network
 from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.graphs import Graph
 from spikeloom.models.recordings.events import joined_bins
