@@ -33,7 +33,7 @@ from onnx import ModelProto, defs
 from random_networks import LOIHI
 from zoo import specimen
 
-from spikeloom.compiler import archive
+from spikeloom.compiler import archive, invariants
 from spikeloom.compiler.errors import CapacityError, SpikeloomError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.counters import read_network
@@ -42,8 +42,9 @@ from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.formats.nir.reader import read_nir
 from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.formats.own_checkpoint import content_digest
-from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.ir import Network
 from spikeloom.compiler.targets.base import with_tables
+from spikeloom.compiler.targets.loihi1 import integers
 from spikeloom.compiler.targets.truenorth.native_file import read_trained
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.networks.networks import Architecture
@@ -313,7 +314,8 @@ def values(read: Callable[[Path], Any], path: Path) -> str:
 def network(read: Callable[[Path], Any], path: Path) -> str:
     """Read a network whose rules hold and whose facts are lines."""
     found = read(path)
-    verify(found.network)
+    rules = invariants if isinstance(found.network, Network) else integers
+    rules.verify(found.network)
     assert all(fact.isprintable() for fact in found.facts)
     return repr(found.facts)
 
