@@ -20,6 +20,7 @@ from zoo import STORAGE, tuned
 from spikeloom.compiler.errors import CapacityError, OptionError, Violation
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
+from spikeloom.compiler.storage import Fixed
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.truenorth.native_file import write_trained
@@ -131,7 +132,7 @@ def test_what_the_chip_refuses_is_listed(as_json, refusal, place, monkeypatch):
     refused, to_integers = {4}, chart_work.to_integers
 
     def picky(network, options, target):
-        if options.packings is not None and options.packings[0].bits in refused:
+        if isinstance(options.storage, Fixed) and options.storage.packings[0].bits in refused:
             raise CapacityError((VIOLATION,))
         return to_integers(network, options, target)
 

@@ -9,7 +9,7 @@ from random_netlists import Axon, Neuron, build
 from random_networks import LOIHI, compiled, integer_chain
 
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.storage import Fixed, Packing
 from spikeloom.compiler.targets.base import EnergyTable, Quantity
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
@@ -205,7 +205,7 @@ LENGTHS = np.array([30, 7, 1, 30])
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
-    netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(Packing(planes=2),))).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(storage=Fixed((Packing(planes=2),)))).netlist
     recordings = events(5, samples=4, steps=30)
     return netlist, recordings.reshape(4, netlist.n_inputs, -1)
 

@@ -9,7 +9,7 @@ from timed_networks import written
 
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.storage import Fixed, Packing
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
@@ -33,7 +33,7 @@ def made(seed=0, packing=None, taxels=6):
     """What the chip stores of a small TactileSGNet."""
     checkpoint = random_checkpoint(taxels=taxels, features=4, sizes=(9, 8, 4), seed=seed)
     network = expand(checkpoint, normalised_adjacency(ring(taxels).edges, taxels))
-    return Pair(netlist=compile_network(network, Options(packings=packing)).netlist, network=network).memory
+    return Pair(netlist=compile_network(network, Options(storage=Fixed(packing))).netlist, network=network).memory
 
 
 def timed(folder):

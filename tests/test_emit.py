@@ -17,7 +17,7 @@ from spikeloom.compiler.errors import CapacityError, DataError, FormatError, Mod
 from spikeloom.compiler.ir import INPUT, fan_in
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.storage import Exact, Packing
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, verify
 from spikeloom.compiler.targets.loihi1.layout.choose import lay_out, least_cores
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
@@ -195,9 +195,8 @@ def cutting(sizes, **limits):
 OPTIONS = [
     ("--prune-unused|--calibrate|--keep-all", compiling(prune_unused=True)),
     ("--prune-unused|--keep-all", compiling(prune_unused=True, training_events=EVENTS, keep_all=True)),
-    ("--spike-exact|--calibrate", compiling(spike_exact=True)),
-    ("--spike-exact|--planes", compiling(spike_exact=True, training_events=EVENTS, packings=(Packing(planes=2),))),
-    (f"--weight-bits 7|{WIDTHS}", compiling(spike_exact=True, training_events=EVENTS, packings=(Packing(bits=7),))),
+    ("--spike-exact|--calibrate", compiling(storage=Exact())),
+    (f"--weight-bits 7|{WIDTHS}", compiling(storage=Exact(7), training_events=EVENTS)),
     *((f"--weight-bits {bits}|{WIDTHS}", rounding(packings=(Packing(bits=bits),))) for bits in (-1, 0, 1, 7, 9)),
     *((f"--planes {planes}|1 to 3", rounding(packings=(Packing(planes=planes),))) for planes in (0, 4)),
     *((f"--scale-groups {n}|8 thresholds|1 to 8", rounding(packings=(Packing(groups=n),))) for n in (0, 9)),

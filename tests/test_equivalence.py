@@ -13,7 +13,7 @@ from scipy import stats
 from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.storage import Fixed, Packing
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
@@ -37,7 +37,7 @@ def rungs(verdict):
 def small(tmp_path_factory):
     """A checkpoint, its propagation matrix and a coarse netlist that often strays from it."""
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
-    netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(Packing(bits=4),))).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(storage=Fixed((Packing(bits=4),)))).netlist
     return checkpoint, adjacency, netlist
 
 
@@ -85,7 +85,7 @@ def test_spikes_and_decisions(small, verdict):
 @pytest.mark.parametrize(("seed", "bits"), [(0, 4), (1, 6)])
 def test_the_first_divergence_is_the_first(tmp_path, seed, bits):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
-    options = Options(packings=(Packing(bits=bits),), keep_all=bits == 6)
+    options = Options(storage=Fixed((Packing(bits=bits),)), keep_all=bits == 6)
     netlist, recordings = compile_network(expand(checkpoint, adjacency), options).netlist, events(2 + seed, samples=3)
     found = verify(netlist, expand(checkpoint, adjacency), recorded(recordings), spec_samples=1).first_divergence
     reference = list(float_spikes(expand(checkpoint, adjacency), recordings).values())

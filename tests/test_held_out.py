@@ -13,7 +13,7 @@ from random_networks import chain, small_target
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.calibrate import FEW, evenly_spaced
-from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.storage import Cheapest, Fixed, Packing
 from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
@@ -51,7 +51,7 @@ def test_what_is_held_out_chooses_no_scale(count):
 @pytest.mark.parametrize("keep", [0.0, 0.97, 1.0])
 def test_the_cheapest_that_keeps_enough_is_chosen_and_what_was_tried_is_counted(keep):
     network, events = unlike()
-    done = compile_network(network, Options(training_events=events, keep=keep))
+    done = compile_network(network, Options(training_events=events, storage=Cheapest(keep)))
     few, several, held = split(len(events))
     draw = np.random.default_rng(0)
     thinned = channels_last(np.stack([one * (draw.random(one.shape, np.float32) < KEPT) for one in events[held]]))
@@ -60,7 +60,7 @@ def test_the_cheapest_that_keeps_enough_is_chosen_and_what_was_tried_is_counted(
     sent = [known, *run_float(network, known).spikes]
     for trial, packing in zip(done.trials, LADDER, strict=False):
         training = events[several if packing.planes > 1 else few]
-        one = compile_network(network, Options(packings=(packing,), training_events=training))
+        one = compile_network(network, Options(storage=Fixed((packing,)), training_events=training))
         equal = (decisions(run_integer(one.integer, thinned).spikes[-1])[0] == wanted) & voted
         assert (trial.equal, trial.decisions) == (equal.sum(), voted.sum())
         assert trial.cores == one.netlist.n_cores
@@ -81,8 +81,8 @@ def test_the_cheapest_that_keeps_enough_is_chosen_and_what_was_tried_is_counted(
 
 def test_storage_that_the_chip_does_not_hold_is_not_chosen():
     network, events = unlike()
-    options = Options(training_events=events, keep=1.0)
-    words = compile_network(network, replace(options, keep=0.0)).trials[0].synapse_words
+    options = Options(training_events=events, storage=Cheapest(1.0))
+    words = compile_network(network, replace(options, storage=Cheapest(0.0))).trials[0].synapse_words
     tight = small_target(core_synapse_words=words, chip_cores=1)
     done = compile_network(network, options, target=tight)
     assert [bool(trial.refused) for trial in done.trials] == [False, False, True, True]
@@ -94,7 +94,7 @@ def test_storage_that_the_chip_does_not_hold_is_not_chosen():
 
 def test_a_single_recording_leaves_none_to_judge_by():
     network, events = unlike(samples=1)
-    done = compile_network(network, Options(training_events=events, keep=1.0))
+    done = compile_network(network, Options(training_events=events, storage=Cheapest(1.0)))
     assert done.trials == ()
     assert [choice.planes for choice in done.choices] == [1, 1]
 

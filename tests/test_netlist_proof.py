@@ -19,7 +19,7 @@ from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.counters import write_counters
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.storage import Exact, Fixed, Packing
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist, write_netlist
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
@@ -140,13 +140,13 @@ def checked(netlist, network, **provenance):
 
 
 MADE = {
-    "4 bits": {"packings": (Packing(bits=4),), "keep_all": True},
-    "3 planes": {"packings": (Packing(bits=3, planes=3),)},
-    "groups": {"packings": (Packing(planes=2, groups=4),)},
-    "8 groups": {"packings": (Packing(groups=8),)},
-    "2 planes": {"packings": (Packing(planes=2),), "keep_all": True},
-    "pruned": {"packings": (Packing(bits=4, planes=2),), "prune_unused": True},
-    "spike-exact": {"spike_exact": True},
+    "4 bits": {"storage": Fixed((Packing(bits=4),)), "keep_all": True},
+    "3 planes": {"storage": Fixed((Packing(bits=3, planes=3),))},
+    "groups": {"storage": Fixed((Packing(planes=2, groups=4),))},
+    "8 groups": {"storage": Fixed((Packing(groups=8),))},
+    "2 planes": {"storage": Fixed((Packing(planes=2),)), "keep_all": True},
+    "pruned": {"storage": Fixed((Packing(bits=4, planes=2),)), "prune_unused": True},
+    "spike-exact": {"storage": Exact()},
     "cores": {"chips": 2, "cores_for": {"fc1": 2}},
 }
 """What options make; if they need no recordings, without them, too."""
@@ -184,7 +184,7 @@ def test_weights_that_the_range_cuts_off_are_at_its_end():
 @pytest.fixture(scope="module", params=[2, 8])
 def rounded(request, tmp_path_factory):
     network = expand(*small_checkpoint(tmp_path_factory.mktemp("small")))
-    netlist = compile_network(network, Options(packings=(Packing(bits=request.param),))).netlist
+    netlist = compile_network(network, Options(storage=Fixed((Packing(bits=request.param),)))).netlist
     assert checked(netlist, network).holds
     return netlist, network
 

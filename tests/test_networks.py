@@ -18,6 +18,7 @@ from test_dynamics import surrogate_spike
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.storage import Given
 from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, TACTILESGNET, Grid, in_order
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
@@ -361,7 +362,7 @@ def test_fine_tuned_on_the_chips_integers_they_are_the_chip(tmp_path, system, bi
     tuned = finetune(expand(checkpoint, seen), training, test, load_target("loihi1"), bits=[bits], epochs=4)
     assert system != TACTILESGNET or tuned.history[-1].loss < tuned.history[0].loss
     again = saved(tmp_path, network, weights=tuned.net.tensors(), forms=tuned.net.forms)
-    netlist = compile_network(expand(again, seen), Options(forms=again.forms)).netlist
+    netlist = compile_network(expand(again, seen), Options(storage=Given(again.forms))).netlist
     assert {projection.bits for projection in lift(netlist).projections} == {bits}
     verdict = verify(netlist, expand(again, seen), test)
     assert verdict.model_different == 0

@@ -14,6 +14,7 @@ from made_onnx import BIAS, FIRES, SECOND, STAGE, STATE_IN, WEIGHTS, fire, model
 from onnx import helper
 from onnx.reference import ReferenceEvaluator
 from oracles import assert_same_network, refused
+from spikeloom.compiler.sensor_layout import sensor_layout
 
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.affine import Affine
@@ -22,7 +23,7 @@ from spikeloom.compiler.formats.onnx.file import Node
 from spikeloom.compiler.formats.onnx.operators import apply
 from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.formats.sensor_layout import sensor_layout
-from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.storage import Fixed, Packing
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.loihi1.options import Options
@@ -107,7 +108,7 @@ def test_modules_come_back_with_the_same_integers(read, name, opset):
     step = read(one_step(net, example, opset_version=opset))
     several = read(exported(AllSteps(net), (torch.zeros(*example.shape, 5),)))
     assert "5 steps unrolled" in several.facts[0]
-    options = Options(packings=(Packing(bits=6),))
+    options = Options(storage=Fixed((Packing(bits=6),)))
     integers = [compile_network(network, options).integer for network in (ours, step.network, several.network)]
     for found in integers[1:]:
         assert_same_network(found, integers[0])

@@ -99,7 +99,7 @@ def test_a_pass_that_breaks_a_rule_is_named_at_once(name, change):
         replace(step, apply=lambda done, apply=step.apply: change(apply(done))) if step.name == name else step
         for step in PASSES
     ]
-    work, _ = start(expand(random_checkpoint(), ring(5)), Options(), load_target("loihi1"))
+    work = start(expand(random_checkpoint(), ring(5)), Options(), load_target("loihi1"))
     seen = []
     refused(VerifyError, "", run, passes, work, lambda name, _: seen.append(name))
     assert name not in seen

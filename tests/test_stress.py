@@ -16,7 +16,7 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.storage import Fixed, Packing
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.networks.reference import float_spikes
@@ -320,7 +320,7 @@ def test_requirements_decide_about_the_exit_code(as_json):
 
 
 def test_what_does_not_apply(bench):
-    netlist = compile_network(bench.pair.network, Options(packings=(Packing(planes=2),))).netlist
+    netlist = compile_network(bench.pair.network, Options(storage=Fixed((Packing(planes=2),)))).netlist
     pair = Pair(netlist=netlist, network=bench.pair.network)
     assert SAMPLED["fewer_bits"].why_not(pair) == "weights are stored in several planes"
     assert SAMPLED["fewer_bits"].why_not(bench.pair) is None

@@ -18,7 +18,7 @@ from spikeloom.compiler.ir import Projection
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import never_fires
-from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.storage import Exact, Fixed, Packing
 from spikeloom.compiler.targets.loihi1 import registers
 from spikeloom.compiler.targets.loihi1.bounds import one_step_bounds, prove_ranges
 from spikeloom.compiler.targets.loihi1.emit import emit
@@ -107,9 +107,9 @@ def test_ranges_are_proven_for_any_input(compilation):
 @pytest.mark.parametrize(
     "options",
     [
-        {"packings": (Packing(bits=2),)},
-        {"packings": (Packing(planes=2, groups=8),)},
-        {"packings": (Packing(bits=2),), "training_events": None},
+        {"storage": Fixed((Packing(bits=2),))},
+        {"storage": Fixed((Packing(planes=2, groups=8),))},
+        {"storage": Fixed((Packing(bits=2),)), "training_events": None},
     ],
 )
 def test_relays_tick_with_their_clocks_however_weights_are_stored(timed, options):
@@ -165,7 +165,7 @@ def events_of_five(seed, samples=6, steps=50):
 @pytest.mark.parametrize("alpha", [0.0, 0.5])
 def test_every_spike_of_the_calibration_is_kept_if_asked(alpha):
     network, events = drawn(1, gain=1.5, alpha=alpha), events_of_five(2)
-    made = compile_network(network, Options(training_events=events, spike_exact=True))
+    made = compile_network(network, Options(training_events=events, storage=Exact()))
     assert [layer.flips for layer in made.exactness] == [0, 0]
     given_ = channels_last(events)
     wanted, found = run_float(network, given_), run_integer(made.integer, given_)

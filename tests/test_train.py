@@ -25,7 +25,7 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.storage import Fixed, Given, Packing
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.options import Options
@@ -253,7 +253,7 @@ def drawn(checkpoint, seed, *, samples=12, steps=20):
 
 
 def tuned_forms(checkpoint, adjacency, events, bits):
-    asked = Options(packings=[Packing(bits=bits, groups=8)], keep_all=True, training_events=events)
+    asked = Options(storage=Fixed((Packing(bits=bits, groups=8),)), keep_all=True, training_events=events)
     return compile_network(expand(checkpoint, adjacency), asked).integer.forms
 
 
@@ -408,7 +408,7 @@ def test_the_model_is_the_chip_on_every_recording(tmp_path, objects_zip, contain
         words = ["finetune", f"pretrained:{name}", "--data", str(place), "--weight-bits", "4", "--epochs", "2"]
         assert main([*words, "-o", str(output)]) == 0
         checkpoint = read_checkpoint(output)
-        netlist = compile_network(expand(checkpoint, adjacency), Options(forms=checkpoint.forms)).netlist
+        netlist = compile_network(expand(checkpoint, adjacency), Options(storage=Given(checkpoint.forms))).netlist
         for split in ("train", "test"):
             data = load_data(place, split)
             model = quantised_spikes(expand(checkpoint, adjacency), data.events)

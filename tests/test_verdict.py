@@ -9,7 +9,7 @@ from scipy import stats
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.storage import Fixed, Packing
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
@@ -166,7 +166,7 @@ def test_votes_that_decide_little(before, after, expected):
 
 def verified(folder, arrays, recordings, packing, **options):
     checkpoint, adjacency = small_checkpoint(folder, last=arrays)
-    netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(packing,), **options)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(storage=Fixed((packing,)), **options)).netlist
     made = verify(netlist, expand(checkpoint, adjacency), recorded(recordings))
     return {breakdown.kind: breakdown for breakdown in made.breakdowns}
 

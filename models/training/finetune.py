@@ -27,7 +27,7 @@ from spikeloom.compiler.errors import require_least
 from spikeloom.compiler.interpret import channels_last, cut
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.calibrate import calibrate
-from spikeloom.compiler.storage import KEEP, Packing
+from spikeloom.compiler.storage import Cheapest, Fixed, Packing
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.compartments import Options, compile_network
 from spikeloom.compiler.types import JsonObject
@@ -97,9 +97,10 @@ def finetune(
     """
     require_least({"epochs": epochs, "seed": seed}, epochs=1, seed=0)
     require_chance(robust)
-    packings = None if bits is None else [Packing(bits=width, groups=groups) for width in bits]
-    storage = Options(packings=packings, keep=KEEP, keep_all=True, training_events=training.events)
-    chosen = compile_network(network, storage, target=target).integer
+    packings = [Packing(bits=width, groups=groups) for width in bits or ()]
+    storage = Fixed(tuple(packings)) if packings else Cheapest()
+    options = Options(storage=storage, keep_all=True, training_events=training.events)
+    chosen = compile_network(network, options, target=target).integer
     released = has_released_dynamics(network)
     with one_thread():
         net = QuantisedNet(network, chosen.forms, RECTANGLE if released else TIMED.surrogate)
@@ -107,10 +108,10 @@ def finetune(
         rate = LEARNING_RATE if released else GENTLE_RATE
         net.start_at(chosen)
         net.make_legal()
-        options = _identity(net, training, test)
-        options |= {"chip": target.name, "scale groups": groups, "epochs": epochs, "seed": seed, "robust": robust}
+        identity = _identity(net, training, test)
+        identity |= {"chip": target.name, "scale groups": groups, "epochs": epochs, "seed": seed, "robust": robust}
         course = Course(
-            options=options,
+            options=identity,
             network=net,
             optimizer=torch.optim.Adam(net.parameters(), lr=rate, amsgrad=True),
             draw=np.random.default_rng(seed),

@@ -6,7 +6,7 @@ from typing import Any
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import Form
-from spikeloom.compiler.storage import KEEP, Packing
+from spikeloom.compiler.storage import Cheapest, Exact, Fixed, Given, Packing, Storage
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.inputs.recordings import origin_of
@@ -23,7 +23,7 @@ def provenance(request: CompileRequest, asked: LoadedNetwork, *, calibrated: Rec
         **asked.origin(request.run),
         **(origin_of(asked.training) or origin_of(seen)),
         **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
-        **storage(parse_packings(request), asked.network.forms),
+        **remembered(storage_of(request, asked.network.forms)),
         "spike_exact": request.spike_exact,
         "keep_all": request.keep_all,
         "prune_unused": request.prune_unused,
@@ -42,7 +42,47 @@ def whole_numbers(text: str, option: str) -> list[int]:
         raise OptionError(f"{option} {text}: not a number; give one, or several as in 8,4,4,8") from None
 
 
-def parse_packings(request: CompileRequest) -> tuple[Packing, ...] | None:
+def storage_of(request: CompileRequest, forms: Sequence[Form] | None = None) -> Storage:
+    """What the options of ``compile`` say about storage; `forms` where a network was fine-tuned for its own.
+
+    OptionError if they are no numbers, contradict each other or ask for what there are no recordings for.
+    """
+    packings = _packings(request)
+    if forms is not None:
+        if packings is not None or request.spike_exact:
+            omitted = "omit --weight-bits, --planes, --scale-groups and --spike-exact"
+            raise OptionError(f"compile: the checkpoint was fine-tuned for its own storage; {omitted}")
+        return Given(forms)
+    _require_held_out(request, chosen=packings is not None or request.spike_exact)
+    if request.spike_exact:
+        bits = Exact().bits if packings is None else packings[0].bits
+        if packings not in (None, (Packing(bits=bits),)):
+            raise OptionError(
+                "--spike-exact: finds planes and scales itself; give one width, no --planes or --scale-groups"
+            )
+        return Exact(bits)
+    if packings is not None:
+        return Fixed(packings)
+    if request.calibrate is None:
+        return Fixed()
+    return Cheapest() if request.keep is None else Cheapest(float(request.keep))
+
+
+def _require_held_out(request: CompileRequest, *, chosen: bool) -> None:
+    """Refuse a share of decisions that is none, or by which nothing can be chosen."""
+    keep = request.keep
+    if keep is None:
+        return
+    if not 0 <= keep <= 1:
+        raise OptionError(f"--keep {keep:g}: not a share; give a number from 0 to 1")
+    if request.calibrate is None:
+        raise OptionError(f"--keep {keep:g}: no recordings to hold out; give --calibrate")
+    if chosen:
+        others = "--weight-bits, --planes, --scale-groups and --spike-exact"
+        raise OptionError(f"--keep {keep:g}: chooses storage; omit it, or {others}")
+
+
+def _packings(request: CompileRequest) -> tuple[Packing, ...] | None:
     """Packing that the options of ``compile`` ask for, or None where they do not.
 
     Raises OptionError if they are no numbers, or disagree about the number of layers.
@@ -62,27 +102,20 @@ def parse_packings(request: CompileRequest) -> tuple[Packing, ...] | None:
     return tuple(Packing(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
 
 
-def parse_keep(request: CompileRequest) -> float | None:
-    """Share of decisions that storage has to keep; OptionError if it is none, or nothing can be chosen by it."""
-    keep = request.keep
-    if keep is None:
-        return KEEP
-    if not 0 <= keep <= 1:
-        raise OptionError(f"--keep {keep:g}: not a share; give a number from 0 to 1")
-    if request.calibrate is None:
-        raise OptionError(f"--keep {keep:g}: no recordings to hold out; give --calibrate")
-    if request.spike_exact or parse_packings(request) is not None:
-        chosen = "--weight-bits, --planes, --scale-groups and --spike-exact"
-        raise OptionError(f"--keep {keep:g}: chooses storage; omit it, or {chosen}")
-    return float(keep)
-
-
-def storage(packings: tuple[Packing, ...] | None, forms: Sequence[Form] | None) -> Mapping[str, Any]:
-    """The same for the provenance of a netlist; `forms` are what a network was fine-tuned for."""
-    if forms is not None:
-        return {"weight_bits": _one_or_list([form.bits for form in forms]), "fine_tuned": True}
-    known, names = packings or (Packing(),), {"weight_bits": "bits", "planes": "planes", "scale_groups": "groups"}
-    return {name: _one_or_list([getattr(packing, field) for packing in known]) for name, field in names.items()}
+def remembered(storage: Storage) -> Mapping[str, Any]:
+    """What the provenance of a netlist has of its storage, before held-out recordings choose."""
+    if isinstance(storage, Given):
+        return {"weight_bits": _one_or_list([form.bits for form in storage.forms]), "fine_tuned": True}
+    packings: tuple[Packing, ...] = (Packing(),)
+    if isinstance(storage, Fixed):
+        packings = storage.packings
+    if isinstance(storage, Exact):
+        packings = (Packing(bits=storage.bits),)
+    return {
+        "weight_bits": _one_or_list([packing.bits for packing in packings]),
+        "planes": _one_or_list([packing.planes for packing in packings]),
+        "scale_groups": _one_or_list([packing.groups for packing in packings]),
+    }
 
 
 def _one_or_list(values: list[int]) -> int | list[int]:

@@ -6,7 +6,7 @@ from typing import Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import Form
-from spikeloom.compiler.storage import MAX_PLANES, Packing
+from spikeloom.compiler.storage import EIGHT_BITS, MAX_PLANES, Exact, Given, Packing, Storage
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.types import AnyArray
 
@@ -15,15 +15,7 @@ from spikeloom.compiler.types import AnyArray
 class Options:
     """Options of a compilation."""
 
-    forms: Sequence[Form] | None = None  # Storage that the network was fine-tuned for, by population
-    # Packing of each layer, or one for all; 8 bits by default. A fine-tuned network brings its own and takes none.
-    packings: Sequence[Packing] | None = None
-    # Add planes and scales until every spike on the training recordings, all of them, is the float64 model's, see
-    # :mod:`storage.spike_exact`; takes the width from `packings` and nothing else
-    spike_exact: bool = False
-    # Least share of equal decisions on held-out training recordings for which the cheapest storage is chosen, see
-    # :mod:`storage.held_out`, where nothing else says how layers are stored; None: 8 bits
-    keep: float | None = None
+    storage: Storage = EIGHT_BITS  # What decides how weights are stored
     share_lists: bool = False  # Round weights that repeat alike, so that cores store their lists once
     keep_all: bool = False  # Keep neurons that provably do nothing, too
     prune_unused: bool = False  # Remove neurons that did not fire on any training recording, too
@@ -36,37 +28,16 @@ class Options:
     free_running: bool = False
     provenance: Mapping[str, Any] = field(default_factory=dict)  # JSON values to store with the netlist
 
-    @property
-    def chooses(self) -> bool:
-        """Whether held-out training recordings choose the storage."""
-        said = self.packings is not None or self.spike_exact or self.forms is not None
-        return self.keep is not None and self.training_events is not None and not said
-
     def require_consistent(self, *, calibrated: bool) -> None:
         """Refuse options that contradict each other; `calibrated` where there are, or will be, training events."""
-        fine_tuned = self.forms is not None
-        packings = self.packings or (Packing(),)
-        plain = len(packings) == 1 and packings[0] == Packing(bits=packings[0].bits)
-        without_evidence = not calibrated or self.keep_all or fine_tuned
-        for refused, why in (
-            (
-                self.prune_unused and without_evidence,
-                "--prune-unused: needs --calibrate; omit it with --keep-all and for a fine-tuned checkpoint",
-            ),
-            (
-                fine_tuned and (self.packings is not None or self.spike_exact),
-                "compile: the checkpoint was fine-tuned for its own storage; omit --weight-bits, --planes, "
-                "--scale-groups and --spike-exact",
-            ),
-            (self.spike_exact and not calibrated, "--spike-exact: nothing to be exact on; give --calibrate"),
-            (
-                self.spike_exact and not plain,
-                "--spike-exact: finds planes and scales itself; give one width, no --planes or --scale-groups",
-            ),
-            (self.chips < 1, f"--chips {self.chips}: not a number of chips; give 1 or more"),
-        ):
-            if refused:
-                raise OptionError(why)
+        if self.prune_unused and (not calibrated or self.keep_all or isinstance(self.storage, Given)):
+            raise OptionError(
+                "--prune-unused: needs --calibrate; omit it with --keep-all and for a fine-tuned checkpoint"
+            )
+        if isinstance(self.storage, Exact) and not calibrated:
+            raise OptionError("--spike-exact: nothing to be exact on; give --calibrate")
+        if self.chips < 1:
+            raise OptionError(f"--chips {self.chips}: not a number of chips; give 1 or more")
 
 
 def check_packings(packings: Sequence[Packing], layers: int, target: Target) -> tuple[Packing, ...]:

@@ -2,19 +2,19 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 
 from spikeloom.compiler import invariants
-from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.passes import calibrate as calibration
 from spikeloom.compiler.passes import prune
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.passes.prune import Masks
-from spikeloom.compiler.pipeline import LATER, Pass, run, step
-from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.pipeline import LATER, run, step
+from spikeloom.compiler.storage import EIGHT_BITS, Cheapest, Exact, Fixed, Given, Packing
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.loihi1 import integers, remove
 from spikeloom.compiler.targets.loihi1.bounds import RangeProof, prove_ranges
@@ -31,9 +31,10 @@ from spikeloom.compiler.targets.loihi1.options import Options, check_packings, r
 from spikeloom.compiler.targets.loihi1.remove import Removal
 from spikeloom.compiler.targets.loihi1.storage import held_out
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice, choose_storage, round_to_forms
-from spikeloom.compiler.targets.loihi1.storage.held_out import HeldOut, Trial
+from spikeloom.compiler.targets.loihi1.storage.held_out import HeldOut
+from spikeloom.compiler.targets.loihi1.storage.ladder import Trial, choose_cheapest
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness, make_exact
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import AnyArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,6 +51,7 @@ class Compilation:
     gone: Masks = ()  # Neurons that are to go in any case, see :func:`without`
     integer: IntegerNetwork = LATER  # In the integers of the chip (`quantize`)
     choices: tuple[Choice, ...] = ()  # Scale of each layer and why
+    packing: Packing = EIGHT_BITS.packings[0]  # Of all layers, where held-out recordings choose
     trials: tuple[Trial, ...] = ()  # Storages that were tried, the cheapest first, where held-out recordings choose
     exactness: tuple[Exactness, ...] = ()  # What is in the way of equal spikes, where these were asked for; else empty
     proofs: tuple[RangeProof, ...] = ()  # Worst-case register values of each layer (`prove`)
@@ -88,14 +90,14 @@ class Compilation:
 
 @step("runs the float network on training recordings, where there are any", keeps="the network")
 def _calibrate(done: Compilation) -> Compilation:
-    options = done.options
+    storage = done.options.storage
     events = done.options.training_events
     if events is None:
         return done
-    if not (options.spike_exact or options.prune_unused):
-        several = any(packing.planes > 1 for packing in options.packings or ())
-        few = calibration.evenly_spaced(np.arange(len(events)), calibration.MANY if several else calibration.FEW)
-        events = events[held_out.split(len(events))[0] if options.chooses else few]
+    if not (isinstance(storage, Exact) or done.options.prune_unused):
+        several = isinstance(storage, Fixed) and any(packing.planes > 1 for packing in storage.packings)
+        some = calibration.evenly_spaced(np.arange(len(events)), calibration.MANY if several else calibration.FEW)
+        events = events[held_out.split(len(events))[0] if isinstance(storage, Cheapest) else some]
     calibrated = calibration.calibrate(done.network, channels_last(events, done.network.input.clocks))
     return replace(done, calibration=calibrated, rates=calibrated.rates)
 
@@ -107,7 +109,7 @@ def _calibrate(done: Compilation) -> Compilation:
 )
 def _disconnect(done: Compilation) -> Compilation:
     quiet = prune.none_of(done.network)
-    if done.options.keep_all or done.options.forms is not None:
+    if done.options.keep_all or isinstance(done.options.storage, Given):
         return replace(done, connected=done.network, quiet=quiet)
     gone = proven = prune.never_fires(done.network)
     if done.options.prune_unused and done.calibration is not None:
@@ -121,79 +123,26 @@ def _disconnect(done: Compilation) -> Compilation:
     keeps="the decisions, as well as the width allows; every training spike where --spike-exact succeeds",
 )
 def _quantize(done: Compilation) -> Compilation:
-    options = done.options
+    storage = done.options.storage
     network = done.connected
     target = done.target
-    if options.chooses:
-        return _cheapest(done)
-    packings = options.packings or (Packing(),)
-    if options.forms is not None:
-        require_stored(options.forms, [population.name for population in network.populations], target)
-        integer, choices = round_to_forms(network, options.forms, done.calibration)
-        return replace(done, integer=integer, choices=choices, connected=LATER)
-    if options.spike_exact and done.calibration is not None:
-        check_packings(packings, len(network.populations), target)
-        integer, choices, exactness = make_exact(network, target, done.calibration, bits=packings[0].bits)
-        return replace(done, integer=integer, choices=choices, exactness=exactness, connected=LATER)
+    rounded = replace(done, connected=LATER)  # large, and no pass needs it again
+    if isinstance(storage, Given):
+        require_stored(storage.forms, [population.name for population in network.populations], target)
+        integer, choices = round_to_forms(network, storage.forms, done.calibration)
+        return replace(rounded, integer=integer, choices=choices)
+    if isinstance(storage, Exact) and done.calibration is not None:
+        check_packings((Packing(bits=storage.bits),), len(network.populations), target)
+        integer, choices, exactness = make_exact(network, target, done.calibration, bits=storage.bits)
+        return replace(rounded, integer=integer, choices=choices, exactness=exactness)
     integer, choices = choose_storage(
-        network, target, packings=packings, calibration=done.calibration, share_lists=options.share_lists
+        network,
+        target,
+        packings=storage.packings if isinstance(storage, Fixed) else (done.packing,),
+        calibration=done.calibration,
+        share_lists=done.options.share_lists,
     )
-    return replace(done, integer=integer, choices=choices, connected=LATER)  # large, and no pass needs it again
-
-
-def _cheapest(done: Compilation) -> Compilation:
-    """Round to the cheapest storage that keeps decisions of held-out recordings, or to the one that keeps most."""
-    options = done.options
-    network = done.network
-    few = done.calibration
-    events = options.training_events
-    keep = options.keep
-    if events is None or keep is None or few is None or len(events) < 2:
-        return _quantize.apply(replace(done, options=replace(options, keep=None)))
-    _, several, left_out = held_out.split(len(events))
-    judge = HeldOut(network, events[left_out])
-    many = None
-    best = done
-    most = -1
-    trials = list[Trial]()
-    for packing in held_out.ladder(done.target):
-        if many is None and (packing.planes > 1 or options.prune_unused):
-            chosen = events[calibration.evenly_spaced(several, calibration.MANY)]
-            many = calibration.calibrate(network, channels_last(chosen, network.input.clocks))
-        chosen_options = replace(options, packings=(packing,))
-        trial = Trial(planes=packing.planes, groups=packing.groups)
-        try:
-            tried = run((_quantize, *INTEGERS, *LAYOUT), replace(done, options=chosen_options, calibration=many or few))
-        except (CapacityError, ModelError) as error:
-            if not trials:
-                raise  # nor does what is larger fit
-            trials.append(replace(trial, refused=str(error)))
-            continue
-        measured = replace(
-            trial,
-            equal=judge.equal(tried.integer),
-            decisions=len(judge),
-            operations=_operations(tried, few),
-            synapse_words=sum(use.used for use in tried.uses if use.name == "core.synapse_words"),
-            cores=tried.netlist.n_cores,
-        )
-        trials.append(measured)
-        if measured.equal > most:
-            best = tried
-            most = measured.equal
-        if most >= keep * len(judge):
-            break
-    rounded = {"integer": best.integer, "choices": best.choices, "connected": LATER}
-    return replace(done, **rounded, trials=tuple(trials), options=replace(options, packings=best.options.packings))
-
-
-def _operations(done: Compilation, known: Calibration) -> float:
-    """Synaptic operations of a training recording, on average, if every spike is the float model's."""
-    total = 0.0
-    for projection in done.integer.projections:
-        weight = projection.weight
-        total += float(known.rate(projection.pre, INPUT)[weight.indices] @ (weight.data != 0))
-    return total * float(known.events.shape[1])
+    return replace(rounded, integer=integer, choices=choices)
 
 
 @step("bounds every register by the weights alone", keeps="the network")
@@ -233,8 +182,8 @@ def _emit(done: Compilation) -> Compilation:
     if done.choices:
         provenance["compensated"] = [choice.layer for choice in done.choices if choice.compensated]
     provenance["digests"] = digests(done.integer, prune.either(done.silent, done.unread))
-    if done.trials and done.options.packings:
-        provenance |= {"planes": done.options.packings[0].planes, "scale_groups": done.options.packings[0].groups}
+    if done.trials:
+        provenance |= {"planes": done.packing.planes, "scale_groups": done.packing.groups}
     made = emit(
         done.held,
         done.layout.cores,
@@ -254,8 +203,8 @@ def _legalize(done: Compilation) -> Compilation:
     return replace(done, uses=require_legal(done.netlist, done.target))
 
 
-FLOATS = (_calibrate, _disconnect, _quantize)
-"""From floats to integers."""
+FLOATS = (_calibrate, _disconnect)
+"""On floats."""
 
 INTEGERS = (_prove, _remove)
 """On integers, where they are no matter from."""
@@ -263,16 +212,14 @@ INTEGERS = (_prove, _remove)
 LAYOUT = (_place, _emit, _legalize)
 """From integers to a netlist."""
 
-STORAGE = (*FLOATS, *INTEGERS)
-"""The longest part of a compilation, which any number of layouts can share."""
+PASSES = (*FLOATS, _quantize, *INTEGERS, *LAYOUT)
 
-PASSES = (*STORAGE, *LAYOUT)
+After = Callable[[str, Compilation], object] | None
+"""As of :func:`pipeline.run`."""
 
 
-def start(
-    source: Network | IntegerNetwork, options: Options, target: Target
-) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
-    """What the passes begin with, and which of them are due: integers are rounded already.
+def start(source: Network | IntegerNetwork, options: Options, target: Target) -> Compilation:
+    """What passes begin with.
 
     OptionError if the options contradict each other, VerifyError if the network breaks a rule.
     """
@@ -280,7 +227,7 @@ def start(
     empty = Compilation(options=options, target=target)
     work = replace(empty, integer=source) if isinstance(source, IntegerNetwork) else replace(empty, network=source)
     work.verify()
-    return work, (*INTEGERS, *LAYOUT) if work.network is LATER else PASSES
+    return work
 
 
 def compile_network(
@@ -288,17 +235,63 @@ def compile_network(
     options: Options | None = None,
     *,
     target: Target | None = None,
-    after: Callable[[str, Compilation], object] | None = None,
+    after: After = None,
 ) -> Compilation:
-    """Lower a network by all passes that are due; `after` as of :func:`pipeline.run`."""
+    """Lower a network by all passes that are due: integers are rounded already."""
     chip = load_target("loihi1") if target is None else target
-    work, passes = start(source, Options() if options is None else options, chip)
-    return run(passes, work, after)
+    work = start(source, Options() if options is None else options, chip)
+    return run((*INTEGERS, *LAYOUT), _rounded(work, after), after)
 
 
 def to_integers(source: Network, options: Options, target: Target) -> Compilation:
     """Round a network to the integers of the chip, without a layout: :func:`lay_out_again` makes as many as wanted."""
-    return run(STORAGE, start(source, options, target)[0])
+    return run(INTEGERS, _rounded(start(source, options, target)))
+
+
+def _rounded(work: Compilation, after: After = None) -> Compilation:
+    """A network in integers; of :class:`Cheapest` storages each is compiled to the end before one is taken."""
+    if work.network is LATER:
+        return work
+    work = run(FLOATS, work, after)
+    storage = work.options.storage
+    events = work.options.training_events
+    if isinstance(storage, Cheapest) and events is not None and len(events) > 1:
+        work = _with_cheapest(work, storage, events)
+        if after is not None:
+            after(_quantize.name, work)
+        return work
+    return run((_quantize,), work, after)
+
+
+def _with_cheapest(work: Compilation, storage: Cheapest, events: AnyArray) -> Compilation:
+    """Round to the cheapest storage that keeps decisions of held-out recordings, or to the one that keeps most."""
+    network = work.network
+    few = work.calibration
+    assert few is not None, "there are recordings"
+    _, several, left_out = held_out.split(len(events))
+
+    @cache
+    def many() -> Calibration:
+        some = events[calibration.evenly_spaced(several, calibration.MANY)]
+        return calibration.calibrate(network, channels_last(some, network.input.clocks))
+
+    def compiled(packing: Packing) -> Compilation:
+        known = many() if packing.planes > 1 or work.options.prune_unused else few
+        return run((_quantize, *INTEGERS, *LAYOUT), replace(work, packing=packing, calibration=known))
+
+    judge = HeldOut(network, events[left_out])
+    best, trials = choose_cheapest(work.target, storage.keep, judge, compiled, partial(_operations, few))
+    chosen = replace(work, connected=LATER, integer=best.integer, choices=best.choices)
+    return replace(chosen, packing=best.packing, trials=trials)
+
+
+def _operations(known: Calibration, integer: IntegerNetwork) -> float:
+    """Synaptic operations of a training recording, on average, if every spike is the float model's."""
+    total = 0.0
+    for projection in integer.projections:
+        weight = projection.weight
+        total += float(known.rate(projection.pre, INPUT)[weight.indices] @ (weight.data != 0))
+    return total * float(known.events.shape[1])
 
 
 def lay_out_again(done: Compilation, options: Options) -> Compilation:

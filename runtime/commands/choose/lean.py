@@ -6,11 +6,12 @@ from typing import Any
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.storage import Fixed, Given
 from spikeloom.compiler.targets.compartments import write_netlist
 from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.checkpoint import load_graph
-from spikeloom.runtime.inputs.compilation import storage
+from spikeloom.runtime.inputs.compilation import remembered
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
@@ -57,7 +58,8 @@ def run(request: LeanRequest) -> Outcome:
     if request.output is not None:
         lean = {"differ": result.differ} | encode(result.rows[result.taken].removed)
         made = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256, **loaded.origin(request.run)}
-        made |= {**origin_of(loaded.training), **storage(None, loaded.network.forms)}
+        forms = loaded.network.forms
+        made |= {**origin_of(loaded.training), **remembered(Fixed() if forms is None else Given(forms))}
         made |= {"keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True, "lean": lean}
         write_netlist(replace(netlist, provenance={**netlist.provenance, **made}), request.output)
     if request.network is not None and loaded.checkpoint is not None:

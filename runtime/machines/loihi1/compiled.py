@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
+from spikeloom.compiler.storage import Cheapest
 from spikeloom.compiler.targets.loihi1.bounds import RangeProof, open_ranges
 from spikeloom.compiler.targets.loihi1.layout.partition import core_bound
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
@@ -10,7 +11,7 @@ from spikeloom.compiler.targets.loihi1.passes import Compilation
 from spikeloom.compiler.targets.loihi1.registers import ACCUMULATOR_MAX
 from spikeloom.compiler.targets.loihi1.remove import Removal
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice
-from spikeloom.compiler.targets.loihi1.storage.held_out import Trial
+from spikeloom.compiler.targets.loihi1.storage.ladder import Trial
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
 from spikeloom.runtime.machines.loihi1 import description
 from spikeloom.runtime.machines.loihi1.description import NetlistFacts
@@ -45,6 +46,8 @@ class CompilationFacts(Shown):
 
 def outcome(done: Compilation, sha256: str, facts: Sequence[str] = (), finetune: str | None = None) -> Outcome:
     """Facts of a compilation, whose netlist was written to a file with a hash, with their layout."""
+    storage = done.options.storage
+    keep = storage.keep if done.trials and isinstance(storage, Cheapest) else None
     result = CompilationFacts(
         netlist=description.describe(done.netlist, done.uses, sha256),
         calibration=done.choices,
@@ -52,11 +55,11 @@ def outcome(done: Compilation, sha256: str, facts: Sequence[str] = (), finetune:
         removals=done.removals,
         exactness=done.exactness,
         trials=done.trials,
-        keep=done.options.keep if done.trials else None,
+        keep=keep,
         core_bound=core_bound(done.held, done.target),
         placement=done.placement,
         facts=facts or None,
-        finetune=finetune if done.trials and not _holds(done.trials, done.options.keep) else None,
+        finetune=None if keep is None or _holds(done.trials, keep) else finetune,
     )
     return Outcome(result, sections)
 

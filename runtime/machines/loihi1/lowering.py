@@ -1,13 +1,14 @@
 """What is compiled for Loihi: networks of floats, which are rounded, and netx files, which bring their integers."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.interpret import channels_last
+from spikeloom.compiler.storage import Storage
 from spikeloom.compiler.targets.loihi1 import integers
 from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.netlist import write_netlist
@@ -16,7 +17,7 @@ from spikeloom.compiler.targets.loihi1.passes import Compilation, compile_networ
 from spikeloom.compiler.types import BoolArray, EventArray
 from spikeloom.models.recordings.events import of_length
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.inputs.compilation import parse_cores, parse_keep, parse_packings, provenance
+from spikeloom.runtime.inputs.compilation import parse_cores, provenance, storage_of
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings
 from spikeloom.runtime.inputs.repeat import LAYOUT, NETWORK, ROUNDING, command, refuse, typed
@@ -36,10 +37,8 @@ def lower(request: CompileRequest, after: Callable[[str, Any], object]) -> Lower
     path = request.checkpoint
     if isinstance(path, str) and path.endswith(NETX):
         return _lower_integers(path, request)
-    packings = parse_packings(request)
-    keep = parse_keep(request)
-    parse_cores(request.cores_for)
-    _options(request, packings=packings, keep=keep).require_consistent(calibrated=request.calibrate is not None)
+    said = _options(request, storage_of(request))
+    said.require_consistent(calibrated=request.calibrate is not None)
     loaded = load_network(path, request)
     forms = loaded.network.forms
     if forms is not None:
@@ -47,11 +46,9 @@ def lower(request: CompileRequest, after: Callable[[str, Any], object]) -> Lower
     seen = None if request.calibrate is None else _calibration(request.calibrate, request.bin, loaded)
     training = None if seen is None else of_length(seen, loaded.network.input.clocks.length).events
     progress("compiling")
-    options = _options(
-        request,
-        packings=packings,
-        keep=keep,
-        forms=forms,
+    options = replace(
+        said,
+        storage=storage_of(request, forms),
         training_events=training,
         provenance=provenance(request, loaded, calibrated=seen),
     )
@@ -78,17 +75,16 @@ def _model(done: Compilation) -> Model:
     return Model(first=first, spikes=spikes)
 
 
-def _options(request: CompileRequest, **further: Any) -> Options:
+def _options(request: CompileRequest, storage: Storage) -> Options:
     """Options of the passes that a request asks for."""
     return Options(
-        spike_exact=request.spike_exact,
+        storage=storage,
         keep_all=request.keep_all,
         prune_unused=request.prune_unused,
         share_lists=request.share_lists,
         cores_for=parse_cores(request.cores_for),
         chips=request.chips,
         free_running=request.free_running,
-        **further,
     )
 
 

@@ -22,7 +22,7 @@ from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part
 from spikeloom.runtime.equivalence.reference import votes_so_far
 from spikeloom.runtime.inputs import repeat
-from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
+from spikeloom.runtime.inputs.compilation import parse_cores, provenance, storage_of
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
 from spikeloom.runtime.machines.backends import machine_of
@@ -194,8 +194,7 @@ def _rounded(work: Measurement, loaded: LoadedNetwork) -> Compilation:
     """A network in its storage; how it is laid out is yet to be said."""
     asked = _compile_request(work, FEWEST)
     options = Options(
-        forms=work.network.forms,
-        packings=parse_packings(asked),
+        storage=storage_of(asked, work.network.forms),
         prune_unused=asked.prune_unused,
         training_events=_part(work.network, _in_steps(work.data, work.network)["train"], WHOLE).events,
     )

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from spikeloom.compiler.storage import Fixed, Given
 from spikeloom.compiler.systems import TACTILESGNET
 from spikeloom.compiler.targets.compartments import Netlist, Options, compile_network
 from spikeloom.compiler.types import IntArray
@@ -24,7 +25,9 @@ def study(
     that may go, by layer.
     """
     progress("compiling")
-    options = Options(forms=loaded.network.forms, training_events=training.events)
+    forms = loaded.network.forms
+    storage = Fixed() if forms is None else Given(forms)
+    options = Options(storage=storage, training_events=training.events)
     compilation = compile_network(loaded.network, options)
     whole, allowed = compilation.netlist, int(differ * len(training) + 1e-9)
     spikes: IntArray = machine_of(whole).run(training.events, lengths=training.lengths).counts.sum(axis=0)

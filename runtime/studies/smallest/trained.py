@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.storage import Packing
+from spikeloom.compiler.storage import Fixed, Packing
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.compartments import Options, compile_network
@@ -70,5 +70,5 @@ def without(plan: Plan, training: Recordings, held: IntArray, epochs: int, targe
         kind.save(file, {"last": made.last}, plan, {})
         loaded = load_network(str(file), NetworkChoice())
         events = np.ascontiguousarray(seen.events)
-        options = Options(training_events=events, packings=(Packing(bits=storage or 8),))
+        options = Options(training_events=events, storage=Fixed((Packing(bits=storage or 8),)))
         return compile_network(loaded.network, options, target=target).netlist

@@ -5,16 +5,11 @@ a recording that is held out loses a quarter of its events, and each quarter of 
 few spikes that move tell there, and one run of each model gives four decisions. Nothing but the training split is read.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-
 import numpy as np
 
 from spikeloom.compiler.interpret import channels_last, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.calibrate import FEW, Spikes, calibrate, evenly_spaced
-from spikeloom.compiler.storage import Packing
-from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, integer_simulation
 from spikeloom.compiler.types import AnyArray, IntArray
 
@@ -26,26 +21,6 @@ KEPT = 0.75
 
 PARTS = 4
 """Parts of each, of the same length, that decide by themselves."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trial:
-    """A storage that was tried: what it keeps, and what it costs."""
-
-    planes: int  # Times that a synapse may be stored
-    groups: int  # Scales in a layer, at most
-    equal: int = 0  # Decisions of quarters of held-out recordings that are the float model's
-    decisions: int = 0  # All of them
-    operations: float = 0.0  # Synaptic operations of a training recording, where spikes are the float model's
-    synapse_words: int = 0  # Memory of all cores
-    cores: int = 0
-    refused: str | None = field(default=None, metadata={"optional": True})  # Why the chip does not hold it
-
-
-def ladder(target: Target) -> Iterator[Packing]:
-    """What is tried, the cheapest first: more scales cost cores, more planes operations and memory."""
-    slots = target.limit("core.threshold_slots")
-    return (Packing(planes=planes, groups=groups) for planes in (1, 2) for groups in (1, slots))
 
 
 def split(count: int) -> tuple[IntArray, IntArray, IntArray]:

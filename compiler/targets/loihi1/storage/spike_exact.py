@@ -12,7 +12,6 @@ import numpy as np
 from spikeloom.compiler.interpret import float_layer
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.calibrate import Calibration, fewer
-from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.targets.loihi1.registers import (
@@ -29,6 +28,7 @@ from spikeloom.compiler.targets.loihi1.storage.choose_storage import (
     explain_choice,
     round_with_more,
 )
+from spikeloom.compiler.targets.loihi1.storage.ladder import coarsest_first
 from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, finest_thresholds, judged, layer_of
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.compiler.types import BoolArray
@@ -61,8 +61,6 @@ def make_exact(
     ModelError if a population has no usable scale at so many `bits` of a mantissa.
     """
     slots = target.limit("core.threshold_slots")
-    steps = (1, 1), (2, 1), (2, slots), (3, slots)
-    ladder = [Packing(bits=bits, planes=planes, groups=groups) for planes, groups in steps]
     exponents = target.choices["synapse.exponent"]
     few = fewer(calibration)
     layers = []
@@ -72,7 +70,7 @@ def make_exact(
         layer = layer_of(network, post, few)
         best = None
         tried: list[tuple[int, int, int]] = []
-        for packing in ladder:
+        for packing in coarsest_first(target, bits):
             if packing.planes > 2 and best is not None and not _full_range(layer, best).any():
                 break  # the planes hold every weight already
             candidate = best_scale(layer, packing, exponents, clip=False)
