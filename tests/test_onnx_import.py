@@ -14,7 +14,6 @@ from made_onnx import BIAS, FIRES, SECOND, STAGE, STATE_IN, WEIGHTS, fire, model
 from onnx import helper
 from onnx.reference import ReferenceEvaluator
 from oracles import assert_same_network, refused
-from spikeloom.compiler.sensor_layout import sensor_layout
 
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.affine import Affine
