@@ -14,7 +14,6 @@ from scipy import sparse
 from torch import Tensor, nn
 
 from spikeloom.compiler import ir
-from spikeloom.compiler.checkpoint import merge
 from spikeloom.compiler.targets.compartments import IntegerNetwork, fullest, registers, round_population
 from spikeloom.compiler.types import EventArray
 from spikeloom.models.networks.chip_layer import ChipLayer, Integers
@@ -22,7 +21,7 @@ from spikeloom.models.networks.layers import rates_of, time_first
 from spikeloom.models.networks.learned import Filters, Learned, Stage, Synapses
 from spikeloom.models.networks.networks import Weights
 from spikeloom.models.networks.surrogate import RECTANGLE, Surrogate
-from spikeloom.models.networks.towers import split
+from spikeloom.models.networks.towers import by_tower
 
 THETA = 0.5
 """Threshold that a network is brought to if it has another: what the surrogate and the learning rate are made for."""
@@ -176,10 +175,7 @@ def in_thresholds(network: ir.Network) -> ir.Network:
 
 def quantised_spikes(network: ir.Network, events: EventArray) -> dict[str, NDArray[np.bool_]]:
     """Spikes of every layer of a fine-tuned network as its torch model computes them, (samples, steps, neurons)."""
-    names = [population.name for population in network.populations]
-    towers = [_spikes(tower, events) for tower in split(network)]
-    owners = () if network.convolution is None else network.convolution.towers
-    return dict(zip(names, merge(owners, towers) if owners else towers[0], strict=True))
+    return by_tower(network, lambda tower: _spikes(tower, events))
 
 
 def _spikes(network: ir.Network, events: EventArray) -> list[NDArray[np.bool_]]:

@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.checkpoint import merge
 from spikeloom.compiler.dynamics import RELAY_WEIGHT
 from spikeloom.compiler.interpret import threads
 from spikeloom.compiler.ir import Network, Population, Projection
 from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached, copy, integrate_float, keep
 from spikeloom.compiler.systems import GCN, TACTILESGNET, feature_major
 from spikeloom.compiler.types import AnyArray, BoolArray, EventArray
-from spikeloom.models.networks.towers import split
+from spikeloom.models.networks.towers import by_tower
 
 BATCH = 8
 """Recordings that run together."""
@@ -34,26 +33,17 @@ def float_spikes(network: Network, events: EventArray, *, dtype: str = "float32"
     The network is one with a convolution, whose propagation is rounded to `dtype`; networks are trained in
     float32.
     """
-    return _run(network, events, np.dtype(dtype), membranes=False)
+    return by_tower(network, lambda tower: _run(tower, events, np.dtype(dtype), membranes=False))
 
 
 def float_membranes(
     network: Network, events: EventArray, *, dtype: str = "float32"
 ) -> dict[str, npt.NDArray[np.floating]]:
     """Membranes of every layer before the comparison; as :func:`float_spikes`, (samples, steps, neurons) of `dtype`."""
-    return _run(network, events, np.dtype(dtype), membranes=True)
+    return by_tower(network, lambda tower: _run(tower, events, np.dtype(dtype), membranes=True))
 
 
-def _run(network: Network, events: AnyArray, dtype: np.dtype[Any], *, membranes: bool) -> dict[str, AnyArray]:
-    names = [population.name for population in network.populations]
-    towers = [_run_tower(tower, events, dtype, membranes=membranes) for tower in split(network)]
-    assert network.convolution is not None, "only a checkpoint says in which order it is summed"
-    owners = network.convolution.towers
-    layers = merge(owners, towers) if owners else towers[0]
-    return dict(zip(names, layers, strict=True))
-
-
-def _run_tower(network: Network, events: AnyArray, dtype: np.dtype[Any], *, membranes: bool) -> list[AnyArray]:
+def _run(network: Network, events: AnyArray, dtype: np.dtype[Any], *, membranes: bool) -> list[AnyArray]:
     """Spikes, or membranes, of each layer of a network that is joined of no others."""
     samples = len(events)
     steps = events.shape[3]
@@ -86,7 +76,7 @@ def _drives(network: Network, dtype: np.dtype[Any]) -> list[Callable[[AnyArray],
 def _convolution(network: Network, dtype: np.dtype[Any]) -> Callable[[AnyArray], AnyArray]:
     """What spikes bring to the first layer, the relays of clocks aside."""
     convolution = network.convolution
-    assert convolution is not None
+    assert convolution is not None, "only a checkpoint says in which order it is summed"
     filters = convolution.filters.astype(dtype)
     propagation = convolution.propagation.astype(dtype)
     bias = convolution.bias.astype(dtype)

@@ -3,14 +3,22 @@
 A tower's float32 sums depend on their order, which the zeros of a matrix for all towers would change.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from spikeloom.compiler.checkpoint import neurons_of
+from spikeloom.compiler.checkpoint import merge, neurons_of
 from spikeloom.compiler.ir import INPUT, Convolution, Network, Projection
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import AnyArray, IntArray
+
+
+def by_tower(network: Network, run: Callable[[Network], Sequence[AnyArray]]) -> dict[str, AnyArray]:
+    """Values of the neurons of each layer by its name, (..., neurons), as `run` gives them of each tower by layer."""
+    names = [population.name for population in network.populations]
+    parts = [run(tower) for tower in split(network)]
+    owners = () if network.convolution is None else network.convolution.towers
+    return dict(zip(names, merge(owners, parts) if owners else parts[0], strict=True))
 
 
 def split(network: Network) -> tuple[Network, ...]:
