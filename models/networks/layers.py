@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikeloom.compiler.layer_kernel import require_below
+from spikeloom.compiler.layer_kernel import copy, integrate_float, require_below
 from spikeloom.compiler.types import EventArray
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 
@@ -239,22 +239,12 @@ def kind_of(like: Tensor) -> type[np.float32] | type[np.float64]:
 
 
 @numba.njit(cache=True)
-def _integrate_step(current: Any, before: Any, beta: Any, theta: Any, spikes: Any, membrane: Any) -> None:
-    zero = membrane.dtype.type(0)
-    one = membrane.dtype.type(1)
-    for i in range(len(membrane)):
-        u = (zero if before[i] > theta else before[i] * beta) + current[i]
-        membrane[i] = u
-        spikes[i] = one if u > theta else zero
-
-
-@numba.njit(cache=True)
 def _integrate(current: Any, beta: Any, theta: Any, spikes: Any, membrane: Any) -> None:
-    steps, size = current.shape
-    before = np.zeros(size, current.dtype)
-    for t in range(steps):
-        _integrate_step(current[t], before, beta, theta, spikes[t], membrane[t])
-        before = membrane[t]
+    state = np.zeros(current.shape[1], current.dtype)
+    no_bias = np.zeros_like(state)
+    for t in range(len(current)):
+        integrate_float(state, current[t], no_bias, beta, theta, spikes[t])
+        copy(state, membrane[t])
 
 
 @numba.njit(cache=True)
