@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from spikeloom.compiler.ir import Network
+    from spikeloom.compiler.storage import Cheapest, Exact, Fixed
     from spikeloom.models.recordings.evtouch import Recordings
     from spikeloom.runtime.commands.main_job.run import Decisions
     from spikeloom.runtime.equivalence.verdict import Verdict
@@ -336,6 +337,7 @@ def compile(
     calibrate: Source | Recordings | None = None,
     bin: float | None = None,
     target: str = DEFAULT_TARGET,
+    storage: Fixed | Cheapest | Exact | None = None,
     weight_bits: Numbers | None = None,
     planes: Numbers | None = None,
     scale_groups: Numbers | None = None,
@@ -369,6 +371,8 @@ def compile(
         :class:`spikeloom.LIF` layers.
     example : Tensor, optional
         Input of one step, for a module.
+    storage : Fixed, Cheapest or Exact, optional
+        How weights are stored, in place of `weight_bits`, `planes`, `scale_groups`, `spike_exact` and `keep`.
 
     Raises
     ------
@@ -377,6 +381,10 @@ def compile(
     """
     given = dict(locals())
     source = _network("compile", network, example)
+    if storage is not None:
+        from spikeloom.runtime.inputs.compilation import options_of
+
+        given |= options_of(storage, given)
     folder = tempfile.mkdtemp(prefix="spikeloom-")
     path = Path(folder) / "netlist.loom"
     from spikeloom.runtime.commands.main_job import compile as command

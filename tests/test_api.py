@@ -17,6 +17,8 @@ from torch import nn
 
 import spikeloom as api
 from spikeloom.compiler.errors import CapacityError, DataError, ModelError, OptionError
+from spikeloom.compiler.storage import Cheapest, Exact, Fixed, Packing
+from spikeloom.runtime.inputs.compilation import STORED, options_of, storage_of
 from spikeloom.runtime.requests.check import CertifyRequest, StressRequest
 from spikeloom.runtime.requests.choices import NetworkChoice
 from spikeloom.runtime.requests.choose import AnytimeRequest, ChartRequest, SmallestRequest
@@ -92,6 +94,7 @@ def test_what_does_not_suit_is_refused(data, net):
     refused(OptionError, "engine 'gpu': allowed: spikeloom, onnx; give one", lambda: net.verify(data, engine="gpu"))
     refused(OptionError, "data None: NoneType found, allowed: text", net.run, None)
     refused(OptionError, "keep 'first': allowed: last, best, clean", lambda: api.train(data, "x.pt", keep="first"))
+    refused(OptionError, "storage 8: allowed: Fixed, Cheapest", lambda: api.compile("x.pt", storage=8))
     refused(OptionError, "spike_exact 1: int found, allowed: True or False", lambda: api.compile("x.pt", spike_exact=1))
     refused(OptionError, "save none/x.loom: the folder does not exist", net.save, "none/x.loom")
     refused(OptionError, "save x.pt: has to end in .loom", net.save, "x.pt")
@@ -104,7 +107,10 @@ def test_what_does_not_suit_is_refused(data, net):
 
 def test_values_of_python_are_those_of_the_words(place, data, net):
     network = str(place / "net.pt")
-    assert api.compile(Path(network), calibrate=data, weight_bits=4).path.read_bytes() == net.path.read_bytes()
+    assert (
+        api.compile(Path(network), calibrate=data, storage=Fixed((Packing(bits=4),))).path.read_bytes()
+        == net.path.read_bytes()
+    )
     assert api.compile(network, weight_bits=[8, 4, 4, 8]).path.read_bytes() == (
         api.compile(network, weight_bits="8,4,4,8").path.read_bytes()
     )
@@ -126,7 +132,7 @@ QUESTIONS = {
     "chart": ChartRequest,
     "load": NetworkChoice,
 }
-BESIDE = {"self", "network", "example", "path", "return"}
+BESIDE = {"self", "network", "example", "storage", "path", "return"}
 """Keywords that are no options: what a question is about."""
 COMMAND_ONLY = {
     "estimate": {"against_processor", "neurobench"},  # give another result
@@ -150,6 +156,17 @@ def test_keywords_are_the_options_of_the_request(name):
         if option.default is not MISSING and keyword.default is not keyword.empty:
             assert keyword.default == option.default, key
         assert f"\n{key} : {function.__annotations__[key]}\n" in function.__doc__
+
+
+@pytest.mark.parametrize(
+    "storage",
+    [Fixed((Packing(bits=4), Packing(planes=2, groups=3))), Cheapest(0.9), Exact(6), Fixed()],
+)
+def test_a_storage_is_what_its_options_say(storage):
+    unsaid = dict.fromkeys(STORED)
+    asked = {"checkpoint": "net.pt", "output": "net.loom", "calibrate": "data", **options_of(storage, unsaid)}
+    assert storage_of(CompileRequest(**asked)) == storage
+    refused(OptionError, "storage and planes", lambda: options_of(storage, unsaid | {"planes": 2}))
 
 
 def test_the_readme_and_the_notebook_pass_a_strict_type_checker(tmp_path):

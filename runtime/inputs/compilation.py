@@ -12,6 +12,9 @@ from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.requests.main_job import CompileRequest
 
+STORED = ("weight_bits", "planes", "scale_groups", "spike_exact", "keep")
+"""Options that say how weights are stored."""
+
 
 def provenance(request: CompileRequest, asked: LoadedNetwork, *, calibrated: Recordings | None) -> Mapping[str, Any]:
     """What a netlist remembers of its compilation, whose scales the recordings `calibrated` chose, if any did."""
@@ -66,6 +69,25 @@ def storage_of(request: CompileRequest, forms: Sequence[Form] | None = None) -> 
     if request.calibrate is None:
         return Fixed()
     return Cheapest() if request.keep is None else Cheapest(float(request.keep))
+
+
+def options_of(storage: Storage, given: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The inverse of :func:`storage_of`: options of ``compile``, of which none but these may be `given`, too."""
+    others = [name for name in STORED if given[name] is not None and given[name] is not False]
+    if others:
+        raise OptionError(f"compile: storage and {others[0]} say how weights are stored; give one of them")
+    match storage:
+        case Cheapest():
+            return {"keep": storage.keep}
+        case Exact():
+            return {"spike_exact": True, "weight_bits": str(storage.bits)}
+        case Fixed():
+            columns = {"weight_bits": "bits", "planes": "planes", "scale_groups": "groups"}
+            return {
+                option: ",".join(str(getattr(packing, field)) for packing in storage.packings)
+                for option, field in columns.items()
+            }
+    raise OptionError(f"compile: storage {storage!r}: allowed: Fixed, Cheapest or Exact; give one")
 
 
 def _require_held_out(request: CompileRequest, *, chosen: bool) -> None:

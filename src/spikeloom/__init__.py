@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from spikeloom.compiler.errors import SpikeloomError
+    from spikeloom.compiler.storage import Cheapest, Exact, Fixed, Packing
     from spikeloom.models.networks.lif import LIF
     from spikeloom.runtime.api import (
         Compiled,
@@ -35,8 +36,12 @@ from spikeloom.compiler import __version__
 
 __all__ = [
     "LIF",
+    "Cheapest",
     "Compiled",
     "Data",
+    "Exact",
+    "Fixed",
+    "Packing",
     "SpikeloomError",
     "__version__",
     "certify",
@@ -66,6 +71,10 @@ def __getattr__(name: str) -> Any:
         from spikeloom.compiler.errors import SpikeloomError
 
         return SpikeloomError
+    if name in ("Cheapest", "Exact", "Fixed", "Packing"):
+        from spikeloom.compiler import storage
+
+        return getattr(storage, name)
     if name == "LIF":
         from spikeloom.models.networks.lif import LIF
 
