@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import delayed
 
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.machines.changes import PART, Effects, joined, single
-from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.studies.robustness.definition import TAXEL, Exhaustive
 from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
 from spikeloom.runtime.studies.robustness.proofs.attack import attack
@@ -26,6 +24,7 @@ from spikeloom.runtime.studies.robustness.proofs.entries import (
     channels_of,
 )
 from spikeloom.runtime.studies.robustness.results import PHASES, Certificate, Certificates, Decided
+from spikeloom.runtime.studies.robustness.threads import in_threads
 
 SHIFT = 25
 """Bins that a recording is shifted by at most."""
@@ -43,18 +42,12 @@ def certify(
     """
     machine.require_sensor(data.events)
     tally = tally_of(machine)
-    work = Parallel(jobs or os.cpu_count(), backend="threading", return_as="generator")
     recordings = zip(data.events, data.step_counts.tolist(), data.labels.tolist(), data.files, strict=True)
     calls = (
         delayed(certificate)(machine, events[..., :length], label, file, shift=shift, most=most, tally=tally)
         for events, length, label, file in recordings
     )
-    certificates = []
-    progress = Progress(len(data))
-    progress(0, "certifying")
-    for done, one in enumerate(work(calls), 1):
-        certificates.append(one)
-        progress(done, "certifying")
+    certificates = in_threads(calls, len(data), "certifying", jobs)
     netlist = machine.netlist
     return Certificates(
         target=netlist.target,

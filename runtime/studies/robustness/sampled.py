@@ -1,19 +1,18 @@
 """The study: every perturbation at every level, once for each seed, on both sides at once."""
 
-import os
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import delayed
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import sha256_of
 from spikeloom.runtime.equivalence.breakdowns import undecided
 from spikeloom.runtime.inputs.recordings import name_of
-from spikeloom.runtime.report.console import Progress, progress
+from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.requests.check import StressRequest
 from spikeloom.runtime.studies.robustness.bench import Bench, bench_of, by_length, whole
 from spikeloom.runtime.studies.robustness.curves import Requirement, curve, unmet
@@ -21,6 +20,7 @@ from spikeloom.runtime.studies.robustness.definition import TAXELS, Level
 from spikeloom.runtime.studies.robustness.pair import SIDES, Inputs, Outcome, Pair, evaluate
 from spikeloom.runtime.studies.robustness.perturbations import SAMPLED
 from spikeloom.runtime.studies.robustness.results import ComparedProvenance, Run, Stress
+from spikeloom.runtime.studies.robustness.threads import in_threads
 
 
 def stress(request: StressRequest, names: Sequence[str], requirements: Sequence[Requirement]) -> Stress:
@@ -45,7 +45,9 @@ def stress(request: StressRequest, names: Sequence[str], requirements: Sequence[
         for seed in range(request.seeds if SAMPLED[name].seeded else 1)
     ]
     measured: dict[str, dict[Level, list[Run]]] = {}
-    for (name, level, _), run in zip(points, _runs(points, bench, reference, request.jobs), strict=True):
+    calls = (delayed(measure)(bench, *point, reference) for point in points)
+    runs = in_threads(calls, len(points), "stress", request.jobs)
+    for (name, level, _), run in zip(points, runs, strict=True):
         measured.setdefault(name, {}).setdefault(level, []).append(run)
     curves = {name: curve(name, each, undisturbed, recordings, classes) for name, each in measured.items()}
     return Stress(
@@ -70,17 +72,6 @@ def stress(request: StressRequest, names: Sequence[str], requirements: Sequence[
             split=request.split,
         ),
     )
-
-
-def _runs(points: Sequence[tuple[str, Level, int]], bench: Bench, reference: Outcome, jobs: int | None) -> list[Run]:
-    """The run of each point, several at a time in threads: kernels let go of the interpreter's lock."""
-    work = Parallel(jobs or os.cpu_count(), backend="threading", return_as="generator")
-    runs = []
-    progress = Progress(len(points))
-    for done, run in enumerate(work(delayed(measure)(bench, *point, reference) for point in points), 1):
-        runs.append(run)
-        progress(done, "stress")
-    return runs
 
 
 def generator(name: str, seed: int) -> np.random.Generator:
