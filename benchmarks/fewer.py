@@ -27,10 +27,10 @@ from spikeloom.models.training.counters import (
     Counted,
     Fitted,
     Plan,
-    counted,
     counters_of,
-    folds,
-    linear_rules,
+    fit_rules,
+    run_counters,
+    split_folds,
 )
 from spikeloom.runtime.studies.counting import decisions_of
 
@@ -50,7 +50,7 @@ def order(data: Counted, polarities: int, classes: int) -> dict[int, np.ndarray]
     for kept in KEPT:
         if kept < len(left):
             columns = np.flatnonzero(np.isin(taxel, left))
-            rule = linear_rules(only(data, columns), classes, [0.1])[0.1]
+            rule = fit_rules(only(data, columns), classes, [0.1])[0.1]
             spiked = (data.spikes[:, columns[rule.used]] > 0).mean(axis=0)
             adds = (rule.weight - rule.weight.mean(axis=0)).var(axis=0) * spiked * (1 - spiked)
             matters = np.bincount(taxel[columns[rule.used]], adds, minlength=left.max() + 1)[left]
@@ -74,7 +74,7 @@ def measured(data: Recordings, of_window: dict[int, Counted], rows: np.ndarray, 
         for kept in WINDOWS[window]:
             few = only(own, np.flatnonzero(np.isin(own.counter[:, 0] // polarities, left[kept])))
             strength, _, lowest = tried(few, classes)
-            rule = linear_rules(few, classes, [strength])[strength]
+            rule = fit_rules(few, classes, [strength])[strength]
             fitted = Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest)
             made = counters_of(few, fitted, training, classes)
             found[f"{kept} taxels, {window} %"] = {
@@ -105,10 +105,10 @@ def main() -> None:
         ramp=arguments.ramp,
         strengths=STRENGTHS,
     )
-    of_window = {window: counted(data, replace(plan, window=window)) for window in WINDOWS}
+    of_window = {window: run_counters(data, replace(plan, window=window)) for window in WINDOWS}
     split = {"split": np.arange(len(data)) >= training}
     for number in range(ROUNDS):
-        fold = folds(data.labels, FOLDS, np.random.default_rng(1000 + number))
+        fold = split_folds(data.labels, FOLDS, np.random.default_rng(1000 + number))
         split |= {f"{number}.{each}": fold == each for each in range(FOLDS)}
     for name, held in split.items():
         if name not in done:

@@ -33,11 +33,11 @@ from spikeloom.models.training.counters import (
     Counted,
     Fitted,
     Plan,
-    counted,
     counters_of,
-    folds,
-    held_out,
-    linear_rules,
+    cross_validate,
+    fit_rules,
+    run_counters,
+    split_folds,
 )
 from spikeloom.runtime.studies.counting import decisions_of
 
@@ -85,7 +85,7 @@ def price(data: Counted, classes: int) -> int:
 
 def tried(data: Counted, classes: int, seeds: Sequence[int] = (0,)) -> tuple[float, np.ndarray, float]:
     """Best strength of a plan on training recordings, how often each is right, and the lowest largest sum."""
-    sums = [held_out(data, classes, seed=seed) for seed in seeds]
+    sums = [cross_validate(data, classes, seed=seed) for seed in seeds]
     right = {name: np.mean([each[name].argmax(axis=1) == data.labels for each in sums], axis=0) for name in sums[0]}
     best = max(right, key=lambda strength: right[strength].mean())
     return best, right[best], min(float(each[best].max(axis=1).min()) for each in sums)
@@ -108,7 +108,7 @@ def measured(
     for name, each in all_counted.items():
         own = each.part(rows)
         once[name] = strength, trials[name], _ = tried(own, classes)
-        rule = linear_rules(own, classes, [strength])[strength]
+        rule = fit_rules(own, classes, [strength])[strength]
         own_of[name] = own
         correct = rule.right(each.part(held))
         found["rules"][name] = {"held_out": float(trials[name].mean()), "right": correct.astype(int).tolist()}
@@ -123,7 +123,7 @@ def measured(
             own, (strength, _, lowest) = own_of[name], tried_again[name]
             if system == "best":
                 own = replace(own, plan=replace(own.plan, ramp=LONG_RAMP))
-            rule = linear_rules(own, classes, [strength])[strength]
+            rule = fit_rules(own, classes, [strength])[strength]
             fitted = Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest)
             made = counters_of(own, fitted, training, classes)
             found["systems"][f"{system}, levels" if levels > 1 else system] = {
@@ -141,7 +141,7 @@ def measured(
 def machines(data: Recordings, rows: np.ndarray, held: np.ndarray) -> Json:
     """Support vector machines on log(1 + events) of each channel in parts, chosen by the same folds."""
     label, found = data.labels[rows], {}
-    fold = folds(label, FOLDS, np.random.default_rng(0))
+    fold = split_folds(label, FOLDS, np.random.default_rng(0))
     for kernel, constants in KERNELS.items():
         trials: dict[tuple[int, float], tuple[float, list[int]]] = {}
         for parts in SVM_PARTS:
@@ -222,10 +222,10 @@ def main() -> None:
         for levels in sorted({1, arguments.levels})
         for bins, parts, events in SMALL + LARGE
     ]
-    all_counted = {name_of(plan): counted(data, plan) for plan in plans}
+    all_counted = {name_of(plan): run_counters(data, plan) for plan in plans}
     split = {"split": np.arange(len(data)) >= training}
     for number in range(ROUNDS):
-        fold = folds(data.labels, FOLDS, np.random.default_rng(1000 + number))
+        fold = split_folds(data.labels, FOLDS, np.random.default_rng(1000 + number))
         split |= {f"{number}.{each}": fold == each for each in range(FOLDS)}
     for name, held in split.items():
         if name not in done:

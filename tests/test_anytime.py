@@ -21,7 +21,7 @@ from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.recordings.events import load_data, of_length
 from spikeloom.models.recordings.grasps import synthetic_split
-from spikeloom.models.training.counters import Plan, counted, counters_of, fit
+from spikeloom.models.training.counters import Plan, counters_of, fit, run_counters
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.capabilities import LONGEST, require_stoppable
@@ -264,7 +264,7 @@ def test_no_output_neuron_spikes_more_often(data):
 
 def test_a_vote_that_never_ceases_is_a_proof():
     training, seen = (synthetic_split(split, limit=48) for split in ("train", "test"))
-    data = counted(training, Plan())
+    data = run_counters(training, Plan())
     made = counters_of(data, fit(data, 6), training, 6)
     machine = require_stoppable(machine_of(compile_network(counting_network(made)).netlist))
     steps = of_length(seen, made.clocks.length)

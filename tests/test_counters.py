@@ -17,7 +17,15 @@ from spikeloom.compiler.formats.counters import BLOCK, counting_network, read_co
 from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.recordings.events import joined_bins, load_data, of_length
-from spikeloom.models.training.counters import Plan, counted, counters_of, fit, folds, held_out, linear_rules
+from spikeloom.models.training.counters import (
+    Plan,
+    counters_of,
+    cross_validate,
+    fit,
+    fit_rules,
+    run_counters,
+    split_folds,
+)
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.studies.counting import decisions_of
 from spikeloom.runtime.studies.robustness.bench import Bench, distances, whole
@@ -51,11 +59,11 @@ def network_spikes(counters, data):
 
 @pytest.mark.parametrize("plan", PLANS, ids=str)
 def test_counters_spike_as_they_are_trained_to(plan):
-    data = counted(made(), plan)
+    data = run_counters(made(), plan)
     fitted = fit(data, CLASSES)
     counters = counters_of(data, fitted, made(), CLASSES)
     found = network_spikes(counters, other := made(seed=1))
-    wanted = counted(other, plan, data.steps)
+    wanted = run_counters(other, plan, data.steps)
     for threshold in plan.thresholds:
         rows = np.flatnonzero(counters.counter[:, 2] == threshold)
         places = [np.flatnonzero((wanted.counter == counters.counter[row]).all(axis=1))[0] for row in rows]
@@ -70,14 +78,14 @@ def test_a_counter_is_blocked_for_a_while_and_not_for_ever():
     events = np.zeros((3, TAXELS, 2, 400), np.uint8)
     for sample, ones in enumerate((2 * 3 + BLOCK - 1, 2 * 3 + BLOCK, 400)):
         events[sample, 0, 0, :ones] = 1
-    spikes = counted(replace(data, events=events), Plan(thresholds=(3,))).spikes
+    spikes = run_counters(replace(data, events=events), Plan(thresholds=(3,))).spikes
     assert spikes[:, 0].tolist() == [1, 2, 4]
 
 
 @pytest.mark.parametrize("plan", PLANS, ids=str)
 def test_network_decides_as_its_rule_and_the_chip_has_every_spike(plan):
     training, other = made(), made(seed=1)
-    data = counted(training, plan)
+    data = run_counters(training, plan)
     fitted = fit(data, CLASSES)
     counters = counters_of(data, fitted, training, CLASSES)
     whole = counters.weight @ data.spikes[:, [*map(data.counter.tolist().index, counters.counter.tolist())]].T
@@ -98,7 +106,7 @@ def test_network_decides_as_its_rule_and_the_chip_has_every_spike(plan):
 
 @pytest.mark.parametrize("plan", PLANS, ids=str)
 def test_stress_runs_them_to_the_end_of_their_ramp(plan):
-    data = counted(made(), plan)
+    data = run_counters(made(), plan)
     counters = counters_of(data, fit(data, CLASSES), made(), CLASSES)
     network, other = counting_network(counters), made(seed=1)
     pair = Pair(netlist=compile_network(network).netlist, network=network)
@@ -118,7 +126,7 @@ def test_stress_runs_them_to_the_end_of_their_ramp(plan):
 
 
 def counters_file(place, plan=PLANS[1]):
-    data = counted(made(), plan)
+    data = run_counters(made(), plan)
     counters = counters_of(data, fit(data, CLASSES), made(), CLASSES).trained({"seen": 3})
     write_counters(place, counters)
     return counters
@@ -167,18 +175,18 @@ def test_inconsistent_and_damaged_files_are_refused(tmp_path, change, said):
     ],
 )
 def test_impossible_plans_are_refused(plan, said):
-    refused(OptionError, said, counted, made(), plan)
+    refused(OptionError, said, run_counters, made(), plan)
 
 
 def test_recordings_without_events_are_refused():
     silent = replace(made(), events=np.zeros((30, TAXELS, 2, STEPS), np.uint8))
-    refused(DataError, "none of them spikes", fit, counted(silent, PLANS[0]), CLASSES)
+    refused(DataError, "none of them spikes", fit, run_counters(silent, PLANS[0]), CLASSES)
 
 
 @pytest.mark.parametrize("plan", PLANS, ids=str)
 def test_rule_is_where_the_loss_is_flat(plan):
-    data = counted(made(rate=0.2), plan)
-    for strength, rule in linear_rules(data, CLASSES, [3.0, 0.01, 0.3]).items():
+    data = run_counters(made(rate=0.2), plan)
+    for strength, rule in fit_rules(data, CLASSES, [3.0, 0.01, 0.3]).items():
         sign = np.where(data.labels[:, None] == np.arange(CLASSES), 1, -1)
         short = np.maximum(1 - sign * rule.sums(data), 0)
         slope = rule.weight.T - 2 * strength * data.spikes[:, rule.used].T @ (sign * short)
@@ -194,17 +202,19 @@ def test_levels_are_told_apart_by_their_boundaries():
         events[sample, channel // 2, channel % 2, 0] = 1
     plan = Plan(thresholds=(1,), strengths=(0.3,))
     right = [
-        np.mean(held_out(counted(replace(data, events=events), each), CLASSES)[0.3].argmax(axis=1) == data.labels)
+        np.mean(
+            cross_validate(run_counters(replace(data, events=events), each), CLASSES)[0.3].argmax(axis=1) == data.labels
+        )
         for each in (plan, replace(plan, levels=3))
     ]
     assert right[0] < 0.9
     assert right[1] == 1
-    refused(OptionError, "--levels 2: 3 classes", fit, counted(data, replace(plan, levels=2)), CLASSES)
+    refused(OptionError, "--levels 2: 3 classes", fit, run_counters(data, replace(plan, levels=2)), CLASSES)
 
 
 def test_folds_share_out_every_class():
     labels = np.repeat([0, 1, 2], [10, 7, 3])
-    fold = folds(labels, 5, np.random.default_rng(0))
+    fold = split_folds(labels, 5, np.random.default_rng(0))
     assert np.ptp(np.bincount(fold)) == 0
     assert all(np.ptp(np.bincount(fold[labels == each], minlength=5)) <= 1 for each in range(3))
 

@@ -11,7 +11,7 @@ from numpy.testing import assert_array_equal
 from spikeloom.compiler.errors import OptionError
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.models.training import record
-from spikeloom.models.training.counters import Plan, counted, counters_of, fit
+from spikeloom.models.training.counters import Plan, counters_of, fit, run_counters
 from spikeloom.runtime.commands.choose import smallest
 from spikeloom.runtime.inputs import recordings as recordings_input
 from spikeloom.runtime.studies.counting import decisions_of
@@ -134,10 +134,10 @@ def test_who_goes_on():
 )
 def test_decisions_are_those_of_the_spiking_network(plan):
     training, test = (synthetic_split(split, limit=72) for split in ("train", "test"))
-    data = counted(training, plan)
+    data = run_counters(training, plan)
     made = counters_of(data, fit(data, 6), training, 6)
     for each in (training, test):
-        assert_array_equal(work.decisions(made, counted(each, plan, data.steps)), decisions_of(made, each))
+        assert_array_equal(work.decisions(made, run_counters(each, plan, data.steps)), decisions_of(made, each))
 
 
 def test_candidates_can_all_be_trained():

@@ -21,7 +21,7 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist import write_netlist
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.targets.truenorth.passes import compile_crossbars
-from spikeloom.models.training.counters import Plan, counted, counters_of, fit
+from spikeloom.models.training.counters import Plan, counters_of, fit, run_counters
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.changes import Changes, by_running, joined, single
 from spikeloom.runtime.machines.loihi1 import engine
@@ -188,7 +188,7 @@ def test_counters_bear_exactly_so_many_events(plan):
     often = np.random.default_rng(4).random((3, 2, 2, 1))
     given = (rng.random((24, 2, 2, 16)) < 0.6 * often[labels]).astype(np.uint8)
     data = recorded(given, labels)
-    seen = counted(data, plan)
+    seen = run_counters(data, plan)
     made = counters_of(seen, fit(seen, 3), data, 3)
     machine = machine_of(compile_network(counting_network(made)).netlist)
     tally, exact = tally_of(machine), set()

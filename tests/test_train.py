@@ -43,7 +43,7 @@ from spikeloom.models.training.evaluate import evaluate
 from spikeloom.models.training.finetune import finetune
 from spikeloom.models.training.recipes import DECAY_EPOCHS, RELEASED, Recipe
 from spikeloom.models.training.record import training_record
-from spikeloom.models.training.robust import worn
+from spikeloom.models.training.robust import disturb
 from spikeloom.models.training.train import Epoch, state_files, train, train_both, validation_split
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.loihi1 import engine
@@ -325,14 +325,14 @@ def test_weights_that_would_overflow_are_shrunk(tmp_path):
 def test_what_is_lost_and_comes_has_its_chance():
     rng = np.random.default_rng(0)
     events = (rng.random((200, 20, 2, 50)) < rng.uniform(0.05, 0.4, (200, 1, 1, 1))).astype(np.uint8)
-    found = worn(events, 0.2, np.random.default_rng(1))
+    found = disturb(events, 0.2, np.random.default_rng(1))
     alive = found.any(axis=(2, 3))
     assert alive.mean() == pytest.approx(0.8, abs=0.02)
     was, now = (each[alive] == 1 for each in (events, found))
     come = np.repeat(0.2 * events.mean(axis=(1, 2, 3))[:, None], 20, axis=1)[alive]
     assert (was & ~now).sum() / was.sum() == pytest.approx(0.2 * (1 - come.mean()), abs=0.01)
     assert (now & ~was).sum() == pytest.approx((come[:, None, None] * ~was).sum(), rel=0.03)
-    assert (worn(events, 0.0, rng) is events, found.dtype) == (True, events.dtype)
+    assert (disturb(events, 0.0, rng) is events, found.dtype) == (True, events.dtype)
 
 
 def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):

@@ -20,7 +20,7 @@ from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.targets.truenorth.counting import LARGEST, planned, run_counters
 from spikeloom.compiler.targets.truenorth.netlist import write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import compile_crossbars
-from spikeloom.models.training.counters import rounded
+from spikeloom.models.training.counters import round_weights
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.votes import class_counts
 
@@ -140,7 +140,7 @@ def test_rounded_weights_keep_the_sums():
     rng = np.random.default_rng(0)
     spikes = (rng.random((200, 40)) < rng.random(40)).astype(float)
     weight = rng.normal(0, 2, (5, 40))
-    whole = rounded(weight, spikes, 7)
+    whole = round_weights(weight, spikes, 7)
     assert set(np.unique(whole)) <= set(range(-7, 8))
     errors = [np.abs(spikes @ (each - weight).T).mean() for each in (whole, np.rint(weight).clip(-7, 7))]
     assert errors[0] < 0.8 * errors[1]

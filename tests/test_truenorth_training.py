@@ -123,14 +123,14 @@ def test_equal_votes_stay_equal():
 
 
 def test_groups_fill_the_axons_of_a_core():
-    found = truenorth.sized(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(5, 325))
+    found = truenorth.size_network(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(5, 325))
     assert (found.groups, found.hidden) == (8, (80, 80))
-    found = truenorth.sized(taxels=39, classes=20, hops=3, features=15, copies=2, clocks=clocks_over(8, 325))
+    found = truenorth.size_network(taxels=39, classes=20, hops=3, features=15, copies=2, clocks=clocks_over(8, 325))
     assert (found.groups, found.hidden) == (5, (120, 120))
     with pytest.raises(OptionError, match=r"--copies 4: 78 input channels with 4 axons each, .* has 256"):
-        truenorth.sized(taxels=39, classes=20, hops=3, features=16, copies=4, clocks=clocks_over(5, 325))
+        truenorth.size_network(taxels=39, classes=20, hops=3, features=16, copies=4, clocks=clocks_over(5, 325))
     with pytest.raises(OptionError, match=r"--features 16: .* 39 taxels and 60 clocks to cores of 85 inputs"):
-        truenorth.sized(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(60, 325))
+        truenorth.size_network(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(60, 325))
 
 
 def written(path, networks=None):

@@ -154,7 +154,7 @@ class SpikingNet(TrainedModule):
         clocks = self.architecture.dynamics.clocks
         spikes, membranes = self._integrate(0, self.conv1, events, self.adjacency)
         if clocks.channels:
-            ticks = relayed(clocks, spikes)
+            ticks = relay_spikes(clocks, spikes)
             spikes = torch.cat([spikes, ticks], dim=2)
             membranes = torch.cat([membranes, ticks * (RELAY_WEIGHT * self.architecture.theta)], dim=2)
         computed = {"conv1": (spikes, membranes)}
@@ -228,7 +228,7 @@ class SpikingNet(TrainedModule):
         return np.append(in_order(self.architecture.system, order), np.arange(order.size, order.size + clocks))
 
 
-def relayed(clocks: Clocks, like: Tensor) -> Tensor:
+def relay_spikes(clocks: Clocks, like: Tensor) -> Tensor:
     """Spikes of the relays, (steps, samples, clocks), for other spikes of the first layer."""
     steps, samples, _ = like.shape
     ticks = torch.from_numpy(clocks.events(steps).T.copy()).to(like)

@@ -99,7 +99,7 @@ class Counted:
         return replace(self, spikes=self.spikes[rows], at=self.at[rows], labels=self.labels[rows])
 
 
-def counted(data: Recordings, plan: Plan, steps: int | None = None) -> Counted:
+def run_counters(data: Recordings, plan: Plan, steps: int | None = None) -> Counted:
     """Run the counters on recordings; `steps` of the training recordings, where these are others."""
     plan.require_possible()
     events = joined_bins(data, plan.bins).events
@@ -164,7 +164,7 @@ def require_levels(levels: int, classes: int) -> None:
         raise OptionError(f"--levels {levels}: {classes} classes are no multiple of it; give another")
 
 
-def linear_rules(data: Counted, classes: int, strengths: Iterable[float]) -> dict[float, Rule]:
+def fit_rules(data: Counted, classes: int, strengths: Iterable[float]) -> dict[float, Rule]:
     """For each strength a support vector machine without bias, one class against the rest.
 
     It looks at the counters that spike now and then. Weights are sums of recordings, of which each class has
@@ -231,7 +231,7 @@ def _newton(alike: FloatArray, sign: FloatArray, share: FloatArray, strength: fl
     return share
 
 
-def folds(labels: IntArray, parts: int, rng: np.random.Generator) -> IntArray:
+def split_folds(labels: IntArray, parts: int, rng: np.random.Generator) -> IntArray:
     """Part of each recording, so that all parts have the same share of every class; (samples,)."""
     fold = np.empty(len(labels), np.int64)
     first = 0
@@ -242,13 +242,13 @@ def folds(labels: IntArray, parts: int, rng: np.random.Generator) -> IntArray:
     return fold
 
 
-def held_out(data: Counted, classes: int, *, seed: int = 0) -> dict[float, FloatArray]:
+def cross_validate(data: Counted, classes: int, *, seed: int = 0) -> dict[float, FloatArray]:
     """For each strength of the plan sums of each class, (samples, classes), by rules that did not see the recording."""
-    fold = folds(data.labels, FOLDS, np.random.default_rng(seed))
+    fold = split_folds(data.labels, FOLDS, np.random.default_rng(seed))
     sums = {strength: np.zeros((len(fold), classes)) for strength in sorted(data.plan.strengths)}
     for left_out in range(FOLDS):
         outside = fold == left_out
-        for strength, rule in linear_rules(data.part(~outside), classes, sums).items():
+        for strength, rule in fit_rules(data.part(~outside), classes, sums).items():
             sums[strength][outside] = rule.sums(data.part(outside))
     return sums
 
@@ -265,14 +265,14 @@ class Fitted:
 
 def fit(data: Counted, classes: int) -> Fitted:
     """Fit the rule on all recordings, at the strength that cross-validation chooses."""
-    sums = held_out(data, classes)
+    sums = cross_validate(data, classes)
     accuracy = {strength: float(np.mean(each.argmax(axis=1) == data.labels)) for strength, each in sums.items()}
     best = max(accuracy, key=accuracy.__getitem__)
-    rule = linear_rules(data, classes, [best])[best]
+    rule = fit_rules(data, classes, [best])[best]
     return Fitted(rule=rule, strength=best, accuracy=accuracy, lowest=float(sums[best].max(axis=1).min()))
 
 
-def rounded(weight: FloatArray, spikes: FloatArray, most: int) -> FloatArray:
+def round_weights(weight: FloatArray, spikes: FloatArray, most: int) -> FloatArray:
     """Whole weights (classes, counters) of at most a magnitude, whose sums over spikes (samples, counters) stay.
 
     One counter after the other is rounded, those that spike most first, and the weights of those to come
@@ -291,7 +291,7 @@ def rounded(weight: FloatArray, spikes: FloatArray, most: int) -> FloatArray:
     return whole
 
 
-def spikes_of(made: Counters, data: Counted) -> NDArray[np.int8]:
+def counter_spikes(made: Counters, data: Counted) -> NDArray[np.int8]:
     """How often each counter of a network has spiked in the end; (samples, counters)."""
     place = {tuple(each): index for index, each in enumerate(data.counter.tolist())}
     return data.spikes[:, [place[tuple(each)] for each in made.counter.tolist()]]
@@ -308,7 +308,7 @@ def counters_of(data: Counted, fitted: Fitted, recordings: Recordings, classes: 
     unit = float(np.abs(fitted.rule.weight).max()) / most
     weight = np.rint(fitted.rule.weight / unit)
     if plan.bits < BITS[-1]:  # as few levels as these need to make up for each other
-        weight = rounded(fitted.rule.weight / unit, data.spikes[:, fitted.rule.used].astype(np.float64), most)
+        weight = round_weights(fitted.rule.weight / unit, data.spikes[:, fitted.rule.used].astype(np.float64), most)
     kept = weight.any(axis=0)
     rule = Rule(used=fitted.rule.used[kept], weight=weight[:, kept])
     highest = rule.highest(data)

@@ -38,7 +38,7 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.evaluate import evaluate, one_thread, rate_loss, require_finite
 from spikeloom.models.training.recipes import TIMED
 from spikeloom.models.training.resume import Course, set_rate
-from spikeloom.models.training.robust import require_chance, worn
+from spikeloom.models.training.robust import disturb, require_chance
 
 BATCH = 4
 """Recordings per step of the optimizer: the weights are rounded anew for each."""
@@ -90,7 +90,7 @@ def finetune(
     Without `bits` the storage is what the compiler chooses on held-out training recordings. Training starts
     from the compiler's integers; shared filters of a first layer start from its scales alone. Nothing is chosen
     on `test`. The `seed` orders the recordings, and draws what is lost of them (`robust`, see
-    :func:`robust.worn`). `state` and `resume` as of :func:`train.train`.
+    :func:`robust.disturb`). `state` and `resume` as of :func:`train.train`.
 
     OptionError, ModelError, CapacityError or DataError if options, network or recordings cannot be used, or
     the loss is no longer a number.
@@ -181,7 +181,7 @@ def _run_epoch(
         chosen = order[step * BATCH : (step + 1) * BATCH]
         course.optimizer.zero_grad()
         lengths = None if training.lengths is None else torch.tensor(training.lengths[chosen])
-        rates = model(time_first(worn(training.events[chosen], robust, course.draw)), lengths)
+        rates = model(time_first(disturb(training.events[chosen], robust, course.draw)), lengths)
         labels = training.labels[chosen]
         loss = rate_loss(rates, labels) if teacher is None else _distilled_loss(rates, teacher[chosen])
         loss.backward()  # type: ignore[no-untyped-call]

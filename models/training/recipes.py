@@ -64,7 +64,7 @@ class Recipe:
     # Added to the loss for each synapse that carries a spike in every step: this times the share of the
     # synapses behind neurons that do so, mean over steps and recordings
     penalty: float = 0.0
-    robust: float = 0.0  # Chance of an event and of a taxel to be lost, see :func:`robust.worn`
+    robust: float = 0.0  # Chance of an event and of a taxel to be lost, see :func:`robust.disturb`
 
     def to_json(self) -> JsonObject:
         """JSON values; without the number of epochs, which a training states by itself, and without defaults."""
@@ -85,8 +85,8 @@ class Recipe:
         betas = dict(self.betas)
         alphas = dict(self.alphas)
         return Dynamics(
-            betas=tuple(held_decays(betas.get(name, beta), 0.0)[0] for name in layers) if betas else (),
-            alphas=tuple(held_decays(beta, alphas.get(name, 0.0))[1] for name in layers) if alphas else (),
+            betas=tuple(realised_decays(betas.get(name, beta), 0.0)[0] for name in layers) if betas else (),
+            alphas=tuple(realised_decays(beta, alphas.get(name, 0.0))[1] for name in layers) if alphas else (),
             clocks=clocks_over(self.clocks, steps),
         )
 
@@ -114,10 +114,10 @@ TIMED = Recipe(
 RECIPES = {recipe.name: recipe for recipe in (RELEASED, TIMED)}
 
 
-def held_decays(beta: float, alpha: float) -> tuple[float, float]:
+def realised_decays(beta: float, alpha: float) -> tuple[float, float]:
     """Decays of membrane and current that the chip's registers hold instead of these.
 
-    >>> held_decays(0.5, 0.95) == (0.5, 3891 / 4096)
+    >>> realised_decays(0.5, 0.95) == (0.5, 3891 / 4096)
     True
     """
     held_alpha, held_beta = kept_shares(*decay_registers(beta, alpha))

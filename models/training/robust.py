@@ -14,7 +14,7 @@ def require_chance(chance: float) -> None:
         raise OptionError(f"--robust {chance:g}: allowed are numbers from 0 to below 1; choose another")
 
 
-def worn(events: EventArray, chance: float, draw: np.random.Generator) -> EventArray:
+def disturb(events: EventArray, chance: float, draw: np.random.Generator) -> EventArray:
     """Recordings (samples, taxels, polarities, steps) of which each event is lost, and each taxel, with a `chance`.
 
     As many events as are lost in the mean come anywhere else. Without a chance nothing is drawn.

@@ -37,7 +37,7 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.evaluate import evaluate, loss_of, one_thread, require_finite
 from spikeloom.models.training.recipes import ADAMW, COSINE, RELEASED, Recipe
 from spikeloom.models.training.resume import Course, set_rate
-from spikeloom.models.training.robust import worn
+from spikeloom.models.training.robust import disturb
 
 MOST_SEED = 2**63 - 1
 """What a torch generator takes."""
@@ -244,7 +244,7 @@ def _loss(
 ) -> torch.Tensor:
     """Loss of some recordings, with the penalty on spikes."""
     lengths = np.array([recordings.steps_of(int(index)) for index in chosen])
-    events = time_first(worn(recordings.events[chosen][..., : lengths.max()], recipe.robust, draw))
+    events = time_first(disturb(recordings.events[chosen][..., : lengths.max()], recipe.robust, draw))
     labels = recordings.labels[chosen]
     filled = torch.tensor(lengths) if lengths.min() < lengths.max() else None
     if not isinstance(network, SpikingNet) or not recipe.penalty:

@@ -55,7 +55,7 @@ def recipe_for(name: str, given: Mapping[str, Any]) -> Recipe:  # noqa: ARG001 -
 
 def architecture(plan: Plan) -> network.NativeArchitecture:
     """Sizes that fill the axons of a core."""
-    return network.sized(
+    return network.size_network(
         taxels=plan.graph.n_taxels,
         classes=plan.classes,
         hops=plan.recipe.hops,

@@ -90,7 +90,7 @@ class NativeArchitecture(Sizes):
         return NativeNet(self, propagation, seed=seed, surrogate=surrogate)
 
 
-def sized(
+def size_network(
     *, taxels: int, classes: int, hops: int, features: int, copies: int, clocks: Clocks, channels: int = 2
 ) -> NativeArchitecture:
     """The architecture whose groups fill the axons of a core best, as few as can be; OptionError if none fit."""

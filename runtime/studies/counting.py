@@ -13,7 +13,7 @@ from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
-from spikeloom.models.training.counters import Plan, counted, counters_of, fit
+from spikeloom.models.training.counters import Plan, counters_of, fit, run_counters
 from spikeloom.models.training.record import Held
 from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.console import progress
@@ -69,7 +69,7 @@ def train_counters(plan: Plan, training: Recordings, test: Recordings, command: 
     """Train a counting network, write it, and read the test split."""
     progress("cross-validation")
     classes = int(training.labels.max()) + 1
-    data = counted(training, plan)
+    data = run_counters(training, plan)
     fitted = fit(data, classes)
     made = counters_of(data, fitted, training, classes)
     progress("test split")

@@ -25,7 +25,7 @@ from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.targets.base import Quantity
 from spikeloom.compiler.types import BoolArray
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.training.counters import Plan, counted, counters_of, fit, held_out, spikes_of
+from spikeloom.models.training.counters import Plan, counter_spikes, counters_of, cross_validate, fit, run_counters
 from spikeloom.runtime.machines.base import Price
 from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.report.numbers import percent, si
@@ -126,7 +126,7 @@ def against_processor(
     The netlist's weights have so many `bits`; `price` and `right` (samples,) are of its run of the `test` recordings.
     """
     rule, plan, validation = _rule(training, bits)
-    spikes = spikes_of(rule, counted(test, plan, rule.steps)).astype(np.int64)
+    spikes = counter_spikes(rule, run_counters(test, plan, rule.steps)).astype(np.int64)
     ours = (spikes @ rule.weight.T).argmax(axis=1) == test.labels
     events, seconds = float(test.events.sum()) / len(test), float(test.step_counts.mean()) * bin_s
     channels, added = rule.taxels * rule.polarities, float(spikes.sum()) / len(test) * rule.classes
@@ -169,11 +169,11 @@ def _rule(training: Recordings, bits: int) -> tuple[Counters, Plan, float]:
     for done, (thresholds, parts) in enumerate(PLANS):
         progress(done, "training rules for a processor")
         plan = Plan(thresholds=thresholds, parts=min(parts, training.steps), bits=bits)
-        data = counted(training, plan)
+        data = run_counters(training, plan)
         fitted = fit(data, classes)
-        right = held_out(data, classes)[fitted.strength].argmax(axis=1) == data.labels
+        right = cross_validate(data, classes)[fitted.strength].argmax(axis=1) == data.labels
         rule = counters_of(data, fitted, training, classes)
-        found.append((rule, plan, right.astype(float), int(spikes_of(rule, data).sum(dtype=np.int64))))
+        found.append((rule, plan, right.astype(float), int(counter_spikes(rule, data).sum(dtype=np.int64))))
     best = max((right for _, _, right, _ in found), key=np.mean)
     behind = [best - right for _, _, right, _ in found]
     near = [each.mean() <= each.std(ddof=1) / np.sqrt(len(each)) for each in behind]

@@ -21,11 +21,11 @@ from spikeloom.models.training.counters import (
     STRENGTHS,
     Counted,
     Fitted,
-    counted,
+    counter_spikes,
     counters_of,
-    folds,
-    linear_rules,
-    spikes_of,
+    fit_rules,
+    run_counters,
+    split_folds,
 )
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.backends import backend_of, machine_of
@@ -121,19 +121,19 @@ def some(data: Recordings) -> Recordings:
 def _counting(work: Trial, training: Recordings) -> Measured:
     """A counting network: its strength, its decisions, its costs."""
     plan = work.candidate.plan({1: STRENGTHS[2:3], 2: STRENGTHS}.get(work.rung, (work.setting or 0.0,)))
-    classes, data = int(training.labels.max()) + 1, counted(training, plan)
+    classes, data = int(training.labels.max()) + 1, run_counters(training, plan)
     right, seeds = np.zeros(len(training), np.int64), range(1, ROUNDS + 1) if work.rung == RUNGS else (0,)
     for seed in seeds:
         decided, strength, lowest = cross_validated(data, classes, training, seed)
         right += decided == training.labels
 
     def compiled(data: Counted) -> tuple[Counters, Any]:
-        rule = linear_rules(data, classes, [strength])[strength]
+        rule = fit_rules(data, classes, [strength])[strength]
         made = counters_of(data, Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest), training, classes)
         return made, backend_of(work.target).lower_counters(made)
 
     costs: dict[str, Any]
-    certified, held = None, folds(data.labels, FOLDS, np.random.default_rng(0)) == 0
+    certified, held = None, split_folds(data.labels, FOLDS, np.random.default_rng(0)) == 0
     try:
         made, netlist = compiled(data)
         if work.certify:
@@ -150,7 +150,7 @@ def _network(work: Trial, training: Recordings) -> Measured:
     """A network that is trained by gradients: decisions on one part, on the last rung on all; costs of the first."""
     plan, target = plan_of(work.candidate, work.sensor, training), load_target(work.target)
     epochs = work.candidate.options["epochs"] // (2 if work.rung == 1 else 1)
-    fold = folds(training.labels, FOLDS, np.random.default_rng(0))
+    fold = split_folds(training.labels, FOLDS, np.random.default_rng(0))
     right, tried = np.zeros((2, len(training)), np.int64)
     costs: dict[str, Any] = {}
     certified = None
@@ -178,7 +178,7 @@ def _baseline(work: Trial, training: Recordings) -> Measured:
     seen, seeds = baselines.features(training, work.candidate), range(1, ROUNDS + 1) if rung == RUNGS else (0,)
     right = {strength: np.zeros(len(training), np.int64) for strength in tried}
     for strength, seed in product(right, seeds):
-        fold = folds(labels, FOLDS, np.random.default_rng(seed))
+        fold = split_folds(labels, FOLDS, np.random.default_rng(seed))
         right[strength] += baselines.decided(system, strength, seen, labels, fold) == labels
     best = max(right, key=lambda strength: right[strength].sum())
     costs, rounds = baselines.priced(system, best, training, work.candidate), (len(seeds),) * len(training)
@@ -190,8 +190,8 @@ def cross_validated(data: Counted, classes: int, sensor: Recordings, seed: int) 
 
     The strength is chosen as ``train`` chooses it; `sensor` has the shape of the recordings.
     """
-    fold = folds(data.labels, FOLDS, np.random.default_rng(seed))
-    rules = [linear_rules(data.part(fold != held), classes, data.plan.strengths) for held in range(FOLDS)]
+    fold = split_folds(data.labels, FOLDS, np.random.default_rng(seed))
+    rules = [fit_rules(data.part(fold != held), classes, data.plan.strengths) for held in range(FOLDS)]
     sums = {strength: np.zeros((len(fold), classes)) for strength in sorted(data.plan.strengths)}
     for strength, held in ((strength, held) for strength in sums for held in range(FOLDS)):
         sums[strength][fold == held] = rules[held][strength].sums(data.part(fold == held))
@@ -210,7 +210,7 @@ def decisions(made: Counters, data: Counted) -> IntArray:
 
     That is exact but for a sum that exceeds all training sums before the recording ends.
     """
-    sums: FloatArray = spikes_of(made, data).astype(np.float64) @ made.weight.T
+    sums: FloatArray = counter_spikes(made, data).astype(np.float64) @ made.weight.T
     crossing = np.floor((made.threshold - made.slope * made.steps - sums) / made.slope) + 1
     return np.asarray(np.where(crossing > made.ramp, np.inf, crossing).argmin(axis=1))
 
