@@ -139,7 +139,7 @@ class Rule:
     weight: FloatArray  # (classes, used)
 
     def right(self, data: Counted) -> BoolArray:
-        """Which recordings it decides rightly; (samples,)."""
+        """Which recordings it classifies correctly; (samples,)."""
         return np.asarray(self.sums(data).argmax(axis=1) == data.labels)
 
     def sums(self, data: Counted) -> FloatArray:

@@ -52,7 +52,7 @@ GENTLE_RATE = 3e-4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TunedEpoch:
-    """Figures of one epoch: counted from 1, mean loss, and training recordings decided right while it ran."""
+    """One epoch, counted from 1: mean loss, and training recordings classified correctly meanwhile."""
 
     epoch: int
     loss: float
@@ -61,11 +61,11 @@ class TunedEpoch:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tuned:
-    """What a fine-tuning left."""
+    """Outcome of a fine-tuning."""
 
     net: QuantisedNet  # With its weights in floats; rounded to its forms they are the chip's
     history: tuple[TunedEpoch, ...]
-    # before, after: Test recordings that the chip's integers decide right, before and after training
+    # before, after: Test recordings that the chip's integers classify correctly, before and after training
     before: int
     after: int
 

@@ -58,7 +58,7 @@ def save(path: Path, kept: Mapping[str, Any], plan: Plan, record: Mapping[str, A
 
 
 def differing(found: Checkpoint, plan: Plan) -> list[str]:
-    """In what a checkpoint is of another plan."""
+    """Names of what differs between a checkpoint and a plan."""
     ours, theirs = (None if grid is None else grid.to_json() for grid in (plan.grid, found.grid))
     same = {
         "graph": same_graph(found, plan),

@@ -1,4 +1,4 @@
-"""What decides a network before it is trained, and what each kind of network offers a training.
+"""What determines a network before it is trained, and what each kind of network offers.
 
 All kinds are listed in :mod:`models.network_kinds`.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Plan:
-    """What decides a network before it is trained."""
+    """What determines a network before it is trained."""
 
     system: str
     graph: Graph
@@ -68,7 +68,7 @@ class NetworkKind(Protocol):
         """Read what `save` wrote."""
 
     def differing(self, found: Any, plan: Plan) -> list[str]:
-        """In what a checkpoint is of another plan."""
+        """Names of what differs between a checkpoint and a plan."""
 
 
 def seen_by(plan: Plan) -> FloatArray:

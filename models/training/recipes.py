@@ -35,7 +35,7 @@ Decays = tuple[tuple[str, float], ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recipe:
-    """Everything that decides a training, beside data, system, graph and seed."""
+    """Everything that determines a training, beside data, system, graph and seed."""
 
     name: str  # Which of ``RECIPES`` it is, or came from
     epochs: int = 100  # Unless the user says otherwise
@@ -67,7 +67,7 @@ class Recipe:
     robust: float = 0.0  # Chance of an event and of a taxel to be lost, see :func:`robust.disturb`
 
     def to_json(self) -> JsonObject:
-        """JSON values; without the number of epochs, which a training states by itself, and without defaults."""
+        """JSON values that are not the defaults; a training states its number of epochs by itself."""
         values = asdict(self) | {"betas": dict(self.betas), "alphas": dict(self.alphas)}
         defaults = {"epochs": self.epochs, "hidden": HIDDEN, "penalty": 0, "robust": 0}
         return {name: value for name, value in values.items() if name not in defaults or value != defaults[name]}

@@ -21,7 +21,7 @@ CHOSEN_ON = {"last": "nothing", "best": "the test split", "clean": "a part of th
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reached:
-    """Test recordings that the network of an epoch decides right."""
+    """Test recordings that the network of an epoch classifies correctly."""
 
     epoch: int
     correct: int
@@ -31,7 +31,7 @@ class Reached:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Held:
-    """Of the recordings that the validation training left out, those that the clean epoch decides right."""
+    """Recordings left out by the validation training, and how many of them the clean epoch classifies correctly."""
 
     correct: int
     samples: int

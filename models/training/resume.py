@@ -122,7 +122,7 @@ def _trained(
 def _after_an_epoch(
     network: torch.nn.Module, optimizer: torch.optim.Optimizer, weights: Mapping[str, Weights]
 ) -> dict[str, Any]:
-    """What the state of a network and its optimizer looks like after an epoch."""
+    """Names, types and shapes of a state after an epoch; its numbers mean nothing."""
     network, optimizer = copy.deepcopy((network, optimizer))
     for parameter in network.parameters():
         parameter.grad = torch.zeros_like(parameter)
@@ -131,7 +131,7 @@ def _after_an_epoch(
 
 
 def _alike(found: Any, wanted: Any) -> bool:
-    """Whether a value is another one, but for finite real numbers."""
+    """Whether two values are equal, finite real numbers aside."""
     if type(found) is not type(wanted):
         return False
     match wanted:

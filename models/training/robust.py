@@ -1,4 +1,4 @@
-"""Recordings as a worn sensor might send them: what training for stable decisions sees instead of them."""
+"""Recordings as a worn sensor might send them, which train networks to decide stably."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from spikeloom.compiler.types import EventArray
 
 
 def require_chance(chance: float) -> None:
-    """Refuse what is no chance, with OptionError."""
+    """Refuse what is not a probability; OptionError."""
     if not 0 <= chance < 1:
         raise OptionError(f"--robust {chance:g}: allowed are numbers from 0 to below 1; choose another")
 

@@ -65,7 +65,7 @@ class Epoch:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trained:
-    """What a training left."""
+    """Outcome of a training."""
 
     architecture: Sizes  # Of the network
     last: Weights  # After the last epoch

@@ -38,7 +38,7 @@ class CountersRecord:
     strength: float  # Of the rule, chosen by cross-validation
     cross_validation: Mapping[str, float]  # Accuracy of each strength on training recordings that it did not see
     counters: int
-    validation: Held  # What cross-validation decided rightly, at this strength
+    validation: Held  # What cross-validation classified correctly, at this strength
     test_correct: int
     test_samples: int
     bin_s: float | None = field(default=None, metadata=OPTIONAL)  # Seconds of a bin, where the recordings were events

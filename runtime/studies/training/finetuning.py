@@ -49,7 +49,7 @@ REPEATED = (*repeat.LAYOUT, "weight_bits", "scale_groups", "robust", "epochs", "
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reached:
-    """Test recordings that are right with the weights rounded, before any training."""
+    """Test recordings classified correctly."""
 
     correct: int
     accuracy: float
@@ -57,7 +57,7 @@ class Reached:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReachedLast(Reached):
-    """Test recordings that are right after the last epoch."""
+    """The same after the last epoch."""
 
     chosen_on: str
 
@@ -84,7 +84,7 @@ class FinetuneRecord:
     bin_s: float | None = field(default=None, metadata=OPTIONAL)
 
     def to_json(self) -> JsonObject:
-        """JSON values; without a width of bins that nobody said."""
+        """JSON values, without a bin width that was not given."""
         return {key: value for key, value in asdict(self).items() if value is not None}
 
 
@@ -121,7 +121,7 @@ def finetune(request: FinetuneRequest) -> Finetuned:
 
 
 def _state(output: Path, *, resume: bool) -> Path:
-    """File of the epochs so far; an old one is never lost, and a missing one never begun anew in silence."""
+    """File of the epochs so far; refused if an old one would be lost, or none is there to resume."""
     state = output.with_name(f"{output.name}.state")
     if state.exists() and not resume:
         raise OptionError(
@@ -216,7 +216,7 @@ def _record(
 
 
 def _require_storage(request: FinetuneRequest, widths: list[int] | None, layers: int, target: Target) -> None:
-    """Refuse widths that the chip does not hold."""
+    """Refuse widths that the chip cannot store."""
     if widths is None:
         repeat.refuse(request, ("scale_groups",), "is for --weight-bits; held-out recordings choose the storage")
     else:

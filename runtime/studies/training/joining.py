@@ -33,7 +33,7 @@ class LayerSize:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Joined(Shown):
-    """Networks that were put side by side; `towers` has of each its file, hash and training record."""
+    """Networks that were joined; `towers` holds the file, hash and training record of each."""
 
     command: str
     towers: Sequence[Mapping[str, Any]]
@@ -72,7 +72,7 @@ def join(request: JoinRequest) -> Joined:
 
 
 def _common_origin(towers: Sequence[Mapping[str, Any]]) -> JsonObject:
-    """What the first was trained on; ModelError if the bins of others are of another width."""
+    """What the first was trained on; ModelError if the widths of their bins differ."""
     origins = [origin_of(tower) for tower in towers]
     widths = sorted({origin["bin_s"] for origin in origins if "bin_s" in origin})
     if len(widths) > 1:
@@ -111,7 +111,7 @@ def _records(name: str, checkpoint: Checkpoint) -> list[dict[str, Any]]:
 
 
 def sections(result: Joined) -> Iterable[Section]:
-    """What was joined, for people."""
+    """The joined network, for people."""
     layers = ", ".join(f"{layer.name} {layer.neurons:,}" for layer in result.layers)
     lines = [result.command, f"  {len(result.towers)} towers: {layers}, {result.classes} classes"]
     lines += [f"    {index}: {tower_line(tower)}" for index, tower in enumerate(result.towers)]

@@ -30,7 +30,7 @@ RECIPE = ("current_decay", "membrane_decay", *SIZES, "batch", "decay_epochs", "s
 
 
 def both_splits(data: str, taxels: int | None, bin_s: float | None) -> tuple[Recordings, Recordings]:
-    """Training and test recordings of a sensor, every one with its label."""
+    """Training and test recordings of a sensor, all of them labelled."""
     progress("reading the recordings")
     require_splits(data)
     shared: dict[str, Any] = {"bin_s": bin_s, "labels_for": "training", "classes": None}
@@ -47,7 +47,7 @@ def both_splits(data: str, taxels: int | None, bin_s: float | None) -> tuple[Rec
 
 
 def _require_classes(training: Recordings, test: Recordings) -> None:
-    """Refuse test recordings of classes above those of training; a warning tells of gaps among these."""
+    """Refuse test recordings of classes beyond those of training; warn of classes without training recordings."""
     highest = int(training.labels.max())
     if missing := sorted(set(range(highest)) - set(training.labels.tolist())):
         tell(f"warning: {training.source}: no recordings to train class {', '.join(map(str, missing))} on")
@@ -142,7 +142,7 @@ def _words(request: TrainRequest, first: dict[str, Any], last: dict[str, Any]) -
 
 
 def _changed(options: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """Options that are not as by default."""
+    """Options that differ from their defaults."""
     return {name: value for name, value in options.items() if value != defaults.get(name)}
 
 

@@ -31,7 +31,7 @@ class Finished(TrainingRecord):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accuracies:
-    """Over seeds; one seed has no deviation."""
+    """Statistics over seeds; a single seed has no deviation."""
 
     mean: float
     std: float | None
@@ -48,7 +48,7 @@ class TrainingReport(Shown):
 
 
 def summary(records: Sequence[TrainingRecord]) -> dict[str, Accuracies]:
-    """Accuracies over seeds by epoch."""
+    """Accuracies of all seeds, by epoch."""
     result: dict[str, Accuracies] = {}
     for protocol in WEIGHTS:
         values = [getattr(record, protocol).accuracy for record in records]

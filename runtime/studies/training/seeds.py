@@ -1,4 +1,4 @@
-"""Seeds of a training side by side, one process each, all ended together, each continued from where it was ended."""
+"""Train several seeds side by side, one process each: all stop together, and each resumes where it stopped."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -155,7 +155,7 @@ def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
 
 
 def finished(job: Job) -> bool:
-    """Whether its checkpoint is there and nothing is left to go on with."""
+    """Whether its checkpoint exists and no interrupted state is left."""
     return not states(job) and job.output.exists()
 
 
@@ -166,12 +166,12 @@ def clear(job: Job) -> None:
 
 
 def states(job: Job) -> list[Path]:
-    """Files of an interrupted training, as far as they are there."""
+    """Files of an interrupted training that exist."""
     return [file for file in state_of(job) if file.exists()]
 
 
 def _require_right_start(jobs: Sequence[Job], *, resume: bool, some_finished: bool) -> None:
-    """Neither lose an interrupted training nor begin anew in silence."""
+    """Refuse to overwrite an interrupted training, or to resume one that does not exist."""
     kept = [file for job in jobs for file in states(job)]
     if kept and not resume:
         raise OptionError(
