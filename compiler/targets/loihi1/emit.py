@@ -4,7 +4,8 @@ Every non-zero synapse is stored once; nothing else changes. Lists are stored sp
 far as the core's memory allows it, because a zero inside a dense list is visited, and paid, like any other synapse.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,48 @@ def _layers(network: IntegerNetwork, removed: Masks) -> tuple[Layer, ...]:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class _Axons:
+    """Input axons of all cores, core after core, and the synapses behind them; an array for each chunk's lists."""
+
+    per_core: IntArray  # (cores,) int64
+    formats: dict[core_needs.SynapseFormat, int] = field(default_factory=dict)  # Their numbers
+    source: list[IntArray] = field(default_factory=list)
+    format: list[IntArray] = field(default_factory=list)
+    length: list[AnyArray] = field(default_factory=list)
+    target: list[AnyArray] = field(default_factory=list)
+    weight: list[AnyArray] = field(default_factory=list)
+
+
+def _axons(
+    network: IntegerNetwork, cores: core_needs.Cores, target: Target, compartment_id: Sequence[IntArray]
+) -> _Axons:
+    """Lists of every core, dense or sparse; `compartment_id` are those of the neurons of each population."""
+    axons = _Axons(np.zeros(len(cores), np.int64))
+    needs = core_needs.Needs(network, target)
+    for core, chunks in enumerate(cores):
+        base = 0
+        lean = needs.lean(chunks)
+        for chunk in chunks:
+            index = core_needs.index_bits(base + chunk.size - 1, target)
+            for lists in needs.lists(chunk):
+                projection = network.projections[lists.projection]
+                dense, _ = core_needs.choose_dense(lists, projection, base, chunk.size, lean=lean, target=target)
+                keys = [(projection.bits, projection.exponent, 0 if flag else index) for flag in dense]
+                source = lists.source
+                if projection.pre != INPUT:
+                    source = network.input.size + compartment_id[projection.pre][source]
+                length, place, weight = _entries(lists, dense, base)
+                axons.per_core[core] += len(source)
+                axons.source.append(source)
+                axons.format.append(np.array([axons.formats.setdefault(key, len(axons.formats)) for key in keys]))
+                axons.length.append(length)
+                axons.target.append(place)
+                axons.weight.append(weight)
+            base += chunk.size
+    return axons
+
+
 def emit(
     network: IntegerNetwork,
     cores: core_needs.Cores,
@@ -79,28 +122,7 @@ def emit(
         """A field of the populations, of each compartment."""
         return np.concatenate([getattr(network.populations[c.population], name)[c.first : c.last] for c in order])
 
-    formats: dict[core_needs.SynapseFormat, int] = {}
-    axons_per_core = np.zeros(len(cores), np.int64)
-    parts: dict[str, list[AnyArray]] = {key: [] for key in ("source", "format", "length", "target", "weight")}
-    needs = core_needs.Needs(network, target)
-    for core, chunks in enumerate(cores):
-        base = 0
-        lean = needs.lean(chunks)
-        for chunk in chunks:
-            index = core_needs.index_bits(base + chunk.size - 1, target)
-            for lists in needs.lists(chunk):
-                projection = network.projections[lists.projection]
-                dense, _ = core_needs.choose_dense(lists, projection, base, chunk.size, lean=lean, target=target)
-                keys = [(projection.bits, projection.exponent, 0 if flag else index) for flag in dense]
-                form = np.array([formats.setdefault(key, len(formats)) for key in keys])
-                source = lists.source
-                if projection.pre != INPUT:
-                    source = network.input.size + compartment_id[projection.pre][source]
-                axons_per_core[core] += len(source)
-                for part, values in zip(parts.values(), (source, form, *_entries(lists, dense, base)), strict=True):
-                    part.append(values)
-            base += chunk.size
-
+    axons = _axons(network, cores, target, compartment_id)
     decays = np.array([(population.decay_u, population.decay_v) for population in network.populations])[layer]
     voting = layer == network.readout.population
     votes = np.full(len(layer), -1)
@@ -114,7 +136,7 @@ def emit(
         layers=_layers(origin or network, unread or none_of(network)),
         core_tile=read_only(tiles),
         core_compartments=read_only(np.cumsum([0, *(sum(chunk.size for chunk in chunks) for chunks in cores)])),
-        core_axons=read_only(np.cumsum([0, *axons_per_core])),
+        core_axons=read_only(np.cumsum([0, *axons.per_core])),
         layer=read_only(layer),
         neuron=read_only(known),
         decay_u=read_only(decays[:, 0]),
@@ -124,14 +146,14 @@ def emit(
         bias_exponent=read_only(column("bias_exponent")),
         scale=read_only_float(column("scale")),
         readout_class=read_only(votes),
-        axon_source=read_only(np.concatenate(parts["source"])),
-        axon_format=read_only(np.concatenate(parts["format"])),
-        axon_synapses=read_only(np.concatenate([[0], np.cumsum(np.concatenate(parts["length"]))])),
-        synapse_target=frozen(np.concatenate(parts.pop("target"))),
-        synapse_weight=frozen(np.concatenate(parts.pop("weight"))),
-        format_weight_bits=read_only([bits for bits, _, _ in formats]),
-        format_exponent=read_only([exponent for _, exponent, _ in formats]),
-        format_index_bits=read_only([index for _, _, index in formats]),
+        axon_source=read_only(np.concatenate(axons.source)),
+        axon_format=read_only(np.concatenate(axons.format)),
+        axon_synapses=read_only(np.concatenate([[0], np.cumsum(np.concatenate(axons.length))])),
+        synapse_target=frozen(np.concatenate(axons.target)),
+        synapse_weight=frozen(np.concatenate(axons.weight)),
+        format_weight_bits=read_only([bits for bits, _, _ in axons.formats]),
+        format_exponent=read_only([exponent for _, exponent, _ in axons.formats]),
+        format_index_bits=read_only([index for _, _, index in axons.formats]),
         provenance=dict(provenance),
         clocks=network.input.clocks,
         bins=network.input.bins,

@@ -15,7 +15,7 @@ from spikeloom.compiler.ir import INPUT, Input, Readout
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerPopulation, IntegerProjection
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.registers import THRESHOLD_MANTISSA_MAX
-from spikeloom.compiler.types import AnyArray, IntArray
+from spikeloom.compiler.types import AnyArray
 
 
 def _one(netlist: Netlist, layer: int, field: str) -> int:
@@ -27,35 +27,32 @@ def _one(netlist: Netlist, layer: int, field: str) -> int:
     return int(values[0])
 
 
-def lift(netlist: Netlist) -> IntegerNetwork:
-    """Collect compartments to populations and axons to projections, one per pair of layers and weight format.
+def _population(netlist: Netlist, index: int) -> IntegerPopulation:
+    """Neurons of a layer; those that the chip does not hold have no bias and the highest threshold."""
+    layer = netlist.layers[index]
+    ids = netlist.compartments_of(index)
 
-    FormatError if a layer has different decays, or several layers vote, which the network form cannot say.
-    """
-    populations = []
-    for index, layer in enumerate(netlist.layers):
-        ids = netlist.compartments_of(index)
-        held = netlist.neuron[ids]
+    def whole(values: AnyArray, missing: float) -> Any:
+        array = np.full(layer.neurons, missing, values.dtype)
+        array[netlist.neuron[ids]] = values[ids]
+        return array
 
-        def whole(values: AnyArray, missing: float, held: IntArray = held, size: int = layer.neurons) -> Any:
-            array = np.full(size, missing, values.dtype)
-            array[held] = values
-            return array
+    return IntegerPopulation(
+        name=layer.name,
+        beta=layer.beta,
+        theta=layer.theta,
+        alpha=layer.alpha,
+        scale=whole(netlist.scale, 1.0),
+        decay_u=_one(netlist, index, "decay_u"),
+        decay_v=_one(netlist, index, "decay_v"),
+        threshold=whole(netlist.threshold, THRESHOLD_MANTISSA_MAX),
+        bias_mantissa=whole(netlist.bias_mantissa, 0),
+        bias_exponent=whole(netlist.bias_exponent, 0),
+    )
 
-        populations.append(
-            IntegerPopulation(
-                name=layer.name,
-                beta=layer.beta,
-                theta=layer.theta,
-                alpha=layer.alpha,
-                scale=whole(netlist.scale[ids], 1.0),
-                decay_u=_one(netlist, index, "decay_u"),
-                decay_v=_one(netlist, index, "decay_v"),
-                threshold=whole(netlist.threshold[ids], THRESHOLD_MANTISSA_MAX),
-                bias_mantissa=whole(netlist.bias_mantissa[ids], 0),
-                bias_exponent=whole(netlist.bias_exponent[ids], 0),
-            )
-        )
+
+def _projections(netlist: Netlist) -> list[IntegerProjection]:
+    """Synapses, one projection for each pair of layers and weight format."""
     axon = netlist.axon_of_synapse()
     source = netlist.axon_source[axon]
     form = netlist.axon_format[axon]
@@ -70,10 +67,10 @@ def lift(netlist: Netlist) -> IntegerNetwork:
     projections = []
     code = ((post * (len(netlist.layers) + 1) + pre + 1) * 64 + exponent + 32) * 16 + bits  # one number sorts faster
     for first in np.unique(code, return_index=True)[1]:
-        held = (code == code[first]) & (netlist.synapse_weight != 0)
+        stored = (code == code[first]) & (netlist.synapse_weight != 0)
         to, origin, power, width = (int(each[first]) for each in (post, pre, exponent, bits))
-        mantissa = netlist.synapse_weight[held].astype(np.int64)
-        weight = sparse.csr_array((mantissa, (row[held], column[held])), shape=(sizes[to], sizes[origin]))
+        mantissa = netlist.synapse_weight[stored].astype(np.int64)
+        weight = sparse.csr_array((mantissa, (row[stored], column[stored])), shape=(sizes[to], sizes[origin]))
         weight.sum_duplicates()
         projections.append(IntegerProjection(pre=origin, post=to, weight=weight, exponent=power, bits=width))
     reached = {projection.post for projection in projections if projection.pre != projection.post}
@@ -82,12 +79,22 @@ def lift(netlist: Netlist) -> IntegerNetwork:
             before = next((i for i, other in enumerate(netlist.layers) if other.depth == layer.depth - 1), INPUT)
             none = sparse.csr_array((layer.neurons, sizes[before]), dtype=np.int64)
             projections += [IntegerProjection(pre=before, post=index, weight=none, exponent=0, bits=layer.weight_bits)]
+    return projections
+
+
+def lift(netlist: Netlist) -> IntegerNetwork:
+    """Collect compartments to populations and axons to projections, one per pair of layers and weight format.
+
+    FormatError if a layer has different decays, or several layers vote, which the network form cannot say.
+    """
+    populations = tuple(_population(netlist, index) for index in range(len(netlist.layers)))
+    projections = _projections(netlist)
     voting = np.unique(netlist.layer[netlist.readout_class >= 0])
     if len(voting) != 1:
         raise FormatError(f"{len(voting)} layers vote for classes, one is allowed; compile it again")
     return IntegerNetwork(
         input=Input(taxels=netlist.taxels, polarities=netlist.polarities, clocks=netlist.clocks, bins=netlist.bins),
-        populations=tuple(populations),
+        populations=populations,
         projections=tuple(projections),
         readout=Readout(
             population=int(voting[0]), label=netlist.readout_class[netlist.compartments_of(int(voting[0]))]
