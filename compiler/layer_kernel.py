@@ -73,7 +73,9 @@ def no_synapses(dtype: npt.DTypeLike) -> Synapses:
 class _Notice(numba_event.Listener):
     """Says once on a terminal that machine code is being compiled, which takes seconds."""
 
-    said, depth, collects = False, 0, True
+    said = False
+    depth = 0
+    collects = True
 
     def on_start(self, _event: Any) -> None:
         """A function, or one that it calls."""

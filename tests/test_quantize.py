@@ -18,7 +18,7 @@ from spikeloom.compiler.targets.loihi1 import registers
 from spikeloom.compiler.targets.loihi1.bounds import one_sided, prove_ranges
 from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.storage import choose_storage as choice_module
-from spikeloom.compiler.targets.loihi1.storage.choose_storage import assemble, best_scale, choose_storage, nudged
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import adjust_biases, assemble, best_scale, choose_storage
 from spikeloom.compiler.targets.loihi1.storage.scales import candidate, layer_of
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import round_population
 from spikeloom.runtime.machines.loihi1.spec import decayed
@@ -93,7 +93,7 @@ def test_an_outlier_is_clipped_if_that_saves_spikes():
     assert choice.clipped == 1
     assert choice.scale > plain.scale
     assert chosen.projections[0].weight.toarray()[0, 0] == 224
-    assert lost(chosen, calibration, 0)[0].sum() < lost(unclipped, calibration, 0)[0].sum()
+    assert spike_cost(chosen, calibration, 0)[0].sum() < spike_cost(unclipped, calibration, 0)[0].sum()
 
 
 @pytest.mark.parametrize(("bits", "theta"), [(8, 0.5), (2, 49.0)])
@@ -148,7 +148,7 @@ def test_the_scale_that_keeps_most_spikes_is_chosen_of_those_that_did_best_on_a_
     found = {(c.form.exponents, c.form.threshold[0]): c for c in made}.values()
     runs = [assemble(network, [c]) for c in found]
     on_all, sampled = (
-        [sum(np.abs(each).sum() for each in lost(run, calibration, 0, rows)) for run in runs]
+        [sum(np.abs(each).sum() for each in spike_cost(run, calibration, 0, rows)) for run in runs]
         for rows in (slice(None), slice(None, None, 3))  # the second is the first of three parts
     )
     finalists = np.argsort(sampled, kind="stable")[: choice_module.FINALISTS]
@@ -157,7 +157,7 @@ def test_the_scale_that_keeps_most_spikes_is_chosen_of_those_that_did_best_on_a_
     assert len(finalists) < best.tried <= len(found)
 
 
-def lost(integer, calibration, post, rows=slice(None)):
+def spike_cost(integer, calibration, post, rows=slice(None)):
     """Of each neuron the spikes that differ, and how many more there are."""
     spikes, wanted = run_integer(integer, calibration.events).spikes[post][rows], calibration.spikes[post][rows]
     more = spikes.sum(axis=(0, 1)) - wanted.sum(axis=(0, 1)).astype(int)
@@ -170,16 +170,16 @@ def test_a_layer_is_judged_on_the_rounded_spikes_of_the_one_before_and_nudged_on
     calibration = calibrate(network, recordings(network, 4, samples=12))
     integer, choices = choose_storage(network, nets.LOIHI, packings=(packing,), calibration=calibration)
     for post, choice in enumerate(choices):  # the whole network runs as each layer was judged
-        assert choice.flips == lost(integer, calibration, post)[0].sum() > 0
+        assert choice.flips == spike_cost(integer, calibration, post)[0].sum() > 0
     layer = layer_of(network, 0, calibration)
     before = best_scale(layer, packing, nets.LOIHI.choices["synapse.exponent"])
-    after = nudged(layer, before, calibration)
+    after = adjust_biases(layer, before, calibration)
     scores = [np.abs(stored.moved).sum(axis=0) for stored in (before, after)]
     changed = before.population.bias != after.population.bias
     assert np.array_equal(scores[1] < scores[0], changed)
     assert np.all(scores[1] <= scores[0])
     assert 0 < changed.sum() < 20
-    assert np.array_equal(after.moved, lost(integer, calibration, 0))
+    assert np.array_equal(after.moved, spike_cost(integer, calibration, 0))
 
 
 def test_a_relay_keeps_no_bias():
@@ -191,7 +191,7 @@ def test_a_relay_keeps_no_bias():
     integer, _ = choose_storage(network, nets.LOIHI, packings=(Packing(bits=3),), calibration=calibration)
     assert integer.populations[0].bias[:-1].any()
     assert integer.populations[0].bias[-1] == 0
-    assert not lost(integer, calibration, 0)[0][-1]
+    assert not spike_cost(integer, calibration, 0)[0][-1]
 
 
 @pytest.mark.parametrize("planes", [(2, 1), (1, 2)])

@@ -27,9 +27,9 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     finest_thresholds,
     fit,
     group_by_fineness,
-    judged,
     layer_of,
     rounded,
+    with_spike_errors,
 )
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import _decay_flips, make_exact
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import round_population, scales
@@ -218,7 +218,7 @@ def test_errors_cancel_on_the_recordings():
         bias = stored.population.bias / 64 - network.populations[0].bias * 400
         return float(np.square(calibration.events.reshape(-1, 48) @ weight.T + bias).mean())
 
-    plain = judged(rounded(layer, form), 0, calibration)
+    plain = with_spike_errors(rounded(layer, form), 0, calibration)
     assert error(compensated(layer, plain, calibration)) < 0.6 * error(plain)
 
 
@@ -227,7 +227,7 @@ def test_compensation_is_kept_only_where_it_keeps_spikes():
     integer, (choice,) = choose_storage(network, LOIHI, packings=(Packing(bits=3),), calibration=calibration)
     assert choice.flips == moved(integer, calibration)
     form = Form(bits=3, exponents=(choice.exponent,), threshold=integer.populations[0].threshold)
-    nearest = judged(rounded(layer_of(network, 0), form), 0, calibration).flips
+    nearest = with_spike_errors(rounded(layer_of(network, 0), form), 0, calibration).flips
     assert choice.flips < nearest if choice.compensated else choice.flips == nearest
 
 
@@ -237,7 +237,7 @@ def test_a_neuron_that_would_overflow_is_rounded_to_nearest():
     layer = layer_of(network, 0)
     finest = finest_thresholds(layer, 8, (-1, 6))
     plain = rounded(layer, Form(bits=8, exponents=(-1, 6), threshold=finest))
-    stored = compensated(layer, judged(plain, 0, calibration), calibration)
+    stored = compensated(layer, with_spike_errors(plain, 0, calibration), calibration)
     assert ONE_STEP_SUM_MAX * 0.99 < stored.reached <= ONE_STEP_SUM_MAX
 
 

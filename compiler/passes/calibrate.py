@@ -95,10 +95,10 @@ class Calibration:
     def raster(self, pres: Sequence[int], post: int, rows: slice) -> Raster:
         """What a population receives in some recordings; kept for the next candidate if recordings are few."""
         key = *pres, post, rows.start
-        found = self._rasters.get(key) or raster([self.source(pre, post, rows) for pre in pres])
+        sources = self._rasters.get(key) or raster([self.source(pre, post, rows) for pre in pres])
         if len(self.events) <= FEW:
-            self._rasters[key] = found
-        return found
+            self._rasters[key] = sources
+        return sources
 
     def moved(self, layer: Layer, post: int, parts: int | None = None) -> IntArray:
         """What a layer without loops does unlike population `post`, given its sources, in the first `parts`.

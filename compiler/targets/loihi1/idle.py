@@ -57,7 +57,8 @@ def forgotten(netlist: Netlist) -> Forgotten:
     membrane = np.stack([-ends, threshold])
     spikes = np.repeat([[False], [True]], n, axis=1)
     for step in range(MOST_BLANK + 1):
-        before, (sure, may) = (current, membrane, spikes), spikes.astype(np.int64)
+        before = current, membrane, spikes
+        sure, may = spikes.astype(np.int64)
         sums = np.stack([more @ sure + less @ may, less @ sure + more @ may])
         current = np.clip(_kept(current, netlist.decay_u + 1) + sums, -most, most)
         membrane = np.clip(_kept(membrane, netlist.decay_v) + current + bias, -MEMBRANE_MAX, MEMBRANE_MAX)

@@ -98,12 +98,12 @@ class IntegerNetwork:
     @property
     def forms(self) -> tuple[Form, ...]:
         """How each population is stored."""
-        found = []
+        forms = []
         for post, population in enumerate(self.populations):
             planes = [p for p in self.projections if p.post == post]
             exponents = tuple(sorted({p.exponent for p in planes}))
-            found.append(Form(bits=planes[0].bits, exponents=exponents, threshold=population.threshold))
-        return tuple(found)
+            forms.append(Form(bits=planes[0].bits, exponents=exponents, threshold=population.threshold))
+        return tuple(forms)
 
 
 def integer_layer(

@@ -39,8 +39,8 @@ def _in_range(netlist: Netlist) -> bool:
     )
 
 
-def lay_out_blocks(netlist: Netlist) -> Blocks | str:
-    """Make blocks of a netlist, or say why there are none."""
+def _refusal(netlist: Netlist) -> str | None:
+    """Why a netlist has no blocks."""
     if netlist.blank:
         return "no layer has a window"
     depth = np.array([layer.depth for layer in netlist.layers])[netlist.layer]
@@ -49,6 +49,13 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
         return "a layer is recurrent or receives from others than the one before it"
     if not _in_range(netlist):
         return "a sum may leave 16 bits, or a membrane or current its register"
+    return None
+
+
+def lay_out_blocks(netlist: Netlist) -> Blocks | str:
+    """Make blocks of a netlist, or say why there are none."""
+    if (refusal := _refusal(netlist)) is not None:
+        return refusal
     seats = _seats(netlist)
 
     # rows: one for each block and each source that reaches it

@@ -175,9 +175,8 @@ def _proven(facts: CompilationFacts) -> Iterator[str]:
 
 
 def _placed(facts: CompilationFacts) -> Iterator[str]:
-    placement, spiking = facts.placement, ""
-    if facts.calibration[0].flips is None:
-        spiking = " if every neuron spiked"
+    placement = facts.placement
+    spiking = " if every neuron spiked" if facts.calibration[0].flips is None else ""
     yield (
         f"cores: {facts.netlist.cores} used, {facts.core_bound} at least; "
         f"spike-hops a step{spiking}: {placement.spike_hops:.1f}"

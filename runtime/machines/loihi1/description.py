@@ -117,7 +117,8 @@ def describe(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Netlist
 
 
 def _layer(netlist: Netlist, index: int) -> LayerFacts:
-    layer, ids = netlist.layers[index], netlist.compartments_of(index)
+    layer = netlist.layers[index]
+    ids = netlist.compartments_of(index)
     axon = netlist.axon_of_synapse()[netlist.layer[netlist.synapse_compartment()] == index]
     source = netlist.axon_source[axon] - netlist.n_inputs
     from_itself = int(np.count_nonzero(netlist.layer[source[source >= 0]] == index))
@@ -160,7 +161,8 @@ def sections(facts: NetlistFacts) -> Iterator[Section]:
         f"({facts.synapses_stored:,} stored, {facts.synapses_nonzero:,} non-zero), {cores}"
     ]
     if facts.clocks is not None and facts.clocks.channels:
-        channels, steps = facts.clocks.channels, facts.clocks.steps
+        channels = facts.clocks.channels
+        steps = facts.clocks.steps
         lines.append(f"  {channels} clocks of {steps} steps each, {channels * steps} in all, beside the sensor")
     if facts.clocks is not None and facts.clocks.length is not None:
         lines.append(f"  a recording is run for {facts.clocks.length} steps, whatever its own length")

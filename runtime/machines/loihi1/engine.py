@@ -109,6 +109,35 @@ def advance(
         raise range_error(engine.netlist, tuple(REGISTER_LIMITS)[register], compartment, step, value)
 
 
+def _empty_trace(
+    netlist: Netlist,
+    recordings: int,
+    length: int,
+    spikes: bool,
+    membranes: bool,
+    updated: bool,
+    packed: bool,
+    charged: int | None,
+) -> Trace:
+    """Zeros of what is kept of recordings, and of so many `charged` sums."""
+    shape = (recordings, length + netlist.drain, netlist.n_compartments)
+    fired = np.zeros((recordings, netlist.n_compartments), np.int64)
+    return Trace(
+        counts=Counts(
+            inputs=np.zeros((recordings, netlist.n_inputs), np.int64),
+            spikes=fired,
+            votes=np.zeros_like(fired) if netlist.blank else fired,
+            updates=np.zeros((recordings, len(netlist.layers)), np.int64),
+            saturations=np.zeros((recordings, len(netlist.layers)), np.int64),
+        ),
+        spikes=np.zeros(shape, np.bool_) if spikes else None,
+        membranes=np.zeros(shape, np.int32) if membranes else None,
+        updated=np.zeros(shape, np.bool_) if updated else None,
+        charged=np.zeros((*shape[:2], charged), np.int64) if charged is not None else None,
+        packed=np.zeros((*shape[:2], -(-shape[2] // 64)), np.uint64) if packed else None,
+    )
+
+
 def simulate(
     netlist: Netlist | Engine,
     events: EventArray,
@@ -137,22 +166,8 @@ def simulate(
     netlist = engine.netlist
     require_channels(netlist, events.shape[1])
     recordings, _, length = events.shape
-    shape = (recordings, length + netlist.drain, netlist.n_compartments)
-    fired = np.zeros((recordings, netlist.n_compartments), np.int64)
-    trace = Trace(
-        counts=Counts(
-            inputs=np.zeros((recordings, netlist.n_inputs), np.int64),
-            spikes=fired,
-            votes=np.zeros_like(fired) if netlist.blank else fired,
-            updates=np.zeros((recordings, len(netlist.layers)), np.int64),
-            saturations=np.zeros((recordings, len(netlist.layers)), np.int64),
-        ),
-        spikes=np.zeros(shape, np.bool_) if spikes else None,
-        membranes=np.zeros(shape, np.int32) if membranes else None,
-        updated=np.zeros(shape, np.bool_) if updated else None,
-        charged=None if charges is None else np.zeros((*shape[:2], charges.sources.shape[1]), np.int64),
-        packed=np.zeros((*shape[:2], -(-shape[2] // 64)), np.uint64) if packed else None,
-    )
+    charged = None if charges is None else charges.sources.shape[1]
+    trace = _empty_trace(netlist, recordings, length, spikes, membranes, updated, packed, charged)
     ends = np.full(recordings, length) if lengths is None else np.asarray(lengths, np.int64)
     run_part, size = (_run_steps, 1) if engine.blocks is None else (_run_layers, PART)
     require_below("length", ends, length + 1)

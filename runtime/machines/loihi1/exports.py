@@ -69,7 +69,8 @@ def _sanafe(request: ExportSource) -> Export:
 
 
 def _onnx(request: ExportSource) -> Export:
-    netlist, form = read_netlist(request.source), request.form or "scan"
+    netlist = read_netlist(request.source)
+    form = request.form or "scan"
     content, *ports = onnx.export(netlist, form)
     inputs, outputs = ([str(port) for port in side] for side in ports)
     facts = OnnxFacts(

@@ -106,8 +106,8 @@ class Loihi(Damageable, Explainable, Stoppable):
         """Spikes and membranes by chip step."""
         try:
             return engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
-        except NumericRangeError as found:
-            found.args = (f"{self.file}: {found}",)
+        except NumericRangeError as error:
+            error.args = (f"{self.file}: {error}",)
             raise
 
     def spec_and_engine(self, channels: EventArray) -> tuple[Trace, Trace]:

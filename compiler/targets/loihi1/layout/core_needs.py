@@ -57,7 +57,7 @@ class Lists:
 
 def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
     """Collect the synapse lists that a chunk's core has to store, zero weights left out."""
-    found = []
+    collected = []
     for index, projection in enumerate(network.projections):
         if projection.post == chunk.population:
             part = projection.weight[chunk.first : chunk.last].tocsc()
@@ -65,7 +65,7 @@ def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
             bounds = part.indptr.astype(np.int64)
             row = part.indices.astype(np.int64)
             source = np.flatnonzero(np.diff(bounds))
-            lists = Lists(
+            into = Lists(
                 projection=index,
                 source=source,
                 nonzero=np.diff(bounds)[source],
@@ -74,8 +74,8 @@ def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
                 first=row[bounds[source]],
                 last=row[bounds[source + 1] - 1],
             )
-            found.append(lists)
-    return tuple(found)
+            collected.append(into)
+    return tuple(collected)
 
 
 def index_bits(highest: int, target: Target) -> int:

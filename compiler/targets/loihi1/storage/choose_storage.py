@@ -36,10 +36,10 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     Rounded,
     candidate,
     grouped,
-    judged,
     layer_of,
-    lost,
     rounded,
+    spike_cost,
+    with_spike_errors,
 )
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load, loads
 from spikeloom.compiler.types import FloatArray
@@ -79,14 +79,15 @@ def _register(population: Population) -> str:
 
 def _repeats(stored: Rounded, target: Target) -> bool:
     """Whether a core that held a whole population would store half of its synapse lists at most."""
-    held = lists = 0
+    stored_lists = 0
+    lists = 0
     for projection in stored.projections:
         weight = projection.weight.tocsc()
         weight.eliminate_zeros()
         lengths = np.diff(weight.indptr)
-        held += len(stored_once(0 * lengths, lengths, weight.indices, weight.data, target))
+        stored_lists += len(stored_once(0 * lengths, lengths, weight.indices, weight.data, target))
         lists += len(lengths)
-    return 2 * held <= lists
+    return 2 * stored_lists <= lists
 
 
 def best_scale(
@@ -124,12 +125,12 @@ def best_scale(
         )
     tried = len(candidates)
     if calibration is not None and tried > FINALISTS:
-        candidates = sorted(candidates, key=lambda c: judged(c, post, calibration, 1).cost)[:FINALISTS]
-    best = min((judged(stored, post, calibration) for stored in candidates), key=attrgetter("cost"))
+        candidates = sorted(candidates, key=lambda c: with_spike_errors(c, post, calibration, 1).cost)[:FINALISTS]
+    best = min((with_spike_errors(stored, post, calibration) for stored in candidates), key=attrgetter("cost"))
     if packing.groups > 1:
         several = grouped(layer, best, packing.groups)
         if several is not None:
-            best = min(judged(several, post, calibration), best, key=attrgetter("cost"))
+            best = min(with_spike_errors(several, post, calibration), best, key=attrgetter("cost"))
     if calibration is not None and not (shared and _repeats(best, shared)):
         best = compensated(layer, best, calibration) or best
     return replace(best, tried=tried)
@@ -142,11 +143,11 @@ def round_with_more(layer: FloatLayer, chosen: Rounded, calibration: Calibration
     """
     many = fewer(calibration, MANY)
     plain = rounded(layer, chosen.form)
-    stored = plain and compensated(layer, judged(plain, layer.post, many), many)
-    return min(judged(chosen, layer.post, many), stored or chosen, key=attrgetter("cost"))
+    stored = plain and compensated(layer, with_spike_errors(plain, layer.post, many), many)
+    return min(with_spike_errors(chosen, layer.post, many), stored or chosen, key=attrgetter("cost"))
 
 
-def nudged(layer: FloatLayer, stored: Rounded, calibration: Calibration) -> Rounded:
+def adjust_biases(layer: FloatLayer, stored: Rounded, calibration: Calibration) -> Rounded:
     """Move the bias of each neuron by what keeps most of its calibration spikes, and their number."""
     before = stored.population
     relays = layer.population.relays
@@ -159,17 +160,17 @@ def nudged(layer: FloatLayer, stored: Rounded, calibration: Calibration) -> Roun
         return replace(before, bias_mantissa=mantissa, bias_exponent=exponent)
 
     bias = before.bias.astype(np.float64)
-    fewest = judged(stored, layer.post, calibration).moved
+    fewest = with_spike_errors(stored, layer.post, calibration).moved
     for share in (sign * nudge for nudge in NUDGES for sign in (1, -1)):
         trial = at(bias + share * unit)
-        found = judged(replace(stored, population=trial), layer.post, calibration).moved
-        better = lost(found) < lost(fewest)
+        moved = with_spike_errors(replace(stored, population=trial), layer.post, calibration).moved
+        better = spike_cost(moved) < spike_cost(fewest)
         better &= loads(trial, stored.projections) <= ONE_STEP_SUM_MAX
         bias = np.where(better, bias + share * unit, bias)
-        fewest = np.where(better, found, fewest)
+        fewest = np.where(better, moved, fewest)
     after = at(bias)
-    nudged = bool(np.any(after.bias != before.bias))
-    return replace(stored, population=after, moved=fewest, compensated=stored.compensated or nudged)
+    shifted = bool(np.any(after.bias != before.bias))
+    return replace(stored, population=after, moved=fewest, compensated=stored.compensated or shifted)
 
 
 def assemble(network: Network, layers: Sequence[Rounded]) -> IntegerNetwork:
@@ -250,7 +251,7 @@ def choose_storage(
         if calibration is not None and known is not None:
             if packing.planes > 1 and (best.compensated or not share_lists):
                 best = round_with_more(layer, best, calibration)
-            best = nudged(layer, best, known)
+            best = adjust_biases(layer, best, known)
             known = known.after(integer_layer(best.population, best.projections))
         layers.append(layer)
         chosen.append(best)
@@ -275,5 +276,5 @@ def round_to_forms(
             overflow = f"the {_register(layer.population)} may overflow"
             what = "a bias has no register value" if stored is None else overflow
             raise ModelError(f"{name}: at the scale that it was fine-tuned for, {what}; fine-tune it again")
-        chosen.append(judged(stored, layer.post, calibration))
+        chosen.append(with_spike_errors(stored, layer.post, calibration))
     return assemble(network, chosen), tuple(map(explain_choice, layers, chosen))

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from spikeloom.compiler.ir import PART, Projection
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.registers import ONE_STEP_SUM_MAX, reach, step_units
-from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, judged, lost, rounded
+from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, rounded, spike_cost, with_spike_errors
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, nearest_steps, scales
 from spikeloom.compiler.types import FloatArray, IntArray
 
@@ -71,22 +71,22 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
             places = [_places(p, rows) for p in projections]
             weight = np.concatenate([p.weight.data[at] for p, at in zip(projections, places, strict=True)], axis=1)
             exact = np.clip(weight * (scale[rows] / step)[:, None], -limit, limit)
-            found = np.rint(exact)
-            found[:, shown] = np.clip(_round_in_turn(exact[:, shown], share), -limit, limit)
-            less = (exact - found)[:, shown]
-            wanted = exact @ meant[inputs] - found @ rate[inputs]
+            whole = np.rint(exact)
+            whole[:, shown] = np.clip(_round_in_turn(exact[:, shown], share), -limit, limit)
+            less = (exact - whole)[:, shown]
+            wanted = exact @ meant[inputs] - whole @ rate[inputs]
             most = (np.sum(sign * np.maximum(sign * less, 0), axis=1) for sign in (-1, 1))
             errors[rows] = np.clip(wanted, *most) * step / scale[rows]
             ends = np.cumsum([at.shape[1] for at in places])[:-1]
-            for each, at, part in zip(steps, places, np.split(found, ends, axis=1), strict=True):
+            for each, at, part in zip(steps, places, np.split(whole, ends, axis=1), strict=True):
                 each[at] = part
     errors[population.size - population.relays :] = 0  # a relay has no bias
     stored = rounded(layer, form, steps, population.bias + errors)
     if stored is None:
         return None
     before = plain.moved
-    after = judged(stored, layer.post, calibration).moved
-    back = (lost(after) > lost(before)) | (loads(stored.population, stored.projections) > ONE_STEP_SUM_MAX)
+    after = with_spike_errors(stored, layer.post, calibration).moved
+    back = (spike_cost(after) > spike_cost(before)) | (loads(stored.population, stored.projections) > ONE_STEP_SUM_MAX)
     for p, each, instead in zip(projections, steps, nearest, strict=True):
         np.copyto(each, instead, where=np.repeat(back, np.diff(p.weight.indptr)))
     stored = rounded(layer, form, steps, population.bias + np.where(back, 0, errors))

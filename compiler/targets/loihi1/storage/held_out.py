@@ -48,10 +48,12 @@ class HeldOut:
     """
 
     def __init__(self, network: Network, events: AnyArray) -> None:
-        self._readout, self._classes = network.readout, network.classes
+        self._readout = network.readout
+        self._classes = network.classes
         self._known = calibrate(network, channels_last(thinned(events), network.input.clocks))
         votes = self._votes(self._known.spikes)
-        self._decided, self._voted = vote(votes), votes.any(axis=1)
+        self._decided = vote(votes)
+        self._voted = votes.any(axis=1)
 
     def equal(self, integer: IntegerNetwork) -> int:
         """Number of decisions that are the same on the chip."""

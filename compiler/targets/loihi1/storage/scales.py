@@ -73,7 +73,7 @@ class Rounded:
     @property
     def cost(self) -> int:
         """What candidates are compared by."""
-        return int(lost(self.moved).sum())
+        return int(spike_cost(self.moved).sum())
 
     @property
     def flips(self) -> int:
@@ -81,7 +81,7 @@ class Rounded:
         return int(self.moved[0].sum())
 
 
-def lost(moved: IntArray) -> IntArray:
+def spike_cost(moved: IntArray) -> IntArray:
     """What each neuron loses: spikes that differ, and how many more or fewer there are, or silence would be cheap."""
     return np.asarray(moved[0] + np.abs(moved[1]))
 
@@ -105,7 +105,7 @@ def rounded(
     return Rounded(form=form, population=integer, projections=planes, reached=reached)
 
 
-def judged(layer: Rounded, post: int, calibration: Calibration | None, parts: int | None = None) -> Rounded:
+def with_spike_errors(layer: Rounded, post: int, calibration: Calibration | None, parts: int | None = None) -> Rounded:
     """The same with what the calibration says of it, or its first `parts`, given what the layers before it send."""
     if calibration is None:
         return layer
@@ -142,18 +142,18 @@ def fit(layer: FloatLayer, bits: int, exponents: tuple[int, ...], mantissa_scale
     """
     population = layer.population
 
-    def tried(units: int) -> tuple[Rounded | None, float]:
+    def at(units: int) -> tuple[Rounded | None, float]:
         threshold = np.full(population.size, units, np.int64)
-        found = rounded(layer, Form(bits=bits, exponents=exponents, threshold=threshold))
+        stored = rounded(layer, Form(bits=bits, exponents=exponents, threshold=threshold))
         # None: a bias that rounds just out of its register, or a relay whose clipped weight no longer reaches
-        return found, np.inf if found is None else found.reached
+        return stored, np.inf if stored is None else stored.reached
 
     high = int(min(population.theta * mantissa_scale * 2.0 ** exponents[0], _largest_threshold(population)))
     if high < 1:
         return None
-    found, over = tried(high)
+    stored, over = at(high)
     if over <= ONE_STEP_SUM_MAX:
-        return found
+        return stored
     low = 0
     under = 0.0
     best = None
@@ -163,11 +163,11 @@ def fit(layer: FloatLayer, bits: int, exponents: tuple[int, ...], mantissa_scale
         share = (ONE_STEP_SUM_MAX - under) / (over - under) if narrowed and np.isfinite(over) else 0.5
         units = min(max(low + int(share * (high - low)), low + 1), high - 1)
         before = high - low
-        found, reached = tried(units)
+        stored, reached = at(units)
         if reached <= ONE_STEP_SUM_MAX:
             low = units
             under = reached
-            best = found
+            best = stored
         else:
             high = units
             over = reached
@@ -224,7 +224,9 @@ def finest_thresholds(layer: FloatLayer, bits: int, exponents: tuple[int, ...]) 
         middle = np.where(high - low > 1, middle, np.maximum(low, 1))
         form = Form(bits=bits, exponents=exponents, threshold=np.maximum(middle, 1))
         good = loads(*round_population(population, layer.projections, form)) <= ONE_STEP_SUM_MAX
-        low, high = np.where(good & (high - low > 1), middle, low), np.where(good | (high - low <= 1), high, middle)
+        is_open = high - low > 1
+        low = np.where(good & is_open, middle, low)
+        high = np.where(good | ~is_open, high, middle)
     return low
 
 
@@ -274,7 +276,7 @@ def grouped(layer: FloatLayer, uniform: Rounded, groups: int) -> Rounded | None:
         return None
     finest = finest_thresholds(layer, uniform.form.bits, uniform.form.exponents)
     threshold = group_by_fineness(np.maximum(finest, uniform.form.threshold), groups)
-    while (found := rounded(layer, replace(uniform.form, threshold=threshold))) and found.reached > ONE_STEP_SUM_MAX:
-        over = loads(found.population, found.projections) > ONE_STEP_SUM_MAX
+    while (stored := rounded(layer, replace(uniform.form, threshold=threshold))) and stored.reached > ONE_STEP_SUM_MAX:
+        over = loads(stored.population, stored.projections) > ONE_STEP_SUM_MAX
         threshold = threshold - np.isin(threshold, threshold[over])
-    return found
+    return stored

@@ -29,7 +29,13 @@ from spikeloom.compiler.targets.loihi1.storage.choose_storage import (
     round_with_more,
 )
 from spikeloom.compiler.targets.loihi1.storage.ladder import coarsest_first
-from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, finest_thresholds, judged, layer_of
+from spikeloom.compiler.targets.loihi1.storage.scales import (
+    FloatLayer,
+    Rounded,
+    finest_thresholds,
+    layer_of,
+    with_spike_errors,
+)
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.compiler.types import BoolArray
 
@@ -77,12 +83,12 @@ def make_exact(
             tried.append((packing.planes, packing.groups, candidate.flips))
             if best is None or candidate.flips <= best.flips:
                 best = candidate
-            if not candidate.flips and not judged(candidate, post, calibration).flips:
+            if not candidate.flips and not with_spike_errors(candidate, post, calibration).flips:
                 break
         assert best is not None, "the ladder has steps"
         if best.flips:
             best = round_with_more(layer, best, calibration)
-        best = judged(best, post, calibration)
+        best = with_spike_errors(best, post, calibration)
         layer = replace(layer, calibration=calibration)
         layers.append(layer)
         chosen.append(best)

@@ -149,4 +149,5 @@ def _forget(
             elif not apart:
                 back[start] = t + 1
                 break
-        quiet[start], back[start] = last, min(back[start], back[start + 1])
+        quiet[start] = last
+        back[start] = min(back[start], back[start + 1])

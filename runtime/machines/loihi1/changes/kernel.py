@@ -141,21 +141,21 @@ def effects(chip: Chip, known: Known, classes: int, changes: Changes) -> Effects
     """What changes of the known recording bring about."""
     count = len(changes.bounds) - 1
     come, gone = np.zeros((2, count, classes), np.int64)
-    found = Effects(come, gone, np.zeros(count, np.int64))
+    made = Effects(come, gone, np.zeros(count, np.int64))
     channel, step = np.ascontiguousarray(changes.cells.T, np.int64)
     require_below("channel", channel, known.events.shape[0])
     require_below("step", step, known.events.shape[1])
-    _run(chip, known, _run_of(chip, known), channel, step, changes.bounds, *found)
-    return found
+    _run(chip, known, _run_of(chip, known), channel, step, changes.bounds, *made)
+    return made
 
 
 def _run_of(chip: Chip, known: Known) -> _Run:
     places = len(chip.bias)
     blocks = len(chip.depth)
     delta, current, membrane = np.zeros((3, places), np.int32)
-    held, looked = np.zeros((2, blocks), np.uint8)
+    differing, looked = np.zeros((2, blocks), np.uint8)
     moved, sign = np.ones((2, places + len(known.events) + 1), np.int64)
-    return _Run(delta, current, membrane, np.zeros(places, np.uint8), held, looked, moved, sign)
+    return _Run(delta, current, membrane, np.zeros(places, np.uint8), differing, looked, moved, sign)
 
 
 # Each loop is a function of its own that writes one array: only so does the compiler vectorise it.
@@ -279,7 +279,8 @@ def _part(chip: Chip, known: Known, run: Any, t: Any, moved: Any, span: Any, com
     if _compare(run.other, run.membrane, chip.threshold, known.fired[t], first, places):
         for c in range(begin * LANES, end * LANES):
             if run.other[c]:  # its spike differs, and votes
-                run.moved[moved], run.sign[moved] = channels + c, 1 - 2 * np.int64(known.fired[t, c])
+                run.moved[moved] = channels + c
+                run.sign[moved] = 1 - 2 * np.int64(known.fired[t, c])
                 moved += 1
                 if chip.label[c] >= 0:
                     (gone if known.fired[t, c] else come)[chip.label[c]] += 1
@@ -329,7 +330,7 @@ def _run(
             while block < blocks:
                 after = _span(chip, known, run, t, block)
                 if after > block:
-                    moved, held = _part(chip, known, run, t, moved, (block, after), come[k], gone[k])
-                    any_held |= held
+                    moved, differs = _part(chip, known, run, t, moved, (block, after), come[k], gone[k])
+                    any_held |= differs
                 block = max(after, block + 1)
             t += 1

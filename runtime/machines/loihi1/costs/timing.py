@@ -209,7 +209,8 @@ def detailed(
     (samples, n_inputs, T); `steps` (samples,) are the chip steps of each recording, by default all.
     """
     fired, worked, seen = (np.ascontiguousarray(bits).view(np.uint8) for bits in (spikes, updated, events != 0))
-    cores, (samples, length) = tables.start.size - 1, spikes.shape[:2]
+    cores = tables.start.size - 1
+    samples, length, _ = spikes.shape
     lengths = np.full(samples, length) if steps is None else steps
     require_below("compartments", np.array(fired.shape[2]), tables.sender.size + 1)
     require_below("channels", np.array(seen.shape[1]), tables.channel_first.size)
