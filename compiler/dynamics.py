@@ -32,7 +32,8 @@ class Clocks:
 
     channels: int = 0  # How many; none by default
     steps: int = 1  # How long each of them has events
-    # Steps that every recording is run: shorter ones end in silence, longer ones are cut; their own by default
+    # Steps that every recording is run: shorter ones end in silence, longer ones are cut; their own by
+    # default
     length: int | None = field(default=None, metadata={"optional": True})
 
     def events(self, steps: int, *, first: int = 0) -> EventArray:

@@ -1,7 +1,7 @@
 """The meaning of the intermediate representation: layer by layer over all time steps.
 
-What a step's spikes bring is summed, then the neurons integrate, compare and reset. A recurrent population also
-receives what it fired in the step before.
+What a step's spikes bring is summed, then the neurons integrate, compare and reset. A recurrent population
+also receives what it fired in the step before.
 """
 
 from __future__ import annotations

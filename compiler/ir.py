@@ -1,9 +1,10 @@
 """The intermediate representation: populations, projections, input and read-out of a network in real numbers.
 
-Populations are numbered by their place in the tuple; ``INPUT`` (-1) stands for the input wherever a projection names
-its source. A projection from a population to itself is recurrent: it brings the spikes of the step before. Weights are
-sparse matrices whose *stored* entries are the structural synapses: a stored zero is a synapse of weight zero. What one
-object can know is checked on construction, everything else in :mod:`compiler.invariants`.
+Populations are numbered by their place in the tuple; ``INPUT`` (-1) stands for the input wherever a
+projection names its source. A projection from a population to itself is recurrent: it brings the spikes of
+the step before. Weights are sparse matrices whose *stored* entries are the structural synapses: a stored
+zero is a synapse of weight zero. What one object can know is checked on construction, everything else in
+:mod:`compiler.invariants`.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -94,14 +95,16 @@ class Form:
 class Convolution:
     """The first layer as it was trained: filters that all its places share, see :mod:`compiler.systems`.
 
-    Sums of float32 depend on their order. With the filters a network can be run in the order in which it was trained,
-    and trained further, while its projections hold the same weights, written out synapse by synapse in float64.
+    Sums of float32 depend on their order. With the filters a network can be run in the order in which it was
+    trained, and trained further, while its projections hold the same weights, written out synapse by synapse
+    in float64.
     """
 
     system: str  # One of ``SYSTEMS``
     filters: Float32Array  # (filters, features, channels)
     bias: Float32Array  # (features,)
-    # Of a TactileSGNet the normalised adjacency A, (taxels, taxels); else the stack (filters, places, taxels)
+    # Of a TactileSGNet the normalised adjacency A, (taxels, taxels); else the stack (filters, places,
+    # taxels)
     propagation: FloatArray
     towers: tuple[IntArray, ...] = ()  # Of a joined network, by layer: see :func:`checkpoint.towers_of`
 
@@ -116,7 +119,8 @@ class Network:
     readout: Readout
     classes: int
     forms: tuple[Form, ...] | None = None  # How the chip stores each population, where it was fine-tuned for it
-    # Where it comes from a checkpoint; whatever changes weights leaves it out. Not printed: it says nothing new
+    # Where it comes from a checkpoint; whatever changes weights leaves it out. Not printed: it says nothing
+    # new
     convolution: Convolution | None = field(default=None, repr=False)
 
 

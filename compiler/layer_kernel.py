@@ -1,7 +1,7 @@
 """A layer of neurons driven by its events: what :mod:`interpret` means, as machine code and without a dense product.
 
-A spike adds the weights that it has, source by source, those of the layer itself after all others. A step costs as much
-as the spikes that arrive in it, and a pass over the neurons.
+A spike adds the weights that it has, source by source, those of the layer itself after all others. A step
+costs as much as the spikes that arrive in it, and a pass over the neurons.
 """
 
 import gc
@@ -126,7 +126,8 @@ def require_below(what: str, indices: AnyArray, bound: int) -> None:
         raise IndexError(f"{what} {low if low < 0 else high}: allowed are 0..{bound - 1}")
 
 
-# Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the loops.
+# Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the
+# loops.
 
 
 @compiled
@@ -319,13 +320,14 @@ def run_layer(
 ) -> None:
     """Run the recordings of a raster in the number type of `bias`, each from rest.
 
-    `registers` are the alpha, beta and theta of floats. Of whole numbers they are the thresholds, the shares that
-    current and membrane keep in 1/4096, and what no membrane passes. `state` (3, neurons)
-    and `before` (neurons,) int32 are for its own use: making them here would take compilation.
+    `registers` are the alpha, beta and theta of floats. Of whole numbers they are the thresholds, the shares
+    that current and membrane keep in 1/4096, and what no membrane passes. `state` (3, neurons) and `before`
+    (neurons,) int32 are for its own use: making them here would take compilation.
 
-    `fired` (recordings, steps, neurons) uint8 is filled, and `membranes`, likewise and before the reset, unless it is
-    empty. Unless `wanted`, the same at a bit a neuron, is empty, `moved` (2, neurons) int32 counts in which entries a
-    neuron differs from it, and the spikes that it has more; `fired` then needs one recording of two steps, no more.
+    `fired` (recordings, steps, neurons) uint8 is filled, and `membranes`, likewise and before the reset,
+    unless it is empty. Unless `wanted`, the same at a bit a neuron, is empty, `moved` (2, neurons) int32
+    counts in which entries a neuron differs from it, and the spikes that it has more; `fired` then needs one
+    recording of two steps, no more.
     """
     recordings, steps = (wanted if len(wanted) else fired).shape[:2]
     kept, last, _ = fired.shape

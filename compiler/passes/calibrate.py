@@ -58,7 +58,8 @@ def packed(spikes: BoolArray) -> Spikes:
 class Calibration:
     """Spikes of the float64 model on the calibration recordings.
 
-    They are run in parts of ``BATCH`` recordings, each evenly spaced over all: the first is a sample of the whole.
+    They are run in parts of ``BATCH`` recordings, each evenly spaced over all: the first is a sample of the
+    whole.
     """
 
     events: BoolArray  # (samples, steps, channels) bool; input events

@@ -1,8 +1,8 @@
 """Disconnect what provably does nothing in the float model: neurons that can never fire.
 
-The bounds hold for any input, so every spike that is left is as before. Such a neuron is taken out before rounding: its
-weights then no longer take room in the accumulators of its targets, whose scales become finer. Left out on request
-only: neurons that did not fire on the training recordings.
+The bounds hold for any input, so every spike that is left is as before. Such a neuron is taken out before
+rounding: its weights then no longer take room in the accumulators of its targets, whose scales become finer.
+Left out on request only: neurons that did not fire on the training recordings.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,8 +32,8 @@ def never_fires(network: Network) -> Masks:
 
     Neurons that vote are never among them.
 
-    A neuron that has not fired holds at most ``sum(positive weights) + bias``, added up by the leak, where a current
-    that outlasts its step has added up the weights already.
+    A neuron that has not fired holds at most ``sum(positive weights) + bias``, added up by the leak, where a
+    current that outlasts its step has added up the weights already.
     """
     silent = spread(network, lambda post, known: _never_fires(network, post, known))
     return _without_voters(network, tuple(silent[post] for post in range(len(network.populations))))

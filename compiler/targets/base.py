@@ -1,7 +1,7 @@
 """Chips: what a chip is, what events on it cost and take, and how its numbers are read.
 
-The folder of a chip has ``chip.toml``, every number once with unit and source, and the passes that lower networks to
-it. Which chips can be compiled for and run is listed in :mod:`runtime.machines.backends`.
+The folder of a chip has ``chip.toml``, every number once with unit and source, and the passes that lower
+networks to it. Which chips can be compiled for and run is listed in :mod:`runtime.machines.backends`.
 """
 
 import math
@@ -142,8 +142,8 @@ def read_target(path: str | os.PathLike[str]) -> Target:
 def with_tables(target: Target, name: str) -> Target:
     """Choose the tables that price and time a run: of the target by `name`, or of a TOML file of that name.
 
-    The file has ``[energy.NAME]`` or ``[time.NAME]`` sections as a target file has; what it lacks stays the target's.
-    OptionError if there is no such table, or the file is wrong.
+    The file has ``[energy.NAME]`` or ``[time.NAME]`` sections as a target file has; what it lacks stays the
+    target's. OptionError if there is no such table, or the file is wrong.
     """
     energy = tuple(table for table in target.energy if table.name == name)
     time = tuple(table for table in target.time if table.name == name)

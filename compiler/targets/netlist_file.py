@@ -3,7 +3,8 @@
 ``manifest``
     JSON text (0-d string): ``format``, ``version``, and every field of the netlist that is no array.
 every array field
-    Under its own name and meaning, in the narrowest little-endian signed type that holds it; real numbers as float64.
+    Under its own name and meaning, in the narrowest little-endian signed type that holds it; real numbers as
+    float64.
 ``sha256``
     Hex digest (0-d string) over all other members in this order: name, dtype, shape and bytes of each.
 
@@ -160,8 +161,8 @@ def column_faults(
 ) -> list[str]:
     """What is wrong about single arrays of a netlist, by their names; values are looked at where all sizes are right.
 
-    Range `bounds` must divide so many entries in so many parts (parts, entries); `lengths` are those of the other
-    arrays; `ranges` of values do not hold their upper end.
+    Range `bounds` must divide so many entries in so many parts (parts, entries); `lengths` are those of the
+    other arrays; `ranges` of values do not hold their upper end.
     """
     wrong = []
     for name, (parts, total) in bounds.items():

@@ -46,8 +46,8 @@ def one_sided(
 ) -> tuple[IntArray, IntArray]:
     """Largest positive and negative synaptic sum that any input can bring to each neuron in a step.
 
-    Planes count one by one, which covers every order of their arrival. Sources that are known to be `silent`, by
-    population, bring nothing.
+    Planes count one by one, which covers every order of their arrival. Sources that are known to be
+    `silent`, by population, bring nothing.
     """
     positive = np.zeros(neurons, np.int64)
     negative = np.zeros(neurons, np.int64)
@@ -68,8 +68,8 @@ def one_sided(
 def one_step_bounds(netlist: Netlist) -> tuple[IntArray, IntArray]:
     """Largest positive and negative synaptic sum that one step can bring to each compartment.
 
-    No order of arrival and no input can bring a running sum outside ``-negative … positive``: it is reached when
-    every positive (negative) synapse is hit at once.
+    No order of arrival and no input can bring a running sum outside ``-negative … positive``: it is reached
+    when every positive (negative) synapse is hit at once.
     """
     synapse = np.arange(netlist.n_synapses)
     shape = netlist.n_compartments, netlist.n_synapses
@@ -90,8 +90,8 @@ def extreme_membranes(
 ) -> tuple[FloatArray, FloatArray]:
     """Highest and, as a magnitude, lowest membrane that currents up to `up` and down to ``-down`` bring about.
 
-    A membrane above its threshold is reset: what a step begins with is at most that. Below zero it sinks until it
-    loses as much as it gains; infinite where it loses nothing.
+    A membrane above its threshold is reset: what a step begins with is at most that. Below zero it sinks
+    until it loses as much as it gains; infinite where it loses nothing.
     """
     kept = (DECAY_ONE - decay_v) / DECAY_ONE
     highest = kept * (threshold << MEMBRANE_SHIFT) + up + np.maximum(bias, 0)
@@ -156,10 +156,11 @@ def open_ranges(unproven: Sequence[str], saturating: Sequence[str]) -> Iterator[
 def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:
     """Bound every register of every population.
 
-    The accumulator is bounded by the positive and the negative weights of a neuron taken separately, which covers
-    every order of arrival. A membrane is bounded above by its threshold (it is reset when it passes it) plus one
-    step, and below by what the leak lets negative input add up to; its own synapse counts once, since it is reset
-    before. Without a leak that is all that arrives in a recording, where the network says how long one is.
+    The accumulator is bounded by the positive and the negative weights of a neuron taken separately, which
+    covers every order of arrival. A membrane is bounded above by its threshold (it is reset when it passes
+    it) plus one step, and below by what the leak lets negative input add up to; its own synapse counts once,
+    since it is reset before. Without a leak that is all that arrives in a recording, where the network says
+    how long one is.
     """
     proofs = []
     length = network.input.clocks.length or np.inf

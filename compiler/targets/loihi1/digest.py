@@ -1,7 +1,7 @@
 """Digests of what a chip holds of each layer: a netlist remembers them from before it was placed.
 
-Neurons that recordings removed, and weights that recordings rounded so that their errors cancel, do not follow from the
-checkpoint. Digests show that they are those that the compiler chose, wherever it put them.
+Neurons that recordings removed, and weights that recordings rounded so that their errors cancel, do not
+follow from the checkpoint. Digests show that they are those that the compiler chose, wherever it put them.
 """
 
 import hashlib

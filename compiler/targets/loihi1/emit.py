@@ -1,7 +1,8 @@
 """Write a partitioned, placed network down as a netlist.
 
-Every non-zero synapse is stored once; nothing else changes. Lists are stored sparse unless they are nearly full, as
-far as the core's memory allows it, because a zero inside a dense list is visited, and paid, like any other synapse.
+Every non-zero synapse is stored once; nothing else changes. Lists are stored sparse unless they are nearly
+full, as far as the core's memory allows it, because a zero inside a dense list is visited, and paid, like
+any other synapse.
 """
 
 from collections.abc import Mapping, Sequence
@@ -108,8 +109,9 @@ def emit(
 ) -> Netlist:
     """Assemble the netlist of a network on cores, with a tile for each of them and JSON values to remember.
 
-    Where neurons were left out, `origin` is the network with all of them, `identity` says for each population which of
-    them are held, and `unread` which were removed although they fire, because their spikes reach no neuron.
+    Where neurons were left out, `origin` is the network with all of them, `identity` says for each
+    population which of them are held, and `unread` which were removed although they fire, because their
+    spikes reach no neuron.
     """
     order = [chunk for chunks in cores for chunk in chunks]
     layer = np.concatenate([np.full(chunk.size, chunk.population) for chunk in order])

@@ -1,8 +1,9 @@
 """What a chip that nobody resets still knows after blank steps: bounds on its registers, without input.
 
-At first nothing is known but what no register exceeds. Each compartment has a least and a largest current and membrane;
-a spike is sure, impossible or open, and open spikes widen the sums that they reach. Decay is monotone, so bounds stay
-bounds, and from step to step they only narrow. Where they meet, the state is the same whatever came before.
+At first nothing is known but what no register exceeds. Each compartment has a least and a largest current
+and membrane; a spike is sure, impossible or open, and open spikes widen the sums that they reach. Decay is
+monotone, so bounds stay bounds, and from step to step they only narrow. Where they meet, the state is the
+same whatever came before.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from spikeloom.compiler.types import IntArray
 class Forgotten:
     """Blank steps after which nothing more is forgotten, and what depends on the past even then.
 
-    `restless` compartments may fire without input, and when they do is left; it moves those that they reach. Registers
-    of `unsettled` others may differ, by up to the share `residue` of their threshold.
+    `restless` compartments may fire without input, and when they do is left; it moves those that they reach.
+    Registers of `unsettled` others may differ, by up to the share `residue` of their threshold.
     """
 
     steps: int

@@ -42,8 +42,8 @@ class LimitUse:
 def list_words(entries: IntArray, weight_bits: IntArray | int, index_bits: IntArray | int, target: Target) -> IntArray:
     """Words of synaptic memory that lists of `entries` synapses take.
 
-    A list is cut in blocks of up to 64 synapses; a block costs its entries and a header, rounded up to whole words
-    (nengo-loihi, ``block.py``, ``Synapse.bits``).
+    A list is cut in blocks of up to 64 synapses; a block costs its entries and a header, rounded up to whole
+    words (nengo-loihi, ``block.py``, ``Synapse.bits``).
     """
     block = target.limit("synapse.block")
     header = target.limit("synapse.block_header_bits")
@@ -58,11 +58,11 @@ def list_words(entries: IntArray, weight_bits: IntArray | int, index_bits: IntAr
 def stored_once(form: IntArray, lengths: IntArray, place: IntArray, weight: IntArray, target: Target) -> IntArray:
     """Which lists of a core synaptic memory holds: a list that several axons share is there once; (stored lists,).
 
-    An input axon points to a list and adds a base to its places, so axons share a list if format and weights are the
-    same and all places are shifted alike. The base has an end: for lists that start farther up, memory holds another,
-    with a part of the shift in its places (nengo-loihi, ``conv.py`` and ``hardware/builder.py``). `form` and `lengths`
-    (lists,) are formats and numbers of entries, `place` (compartment on the core) and `weight` (entries,) those of all
-    lists in turn.
+    An input axon points to a list and adds a base to its places, so axons share a list if format and weights
+    are the same and all places are shifted alike. The base has an end: for lists that start farther up,
+    memory holds another, with a part of the shift in its places (nengo-loihi, ``conv.py`` and
+    ``hardware/builder.py``). `form` and `lengths` (lists,) are formats and numbers of entries, `place`
+    (compartment on the core) and `weight` (entries,) those of all lists in turn.
 
     >>> from spikeloom.compiler.targets.base import load_target
     >>> place, weight = np.array([0, 2, 5, 7, 3, 300, 302]), np.array([8, -4, 8, -4, 8, 8, -4])

@@ -1,8 +1,8 @@
 """Read a netlist back as an integer network: the inverse of :mod:`loihi1.emit`, cores forgotten.
 
-Synapses of weight zero are stored by chance (inside dense lists) and are left out. A layer whose weights all rounded
-to zero stores no synapse; it is given an empty projection from the layer before. Neurons that the chip does not
-hold come back without synapses or bias, so that they never fire.
+Synapses of weight zero are stored by chance (inside dense lists) and are left out. A layer whose weights all
+rounded to zero stores no synapse; it is given an empty projection from the layer before. Neurons that the
+chip does not hold come back without synapses or bias, so that they never fire.
 """
 
 from typing import Any

@@ -6,15 +6,16 @@ Ids
 ``core_compartments[k] … core_compartments[k+1]-1``. *Axons* (input axons, one synapse list each) are numbered the
 same way through ``core_axons``; the synapses of axon ``a`` are ``axon_synapses[a] … axon_synapses[a+1]-1``.
 
-An axon listens to one *source*, a single integer: ``0 … n_inputs-1`` is an input channel (channel
-``taxel * polarities + polarity``, then the clocks), ``n_inputs + c`` is compartment ``c``. The output axons of a
+An axon listens to one *source*, a single integer: ``0 … n_inputs-1`` is an input channel (channel ``taxel *
+polarities + polarity``, then the clocks), ``n_inputs + c`` is compartment ``c``. The output axons of a
 compartment are the axons that name it as source; they are not stored a second time.
 
-A synapse targets compartment ``synapse_target`` *of its core* (0-based within the core) with the signed mantissa
-``synapse_weight``; it adds ``mantissa * 2**exponent`` of its list's format, shifted left by six, to the target's
-synaptic sum. A list whose format has ``index_bits == 0`` is dense: it stores one weight for every compartment from
-its first target to its last, zeros included. Lists are written out for every axon; those of a core that differ by a
-shift alone are one in its memory, which :func:`legalize.stored_once` finds again.
+A synapse targets compartment ``synapse_target`` *of its core* (0-based within the core) with the signed
+mantissa ``synapse_weight``; it adds ``mantissa * 2**exponent`` of its list's format, shifted left by six, to
+the target's synaptic sum. A list whose format has ``index_bits == 0`` is dense: it stores one weight for
+every compartment from its first target to its last, zeros included. Lists are written out for every axon;
+those of a core that differ by a shift alone are one in its memory, which :func:`legalize.stored_once` finds
+again.
 
 Time
 ----
@@ -86,8 +87,8 @@ class Netlist(netlist_file.Netlist):
     # (compartments,) int64; ``mantissa * 2**exponent`` is added to the membrane, unshifted
     bias_mantissa: IntArray
     bias_exponent: IntArray
-    # (compartments,) float64; weight units (mantissa times 2**exponent) per unit of the float model's membrane, which
-    # is register / (64 * scale); no register of the chip
+    # (compartments,) float64; weight units (mantissa times 2**exponent) per unit of the float model's
+    # membrane, which is register / (64 * scale); no register of the chip
     scale: FloatArray
     readout_class: IntArray  # (compartments,) int64; class that a spike votes for, -1 for none
     # axon_source, axon_format: (axons,) int64; source id and synapse format of each axon

@@ -19,9 +19,11 @@ class Options:
     share_lists: bool = False  # Round weights that repeat alike, so that cores store their lists once
     keep_all: bool = False  # Keep neurons that provably do nothing, too
     prune_unused: bool = False  # Remove neurons that did not fire on any training recording, too
-    # (samples, taxels, polarities, steps); recordings for calibration: 32, evenly spaced, are used, of planes 256
+    # (samples, taxels, polarities, steps); recordings for calibration: 32, evenly spaced, are used, of
+    # planes 256
     training_events: AnyArray | None = None
-    # Least number of cores of a layer, by name; they hold no other. Its neurons are cut as evenly as possible.
+    # Least number of cores of a layer, by name; they hold no other. Its neurons are cut as evenly as
+    # possible.
     cores_for: Mapping[str, int] = field(default_factory=dict)
     chips: int = 1  # Number of chips at most; as few are used as hold the cores
     # No layer has a window, and blank steps follow each recording, see :mod:`loihi1.idle`

@@ -302,8 +302,9 @@ def lay_out_again(done: Compilation, options: Options) -> Compilation:
 def without(done: Compilation, gone: Masks, *, rates: tuple[FloatArray, ...] | None = None) -> Netlist:
     """Remove more neurons, (neurons,) bool by population, and lay out the rest on the fewest cores of one chip.
 
-    Weights and thresholds are the same integers: on any recording on which none of these neurons fires, every other
-    spike is as before. Each population must keep a neuron; `rates` are spikes per step of all, for the placement.
+    Weights and thresholds are the same integers: on any recording on which none of these neurons fires,
+    every other spike is as before. Each population must keep a neuron; `rates` are spikes per step of all,
+    for the placement.
     """
     options = Options(provenance=done.netlist.provenance)
     work = replace(done, options=options, calibration=None, rates=rates, gone=gone)

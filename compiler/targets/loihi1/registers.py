@@ -48,8 +48,8 @@ ONE_STEP_SUM_MAX = ACCUMULATOR_MAX >> MEMBRANE_SHIFT
 def weight_step(bits: int) -> int:
     """Distance between neighbouring mixed-sign weight mantissas of a storage width.
 
-    A mixed-sign format spends one bit on the sign and drops the least significant bits of a 9-bit span, so even
-    8 bits only hold even mantissas.
+    A mixed-sign format spends one bit on the sign and drops the least significant bits of a 9-bit span, so
+    even 8 bits only hold even mantissas.
 
     >>> [weight_step(bits) for bits in (8, 6, 4, 2)]
     [2, 8, 32, 128]
@@ -60,8 +60,8 @@ def weight_step(bits: int) -> int:
 def decay_registers(beta: float, alpha: float = 0.0) -> tuple[int, int]:
     """Registers ``decay_u`` and ``decay_v`` nearest to a current decay and a membrane decay.
 
-    The chip's current loses one part in 4096 more than its register says. So it can forget all, which a membrane
-    cannot, and cannot keep all.
+    The chip's current loses one part in 4096 more than its register says. So it can forget all, which a
+    membrane cannot, and cannot keep all.
     """
     return min(4095, max(0, round(4096 * (1 - alpha)) - 1)), min(4095, max(0, round(4096 * (1 - beta))))
 
@@ -135,7 +135,8 @@ def split_planes(steps: IntArray, bits: int, exponents: tuple[int, ...]) -> list
 def encode_bias(bias: FloatArray) -> tuple[IntArray, IntArray]:
     """Round biases in membrane units (1/64 of a weight unit) to mantissa and exponent, the smallest that holds each.
 
-    ``mantissa * 2**exponent`` is the nearest value that the chip can hold; ValueError beyond ``4095 * 2**7``.
+    ``mantissa * 2**exponent`` is the nearest value that the chip can hold; ValueError beyond ``4095 *
+    2**7``.
 
     >>> [part.tolist() for part in encode_bias(np.array([-4095.0, 4096.0, 4095.4, 0.4]))]
     [[-4095, 2048, 4095, 0], [0, 1, 0, 0]]

@@ -2,10 +2,10 @@
 
 All of it stands in one file, since numba caches machine code by the stamp of the file that it was made from.
 
-A *block* is 64 neurons of one layer; who spiked in it is one 64-bit word. Its synapses are
-rows of 64 weights, one for each source that reaches it. In each step the rows of the sources that are active are added
-up in registers, and the 64 neurons integrate, compare and reset. A block runs through the whole recording before the
-next one starts, so that its rows and membranes stay in cache: no layer receives from a later one.
+A *block* is 64 neurons of one layer; who spiked in it is one 64-bit word. Its synapses are rows of 64
+weights, one for each source that reaches it. In each step the rows of the sources that are active are added
+up in registers, and the 64 neurons integrate, compare and reset. A block runs through the whole recording
+before the next one starts, so that its rows and membranes stay in cache: no layer receives from a later one.
 
 *Sixteen bits.* :mod:`loihi1.blocks` proves that the positive and the negative weights of a step each add up to 32,767
 at most (the accumulator's 21 bits hold them shifted left by six). A sum of some of both lies in between, in whatever
@@ -61,20 +61,20 @@ class Blocks(NamedTuple):
     # (stages,) bool; whether every block of a stage has a row for every source; then its sources are listed
     dense: AnyArray
     first: IntArray  # (blocks + 1,) int64; bounds of each block in the links
-    # word, linked, row: (links,) int64, uint64, int64; A word of sources that reach a block, which of them do, and the
-    # row of the first of these
+    # word, linked, row: (links,) int64, uint64, int64; A word of sources that reach a block, which of them
+    # do, and the row of the first of these
     word: IntArray
     linked: AnyArray
     row: IntArray
-    # (rows * 64,) int8 or int16; net weight of a source for each position of a block, shifted right by what all weights
-    # of the block have in common
+    # (rows * 64,) int8 or int16; net weight of a source for each position of a block, shifted right by what
+    # all weights of the block have in common
     weight: AnyArray
     shift: AnyArray  # (blocks,) uint32; from a sum of these to membrane units
     reached: AnyArray  # (rows,) uint64; positions that a source has a synapse to, whatever its weight
     restful: AnyArray  # (blocks,) uint64; positions without a bias
     held: AnyArray  # (blocks,) uint64; positions that hold a compartment
-    # bias, threshold: (blocks * 64,) int32; in membrane units; a position without a compartment has a threshold that
-    # nothing reaches
+    # bias, threshold: (blocks * 64,) int32; in membrane units; a position without a compartment has a
+    # threshold that nothing reaches
     bias: AnyArray
     threshold: AnyArray
     # keep, keep_u: (blocks,) uint32; what a membrane and a current keep in a step, in 1/4096
@@ -92,12 +92,12 @@ class Scratch(NamedTuple):
     """What a recording leaves behind, for the next to use again."""
 
     words: AnyArray  # (steps * words of the inputs,) uint64; channels with an event in each step
-    # listed, bounds: as many int32 as bits can be set in a stage and LISTED more, and (steps + 1,) int64; sources of a
-    # stage and the bounds of its steps
+    # listed, bounds: as many int32 as bits can be set in a stage and LISTED more, and (steps + 1,) int64;
+    # sources of a stage and the bounds of its steps
     listed: AnyArray
     bounds: IntArray
-    # raster, idle: (steps * blocks,) uint64; who spiked and who was idle, stage after stage; within a stage step after
-    # step
+    # raster, idle: (steps * blocks,) uint64; who spiked and who was idle, stage after stage; within a stage
+    # step after step
     raster: AnyArray
     idle: AnyArray
     spikes: AnyArray  # (blocks * 64,) int64; spikes of each position
@@ -571,9 +571,10 @@ def run_recordings(
 ) -> None:
     """Run some recordings: `events` (recordings, channels, columns) uint8, not zero where there is one.
 
-    Filled, from zeros, are the counts `inputs`, `spikes`, `updates`; `fired` and `updated` (recordings, chip steps,
-    words) uint64 and `membranes` (recordings, chip steps, compartments) int32, or no recordings of what is not wanted.
-    Arrays for its own use come from :func:`scratch_of`, as they cost no compilation there.
+    Filled, from zeros, are the counts `inputs`, `spikes`, `updates`; `fired` and `updated` (recordings, chip
+    steps, words) uint64 and `membranes` (recordings, chip steps, compartments) int32, or no recordings of
+    what is not wanted. Arrays for its own use come from :func:`scratch_of`, as they cost no compilation
+    there.
     """
     for r in range(events.shape[0]):
         steps = lengths[r]
@@ -629,9 +630,9 @@ def add_charges(
 ) -> None:
     """Add what happened in some recordings to the sums of each chip step, `charged` (recordings, chip steps, sums).
 
-    `events`, `fired` and `updated` are as in :func:`run_recordings`; `sources` those of :class:`trace.Charges`,
-    padded. An update adds one of few `kinds` (kinds, sums); bits of `members` (kinds, words) are compartments of each.
-    In `totals`, as long as a row of `sources`, a step is added up.
+    `events`, `fired` and `updated` are as in :func:`run_recordings`; `sources` those of
+    :class:`trace.Charges`, padded. An update adds one of few `kinds` (kinds, sums); bits of `members`
+    (kinds, words) are compartments of each. In `totals`, as long as a row of `sources`, a step is added up.
     """
     for r in range(events.shape[0]):
         for channel in range(events.shape[1]):

@@ -122,7 +122,8 @@ class _Seats(NamedTuple):
     """Where compartments sit."""
 
     position: IntArray  # (compartments,) int64; block and lane of each
-    # layer, keep, keep_u: (blocks,) int64; layer of each block, and what its membranes and currents keep, in 1/4096
+    # layer, keep, keep_u: (blocks,) int64; layer of each block, and what its membranes and currents keep, in
+    # 1/4096
     layer: IntArray
     keep: IntArray
     keep_u: IntArray

@@ -27,8 +27,8 @@ ZEROED = 0.25
 class CompilationFacts(Shown):
     """A netlist with the reasons for its scales, the proofs and the placement.
 
-    `facts` is what was read from a file of another format; `finetune` the command that helps where no storage keeps
-    the share `keep` of the decisions.
+    `facts` is what was read from a file of another format; `finetune` the command that helps where no
+    storage keeps the share `keep` of the decisions.
     """
 
     netlist: NetlistFacts = field(metadata=INLINE)

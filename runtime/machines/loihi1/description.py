@@ -58,7 +58,8 @@ class LayerFacts:
 class NetlistFacts(Shown):
     """A netlist; synapses are counted in the network, as stored on cores, and as stored and not zero.
 
-    Words of synaptic memory are those of all cores; unrolled are those that it would take if no axons shared a list.
+    Words of synaptic memory are those of all cores; unrolled are those that it would take if no axons shared
+    a list.
     """
 
     target: str

@@ -1,10 +1,10 @@
 """The fast twin of :mod:`loihi1.spec`: the same spikes, membranes and counts, bit for bit.
 
-There are two kernels. A network of layers that each receive from the one before, in which no register can overflow or
-saturate, is run layer after layer in :mod:`loihi1.block_kernel`; whole recordings only.
+There are two kernels. A network of layers that each receive from the one before, in which no register can
+overflow or saturate, is run layer after layer in :mod:`loihi1.block_kernel`; whole recordings only.
 
-Any other network is run step after step in :mod:`loihi1.kernel`, which knows no recordings: :func:`advance` moves a
-state by any number of chip steps.
+Any other network is run step after step in :mod:`loihi1.kernel`, which knows no recordings: :func:`advance`
+moves a state by any number of chip steps.
 """
 
 import os
@@ -86,11 +86,11 @@ def advance(
 ) -> None:
     """Run some chip steps, by default one per column; any split of a recording into calls gives the same result.
 
-    Column 0 of `events` (n_inputs, columns) belongs to the next step of `state`, see :func:`start`; steps beyond the
-    last column have no events. `length` are the data steps of the whole recording, which close each layer's window if
-    it has one, ``NO_END`` if nobody knows. `spikes`, `membranes`, `updated` (steps, compartments) are filled, see
-    :class:`trace.Trace`. Raises DataError and NumericRangeError as :func:`spec.simulate` does, with the same message;
-    after that the state is of no further use.
+    Column 0 of `events` (n_inputs, columns) belongs to the next step of `state`, see :func:`start`; steps
+    beyond the last column have no events. `length` are the data steps of the whole recording, which close
+    each layer's window if it has one, ``NO_END`` if nobody knows. `spikes`, `membranes`, `updated` (steps,
+    compartments) are filled, see :class:`trace.Trace`. Raises DataError and NumericRangeError as
+    :func:`spec.simulate` does, with the same message; after that the state is of no further use.
     """
     require_channels(engine.netlist, events.shape[0])
     assert engine.tables is not None, "single steps need prepare(netlist, stepwise=True)"
@@ -153,14 +153,14 @@ def simulate(
 ) -> Trace:
     """Run a batch of recordings (recordings, n_inputs, T) uint8 or bool, each from rest; the trace has a leading axis.
 
-    `lengths` (recordings,) are the data steps of each where some are shorter: what comes after them is not run and
-    zero in the trace. `spikes`, `membranes`, `updated` say what to keep per chip step (one, four and one bytes for each
-    compartment), `packed` keeps spikes at a bit each, `charges` are what events add to the sums
-    of each chip step. Recordings run on `threads` at a time, by default one per processor; `progress` is called with
-    the number that is done.
+    `lengths` (recordings,) are the data steps of each where some are shorter: what comes after them is not
+    run and zero in the trace. `spikes`, `membranes`, `updated` say what to keep per chip step (one, four and
+    one bytes for each compartment), `packed` keeps spikes at a bit each, `charges` are what events add to
+    the sums of each chip step. Recordings run on `threads` at a time, by default one per processor;
+    `progress` is called with the number that is done.
 
-    Raises DataError for another number of channels, and NumericRangeError as :func:`spec.simulate` does, for the first
-    recording that overflows; a note on the exception says which.
+    Raises DataError for another number of channels, and NumericRangeError as :func:`spec.simulate` does, for
+    the first recording that overflows; a note on the exception says which.
     """
     engine = netlist if isinstance(netlist, Engine) else prepare(netlist)
     netlist = engine.netlist

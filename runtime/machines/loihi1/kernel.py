@@ -30,8 +30,8 @@ class Tables(NamedTuple):
     """A netlist as the kernel reads it; nothing in here changes."""
 
     first: IntArray  # (sources + 1,) int64; bounds of each source, channels before compartments, in the synapses
-    # sum_of, magnitude: (synapses,) uint32, uint16; the sum that a synapse adds to, and what: that of the positive
-    # weights of compartment c is 2 * c, that of the negative ones follows
+    # sum_of, magnitude: (synapses,) uint32, uint16; the sum that a synapse adds to, and what: that of the
+    # positive weights of compartment c is 2 * c, that of the negative ones follows
     sum_of: AnyArray
     magnitude: AnyArray
     begin: AnyArray  # (compartments,) int32; chip step from which the layer of each integrates
@@ -211,8 +211,8 @@ def chip_steps(
 ) -> tuple[int, int, int, int]:
     """Run chip steps; column 0 of `events`, 0 or 1, belongs to the first of them.
 
-    `spikes`, `membranes` and `updated` have one row per step, or none where they are not wanted. Returns chip step,
-    compartment, register and value of the first overflow; the compartment is -1 if there is none.
+    `spikes`, `membranes` and `updated` have one row per step, or none where they are not wanted. Returns
+    chip step, compartment, register and value of the first overflow; the compartment is -1 if there is none.
     """
     for t in range(steps):
         step = state.counter[0]

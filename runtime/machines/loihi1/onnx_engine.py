@@ -52,8 +52,9 @@ def simulate(
 ) -> tuple[BoolArray, IntArray]:
     """Run recordings (recordings, n_inputs, T), each from rest; of so many steps where some are shorter than T.
 
-    Returns spikes (recordings, chip steps, compartments), as in :class:`trace.Trace`, and the votes (recordings,
-    classes) that the graph counts. Raises DataError if the recordings have other channels than the network.
+    Returns spikes (recordings, chip steps, compartments), as in :class:`trace.Trace`, and the votes
+    (recordings, classes) that the graph counts. Raises DataError if the recordings have other channels than
+    the network.
     """
     netlist = prepared.netlist
     require_channels(netlist, events.shape[1])

@@ -1,6 +1,7 @@
 """Level EN, whether a netlist holds its checkpoint, rounded: every neuron, connection, weight and register.
 
-All is judged at the netlist's own scale, threshold / theta of each neuron, so only the choice of the scale is free:
+All is judged at the netlist's own scale, threshold / theta of each neuron, so only the choice of the scale
+is free:
 
 * a threshold is theta times the scale, exactly;
 * decay registers are those nearest to the checkpoint's decays;
@@ -9,10 +10,10 @@ All is judged at the netlist's own scale, threshold / theta of each neuron, so o
 * layers lag behind the data as their paths are long, neurons vote for their classes, no limit of the chip is broken.
 
 Weights and biases are not so in a layer that was rounded on recordings so that its errors cancel
-(:mod:`storage.compensate`), and neurons may be left out because they did not fire in them. What these recordings chose
-is held against the digests that the compiler took before it placed the network (:mod:`loihi1.digest`). Besides, most
-weights must be the nearest, and no bias may make up for more than its neuron's weights have lost, beside what
-calibration moves it by at most.
+(:mod:`storage.compensate`), and neurons may be left out because they did not fire in them. What these
+recordings chose is held against the digests that the compiler took before it placed the network
+(:mod:`loihi1.digest`). Besides, most weights must be the nearest, and no bias may make up for more than its
+neuron's weights have lost, beside what calibration moves it by at most.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,18 +43,18 @@ BIAS_LIMIT = registers.BIAS_MANTISSA_MAX << registers.BIAS_EXPONENT_MAX
 """Largest bias that a register holds, membrane units."""
 
 MOVED = 0.5
-"""Share of a layer's weights that compensation may move from the nearest value; another checkpoint's hardly ever are
-the nearest."""
+"""Share of a layer's weights that compensation may move from the nearest value; another checkpoint's hardly
+ever are the nearest."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LayerRounding:
     """What a layer stores, against its checkpoint.
 
-    Of its `weights` (between neurons that the chip holds, not zero on both sides) so many are the `nearest` on the
-    layer's grid; the farthest is so many steps of the grid off, clipped weights from their limit. A layer is
-    `compensated` if it was rounded so that errors cancel: weights, and biases with them, need not be the nearest.
-    `faults` says what is not as rounding the checkpoint gives it.
+    Of its `weights` (between neurons that the chip holds, not zero on both sides) so many are the `nearest`
+    on the layer's grid; the farthest is so many steps of the grid off, clipped weights from their limit. A
+    layer is `compensated` if it was rounded so that errors cancel: weights, and biases with them, need not
+    be the nearest. `faults` says what is not as rounding the checkpoint gives it.
     """
 
     weights: int
@@ -86,7 +87,8 @@ class _Silence:
 class _Weights:
     """Weights into a layer: how many, how many are not the nearest, and the farthest of these.
 
-    `lost` and `gained` are what the weights of each neuron lose to, and gain on, the checkpoint's; weight units.
+    `lost` and `gained` are what the weights of each neuron lose to, and gain on, the checkpoint's; weight
+    units.
     """
 
     lost: FloatArray
@@ -117,9 +119,9 @@ class _Weights:
 def check_rounding(netlist: Netlist, integer: IntegerNetwork, target: Target, network: Network) -> NetlistCheck:
     """Hold what a netlist stores against the float network that it should have been compiled from; simulates nothing.
 
-    `integer` is the netlist, cores forgotten. A network that was fine-tuned on the chip's integers compensates nothing.
-    Otherwise the netlist remembers which layers were compensated, and digests of what came of it: without these every
-    weight has to be the nearest.
+    `integer` is the netlist, cores forgotten. A network that was fine-tuned on the chip's integers
+    compensates nothing. Otherwise the netlist remembers which layers were compensated, and digests of what
+    came of it: without these every weight has to be the nearest.
     """
     provenance = netlist.provenance
     absent = netlist.absent

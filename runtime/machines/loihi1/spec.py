@@ -11,9 +11,10 @@ Outside this window current and membrane are zero and it is silent; what arrives
 integrates before data arrives and nothing leaks into the next recording. On silicon the management core does this
 between two steps: it resets a layer when its window begins and again when it ends.
 
-Nobody resets a free-running chip. All its layers always integrate, ``blank`` steps without input follow the ``T`` of a
-recording, and as many come before the first one. Votes are counted until the last data step has come through, in chip
-steps ``0 … T + max_depth - 1``. So this module takes several recordings in a row, blank steps between them, as one.
+Nobody resets a free-running chip. All its layers always integrate, ``blank`` steps without input follow the
+``T`` of a recording, and as many come before the first one. Votes are counted until the last data step has
+come through, in chip steps ``0 … T + max_depth - 1``. So this module takes several recordings in a row,
+blank steps between them, as one.
 
 Registers
 ---------
@@ -83,9 +84,9 @@ def _joined(lists: list[tuple[IntArray, IntArray]]) -> tuple[IntArray, IntArray]
 def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trace:
     """Run one recording (n_inputs, T) through the chip; the trace has spikes, membranes and updates, no leading axis.
 
-    Raises DataError if the recording has another number of input channels than the network, and NumericRangeError at
-    the first register that would overflow: the lowest chip step, then the lowest compartment id, the synaptic sum
-    before the current.
+    Raises DataError if the recording has another number of input channels than the network, and
+    NumericRangeError at the first register that would overflow: the lowest chip step, then the lowest
+    compartment id, the synaptic sum before the current.
     """
     require_channels(netlist, events.shape[0])
     n_inputs, length = events.shape

@@ -7,7 +7,8 @@
     total = stream.finish()[-1]             # the counts that `spikeloom run` prints
     stream.reset()                          # the next grasp
 
-The bins are steps of the network: where these join several bins of the recordings, an event in any of them counts.
+The bins are steps of the network: where these join several bins of the recordings, an event in any of them
+counts.
 
 *Lag.* A layer of depth ``d`` integrates data step ``t`` in chip step ``t + d``. So the votes after the bin ``t`` rest
 on the bins up to ``t - d`` of the layer that is read out; :meth:`Stream.finish` runs the steps that are missing. Step
@@ -53,10 +54,10 @@ class Stream:
     def step(self, events: npt.ArrayLike) -> Step:
         """Run the chip step of one bin.
 
-        `events` (taxels, polarities), or flat with channel ``taxel * polarities + polarity``, are 1 where a taxel sent
-        an event of that polarity within the bin, else 0, of any number type or bool; the network's clocks tick by
-        themselves. Raises DataError for another shape or other values, or after the end, NumericRangeError if a
-        register would overflow; that ends the stream.
+        `events` (taxels, polarities), or flat with channel ``taxel * polarities + polarity``, are 1 where a
+        taxel sent an event of that polarity within the bin, else 0, of any number type or bool; the
+        network's clocks tick by themselves. Raises DataError for another shape or other values, or after the
+        end, NumericRangeError if a register would overflow; that ends the stream.
         """
         if self._ended:
             raise DataError(
@@ -74,8 +75,9 @@ class Stream:
     def finish(self) -> tuple[Step, ...]:
         """End the grasp: run the chip steps by which the slowest layer lags; the last one has the final counts.
 
-        None for a network without lag, whose last step was final. Where a network says how long a recording is run, as
-        counters do, the steps that are missing come first, in silence. Raises as :meth:`step` does.
+        None for a network without lag, whose last step was final. Where a network says how long a recording
+        is run, as counters do, the steps that are missing come first, in silence. Raises as :meth:`step`
+        does.
         """
         if self._ended:
             raise DataError("stream: a second end found, a grasp has one; call reset() to begin the next grasp")

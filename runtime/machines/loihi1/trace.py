@@ -1,7 +1,7 @@
 """What a simulation hands back: spikes, membranes, counts. Shared by both simulators; nobody else counts.
 
-Chip steps run from 0 to ``T + netlist.drain - 1`` for a recording of ``T`` data steps. Compartments are in the
-order of the netlist's ids. A batch of recordings adds one leading axis to every array.
+Chip steps run from 0 to ``T + netlist.drain - 1`` for a recording of ``T`` data steps. Compartments are in
+the order of the netlist's ids. A batch of recordings adds one leading axis to every array.
 """
 
 from collections.abc import Sequence
@@ -27,9 +27,9 @@ class Counts:
 
     inputs: IntArray  # (…, n_inputs) int64; input events per channel
     spikes: IntArray  # (…, compartments) int64; spikes per compartment
-    # (…, layers) int64; neuron updates: compartment-steps inside the layer's window in which the compartment had work
-    # to do, that is its membrane or its current was not zero before the step, or an active axon held a synapse to it
-    # (whatever the weight), or its bias is not zero
+    # (…, layers) int64; neuron updates: compartment-steps inside the layer's window in which the compartment
+    # had work to do, that is its membrane or its current was not zero before the step, or an active axon
+    # held a synapse to it (whatever the weight), or its bias is not zero
     updates: IntArray
     saturations: IntArray  # (…, layers) int64; compartment-steps whose membrane was clipped to its register
     votes: IntArray  # (…, compartments) int64; spikes that count where a compartment votes: not those of blank steps
@@ -54,13 +54,16 @@ class Trace:
     """Result of a simulation."""
 
     counts: Counts  # What happened, summed over chip steps
-    # the others are None unless wanted; (…, chip steps, compartments) bool, int32 and bool are the first three
+    # the others are None unless wanted; (…, chip steps, compartments) bool, int32 and bool are the first
+    # three
     spikes: BoolArray | None
-    # what was compared with the threshold, before a spike resets it, in 1/64 of a weight unit; zero outside the window
+    # what was compared with the threshold, before a spike resets it, in 1/64 of a weight unit; zero outside
+    # the window
     membranes: MembraneArray | None
     updated: BoolArray | None = None  # Whether a compartment had work to do, as ``Counts.updates`` counts it
     charged: IntArray | None = None  # (…, chip steps, sums) int64; what events add up to under some charges
-    # (…, chip steps, ceil(compartments / 64)) uint64; spike of compartment c at bit ``c % 64`` of word ``c // 64``
+    # (…, chip steps, ceil(compartments / 64)) uint64; spike of compartment c at bit ``c % 64`` of word ``c
+    # // 64``
     packed: npt.NDArray[np.uint64] | None = None
 
 
@@ -84,8 +87,8 @@ def unpack(packed: npt.NDArray[np.uint64], compartments: int) -> BoolArray:
 def aligned(netlist: Netlist, array: AnyArray, layer: int) -> AnyArray:
     """Cut one layer out of a trace and shift it back by its depth, as the float model counts time.
 
-    `array` (…, chip steps, compartments) becomes (…, T, neurons), ordered by neuron; zero for those that the chip does
-    not hold.
+    `array` (…, chip steps, compartments) becomes (…, T, neurons), ordered by neuron; zero for those that the
+    chip does not hold.
     """
     depth = netlist.layers[layer].depth
     length = array.shape[-2] - netlist.drain

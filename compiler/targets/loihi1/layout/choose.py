@@ -1,7 +1,8 @@
 """Lay a network out on as few cores as every limit allows.
 
-The integer network is not changed: which neuron sits where has no influence on any spike. A layer on more cores is
-swept and fed in parallel, but each of its spikes, and each spike that it receives, is sent to more of them.
+The integer network is not changed: which neuron sits where has no influence on any spike. A layer on more
+cores is swept and fed in parallel, but each of its spikes, and each spike that it receives, is sent to more
+of them.
 """
 
 from collections.abc import Iterator, Mapping
@@ -70,8 +71,9 @@ def lay_out(
 ) -> Layout:
     """Lay a network out on the fewest cores.
 
-    Layers in `cores_for` get so many cores at least, which hold no other layer. `rates` are spikes per step (neurons,)
-    of each population. CapacityError if a limit cannot be kept, OptionError if there are not so many cores.
+    Layers in `cores_for` get so many cores at least, which hold no other layer. `rates` are spikes per step
+    (neurons,) of each population. CapacityError if a limit cannot be kept, OptionError if there are not so
+    many cores.
     """
     least = least_cores(network, cores_for or {}, target, chips)
     cores = partition(network, target, rates, cores_for=least or None, chips=chips)

@@ -2,9 +2,9 @@
 
 The integer network is not changed: which neuron sits where has no influence on any spike.
 
-Synaptic memory, axons and compartments are all counted by the rules of the target; the split of a population decides
-how many output axons the populations before it need, so populations are cut from the last to the first. A recurrent one
-needs some for its own chunks, so it is cut again until they are enough.
+Synaptic memory, axons and compartments are all counted by the rules of the target; the split of a population
+decides how many output axons the populations before it need, so populations are cut from the last to the
+first. A recurrent one needs some for its own chunks, so it is cut again until they are enough.
 """
 
 from bisect import bisect_left
@@ -29,8 +29,8 @@ EXACT_CHUNKS = 10
 def cut_layer(needs: Needs, population: int, least: int | None = None) -> list[Chunk]:
     """Cut one population into full chunks, or as evenly as possible into at least `least`.
 
-    A recurrent one is cut until its neurons have output axons for its own chunks, too; finer chunks need more.
-    CapacityError if one of its neurons fits no core, OptionError if it needs more than `least` chunks.
+    A recurrent one is cut until its neurons have output axons for its own chunks, too; finer chunks need
+    more. CapacityError if one of its neurons fits no core, OptionError if it needs more than `least` chunks.
     """
 
     def once() -> list[Chunk]:
@@ -64,8 +64,9 @@ def _fill(needs: Needs, population: int) -> list[Chunk]:
             needs.drop(tried)
             return broken
 
-        # A larger chunk needs more of every limit but synapse formats (all its lists may be dense) and memory (more of
-        # them may be alike); there a smaller chunk than the largest may come out, which fits as well.
+        # A larger chunk needs more of every limit but synapse formats (all its lists may be dense) and
+        # memory (more of them may be alike); there a smaller chunk than the largest may come out, which fits
+        # as well.
         ends = range(first + 1, min(size, first + needs.target.limit("core.compartments")) + 1)
         fitting = bisect_left(ends, True, key=exceeds)
         if not fitting:
@@ -213,11 +214,12 @@ def partition(
 ) -> Cores:
     """Assign every neuron to a core, on as few as the cut into chunks allows if the densest of a core comes first.
 
-    Populations in `cores_for` are cut as evenly as possible into so many chunks at least, each on a core of its own;
-    the others into full ones. Among equal packings, searched exhaustively up to
-    ``EXACT_CHUNKS`` chunks, the one that keeps most traffic within a core is taken; `rates` are spikes per step
-    (neurons,) of each population, all equal without. CapacityError, with every violation, if a single neuron exceeds a
-    limit or the chips have too few cores; OptionError if a population needs more cores than `cores_for` says.
+    Populations in `cores_for` are cut as evenly as possible into so many chunks at least, each on a core of
+    its own; the others into full ones. Among equal packings, searched exhaustively up to ``EXACT_CHUNKS``
+    chunks, the one that keeps most traffic within a core is taken; `rates` are spikes per step (neurons,) of
+    each population, all equal without. CapacityError, with every violation, if a single neuron exceeds a
+    limit or the chips have too few cores; OptionError if a population needs more cores than `cores_for`
+    says.
     """
     needs = Needs(network, target)
     least = cores_for or {}

@@ -1,8 +1,9 @@
 """Put cores on tiles of the mesh so that spikes travel few hops.
 
-Neither the network nor its cores are changed: position has no influence on any spike. The cores of a network that is
-too large for one chip are shared among several, and those of each are placed by themselves; tiles are numbered chip
-after chip. Links between chips have no public latency or energy on Loihi, so the only aim is that few packets need one.
+Neither the network nor its cores are changed: position has no influence on any spike. The cores of a network
+that is too large for one chip are shared among several, and those of each are placed by themselves; tiles
+are numbered chip after chip. Links between chips have no public latency or energy on Loihi, so the only aim
+is that few packets need one.
 
 References
 ----------
@@ -111,9 +112,9 @@ def _improve(between: FloatArray, price: FloatArray, tile_cores: int, site: IntA
 def place(traffic: FloatArray, target: Target) -> Placement:
     """Choose tiles of few spikes times hops; among equal ones those with more of the cheaper east-west hops.
 
-    A layout is grown around each of the busiest cores and improved change by change, and the best of these is taken:
-    the optimum, by branch and bound, on every network tried that has up to ten cores. `traffic` is packets per step,
-    (cores, cores).
+    A layout is grown around each of the busiest cores and improved change by change, and the best of these
+    is taken: the optimum, by branch and bound, on every network tried that has up to ten cores. `traffic` is
+    packets per step, (cores, cores).
     """
     width = target.limit("mesh.width")
     height = target.limit("mesh.height")
@@ -160,8 +161,8 @@ def require_one_chip(core_tile: IntArray, target: Target, what: str) -> None:
 def share(traffic: FloatArray, room: int) -> IntArray:
     """Chip of each core, on as few chips as hold them.
 
-    A chip, of `room` cores, is grown from the lowest core that has none by the one that talks most to it, until it is
-    full.
+    A chip, of `room` cores, is grown from the lowest core that has none by the one that talks most to it,
+    until it is full.
     """
     between = traffic + traffic.T
     cores = len(between)

@@ -1,9 +1,9 @@
 """Round a network to chip integers: choose width, planes and scales of every population.
 
-Spikes change. Which scale is best is decided on the calibration recordings, by the spikes of a layer that differ from
-the float64 model's, and by how many more or fewer there are, when it receives what the rounded layers before it send.
-Weights are then rounded so that their errors cancel, where that keeps more spikes, and biases, which are 64 times
-finer, take up what is left. Without calibration the weights alone decide.
+Spikes change. Which scale is best is decided on the calibration recordings, by the spikes of a layer that
+differ from the float64 model's, and by how many more or fewer there are, when it receives what the rounded
+layers before it send. Weights are then rounded so that their errors cancel, where that keeps more spikes,
+and biases, which are 64 times finer, take up what is left. Without calibration the weights alone decide.
 """
 
 from collections.abc import Sequence
@@ -229,10 +229,10 @@ def choose_storage(
 ) -> tuple[IntegerNetwork, tuple[Choice, ...]]:
     """Choose the scales of each population and round weights, thresholds, biases and decays.
 
-    To `share_lists`, errors cancel only in layers whose weights do not repeat, see :func:`legalize.stored_once`.
-    ``calibrate.FEW`` recordings of the calibration choose, several planes use ``MANY``; without it scales come from the
-    weights and the proven bounds alone. OptionError if there are no such packings; ModelError, with a line for each, if
-    populations have no usable scale.
+    To `share_lists`, errors cancel only in layers whose weights do not repeat, see
+    :func:`legalize.stored_once`. ``calibrate.FEW`` recordings of the calibration choose, several planes use
+    ``MANY``; without it scales come from the weights and the proven bounds alone. OptionError if there are
+    no such packings; ModelError, with a line for each, if populations have no usable scale.
     """
     packings = check_packings(packings, len(network.populations), target)
     layers = []

@@ -1,8 +1,8 @@
 """Round the weights of a layer so that the errors of its synapses cancel on what the layer usually gets.
 
-Nearest rounding treats synapses one by one. Here they are rounded one after the other, and what one gains or loses is
-made up for by those still to come, as far as their inputs spike together; the bias takes up the mean that is left.
-No register, width or count changes.
+Nearest rounding treats synapses one by one. Here they are rounded one after the other, and what one gains or
+loses is made up for by those still to come, as far as their inputs spike together; the bias takes up the
+mean that is left. No register, width or count changes.
 
 References
 ----------
@@ -40,10 +40,10 @@ INPUTS = 4096
 def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> Rounded | None:
     """Round one population as `plain`, which was judged, is stored; None where a bias has no register value.
 
-    Weights that the range cuts off stay at its end: their errors are not passed on. The bias takes up what the mean sum
-    is then off, also because layers before were rounded, but no more than the weights have lost. A neuron whose sums
-    would leave the accumulator, or that keeps fewer of its spikes (one that fires from its bias alone, say), is rounded
-    to nearest instead.
+    Weights that the range cuts off stay at its end: their errors are not passed on. The bias takes up what
+    the mean sum is then off, also because layers before were rounded, but no more than the weights have
+    lost. A neuron whose sums would leave the accumulator, or that keeps fewer of its spikes (one that fires
+    from its bias alone, say), is rounded to nearest instead.
     """
     from spikeloom.compiler.layer_kernel import coincidences
 

@@ -1,8 +1,9 @@
 """Which storage is good enough: the cheapest whose decisions are the float model's on recordings that chose no scale.
 
-A network decides the recordings that it was trained on by wide margins, which hide what rounding does to new ones. So
-a recording that is held out loses a quarter of its events, and each quarter of its steps decides by its own votes: a
-few spikes that move tell there, and one run of each model gives four decisions. Nothing but the training split is read.
+A network decides the recordings that it was trained on by wide margins, which hide what rounding does to new
+ones. So a recording that is held out loses a quarter of its events, and each quarter of its steps decides by
+its own votes: a few spikes that move tell there, and one run of each model gives four decisions. Nothing but
+the training split is read.
 """
 
 import numpy as np
@@ -44,7 +45,8 @@ def thinned(events: AnyArray) -> AnyArray:
 class HeldOut:
     """Decisions of the float model in each part of thinned recordings, and a chip's beside them.
 
-    Recordings are (samples, taxels, polarities, steps); parts in which the float model casts no vote do not count.
+    Recordings are (samples, taxels, polarities, steps); parts in which the float model casts no vote do not
+    count.
     """
 
     def __init__(self, network: Network, events: AnyArray) -> None:

@@ -1,6 +1,7 @@
 """Scales of one population: the finest that the accumulator allows, one for all neurons or one for each group.
 
-Nothing here looks at the rest of the network; :mod:`storage.choose_storage` chooses among what is found here.
+Nothing here looks at the rest of the network; :mod:`storage.choose_storage` chooses among what is found
+here.
 """
 
 from collections.abc import Sequence
@@ -27,8 +28,9 @@ from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, roun
 from spikeloom.compiler.types import FloatArray, IntArray
 
 WORTHWHILE = 0.95
-"""The largest exponent that leaves this share of the finest weight scale is taken: each step up lets threshold and
-bias round twice as finely (a proof at exponent 0 costs fc1 of the released networks two percent of scale)."""
+"""The largest exponent that leaves this share of the finest weight scale is taken: each step up lets
+threshold and bias round twice as finely (a proof at exponent 0 costs fc1 of the released networks two
+percent of scale)."""
 
 SCALE_STEPS = 1024
 """A scale that the accumulator limits is the finest to one part in this many."""
@@ -62,10 +64,11 @@ class Rounded:
     form: Form  # How it is stored
     population: IntegerPopulation
     projections: tuple[IntegerProjection, ...]
-    # Largest one-sided sum of one step that any input brings, weight units. A current that outlasts its step counts as
-    # the sum that fills the accumulator as far as it fills its own register.
+    # Largest one-sided sum of one step that any input brings, weight units. A current that outlasts its step
+    # counts as the sum that fills the accumulator as far as it fills its own register.
     reached: float
-    # Calibration spikes of each neuron that differ from float64, and how many more there are: (2, neurons) once judged
+    # Calibration spikes of each neuron that differ from float64, and how many more there are: (2, neurons)
+    # once judged
     moved: IntArray = field(default_factory=lambda: np.zeros((2, 0), np.int64))
     tried: int = 1  # Scales that were compared
     compensated: bool = False  # Whether weights were rounded so that their errors cancel
@@ -135,17 +138,18 @@ def _largest_threshold(population: Population) -> float:
 def fit(layer: FloatLayer, bits: int, exponents: tuple[int, ...], mantissa_scale: float) -> Rounded | None:
     """Population with the finest scale up to `mantissa_scale` that stays within the accumulator.
 
-    Scales are in mantissa units of the finest plane per membrane unit. A threshold is a whole number of weight units.
-    Only scales at which it is one exactly are tried, so it carries no rounding at all; that costs at most one unit of
-    scale in ``theta * scale``. Rounded weights, and so their sum, never shrink when the scale grows: the finest scale
-    (to one part in ``SCALE_STEPS``) is closed in from both sides.
+    Scales are in mantissa units of the finest plane per membrane unit. A threshold is a whole number of
+    weight units. Only scales at which it is one exactly are tried, so it carries no rounding at all; that
+    costs at most one unit of scale in ``theta * scale``. Rounded weights, and so their sum, never shrink
+    when the scale grows: the finest scale (to one part in ``SCALE_STEPS``) is closed in from both sides.
     """
     population = layer.population
 
     def at(units: int) -> tuple[Rounded | None, float]:
         threshold = np.full(population.size, units, np.int64)
         stored = rounded(layer, Form(bits=bits, exponents=exponents, threshold=threshold))
-        # None: a bias that rounds just out of its register, or a relay whose clipped weight no longer reaches
+        # None: a bias that rounds just out of its register, or a relay whose clipped weight no longer
+        # reaches
         return stored, np.inf if stored is None else stored.reached
 
     high = int(min(population.theta * mantissa_scale * 2.0 ** exponents[0], _largest_threshold(population)))
@@ -159,7 +163,8 @@ def fit(layer: FloatLayer, bits: int, exponents: tuple[int, ...], mantissa_scale
     best = None
     narrowed = True
     while high - low > max(1, low // SCALE_STEPS):
-        # in proportion as long as that narrows well, else in the middle: sums of few coarse weights grow in leaps
+        # in proportion as long as that narrows well, else in the middle: sums of few coarse weights grow in
+        # leaps
         share = (ONE_STEP_SUM_MAX - under) / (over - under) if narrowed and np.isfinite(over) else 0.5
         units = min(max(low + int(share * (high - low)), low + 1), high - 1)
         before = high - low
@@ -185,9 +190,9 @@ def candidate(
 ) -> tuple[Rounded | None, bool]:
     """Best compromise between a fine weight scale and a fine threshold, see ``WORTHWHILE``.
 
-    Weights that are whole numbers stay so, up to their scale. `factor` says how far the scale may exceed the one that
-    just holds the largest weight; the rest is clipped. Also whether registers, not that, limit the scale: a larger
-    factor gives the same.
+    Weights that are whole numbers stay so, up to their scale. `factor` says how far the scale may exceed the
+    one that just holds the largest weight; the rest is clipped. Also whether registers, not that, limit the
+    scale: a larger factor gives the same.
     """
     bits = packing.bits
     peak = float(layer.peaks().max(initial=0))
@@ -233,8 +238,8 @@ def finest_thresholds(layer: FloatLayer, bits: int, exponents: tuple[int, ...]) 
 def group_by_fineness(finest: IntArray, groups: int) -> IntArray:
     """Give neurons at most `groups` thresholds, none above its own finest, so that ``sum(1 / threshold)`` is least.
 
-    Rounding errors grow with ``1 / threshold``. Sorted by what they allow, the neurons of a group are neighbours and
-    share the smallest: an optimal cut is found by dynamic programming.
+    Rounding errors grow with ``1 / threshold``. Sorted by what they allow, the neurons of a group are
+    neighbours and share the smallest: an optimal cut is found by dynamic programming.
 
     >>> group_by_fineness(np.array([10, 100, 11, 90, 12]), 2).tolist()
     [10, 90, 10, 90, 10]
@@ -267,8 +272,8 @@ def group_by_fineness(finest: IntArray, groups: int) -> IntArray:
 def grouped(layer: FloatLayer, uniform: Rounded, groups: int) -> Rounded | None:
     """Population with up to `groups` thresholds, each as fine as its neurons allow, stored as a `uniform` one.
 
-    Sums of several planes may be larger at a smaller threshold. A group in which one is too large is made coarser, step
-    by step, down to the threshold of the `uniform` one, whose sums hold.
+    Sums of several planes may be larger at a smaller threshold. A group in which one is too large is made
+    coarser, step by step, down to the threshold of the `uniform` one, whose sums hold.
 
     None where some neurons relay clocks: these bind the threshold of all.
     """

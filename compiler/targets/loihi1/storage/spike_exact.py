@@ -1,7 +1,8 @@
 """Add planes and scales, layer by layer, until every calibration spike is the float64 model's.
 
-Each layer is judged on the float64 model's own input, so that one layer's errors do not hide another's: if no layer
-moves a spike, the whole network does not. Where spikes still move, it is said which limit of the chip is in the way.
+Each layer is judged on the float64 model's own input, so that one layer's errors do not hide another's: if
+no layer moves a spike, the whole network does not. Where spikes still move, it is said which limit of the
+chip is in the way.
 """
 
 from collections import Counter

@@ -1,9 +1,10 @@
 """How a population is stored: width and exponents of its weights, threshold of each neuron; and rounding to that.
 
-This is the one place where weights become mantissas, for the compiler and for quantisation-aware training alike.
+This is the one place where weights become mantissas, for the compiler and for quantisation-aware training
+alike.
 
-A scale is never stored beside a threshold: a neuron whose threshold is ``T`` weight units has ``T / theta`` weight
-units to each membrane unit of the float model, so the threshold carries no rounding at all.
+A scale is never stored beside a threshold: a neuron whose threshold is ``T`` weight units has ``T / theta``
+weight units to each membrane unit of the float model, so the threshold carries no rounding at all.
 
 *Planes.* A synapse may be stored several times, with different exponents; the chip adds them up. Two planes of eight
 bits are one weight of up to 16 bits. Only a weight that the finest plane cannot hold uses the next one.
@@ -74,8 +75,8 @@ def round_population(
 ) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
     """Registers of one population and its synapses, every weight rounded to the nearest.
 
-    Where `steps` are given, an array for each projection, they are taken instead of the weights; a `bias` (neurons,),
-    in model units, instead of the population's. ValueError if one has no register value.
+    Where `steps` are given, an array for each projection, they are taken instead of the weights; a `bias`
+    (neurons,), in model units, instead of the population's. ValueError if one has no register value.
     """
     scale = scales(population, form)
     wanted = population.bias if bias is None else bias
@@ -101,8 +102,8 @@ def round_population(
 def current_load(decay_u: int) -> float:
     """Share of its register that a current can fill, against that of the accumulator which a sum of one step fills.
 
-    A current that loses ``(decay_u + 1) / 4096`` a step adds up to ``4096 / (decay_u + 1)`` sums, in a register four
-    times as wide. At least 1: the accumulator comes first.
+    A current that loses ``(decay_u + 1) / 4096`` a step adds up to ``4096 / (decay_u + 1)`` sums, in a
+    register four times as wide. At least 1: the accumulator comes first.
     """
     return max(1.0, ONE_STEP_SUM_MAX * (4096 / (decay_u + 1)) * (1 << MEMBRANE_SHIFT) / CURRENT_MAX)
 
@@ -110,8 +111,9 @@ def current_load(decay_u: int) -> float:
 def loads(population: IntegerPopulation, projections: tuple[IntegerProjection, ...]) -> FloatArray:
     """One-sided sums, or more where a current that outlasts its step fills a register sooner; shape (neurons,).
 
-    What is within ``ONE_STEP_SUM_MAX`` overflows neither accumulator nor current, whatever the input. Nor does it
-    saturate a membrane, unless that keeps more than half of itself: the scale would then be too coarse.
+    What is within ``ONE_STEP_SUM_MAX`` overflows neither accumulator nor current, whatever the input. Nor
+    does it saturate a membrane, unless that keeps more than half of itself: the scale would then be too
+    coarse.
     """
     return fullest(population, *one_sided(projections, population.size))
 

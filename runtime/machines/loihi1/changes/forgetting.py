@@ -1,8 +1,9 @@
 """How soon a run is the known one again, whatever its registers were: interval arithmetic on the chip's integers.
 
-At some step nothing is known but what no register exceeds. From then on the events are those of the known recording.
-Each place has a least and a largest membrane and current; a spike is sure, impossible or open; open spikes widen the
-sums that they reach. Decay is monotone, so that bounds stay bounds. Where all of them meet, the run is the known one.
+At some step nothing is known but what no register exceeds. From then on the events are those of the known
+recording. Each place has a least and a largest membrane and current; a spike is sure, impossible or open;
+open spikes widen the sums that they reach. Decay is monotone, so that bounds stay bounds. Where all of them
+meet, the run is the known one.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Runs that differ from a known one by a few events: only what a change reaches is simulated, with numba.
 
-The known run is kept: the registers before each step and the sums within it. Of a changed run only *blocks* of 64
-compartments are held in which some register differs, and a step looks at these and at those that a changed event or
-spike reaches. Where none is left the rest of the run is the known one. All of it is exact, in the integers of
-:mod:`loihi1.spec`; no register may overflow, whatever the input.
+The known run is kept: the registers before each step and the sums within it. Of a changed run only *blocks*
+of 64 compartments are held in which some register differs, and a step looks at these and at those that a
+changed event or spike reaches. Where none is left the rest of the run is the known one. All of it is exact,
+in the integers of :mod:`loihi1.spec`; no register may overflow, whatever the input.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class Chip(NamedTuple):
 
     synapses: Synapses  # Of the input channels, then of each place
     depth: IntArray  # (blocks,) int64
-    # keep_u, keep_v, threshold, bias, lowest: (places,) int32; decays in 1/4096, then membrane units; no membrane is
-    # below the lowest
+    # keep_u, keep_v, threshold, bias, lowest: (places,) int32; decays in 1/4096, then membrane units; no
+    # membrane is below the lowest
     keep_u: AnyArray
     keep_v: AnyArray
     threshold: AnyArray
@@ -78,8 +78,8 @@ class Known(NamedTuple):
 class _Run(NamedTuple):
     """A run that goes on."""
 
-    # delta, current, membrane: (places,) int32; what sums have more than the known ones, all zero between two steps;
-    # registers, valid in blocks that are held
+    # delta, current, membrane: (places,) int32; what sums have more than the known ones, all zero between
+    # two steps; registers, valid in blocks that are held
     delta: AnyArray
     current: AnyArray
     membrane: AnyArray

@@ -1,9 +1,9 @@
 """What a run costs: synaptic operations, neuron updates, packets, hops, and energy per named table.
 
-Everything is computed from counts of a simulation and from the netlist; the simulators know no joules. A *synaptic
-operation* is one stored entry of a synapse list visited by one spike; zeros held in a dense list are visited too and
-are also counted apart. Priced is a run of ``T + depth`` chip steps in which input events act in the step they arrive
-in: they visit synapses, but their injection into the mesh has no public price.
+Everything is computed from counts of a simulation and from the netlist; the simulators know no joules. A
+*synaptic operation* is one stored entry of a synapse list visited by one spike; zeros held in a dense list
+are visited too and are also counted apart. Priced is a run of ``T + depth`` chip steps in which input events
+act in the step they arrive in: they visit synapses, but their injection into the mesh has no public price.
 
 References
 ----------
@@ -53,9 +53,10 @@ BETWEEN_CHIPS = "packet_between_chips"
 class Costs:
     """Counts per recording and group of neurons, (samples, groups), and energies; groups are those of a meter.
 
-    Synaptic operations belong to the group that receives them, packets and hops to the group that sends them; `zeros`
-    are operations on stored zeros, `between_chips` packets that leave their chip. `steps` are the chip steps of the
-    longest recording; joules are by table, and `unpriced` are the tables that lack events which happened.
+    Synaptic operations belong to the group that receives them, packets and hops to the group that sends
+    them; `zeros` are operations on stored zeros, `between_chips` packets that leave their chip. `steps` are
+    the chip steps of the longest recording; joules are by table, and `unpriced` are the tables that lack
+    events which happened.
     """
 
     events: Mapping[str, FloatArray]
@@ -75,8 +76,8 @@ class Costs:
 class Meter:
     """What one event of each source causes, prepared by :func:`prepare` for any number of runs.
 
-    `caused` is (sources, names * groups): amount of each event of `names` for each group by a spike of each source,
-    input channels first; `neurons` are the compartments of each group.
+    `caused` is (sources, names * groups): amount of each event of `names` for each group by a spike of each
+    source, input channels first; `neurons` are the compartments of each group.
     """
 
     target: Target
@@ -129,8 +130,8 @@ def prepare(netlist: Netlist, target: Target, by: Literal["layer", "core", "whol
 def count(meter: Meter, counts: Counts, chip_steps: int | IntArray) -> dict[str, FloatArray]:
     """Amount per recording and group of everything that a meter knows and of neuron updates.
 
-    `counts` are those of a batch, with one leading axis of recordings and updates by group; `chip_steps` those of all
-    recordings, or of each (samples,).
+    `counts` are those of a batch, with one leading axis of recordings and updates by group; `chip_steps`
+    those of all recordings, or of each (samples,).
     """
     sources = np.concatenate([counts.inputs, counts.spikes], axis=1).astype(np.float64)
     amounts = dict(zip(meter.names, np.split(sources @ meter.caused, len(meter.names), axis=1), strict=True))

@@ -1,7 +1,8 @@
 """How votes, operations, energy and time of recordings add up step by step, from one run.
 
-Whatever is linear in events is added up by the engine itself (:class:`trace.Charges`): no spike is kept, and no
-window is run for itself. A chip that is stopped after so many steps has done, and cost, what stands there.
+Whatever is linear in events is added up by the engine itself (:class:`trace.Charges`): no spike is kept, and
+no window is run for itself. A chip that is stopped after so many steps has done, and cost, what stands
+there.
 """
 
 import numpy as np

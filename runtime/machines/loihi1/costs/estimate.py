@@ -30,8 +30,8 @@ HELD = 1 << 27
 class Estimate:
     """Costs of a batch of recordings.
 
-    Events and energies by layer; steps at the sensor's pace, blank ones too; times by table; and, in detail ``cycle``
-    only, detailed times and joules by table and core.
+    Events and energies by layer; steps at the sensor's pace, blank ones too; times by table; and, in detail
+    ``cycle`` only, detailed times and joules by table and core.
     """
 
     costs: Costs
@@ -52,11 +52,11 @@ def estimate(
 ) -> tuple[Trace, Estimate]:
     """Run recordings, some at a time, and say what they cost.
 
-    `events` are (samples, n_inputs, T), `lengths` (samples,) the data steps of each, `detail` is ``counts`` or
-    ``cycle``; `progress` is called with the number of recordings done. The trace holds counts alone.
+    `events` are (samples, n_inputs, T), `lengths` (samples,) the data steps of each, `detail` is ``counts``
+    or ``cycle``; `progress` is called with the number of recordings done. The trace holds counts alone.
 
-    DataError and NumericRangeError as the engine says; OptionError if several chips shall be simulated by the cycle.
-    Their events are counted and priced but not timed: links between chips have no public latency.
+    DataError and NumericRangeError as the engine says; OptionError if several chips shall be simulated by
+    the cycle. Their events are counted and priced but not timed: links between chips have no public latency.
     """
     prepared = netlist if isinstance(netlist, engine.Engine) else engine.prepare(netlist)
     netlist = prepared.netlist

@@ -131,8 +131,8 @@ class Static:
 class CostReport:
     """Costs of a batch of recordings.
 
-    The mean inference and, each amount for itself, the extremes; where energy and time go; and what is missing from all
-    this. `chip_steps` are those of the longest recording.
+    The mean inference and, each amount for itself, the extremes; where energy and time go; and what is
+    missing from all this. `chip_steps` are those of the longest recording.
     """
 
     samples: int

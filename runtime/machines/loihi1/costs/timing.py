@@ -8,8 +8,8 @@ where others are under way and blocked where the links are full, and waits until
 lasts until the last neuron is swept and the last message processed, then the barrier. The tests hold both models
 against a plain definition, one message at a time.
 
-Spikes of a step are sent and processed within that step and act in the next. *Input events* act in the step in which
-they arrive: the receiving cores process them from its start, and nobody pays for their injection.
+Spikes of a step are sent and processed within that step and act in the next. *Input events* act in the step
+in which they arrive: the receiving cores process them from its start, and nobody pays for their injection.
 
 References
 ----------
@@ -65,7 +65,8 @@ class DetailedTimes(StepTimes):
     sent_ns: FloatArray
     processed_ns: FloatArray
     blocked_ns: FloatArray  # for which cores could not send because the links were full, summed over the cores
-    # most messages on any link at any time; one on its way counts as one spread evenly over its links and its end
+    # most messages on any link at any time; one on its way counts as one spread evenly over its links and
+    # its end
     peak_load: FloatArray
 
 
@@ -103,7 +104,8 @@ def prepare(netlist: Netlist, target: Target, table: TimeTable) -> Tables:
     width = target.limit("mesh.width")
     tile_cores = target.limit("mesh.tile_cores")
     port = np.array([np.sum(tile[:core] == tile[core]) for core in range(n_cores)])
-    # the messages of a spike go out in the order of columns, rows and cores of a tile, as the reference has it
+    # the messages of a spike go out in the order of columns, rows and cores of a tile, as the reference has
+    # it
     rank = np.lexsort((port, tile // width, tile % width)).argsort()
     order = np.lexsort((rank[destination], netlist.axon_source))
     from_input = netlist.axon_source[order] < n_inputs
@@ -205,8 +207,9 @@ def detailed(
 ) -> DetailedTimes:
     """Time a batch of recordings by the detailed model.
 
-    `spikes` and `updated` (samples, chip steps, compartments) are a simulator's, see :class:`trace.Trace`, for `events`
-    (samples, n_inputs, T); `steps` (samples,) are the chip steps of each recording, by default all.
+    `spikes` and `updated` (samples, chip steps, compartments) are a simulator's, see :class:`trace.Trace`,
+    for `events` (samples, n_inputs, T); `steps` (samples,) are the chip steps of each recording, by default
+    all.
     """
     fired, worked, seen = (np.ascontiguousarray(bits).view(np.uint8) for bits in (spikes, updated, events != 0))
     cores = tables.start.size - 1

@@ -1,7 +1,7 @@
 """Loops of :mod:`costs.timing`, compiled with numba.
 
-Latencies are whole picoseconds and link loads are whole multiples of one over ``Tables.unit``, so sums neither round
-nor depend on their order. Only what congestion and blocking add is fractional.
+Latencies are whole picoseconds and link loads are whole multiples of one over ``Tables.unit``, so sums
+neither round nor depend on their order. Only what congestion and blocking add is fractional.
 
 *Who is next.* Of equal times the lower core comes first. Messages to one core arrive in the order in which they are
 sent, so each core needs only a queue.
@@ -24,17 +24,18 @@ class Tables(NamedTuple):
     update: int
     spike: int
     axon_out: int  # Picoseconds of a message at its sender
-    # sender, sending: (compartments,) int64; core of each, and picoseconds of a spike there, messages included
+    # sender, sending: (compartments,) int64; core of each, and picoseconds of a spike there, messages
+    # included
     sender: IntArray
     sending: IntArray
     first: IntArray  # (compartments + 1,) int64; bounds of each compartment in the deliveries
-    # destination, processing, route: (deliveries,) int64; core that receives it, picoseconds that it takes there, and
-    # way that it goes
+    # destination, processing, route: (deliveries,) int64; core that receives it, picoseconds that it takes
+    # there, and way that it goes
     destination: IntArray
     processing: IntArray
     route: IntArray
-    # channel_first, channel_destination, channel_processing: The same for input channels, which are on no core and go
-    # no way
+    # channel_first, channel_destination, channel_processing: The same for input channels, which are on no
+    # core and go no way
     channel_first: IntArray
     channel_destination: IntArray
     channel_processing: IntArray
@@ -208,8 +209,8 @@ def schedule(
 ) -> None:
     """Send the messages of each step of a recording in the order of time.
 
-    Filled are `spent` (steps, 2 * cores), from zeros: when each core has sent everything, then when it has processed
-    everything; and as :func:`_send_all` says `blocked` and `peak` (steps,). Times are picoseconds.
+    Filled are `spent` (steps, 2 * cores), from zeros: when each core has sent everything, then when it has
+    processed everything; and as :func:`_send_all` says `blocked` and `peak` (steps,). Times are picoseconds.
     """
     cores = tables.start.size - 1
     most = tables.destination.size + cores
