@@ -96,6 +96,14 @@ def _axons(
     return axons
 
 
+def _votes(network: IntegerNetwork, layer: IntArray, neuron: IntArray) -> IntArray:
+    """Class that each compartment votes for, -1 for none."""
+    voting = layer == network.readout.population
+    votes = np.full(len(layer), -1)
+    votes[voting] = network.readout.label[neuron[voting]]
+    return votes
+
+
 def emit(
     network: IntegerNetwork,
     cores: core_needs.Cores,
@@ -126,9 +134,6 @@ def emit(
 
     axons = _axons(network, cores, target, compartment_id)
     decays = np.array([(population.decay_u, population.decay_v) for population in network.populations])[layer]
-    voting = layer == network.readout.population
-    votes = np.full(len(layer), -1)
-    votes[voting] = network.readout.label[numbers[voting]]
     known = numbers if identity is None else np.concatenate([identity[c.population][c.first : c.last] for c in order])
     return Netlist(
         target=target.name,
@@ -147,7 +152,7 @@ def emit(
         bias_mantissa=read_only(column("bias_mantissa")),
         bias_exponent=read_only(column("bias_exponent")),
         scale=read_only_float(column("scale")),
-        readout_class=read_only(votes),
+        readout_class=read_only(_votes(network, layer, numbers)),
         axon_source=read_only(np.concatenate(axons.source)),
         axon_format=read_only(np.concatenate(axons.format)),
         axon_synapses=read_only(np.concatenate([[0], np.cumsum(np.concatenate(axons.length))])),

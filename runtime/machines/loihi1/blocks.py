@@ -52,6 +52,13 @@ def _refusal(netlist: Netlist) -> str | None:
     return None
 
 
+def _consecutive(compartment: IntArray) -> IntArray:
+    """Compartment of the first position of each block whose compartments are consecutive, else -1."""
+    seated = compartment.reshape(-1, LANES)
+    rises = np.all((seated == seated[:, :1] + np.arange(LANES)) | (seated < 0), axis=1)
+    return np.where(rises, seated[:, 0], -1)
+
+
 def lay_out_blocks(netlist: Netlist) -> Blocks | str:
     """Make blocks of a netlist, or say why there are none."""
     if (refusal := _refusal(netlist)) is not None:
@@ -89,12 +96,10 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
     size = len(seats.layer) * LANES
     bias = np.zeros(size, np.int32)
     threshold = np.full(size, NEVER, np.int32)
+    compartment = np.full(size, -1)
     bias[seats.position] = netlist.bias_mantissa << netlist.bias_exponent
     threshold[seats.position] = netlist.threshold << MEMBRANE_SHIFT
-    compartment = np.full(size, -1)
     compartment[seats.position] = np.arange(netlist.n_compartments)
-    seated = compartment.reshape(-1, LANES)
-    consecutive = np.all((seated == seated[:, :1] + np.arange(LANES)) | (seated < 0), axis=1)
     return Blocks(
         stage=seats.stage,
         dense=dense,
@@ -114,7 +119,7 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
         depth=seats.depth[seats.layer],
         layer=seats.layer,
         compartment=compartment,
-        whole=np.where(consecutive, seated[:, 0], -1),
+        whole=_consecutive(compartment),
     )
 
 

@@ -129,21 +129,35 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trac
 
         # compare: strictly above
         spikes[t] = window & (membrane > threshold)
-        membranes[t], updated[t], saturated[t] = membrane, window & worked, window & (membrane != wanted)
+        membranes[t] = membrane
+        updated[t] = window & worked
+        saturated[t] = window & (membrane != wanted)
 
         # reset: the membrane only
         membrane[spikes[t]] = 0
         fired = (n_inputs + np.flatnonzero(spikes[t])).tolist()
 
+    counts = _counts(netlist, events, spikes, updated, saturated)
+    return Trace(counts=counts, spikes=spikes, membranes=membranes, updated=updated)
+
+
+def _counts(
+    netlist: Netlist,
+    events: npt.NDArray[np.uint8 | np.bool_],
+    spikes: BoolArray,
+    updated: BoolArray,
+    saturated: BoolArray,
+) -> Counts:
+    """How often everything happened in a recording."""
     layers = len(netlist.layers)
-    counts = Counts(
+    window = events.shape[1] + netlist.max_depth
+    return Counts(
         inputs=np.count_nonzero(events, axis=1),
         spikes=np.count_nonzero(spikes, axis=0),
-        votes=np.count_nonzero(spikes[: length + netlist.max_depth], axis=0),
+        votes=np.count_nonzero(spikes[:window], axis=0),
         updates=np.bincount(netlist.layer, np.count_nonzero(updated, axis=0), layers).astype(np.int64),
         saturations=np.bincount(netlist.layer, np.count_nonzero(saturated, axis=0), layers).astype(np.int64),
     )
-    return Trace(counts=counts, spikes=spikes, membranes=membranes, updated=updated)
 
 
 def _require_range(
