@@ -68,8 +68,7 @@ def load_data(
     Labels are `UNLABELLED` where nothing says them, see `need_labels`. In the released layout all recordings
     have labels, the same steps and taxels, and no counts.
 
-    DataError if a recording cannot be used, with file and place; OptionError if `bin_s` is not a duration or
-    given for what has bins already, or `limit` is below 1.
+    DataError if a recording cannot be used; OptionError if `bin_s` or `limit` cannot be, or bins are there.
     """
     _require_options(bin_s, limit)
     place = _place_of(path)

@@ -92,8 +92,7 @@ def finetune(
     on `test`. The `seed` orders the recordings, and draws what is lost of them (`robust`, see
     :func:`robust.disturb`). `state` and `resume` as of :func:`train.train`.
 
-    OptionError, ModelError, CapacityError or DataError if options, network or recordings cannot be used, or
-    the loss is no longer a number.
+    A SpikeloomError if options, network or recordings cannot be used, or the loss is no longer a number.
     """
     require_least({"epochs": epochs, "seed": seed}, epochs=1, seed=0)
     require_chance(robust)
