@@ -39,7 +39,7 @@ NUMERIC = {
     "compiler/passes": "calibrate expand prune",
     "compiler/targets/loihi1": "bounds emit integers legalize lift registers remove",
     "compiler/targets/loihi1/layout": "choose core_needs partition place",
-    "compiler/targets/loihi1/storage": "choose_storage compensate scales spike_exact weight_storage",
+    "compiler/targets/loihi1/storage": "choose_storage compensate held_out ladder scales spike_exact weight_storage",
     "compiler/targets/truenorth": "legalize lower native",
     "models": "graphs",
     "models/networks": "layers lif quantised reference",
