@@ -133,7 +133,6 @@ def emit(
         return np.concatenate([getattr(network.populations[c.population], name)[c.first : c.last] for c in order])
 
     axons = _axons(network, cores, target, compartment_id)
-    decays = np.array([(population.decay_u, population.decay_v) for population in network.populations])[layer]
     known = numbers if identity is None else np.concatenate([identity[c.population][c.first : c.last] for c in order])
     return Netlist(
         target=target.name,
@@ -146,8 +145,8 @@ def emit(
         core_axons=read_only(np.cumsum([0, *axons.per_core])),
         layer=read_only(layer),
         neuron=read_only(known),
-        decay_u=read_only(decays[:, 0]),
-        decay_v=read_only(decays[:, 1]),
+        decay_u=read_only([network.populations[post].decay_u for post in layer]),
+        decay_v=read_only([network.populations[post].decay_v for post in layer]),
         threshold=read_only(column("threshold")),
         bias_mantissa=read_only(column("bias_mantissa")),
         bias_exponent=read_only(column("bias_exponent")),

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from spikeloom.compiler.targets.loihi1.bounds import reach
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.registers import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
-from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.compiler.types import AnyArray, BoolArray, IntArray
 from spikeloom.runtime.machines.loihi1.block_kernel import LANES, Blocks
 
 SUM_MAX = 2**15 - 1
@@ -52,6 +52,13 @@ def _refusal(netlist: Netlist) -> str | None:
     return None
 
 
+def _joined(word: IntArray, position: IntArray, words: int) -> AnyArray:
+    """Words, so many, in which the bits at these positions are set."""
+    joined = np.zeros(words, np.uint64)
+    np.bitwise_or.at(joined, word, _bit(position))
+    return joined
+
+
 def _consecutive(compartment: IntArray) -> IntArray:
     """Compartment of the first position of each block whose compartments are consecutive, else -1."""
     seated = compartment.reshape(-1, LANES)
@@ -80,18 +87,16 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
         return "synapses too scattered for rows of 64"
     row_block, row_source = np.divmod(rows, width)
     net = np.zeros(len(rows) * LANES, np.int16)
-    reached = np.zeros(len(rows), np.uint64)
     row = np.searchsorted(rows, pair)
     # of several synapses of one entry, what leaves 16 bits on the way comes back into them
     np.add.at(net, row * LANES + lane, netlist.effective_weight().astype(np.int16))
-    np.bitwise_or.at(reached, row, _bit(lane))
+    reached = _joined(row, lane, len(rows))
     shift, weight = _narrowed(net, row_block, len(seats.layer))
 
     # links: the rows of a block by words of sources
     words = width // LANES
     links, first_row, link = np.unique(row_block * words + row_source // LANES, return_index=True, return_inverse=True)
-    linked = np.zeros(len(links), np.uint64)
-    np.bitwise_or.at(linked, link, _bit(row_source % LANES))
+    linked = _joined(link, row_source % LANES, len(links))
 
     size = len(seats.layer) * LANES
     bias = np.zeros(size, np.int32)
