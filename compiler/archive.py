@@ -65,11 +65,11 @@ def narrow(array: Array) -> Array:
 
 def digest(members: Mapping[str, Array]) -> str:
     """Hex sha256 over name, dtype, shape and bytes of each member, in their order."""
-    found = hashlib.sha256()
+    running = hashlib.sha256()
     for name, array in members.items():
-        found.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()
+        running.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        running.update(np.ascontiguousarray(array).tobytes())
+    return running.hexdigest()
 
 
 def arrays_digest(arrays: Mapping[str, Array]) -> str:
@@ -110,7 +110,8 @@ def write_archive(content: bytes, path: str | os.PathLike[str]) -> str:
 
 def opened_zip(file: IO[bytes]) -> zipfile.ZipFile:
     """A zip that checks CRCs as it is read; FileFault where its directory has lost a member or its name."""
-    opened, end = zipfile.ZipFile(file), 0
+    opened = zipfile.ZipFile(file)
+    end = 0
     for info in sorted(opened.infolist(), key=lambda info: info.header_offset):
         _require_no_member(file, end, info.header_offset)
         file.seek(info.header_offset + 26)
@@ -147,9 +148,10 @@ def read_npy(content: bytes) -> Array:
     file = io.BytesIO(content)
     headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, fortran, dtype = headers[np.lib.format.read_magic(file)](file)
-    held, wanted = len(content) - file.tell(), math.prod(shape) * dtype.itemsize
-    if dtype.hasobject or min(shape, default=1) < 0 or held != wanted:
-        raise FileFault(f"holds an array of objects, or one of {wanted} bytes in {held}")
+    size = len(content) - file.tell()
+    wanted = math.prod(shape) * dtype.itemsize
+    if dtype.hasobject or min(shape, default=1) < 0 or size != wanted:
+        raise FileFault(f"holds an array of objects, or one of {wanted} bytes in {size}")
     values = np.frombuffer(content, dtype, offset=file.tell()) if wanted else np.zeros(0, dtype)
     return values.reshape(shape, order="F" if fortran else "C")
 
@@ -169,8 +171,8 @@ def stated(path: Path, name: str) -> str | None:
             manifest = json.loads(str(np.lib.format.read_array(member, allow_pickle=False)))
     except Exception:  # zipfile and numpy raise whatever they meet; a header may announce more than the memory holds
         return None
-    found = manifest.get(name) if isinstance(manifest, dict) else None
-    return found if isinstance(found, str) else None
+    value = manifest.get(name) if isinstance(manifest, dict) else None
+    return value if isinstance(value, str) else None
 
 
 def is_netlist(path: str | os.PathLike[str]) -> bool:
@@ -203,13 +205,14 @@ def entry_faults(manifest: Mapping[str, Any], kinds: Mapping[str, Kind]) -> list
 
 def array_faults(arrays: Mapping[str, Array], axes: Mapping[str, int], floats: Iterable[str] = ()) -> list[str]:
     """Arrays with other axes than one, or than `axes` says, and those that are no integers, or `floats` no reals."""
-    found = []
+    faults = []
     for name, array in arrays.items():
-        due, kind = axes.get(name, 1), "f" if name in floats else "i"
+        due = axes.get(name, 1)
+        kind = "f" if name in floats else "i"
         if (array.ndim, array.dtype.kind) != (due, kind):
             shape = ("list", "table", "block")[due - 1]
-            found.append(f"{name} is no {shape} of {'numbers' if kind == 'f' else 'integers'}")
-    return found
+            faults.append(f"{name} is no {shape} of {'numbers' if kind == 'f' else 'integers'}")
+    return faults
 
 
 def _is(value: Any, kind: Kind) -> bool:  # noqa: PLR0911 - one for each kind
@@ -244,10 +247,12 @@ def read_archive(
     Entries of the manifest are of these `kinds`; `names` gives from it the names of all arrays, in their order.
     FileFault, or what parsing raises, if the file is missing, damaged, altered, or of another format or version.
     """
-    members, what = read_members(path), "network" if wanted in (TRAINED, COUNTERS) else "netlist"
+    members = read_members(path)
+    what = "network" if wanted in (TRAINED, COUNTERS) else "netlist"
     if missing := sorted({"manifest", "sha256"} - set(members)):
         raise FileFault(f"is not a {what} (no {' and no '.join(missing)})")
-    text, written = members.pop("manifest"), str(members.pop("sha256"))
+    text = members.pop("manifest")
+    written = str(members.pop("sha256"))
     manifest = json.loads(str(text))
     kind = manifest.get("format") if isinstance(manifest, dict) else None
     if isinstance(kind, str) and kind in FORMATS and kind != wanted:

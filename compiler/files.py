@@ -87,11 +87,13 @@ def reading(where: object, error: type[SpikeloomError], remedy: str) -> Iterator
     except (MemoryError, OptionError):
         raise
     except Exception as found:
-        kind, said = error, f"is truncated or damaged, or something else ({type(found).__name__}: {found}); {remedy}"
+        kind = error
+        said = f"is truncated or damaged, or something else ({type(found).__name__}: {found}); {remedy}"
         if isinstance(found, FileFault):
             said = f"{found}; {remedy}"
         elif isinstance(found, SpikeloomError):
-            kind, said = type(found), str(found)
+            kind = type(found)
+            said = str(found)
         elif isinstance(found, OSError) and found.strerror:
             said = f"cannot be read ({found.strerror}); check its permissions"
         raise kind(f"{where}: {_shortened(said, MOST_SAID - 2 - len(Path(str(where)).name))}") from found

@@ -4,5 +4,7 @@ Checkpoints: ``checkpoint_reader`` takes any, our own format among them, ``torch
 Networks of other frameworks: ``onnx``, ``nir``, ``netx``. For other simulators: ``sanafe``, ``ranc``.
 """
 
-ONNX, NIR, NETX = ".onnx", ".nir", ".net"
+ONNX = ".onnx"
+NIR = ".nir"
+NETX = ".net"
 """How names of files from other frameworks end."""

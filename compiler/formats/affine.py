@@ -82,9 +82,9 @@ def added(values: Sequence[tuple[float, A]], shape: tuple[int, ...]) -> A:
 
 def scaled(value: A, factor: FloatArray, change: np.ufunc = np.multiply) -> A:
     """Each element times a constant of its own, or divided by it."""
-    terms = {atom: own.copy() for atom, own in value.terms.items()}
-    for own in terms.values():
-        own.data = change(own.data, np.repeat(factor, np.diff(own.indptr)))
+    terms = {atom: rows.copy() for atom, rows in value.terms.items()}
+    for rows in terms.values():
+        rows.data = change(rows.data, np.repeat(factor, np.diff(rows.indptr)))
     return replace(value, terms=terms, bias=change(value.bias, factor))
 
 
@@ -149,7 +149,8 @@ def convolution(
         if span > covered:
             raise ModelError(f"has a kernel of {taps} for {size} places; export it again")
     out = [(room - span) // step + 1 for room, span, step in zip(padded_space, spans, stride, strict=True)]
-    points, taps = math.prod(out), math.prod(kernel)
+    points = math.prod(out)
+    taps = math.prod(kernel)
     _require_few(max(weight.size * points, points, channels * math.prod(padded_space)))
     # where in the input each tap looks from each place; -1 is the padding
     positions = np.pad(np.arange(math.prod(shape)).reshape(shape), [(0, 0), *padding], constant_values=-1)

@@ -63,14 +63,15 @@ def by_depth(layers: Sequence[Layer]) -> list[list[int]]:
 
     Raises ModelError if some feed each other in a circle.
     """
-    left, found = {index: layer.sources.keys() - {INPUT, index} for index, layer in enumerate(layers)}, []
+    left = {index: layer.sources.keys() - {INPUT, index} for index, layer in enumerate(layers)}
+    ready = []
     while left:
-        found.append([index for index, sources in left.items() if not sources & left.keys()])
-        if not found[-1]:
+        ready.append([index for index, sources in left.items() if not sources & left.keys()])
+        if not ready[-1]:
             stuck = ", ".join(printable(layers[index].name) for index in left)
             raise ModelError(f"layers {stuck} feed each other in a circle; a layer may feed itself, no layer before it")
-        left = {index: sources for index, sources in left.items() if index not in found[-1]}
-    return found
+        left = {index: sources for index, sources in left.items() if index not in ready[-1]}
+    return ready
 
 
 def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArray) -> Network:

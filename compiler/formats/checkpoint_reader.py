@@ -36,14 +36,14 @@ def read_checkpoint(
     if faults := constant_faults(beta, theta):
         raise OptionError(faults[0])
     with reading(path, ModelError, AGAIN):
-        found = _read(read_whole(Path(path), "checkpoint"), run, weights)
-    _require_fit(str(path), found, beta, theta)
+        checkpoint = _read(read_whole(Path(path), "checkpoint"), run, weights)
+    _require_fit(str(path), checkpoint, beta, theta)
     given = [name for name, value in (("beta", beta), ("theta", theta)) if value is not None]
     return replace(
-        found,
-        beta=found.beta if beta is None else beta,
-        theta=found.theta if theta is None else theta,
-        assumed=tuple(name for name in found.assumed if name not in given),
+        checkpoint,
+        beta=checkpoint.beta if beta is None else beta,
+        theta=checkpoint.theta if theta is None else theta,
+        assumed=tuple(name for name in checkpoint.assumed if name not in given),
     )
 
 
@@ -64,7 +64,7 @@ def _read(content: bytes, run: int, weights: str | None) -> Checkpoint:
         if run != 0:
             raise ModelError(f"--run {run}: the file holds only run 0; omit --run")
         return read_own(content, members, weights)
-    found = read_torch(content, run)
+    checkpoint = read_torch(content, run)
     if weights not in (None, "last"):
         raise ModelError(f"--weights {weights}: the file holds the last epoch only; omit --weights")
-    return found
+    return checkpoint

@@ -48,7 +48,8 @@ KINDS: dict[str, archive.Kind] = {
 
 def counting_network(counters: Counters) -> Network:
     """The populations and synapses of a counting network."""
-    channels, clocks = counters.taxels * counters.polarities, counters.clocks
+    channels = counters.taxels * counters.polarities
+    clocks = counters.clocks
     layers: list[Layer] = []
 
     def add(name: str, beta: float, theta: float, sources: Mapping[int, Sparse], bias: float = 0.0) -> int:
@@ -56,12 +57,13 @@ def counting_network(counters: Counters) -> Network:
         layers.append(Layer(name=name, beta=beta, theta=theta, bias=np.full(neurons, bias), sources=sources))
         return len(layers) - 1
 
-    source, width = INPUT, channels
+    source = INPUT
+    width = channels
     if clocks.channels:
         width = channels * counters.parts
         every = sparse.vstack([sparse.eye_array(channels)] * counters.parts)
-        own = sparse.kron(sparse.eye_array(counters.parts), np.ones((channels, 1)))
-        gates = sparse.csr_array(sparse.hstack([every, own]))
+        clocked = sparse.kron(sparse.eye_array(counters.parts), np.ones((channels, 1)))
+        gates = sparse.csr_array(sparse.hstack([every, clocked]))
         source = add("gates", 0.0, 1.5, {INPUT: gates})
     channel, part, count = counters.counter.T
     summed = {}

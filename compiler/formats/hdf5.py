@@ -45,10 +45,10 @@ class Part:
         """An entry as float64, of its own shape; ModelError if there is none, or it is no finite numbers."""
         if not self.has(key):
             raise self.fail(f"has no {key}; {AGAIN}")
-        found = self.values[key]
-        if not isinstance(found, np.ndarray):
+        values = self.values[key]
+        if not isinstance(values, np.ndarray):
             raise self.fail(f"{key} is no array of numbers; {AGAIN}")
-        array = found.astype(np.float64)
+        array = values.astype(np.float64)
         if bad := int(np.count_nonzero(~np.isfinite(array))):
             raise self.fail(f"{key} has {bad} of {array.size} values NaN or infinite; train it again")
         return array
@@ -71,8 +71,8 @@ class Part:
 
 def entry_of(group: Tree, key: str, kind: type[E]) -> E:
     """An entry of a group that is of a kind, else an empty one of that kind."""
-    found = group.get(key)
-    return found if isinstance(found, kind) else kind()
+    entry = group.get(key)
+    return entry if isinstance(entry, kind) else kind()
 
 
 def read_hdf5(path: Path, what: str) -> tuple[Tree, str]:

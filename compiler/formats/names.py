@@ -32,13 +32,14 @@ def plain_names(names: Sequence[str], taken: Collection[str] = ()) -> tuple[str,
     >>> plain_names(["a.b", "input", "fc", "fc"], taken=["input"])
     ('a_b', 'input_1', 'fc_2', 'fc_3')
     """
-    plain, found = [re.sub(r"\W", "_", name, flags=re.ASCII) for name in names], list[str]()
+    plain = [re.sub(r"\W", "_", name, flags=re.ASCII) for name in names]
+    unique = list[str]()
     for place, name in enumerate(plain):
         free = name if plain.count(name) == 1 and name not in taken else f"{name}_{place}"
-        while free in {*taken, *found, *plain[place + 1 :]}:
+        while free in {*taken, *unique, *plain[place + 1 :]}:
             free += "_"
-        found.append(free)
-    return tuple(found)
+        unique.append(free)
+    return tuple(unique)
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:

@@ -232,9 +232,11 @@ def read_own(content: bytes, members: dict[str, bytes], weights: str | None) -> 
     if weights not in sets:
         raise ModelError(f"--weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
     chosen = {name.removeprefix(f"{weights}/"): a for name, a in arrays.items() if name.startswith(f"{weights}/")}
-    system, towers = manifest["architecture"], manifest.get("towers", 1)
+    system = manifest["architecture"]
+    towers = manifest.get("towers", 1)
     edges = read_only(np.array(manifest["graph"]["edges"], np.int64).reshape(-1, 2))
-    grid, dynamics = None, PLAIN
+    grid = None
+    dynamics = PLAIN
     if system == GRID_CNN and (said := manifest.get("grid")):
         grid = Grid(**said | {"cells": read_only(said["cells"])})
         if np.any(grid.cells >= (grid.rows, grid.columns)):
@@ -252,7 +254,7 @@ def read_own(content: bytes, members: dict[str, bytes], weights: str | None) -> 
         faults.append(f"the graph joins taxels outside 0..{manifest['taxels'] - 1}")
     if faults:
         raise FileFault("; ".join(faults))
-    found = Checkpoint(
+    checkpoint = Checkpoint(
         **layers_of(chosen),
         beta=float(manifest["beta"]),
         theta=float(manifest["theta"]),
@@ -269,7 +271,7 @@ def read_own(content: bytes, members: dict[str, bytes], weights: str | None) -> 
         towers=towers,
         bins=manifest.get("bins", 1),
     )
-    return replace(found, forms=_forms(manifest["forms"], found)) if "forms" in manifest else found
+    return replace(checkpoint, forms=_forms(manifest["forms"], checkpoint)) if "forms" in manifest else checkpoint
 
 
 def _signed_content(members: Mapping[str, bytes]) -> tuple[dict[str, Any], Arrays]:
@@ -309,7 +311,8 @@ def _tower_faults(arrays: Arrays, taxels: int, classes: int, kind: tuple[str, Gr
         features = len(arrays["conv1.bias"])
         faults = taxel_faults(arrays, features, dynamics.clocks.channels)
         received = arrays["fc1.weight"].shape[1] - dynamics.clocks.channels
-        places, made_classes = received // features, len(arrays[f"fc{stages}.bias"])
+        places = received // features
+        made_classes = len(arrays[f"fc{stages}.bias"])
         faults = faults or shape_faults(system, len(arrays["conv1.hops"]), places, taxels, grid)
         made_for = places if system in GRAPH_SYSTEMS else taxels, made_classes
         if not faults and made_for != (taxels, classes):

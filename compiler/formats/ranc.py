@@ -52,18 +52,21 @@ def expressed(netlist: CrossbarNetlist, ticks: int | None = None) -> Terms:
     - Of these, and of those that a spike reduces by their threshold, none may reach a floor that holds them, for RANC
       has none: not within `ticks`, from the least that leak and weights above crossing points can come to in a tick.
     """
-    reset_to, held = netlist.reset_mode == RESET_TO, netlist.negative_saturates > 0
+    reset_to = netlist.reset_mode == RESET_TO
+    saturating = netlist.negative_saturates > 0
     if reversing := np.count_nonzero((netlist.leak_reversal > 0) & (netlist.leak != 0)):
         raise ModelError(f"RANC has no leak with reversal ({reversing} neurons); leave them out")
 
-    centred, floor = reset_to & held, netlist.negative_threshold
+    centred = reset_to & saturating
+    floor = netlist.negative_threshold
     span = netlist.reset + floor
     scale = np.where(centred & (span % 2 == 1), 2, 1)
     shift = np.where(centred, scale * (floor - netlist.reset) // 2, 0)
     shift[netlist.reset_mode == RESET_NONE] = -netlist.threshold[netlist.reset_mode == RESET_NONE]
 
-    endless = (netlist.reset_mode == RESET_NONE) | ((netlist.reset_mode == RESET_LINEAR) & held)
-    neuron, least = netlist.neuron_of_synapse(), np.zeros(netlist.n_neurons, np.int64)
+    endless = (netlist.reset_mode == RESET_NONE) | ((netlist.reset_mode == RESET_LINEAR) & saturating)
+    neuron = netlist.neuron_of_synapse()
+    least = np.zeros(netlist.n_neurons, np.int64)
     np.add.at(least, neuron, np.minimum(netlist.weight[neuron, netlist.axon_type[netlist.axon_of_synapse()]], 0))
     fall = np.minimum(least + netlist.leak, 0)
     room = floor + np.minimum(netlist.initial, 0)
@@ -106,8 +109,10 @@ class Mesh:
 
 def mesh_of(netlist: CrossbarNetlist) -> Mesh:
     """The smallest rectangle of all cores; the bus is at the first place that is free, or in a row above."""
-    x, y = netlist.core_x - netlist.core_x.min(), netlist.core_y - netlist.core_y.min()
-    width, taken = int(x.max()) + 1, set((x + (int(x.max()) + 1) * y).tolist())
+    x = netlist.core_x - netlist.core_x.min()
+    y = netlist.core_y - netlist.core_y.min()
+    width = int(x.max()) + 1
+    taken = set((x + (int(x.max()) + 1) * y).tolist())
     row, column = divmod(next(place for place in range(len(taken) + 1) if place not in taken), width)
     return Mesh(x=x, y=y, width=width, height=max(int(y.max()), row) + 1, bus=(column, row))
 
@@ -116,7 +121,8 @@ def packets_of(netlist: CrossbarNetlist, events: EventArray, mesh: Mesh) -> list
     """Place and axon of the packets of each tick of a recording (n_inputs, T), clocks included; one for each axon."""
     ticks = netlist.ticks(events.shape[1])
     due: list[set[tuple[int, int, int]]] = [set() for _ in range(ticks)]
-    x, y = mesh.x.tolist(), mesh.y.tolist()
+    x = mesh.x.tolist()
+    y = mesh.y.tolist()
     feeds = (netlist.feed_channel, netlist.feed_core, netlist.feed_line, netlist.feed_tick)
     for channel, core, line, offset in zip(*(column.tolist() for column in feeds), strict=True):
         for step in np.flatnonzero(events[channel]).tolist():
@@ -148,8 +154,8 @@ def crossbar(netlist: CrossbarNetlist, core: int) -> tuple[IntArray, IntArray]:
     kinds[lines] = netlist.axon_type[axons]
     points = np.zeros((int(np.diff(netlist.core_neurons)[core]), len(kinds)), np.int64)
     for axon in range(axons.start, axons.stop):
-        held = slice(*netlist.axon_synapses[axon : axon + 2].tolist())
-        points[netlist.synapse_neuron[held], netlist.axon_line[axon]] = 1
+        synapses = slice(*netlist.axon_synapses[axon : axon + 2].tolist())
+        points[netlist.synapse_neuron[synapses], netlist.axon_line[axon]] = 1
     return kinds, points
 
 
@@ -160,7 +166,9 @@ def export(given: CrossbarNetlist, events: EventArray | None = None) -> Iterator
     for how many ticks the spikes are proven to be ours, null for ever; RANC does not read it.
     """
     terms = expressed(given, None if events is None else given.ticks(events.shape[1]))
-    netlist, mesh, chip = terms.netlist, mesh_of(given), load_target(given.target)
+    netlist = terms.netlist
+    mesh = mesh_of(given)
+    chip = load_target(given.target)
     voters = np.flatnonzero(netlist.readout_class >= 0)
     config = {
         "exact_ticks": terms.ticks,

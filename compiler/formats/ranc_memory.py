@@ -23,7 +23,9 @@ def sizes(terms: Terms, chip: Target) -> dict[str, int]:
 
     ModelError for more classes than its output bus has numbers.
     """
-    netlist, mesh, axons = terms.netlist, mesh_of(terms.netlist), chip.limit("core.axons")
+    netlist = terms.netlist
+    mesh = mesh_of(terms.netlist)
+    axons = chip.limit("core.axons")
     if netlist.classes >= axons:
         raise ModelError(f"{netlist.classes} classes, {axons - 1} allowed on RANC's output bus; give a smaller network")
     return WIDTHS | {
@@ -41,7 +43,9 @@ def sizes(terms: Terms, chip: Target) -> dict[str, int]:
 
 def memories(terms: Terms, found: dict[str, int]) -> Iterator[tuple[str, str]]:
     """Name and content of each memory file; neurons leave on the output of their class, all others on the next."""
-    netlist, mesh, axons = terms.netlist, mesh_of(terms.netlist), found["AXONS"]
+    netlist = terms.netlist
+    mesh = mesh_of(terms.netlist)
+    axons = found["AXONS"]
     places = (mesh.x + mesh.width * mesh.y).tolist()
     outputs = np.where(netlist.readout_class < 0, netlist.classes, netlist.readout_class)
     limits = (netlist.threshold, -netlist.negative_threshold, netlist.reset_mode)
@@ -53,7 +57,8 @@ def memories(terms: Terms, found: dict[str, int]) -> Iterator[tuple[str, str]]:
     widths += [found["OFFSET_BITS"]] * 2 + way
     silent = "0" * axons + _joined([*[0] * 7, 1, *[0] * 6], widths)  # a threshold of 1
     for place in range(mesh.width * mesh.height):
-        kinds, rows = np.zeros(0, np.int64), list[str]()
+        kinds = np.zeros(0, np.int64)
+        rows = list[str]()
         if place in places:
             core = places.index(place)
             kinds, points = crossbar(netlist, core)

@@ -75,7 +75,8 @@ def input_tiles(netlist: Netlist, target: Target) -> tuple[int, ...]:
 def cores(netlist: Netlist, target: Target) -> tuple[str, ...]:
     """``tile.core`` of the netlist's cores, then of those that hold the input channels; tiles count by columns."""
     require_one_chip(netlist.core_tile, target, "--to sanafe")
-    width, height = target.limit("mesh.width"), target.limit("mesh.height")
+    width = target.limit("mesh.width")
+    height = target.limit("mesh.height")
     tiles = [*netlist.core_tile.tolist(), *input_tiles(netlist, target)]
     return tuple(f"{tile % width * height + tile // width}.{tiles[:n].count(tile)}" for n, tile in enumerate(tiles))
 
@@ -83,10 +84,13 @@ def cores(netlist: Netlist, target: Target) -> tuple[str, ...]:
 def export(netlist: Netlist, target: Target) -> Iterator[str]:
     """Lines of the file; OptionError if the netlist takes several chips, ModelError if one has no room for inputs."""
     room = target.limit("core.compartments")
-    names, number, places = group_names(netlist), netlist.number_in_layer(), cores(netlist, target)
+    names = group_names(netlist)
+    number = netlist.number_in_layer()
+    places = cores(netlist, target)
     yield f"# spikeloom netlist for SANA-FE {VERSION} and its loihi.yaml; give the neurons of group {INPUT} 'spikes'"
     if netlist.clocks.channels:
-        length, first = netlist.clocks.steps, netlist.n_inputs - netlist.clocks.channels
+        length = netlist.clocks.steps
+        first = netlist.n_inputs - netlist.clocks.channels
         yield f"# from neuron {first} on they are clocks: each spikes in {length} steps, one after the other"
     if netlist.clocks.length is not None:
         yield f"# every recording is run for {netlist.clocks.length} steps, in silence after its end"
@@ -144,16 +148,18 @@ def _edges(netlist: Netlist, names: tuple[str, ...], number: IntArray) -> Iterat
     axon_pre = np.append(np.full(inputs, -1), netlist.layer)[netlist.axon_source]
     axon_number = np.append(np.arange(inputs), number)[netlist.axon_source]
     axon = netlist.axon_of_synapse()
-    pre, source = axon_pre[axon], axon_number[axon]
+    pre = axon_pre[axon]
+    source = axon_number[axon]
     target = netlist.synapse_compartment()
-    post, weight = netlist.layer[target], netlist.effective_weight()
+    post = netlist.layer[target]
+    weight = netlist.effective_weight()
     for a, pre_name in enumerate((INPUT, *names), start=-1):
         for b, post_name in enumerate(names):
-            found = np.flatnonzero((pre == a) & (post == b))
-            if not len(found):
+            between = np.flatnonzero((pre == a) & (post == b))
+            if not len(between):
                 continue
-            pairs = zip(source[found].tolist(), number[target[found]].tolist(), strict=True)
+            pairs = zip(source[between].tolist(), number[target[between]].tolist(), strict=True)
             yield f"    - {pre_name} -> {post_name}:"
             yield "        type: sparse"
             yield f"        source_target_pairs: [{', '.join(f'[{i}, {j}]' for i, j in pairs)}]"
-            yield f"        weight: [{', '.join(f'{w}.0' for w in weight[found].tolist())}]"
+            yield f"        weight: [{', '.join(f'{w}.0' for w in weight[between].tolist())}]"

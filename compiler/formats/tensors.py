@@ -160,7 +160,8 @@ def _joined_forms(joined: Checkpoint, every: Sequence[Checkpoint]) -> tuple[Form
 
 def _facts(checkpoint: Checkpoint) -> dict[str, object]:
     """What the networks of a joined one have in common."""
-    grid, dynamics = checkpoint.grid, checkpoint.dynamics
+    grid = checkpoint.grid
+    dynamics = checkpoint.dynamics
     edges = np.zeros((0, 2), np.int64) if checkpoint.edges is None else checkpoint.edges
     sizes = [len(stage.bias) // checkpoint.towers for stage in checkpoint.dense]
     layers = range(1 + len(sizes))

@@ -18,8 +18,8 @@ def text(made: Any) -> str:
     """
     lines = [type(made).__name__]
     for field in filter(_is_printed, fields(made)):
-        held = getattr(made, field.name)
-        entries = held if isinstance(held, tuple) else [held]
+        value = getattr(made, field.name)
+        entries = value if isinstance(value, tuple) else [value]
         lines += [f"  {field.name} {_shown(entry)}" for entry in entries if not isinstance(entry, Mapping)]
     return "\n".join(lines) + "\n"
 
@@ -47,14 +47,15 @@ def _span(values: AnyArray) -> str:
     """Least and largest value."""
     if not values.size:
         return "none"
-    low, high = values.min(), values.max()
+    low = values.min()
+    high = values.max()
     return f"{low:.6g}" if low == high else f"{low:.6g}…{high:.6g}"
 
 
 def _digest(*arrays: AnyArray) -> str:
     """A short hash of the values, whatever integer type holds them: stored numbers and indices come in several."""
-    found = hashlib.sha256()
+    running = hashlib.sha256()
     for array in arrays:
         whole = array if array.dtype.kind == "f" else array.astype(np.int64)
-        found.update(np.ascontiguousarray(whole).tobytes())
-    return found.hexdigest()[:12]
+        running.update(np.ascontiguousarray(whole).tobytes())
+    return running.hexdigest()[:12]

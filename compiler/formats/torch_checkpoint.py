@@ -35,7 +35,8 @@ GIVE = "give a file of spikeloom train or of the released layout"
 GIVE_WEIGHTS = "give the weights of a TactileSGNet"
 NOT_A_CHECKPOINT = f"is not a checkpoint; {GIVE}"
 
-BETA, THETA = 0.2, 0.5
+BETA = 0.2
+THETA = 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""
 
 
@@ -47,14 +48,16 @@ def read_torch(content: bytes, run: int) -> Checkpoint:
     """Read the content of a torch file; raises as :func:`read_checkpoint`."""
     loaded = load_torch(content)
     if isinstance(loaded, dict) and "net_list" in loaded:
-        states, layout = loaded["net_list"], "released"
+        states = loaded["net_list"]
+        layout = "released"
         if not isinstance(states, list | tuple) or not states:
             raise ModelError("net_list holds no run; give the file of a finished training")
     else:
-        states, layout = [loaded], "state_dict"
+        states = [loaded]
+        layout = "state_dict"
     if not 0 <= run < len(states):
-        held = "only run 0" if len(states) == 1 else f"runs 0 to {len(states) - 1}"
-        raise ModelError(f"--run {run}: the file holds {held}; choose one that it holds")
+        available = "only run 0" if len(states) == 1 else f"runs 0 to {len(states) - 1}"
+        raise ModelError(f"--run {run}: the file holds {available}; choose one that it holds")
     return Checkpoint(
         **layers_of(_unified(_arrays(states[run], len(content)))),
         beta=BETA,

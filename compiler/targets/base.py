@@ -20,12 +20,15 @@ from spikeloom.compiler.types import JsonObject
 
 REMEDY = "fix it"
 
-COMPARTMENTS, CROSSBARS = "compartments", "crossbars"
+COMPARTMENTS = "compartments"
+CROSSBARS = "crossbars"
 """What cores are made of: lists of weighted synapses onto compartments (Loihi), or a binary crossbar (TrueNorth)."""
 
 _NOT_MODELLED = {"loihi2": "not modelled; no public per-event energies"}
 
-PRICE_UNIT, POWER_UNIT, TIME_UNIT = "pJ", "mW", "ns"
+PRICE_UNIT = "pJ"
+POWER_UNIT = "mW"
+TIME_UNIT = "ns"
 PICOSECONDS = 1000
 """In a TIME_UNIT; finer latencies are rounded."""
 

@@ -242,7 +242,8 @@ def mcnemar(labels: IntArray, first: IntArray, second: IntArray) -> tuple[int, i
     """
     only_first = int(((first == labels) & (second != labels)).sum())
     only_second = int(((first != labels) & (second == labels)).sum())
-    n, k = only_first + only_second, min(only_first, only_second)
+    n = only_first + only_second
+    k = min(only_first, only_second)
     tail = sum(math.comb(n, i) for i in range(k + 1)) / 2**n
     return only_first, only_second, min(1.0, 2 * tail)
 

@@ -77,13 +77,13 @@ def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tupl
         if checkpoint.edges is None:
             raise ModelError(f"{where}: the graph is not in this file; name it with --graph: {CHOICES}")
         return str(checkpoint.graph), seen(checkpoint.edges, checkpoint.taxels)
-    found = seen(asked.edges, asked.n_taxels)
-    if checkpoint.edges is not None and not np.array_equal(seen(checkpoint.edges, checkpoint.taxels), found):
+    sees = seen(asked.edges, asked.n_taxels)
+    if checkpoint.edges is not None and not np.array_equal(seen(checkpoint.edges, checkpoint.taxels), sees):
         raise ModelError(
             f"{where}: graph and weights disagree: it was trained on {checkpoint.graph}, --graph says "
             f"{asked.name}; omit --graph"
         )
-    return asked.name, found
+    return asked.name, sees
 
 
 def load_checkpoint(path: str, request: CheckpointChoice) -> Checkpoint:

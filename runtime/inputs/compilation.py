@@ -19,7 +19,8 @@ STORED = ("weight_bits", "planes", "scale_groups", "spike_exact", "keep")
 def provenance(request: CompileRequest, asked: LoadedNetwork, *, calibrated: Recordings | None) -> Mapping[str, Any]:
     """What a netlist remembers of its compilation, whose scales the recordings `calibrated` chose, if any did."""
     seen = {} if calibrated is None else {"data": calibrated.source, "bin_s": calibrated.bin_s}
-    checkpoint, cores_for = asked.checkpoint, parse_cores(request.cores_for)
+    checkpoint = asked.checkpoint
+    cores_for = parse_cores(request.cores_for)
     return {
         "spikeloom": __version__,
         "checkpoint_sha256": asked.sha256,
@@ -111,16 +112,16 @@ def _packings(request: CompileRequest) -> tuple[Packing, ...] | None:
     """
     if not (request.weight_bits or request.planes or request.scale_groups):
         return None
-    asked = {
+    numbers = {
         "--weight-bits": whole_numbers(request.weight_bits or "8", "--weight-bits"),
         "--planes": whole_numbers(request.planes or "1", "--planes"),
         "--scale-groups": whole_numbers(request.scale_groups or "1", "--scale-groups"),
     }
-    layers = max(len(values) for values in asked.values())
-    for option, values in asked.items():
+    layers = max(len(values) for values in numbers.values())
+    for option, values in numbers.items():
         if len(values) not in (1, layers):
             raise OptionError(f"{option}: {len(values)} numbers, another option gives {layers}; give as many, or one")
-    columns = [values if len(values) == layers else values * layers for values in asked.values()]
+    columns = [values if len(values) == layers else values * layers for values in numbers.values()]
     return tuple(Packing(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
 
 
@@ -154,12 +155,12 @@ def parse_cores(words: str | None) -> dict[str, int]:
     """
     if words is None:
         return {}
-    found: dict[str, int] = {}
+    cores: dict[str, int] = {}
     for word in words.split(","):
         layer, _, count = word.strip().partition("=")
         if not layer or not (count.isascii() and count.isdecimal()) or int(count) == 0:
             raise OptionError(f"--cores-for {words}: {word!r} is not LAYER=N, N from 1; write for example fc1=6")
-        if layer in found:
+        if layer in cores:
             raise OptionError(f"--cores-for {words}: names {layer} twice; give it once")
-        found[layer] = int(count)
-    return found
+        cores[layer] = int(count)
+    return cores

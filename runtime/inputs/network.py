@@ -61,10 +61,12 @@ class LoadedNetwork:
                 return why
         for name in ("beta", "theta") if self.checkpoint is not None else ():
             for layer, ours in zip(netlist.layers, self.network.populations, strict=False):
-                found = getattr(ours, name)
-                due = getattr(layer, name, found)
-                if due != found:
-                    return f"{layer.name} was compiled with {name} {due:g}, this has {found:g}; give --{name} {due:g}"
+                value_here = getattr(ours, name)
+                due = getattr(layer, name, value_here)
+                if due != value_here:
+                    return (
+                        f"{layer.name} was compiled with {name} {due:g}, this has {value_here:g}; give --{name} {due:g}"
+                    )
         return None
 
     def require_same(self, path: str, netlist: Netlist, run: int) -> None:

@@ -47,27 +47,27 @@ def recordings(
 
     Raises DataError or OptionError if they cannot be used, or do not suit the network.
     """
-    own = (trained or {}).get("bin_s")
+    trained_bin = (trained or {}).get("bin_s")
     if isinstance(path, Recordings):
         require_suited(path, classes=classes, taxels=taxels)
-        _require_width(path, own)
+        _require_width(path, trained_bin)
         if limit is not None and limit < 1:
             raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
         data = path.part(slice(limit))
         return events.joined_bins(data if labels_for is None else events.need_labels(data, labels_for), bins)
     if path != SYNTHETIC:
-        if own is not None and bin_s not in (None, own):
-            raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {own:g} s; omit --bin")
+        if trained_bin is not None and bin_s not in (None, trained_bin):
+            raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {trained_bin:g} s; omit --bin")
         data = events.load_data(
             path,
             split,
             bin_s=bin_s,
-            default_bin_s=BIN_S if own is None else own,
+            default_bin_s=BIN_S if trained_bin is None else trained_bin,
             limit=limit,
             classes=classes,
             taxels=taxels,
         )
-        _require_width(data, own)
+        _require_width(data, trained_bin)
         _require_sensor(data, split, taxels)
         show_counts(data.source, data.split, data.counts)
         if labels_for is not None:
@@ -106,15 +106,16 @@ def _require_sensor(data: Recordings, split: str, taxels: int | None) -> None:
 
 def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int, *, whole: bool) -> None:
     """Say on stderr where recordings look like other ones than a network was trained on."""
-    name, known = trained.get("data", data.source), int(data.labels.max(initial=UNLABELLED))
+    name = trained.get("data", data.source)
+    known = int(data.labels.max(initial=UNLABELLED))
     fewer = whole and len(data) >= classes and UNLABELLED < known < classes - 1
     same = name.partition(", seed")[0] == data.source.partition(", seed")[0]  # splits of synthetic ones differ in these
     origin = "" if same else f"the network was trained on {name}; "
     if fewer:
         tell(f"warning: {data.source}: {origin}their classes are 0..{known}, the network's 0..{classes - 1}")
     elif origin and not (whole and len(data) == 1):  # a file of one recording has its own name
-        asked = "calibrate on what it knows" if data.split == "train" else "are their classes the same?"
-        tell(f"warning: {data.source}: {origin}{asked}")
+        advice = "calibrate on what it knows" if data.split == "train" else "are their classes the same?"
+        tell(f"warning: {data.source}: {origin}{advice}")
 
 
 def require_splits(path: str | Recordings) -> None:

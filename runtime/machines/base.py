@@ -133,14 +133,14 @@ def one_by_one(channels: EventArray, lengths: IntArray | None) -> Iterator[Event
 
 def differences(slow: Any, fast: Any) -> int:
     """Entries of a trace and its counts that differ where `slow` has any; `fast` is a batch of the one recording."""
-    found = 0
+    count = 0
     for name, one in ((field.name, getattr(slow, field.name)) for field in fields(slow)):
         batch = getattr(fast, name)
         if is_dataclass(one):
-            found += differences(one, batch)
+            count += differences(one, batch)
         elif one is not None:
-            found += int(np.count_nonzero(one != batch[0]))
-    return found
+            count += int(np.count_nonzero(one != batch[0]))
+    return count
 
 
 def require_channels(netlist: Netlist, channels: int) -> None:
@@ -340,11 +340,12 @@ class Machine(ABC):
 
     def require_sensor(self, events: EventArray) -> None:
         """Refuse recordings with another number of input channels: a DataError."""
-        found, due = events.shape[1] * events.shape[2], self.netlist.taxels * self.netlist.polarities
-        if found != due:
+        channels = events.shape[1] * events.shape[2]
+        due = self.netlist.taxels * self.netlist.polarities
+        if channels != due:
             raise DataError(
-                f"recordings: {found} input channels found, the netlist has {due}; use recordings of the sensor that "
-                "the network was compiled for"
+                f"recordings: {channels} input channels found, the netlist has {due}; use recordings of the "
+                "sensor that the network was compiled for"
             )
 
     def batch(self, steps: int) -> int:  # noqa: ARG002

@@ -6,9 +6,14 @@ from dataclasses import dataclass
 
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
-WEIGHTS, BIAS, BETA = "weight rounding", "bias rounding", "realised beta"
-TRUNCATION, SATURATION, TIE = "round toward zero", "saturation or overflow", "tie (> or >=)"
-LEFT_OUT, UNKNOWN = "neuron left out", "not known"
+WEIGHTS = "weight rounding"
+BIAS = "bias rounding"
+BETA = "realised beta"
+TRUNCATION = "round toward zero"
+SATURATION = "saturation or overflow"
+TIE = "tie (> or >=)"
+LEFT_OUT = "neuron left out"
+UNKNOWN = "not known"
 
 Sources = tuple[tuple[tuple[int, BoolArray], ...], ...]
 """For each population its presynaptic populations, and which pairs (neurons of pre, neurons of post) are connected."""

@@ -114,7 +114,8 @@ def taxels(machine: Machine, loaded: LoadedNetwork, data: Recordings, counts: In
 
     `counts` are those of the chip's :class:`Run`; `sensor` is what the user named by ``--taxels``.
     """
-    netlist, places = machine.netlist, sensor_places(sensor)
+    netlist = machine.netlist
+    places = sensor_places(sensor)
     known = len(places) == netlist.taxels and places.shape[1] > 1
     checkpoint = loaded.checkpoint
     edges: IntArray = np.zeros((0, 2), np.int64)
@@ -187,7 +188,9 @@ def _commands(request: ReportRequest, recording: str, bin_s: float) -> dict[str,
         path = "" if given is None else str(getattr(given, "source", given))  # recordings that Python handed over
         return Path(path).name or path
 
-    net, checkpoint, data = name(request.netlist), name(request.checkpoint), name(request.data)
+    net = name(request.netlist)
+    checkpoint = name(request.checkpoint)
+    data = name(request.data)
     options = repeat.given(request, repeat.NETWORK)
     options |= {option: name(options[option]) or None for option in ("taxels", "edges")}
     model = repeat.words(options | {"polarities": request.polarities})

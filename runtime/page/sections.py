@@ -180,7 +180,9 @@ def _cores(cores: CoreMap) -> list[Block]:
         ]
         for way in sorted(cores.traffic, key=lambda way: -way.packets)
     ]
-    mesh, tiles, chips = cores.mesh, {core.tile for core in cores.cores}, {core.chip for core in cores.cores}
+    mesh = cores.mesh
+    tiles = {core.tile for core in cores.cores}
+    chips = {core.chip for core in cores.cores}
     figure = Figure(
         "cores-map",
         partial(pictures.mesh, cores),

@@ -105,8 +105,8 @@ def _value(each: Field[Any], value: Any) -> Any:
     taken = _taken(kind, value)
     choices = each.metadata["choices"]
     if taken is None and not hasattr(value, "populations") and not hasattr(value, "events"):
-        found = f"{each.name} {reprlib.repr(value)}: {type(value).__name__} found"
-        raise OptionError(f"{found}, allowed: {ALLOWED.get(kind, kind)}; give one")
+        fault = f"{each.name} {reprlib.repr(value)}: {type(value).__name__} found"
+        raise OptionError(f"{fault}, allowed: {ALLOWED.get(kind, kind)}; give one")
     if choices and not set(taken if kind == "tuple" else [taken]) <= set(choices):
         raise OptionError(f"{each.name} {value!r}: allowed: {', '.join(map(str, choices))}; give one of these")
     return value if taken is None else taken  # networks and recordings stay what they are

@@ -56,13 +56,14 @@ class CountersReport(Shown):
 def decisions_of(counters: Counters, data: Recordings) -> IntArray:
     """Class of each recording, as the spiking network decides."""
     network = counting_network(counters)
-    ready, found = float_simulation(network), []
+    ready = float_simulation(network)
+    decided = []
     steps = of_length(joined_bins(data, counters.bins), counters.clocks.length)
     for first in range(0, len(data), PART):
         events = channels_last(steps.events[first : first + PART], counters.clocks)
         votes = ready.run(events).spikes[network.readout.population]
-        found.append(readout_counts(network.readout, network.classes, votes).argmax(axis=1))
-    return np.concatenate(found)
+        decided.append(readout_counts(network.readout, network.classes, votes).argmax(axis=1))
+    return np.concatenate(decided)
 
 
 def train_counters(plan: Plan, training: Recordings, test: Recordings, command: str, output: str) -> CountersReport:

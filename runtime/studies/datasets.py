@@ -72,7 +72,8 @@ class Converted:
 
 def describe(recordings: Recordings) -> Described:
     """Count the events of one split."""
-    lengths, bin_s = recordings.step_counts, recordings.seconds
+    lengths = recordings.step_counts
+    bin_s = recordings.seconds
     per_taxel = recordings.events.sum(axis=(0, 3), dtype=np.int64)
     total = per_taxel.sum(axis=1)
     alive = total > 0
@@ -103,7 +104,9 @@ def describe(recordings: Recordings) -> Described:
 
 def described_sections(result: Described) -> Iterator[Section]:
     """Statistics for people."""
-    duration, rate, labels = result.duration_s, result.rate, result.labels
+    duration = result.duration_s
+    rate = result.rate
+    labels = result.labels
     short, middle, long = (f"{seconds:g}" for seconds in duration.values())
     lasts = f"{long} s" if short == long else f"{short} … {long} s (median {middle} s)"
     each = sorted(set(labels.values()))

@@ -11,11 +11,13 @@ def front(gains: Sequence[float], costs: Sequence[float]) -> list[bool]:
     """Which points no other one beats: at least as much gain for at most the cost, and better in one of them."""
     order = sorted(range(len(gains)), key=lambda i: (costs[i], -gains[i]))
     on = [False] * len(gains)
-    best, best_cost = float("-inf"), float("nan")
+    best = float("-inf")
+    best_cost = float("nan")
     for i in order:
         on[i] = gains[i] > best or (gains[i] == best and costs[i] == best_cost)
         if gains[i] > best:
-            best, best_cost = gains[i], costs[i]
+            best = gains[i]
+            best_cost = costs[i]
     return on
 
 

@@ -102,7 +102,8 @@ def sweep(
         try:
             progress(0, label)
             for done, (index, found) in enumerate(side_by_side(waiting, partial(_named, measure), jobs=jobs), 1):
-                key, text = waiting[index].key, json.dumps(found, allow_nan=False)
+                key = waiting[index].key
+                text = json.dumps(found, allow_nan=False)
                 with kept:
                     kept.execute("INSERT INTO results VALUES (?, ?)", (key, sealed(key, text)))
                 results[key] = decode(kind, json.loads(text))
@@ -160,7 +161,9 @@ def side_by_side(
 
     for tracker in (resource_tracker, trackers_of_joblib):
         tracker.ensure_running()  # which makes later processes hear signals, so it comes first
-    attempt, left, stood = delayed(partial(_in_child, os.getpid(), Path.cwd(), run)), dict(enumerate(payloads)), False
+    attempt = delayed(partial(_in_child, os.getpid(), Path.cwd(), run))
+    left = dict(enumerate(payloads))
+    stood = False
     with parallel_config("loky", n_jobs=processes, inner_max_num_threads=1), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "A worker stopped")  # one that has grown is replaced, and nothing lost
         while left:
@@ -191,7 +194,8 @@ def _killed_when_still(ended: threading.Event) -> None:
     """Kill joblib's processes once none has used its processor for `STILL_S`, as after a stop signal; needs /proc."""
     used: dict[int, list[str]] = {}
     while not ended.wait(STILL_S):
-        before, used = used, {}
+        before = used
+        used = {}
         with suppress(OSError):  # of a process that has ended
             for children in Path(f"/proc/{os.getpid()}/task").glob("*/children"):
                 for child in children.read_text().split():

@@ -50,7 +50,8 @@ PRICES = {
 CLOCK_HZ = 80e6
 
 # Load, raise and store a count, load its threshold, compare, branch; load a weight and a sum, add, store, count on
-EVENT_CYCLES, ADD_CYCLES = 12, 8
+EVENT_CYCLES = 12
+ADD_CYCLES = 8
 
 PLANS = tuple(product(((1, 4, 16, 64), (1, 2, 4, 8, 16, 32, 64)), (1, 5, 10)))
 """Thresholds and parts that are tried."""
@@ -128,8 +129,10 @@ def against_processor(
     rule, plan, validation = _rule(training, bits)
     spikes = counter_spikes(rule, run_counters(test, plan, rule.steps)).astype(np.int64)
     ours = (spikes @ rule.weight.T).argmax(axis=1) == test.labels
-    events, seconds = float(test.events.sum()) / len(test), float(test.step_counts.mean()) * bin_s
-    channels, added = rule.taxels * rule.polarities, float(spikes.sum()) / len(test) * rule.classes
+    events = float(test.events.sum()) / len(test)
+    seconds = float(test.step_counts.mean()) * bin_s
+    channels = rule.taxels * rule.polarities
+    added = float(spikes.sum()) / len(test) * rule.classes
     work = processor(
         adds=2 * events + added + rule.classes,
         # of a sum 32 bits, there and back
@@ -140,7 +143,8 @@ def against_processor(
     def side(correct: BoolArray, dynamic: Iterable[float], static: Iterable[float], fastest_s: float) -> Side:
         joules, watts = ((min(each), max(each)) for each in map(list, (dynamic, static)))
         low, high = (each + power * seconds for each, power in zip(joules, watts, strict=True))
-        speed, count = events / fastest_s if fastest_s else math.inf, int(correct.sum())
+        speed = events / fastest_s if fastest_s else math.inf
+        count = int(correct.sum())
         return Side(correct=count, dynamic_j=joules, static_w=watts, pace_j=(low, high), events_per_s=speed)
 
     fastest = next((float(each.mean()) for each in price.time_s.values()), 0.0)
@@ -165,7 +169,9 @@ def against_processor(
 
 def _rule(training: Recordings, bits: int) -> tuple[Counters, Plan, float]:
     """The cheapest rule that is not shown to be worse than the best, its plan, and its accuracy in cross-validation."""
-    classes, found, progress = int(training.labels.max()) + 1, [], Progress(len(PLANS))
+    classes = int(training.labels.max()) + 1
+    found = []
+    progress = Progress(len(PLANS))
     for done, (thresholds, parts) in enumerate(PLANS):
         progress(done, "training rules for a processor")
         plan = Plan(thresholds=thresholds, parts=min(parts, training.steps), bits=bits)
@@ -184,7 +190,8 @@ def _rule(training: Recordings, bits: int) -> tuple[Counters, Plan, float]:
 def _verdict(chip: Side, small: Side) -> str:
     """Who takes less at the sensor's pace."""
     if small.pace_j[1] < chip.pace_j[0]:
-        least, most = chip.pace_j[0] / small.pace_j[1], chip.pace_j[1] / small.pace_j[0]
+        least = chip.pace_j[0] / small.pace_j[1]
+        most = chip.pace_j[1] / small.pace_j[0]
         return f"a microcontroller is cheaper at the sensor's pace: {least:,.0f} to {most:,.0f} times"
     if chip.pace_j[1] < small.pace_j[0]:
         return "the chip is cheaper than a microcontroller at the sensor's pace"
@@ -193,7 +200,8 @@ def _verdict(chip: Side, small: Side) -> str:
 
 def sections(found: Comparison) -> Iterator[Section]:
     """The comparison for people."""
-    plan, work = found.plan, found.work
+    plan = found.plan
+    work = found.work
     about = (
         f"on a processor: {found.counters} counters of {', '.join(map(str, plan.thresholds))} events in "
         f"{plan.parts} parts, {plan.bits}-bit weights; {work.operations:,.0f} operations, "

@@ -169,9 +169,9 @@ class Watch:
     def _show(self, line: str, kind: str, grasp: int, bins: int, step: Step, more: JsonObject | None = None) -> None:
         """Print a line, if there is one, or what it says as an object."""
         if self.as_json:
-            found = {"kind": kind, "grasp": grasp, "bins": bins, "time_s": float(self.bin_s * bins)}
-            found |= {"decision": step.decision, "margin": step.margin, "counts": step.counts.tolist()}
-            line = json.dumps(found | (more or {}))
+            standing = {"kind": kind, "grasp": grasp, "bins": bins, "time_s": float(self.bin_s * bins)}
+            standing |= {"decision": step.decision, "margin": step.margin, "counts": step.counts.tolist()}
+            line = json.dumps(standing | (more or {}))
         if line:
             sys.stdout.write(f"{line}\n")
             sys.stdout.flush()

@@ -73,7 +73,7 @@ def blocks_of(tree: Tree) -> list[Block]:
     layers = entry_of(tree, "layer", dict)
     if not layers:
         raise ModelError(f"has no layers, so it is no netx file; {AGAIN}")
-    found = []
+    blocks = []
     for number in range(len(layers)):
         entries = layers.get(str(number))
         if not isinstance(entries, dict):
@@ -81,8 +81,8 @@ def blocks_of(tree: Tree) -> list[Block]:
         kind = entries.get("type")
         while isinstance(kind, list) and kind:
             kind = kind[0]
-        found.append(Block(number=number, type=kind[:20] if isinstance(kind, str) else "", values=entries))
-    return found
+        blocks.append(Block(number=number, type=kind[:20] if isinstance(kind, str) else "", values=entries))
+    return blocks
 
 
 def read_netx(
@@ -193,7 +193,9 @@ def _conv(block: Block, shape: tuple[int, ...]) -> tuple[ir.Sparse, tuple[int, .
             f"weight has the shape {list(weight.shape)} and its input {list(shape)}, wanted are (filters, channels, "
             f"height, width) and (channels, height, width); {AGAIN}"
         )
-    stride, dilation, groups = block.few("stride", 2), block.few("dilation", 2), block.few("groups")[0]
+    stride = block.few("stride", 2)
+    dilation = block.few("dilation", 2)
+    groups = block.few("groups")[0]
     padding = [(zeros, zeros) for zeros in block.few("padding", 2)]
     with named(block):
         matrix, out = convolution(
@@ -226,7 +228,8 @@ def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopul
     entries: Tree = entry_of(block.values, "neuron", dict)
     if not entries:
         raise block.fail("has no neuron, so its membranes are the result, and a chip counts spikes; remove it")
-    neuron, kind = replace(block, values=entries), entries.get("type")
+    neuron = replace(block, values=entries)
+    kind = entries.get("type")
     if kind not in NEURONS:
         raise block.fail(f"has neurons of type {str(kind)[:20]!r}, allowed are {' and '.join(NEURONS)}; use them")
     graded = entries.get("gradedSpike"), entries.get("messageBits")
@@ -236,7 +239,9 @@ def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopul
         if (key in entries or key not in ("refDelay", "wgtExp")) and not least <= neuron.few(key)[0] <= most:
             allowed = f"allowed are {least} to {most}" if least < most else f"allowed is {least}"
             raise block.fail(f"{key} is {neuron.few(key)[0]}, {allowed}; train it so")
-    decay_u, decay_v, threshold = neuron.few("iDecay")[0] - 1, neuron.few("vDecay")[0], neuron.few("vThMant")[0]
+    decay_u = neuron.few("iDecay")[0] - 1
+    decay_v = neuron.few("vDecay")[0]
+    threshold = neuron.few("vThMant")[0]
     bias = _bias(block, size, shape)
     alpha, beta = kept_shares(decay_u, decay_v)
     return IntegerPopulation(

@@ -20,7 +20,9 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, entry_of
 from spikeloom.compiler.formats.names import named, printable
 
-GRAPH, INPUT_NODE, OUTPUT_NODE = "NIRGraph", "Input", "Output"
+GRAPH = "NIRGraph"
+INPUT_NODE = "Input"
+OUTPUT_NODE = "Output"
 
 SPIKING = ("CubaLIF", "IF", "LIF", "Threshold")
 
@@ -110,11 +112,11 @@ def _flat(graph: Tree, above: str) -> tuple[dict[str, Node], list[tuple[str, str
 
 def only(nodes: Mapping[str, Node], kind: str) -> Node:
     """The only node of a type; ModelError if there are none or several."""
-    found = [node for node in nodes.values() if node.type == kind]
-    if len(found) != 1:
-        shown = f" ({', '.join(printable(node.name) for node in found)})" if found else ""
-        raise ModelError(f"has {len(found)} nodes of type {kind}{shown}, one is allowed; export one network")
-    return found[0]
+    matching = [node for node in nodes.values() if node.type == kind]
+    if len(matching) != 1:
+        shown = f" ({', '.join(printable(node.name) for node in matching)})" if matching else ""
+        raise ModelError(f"has {len(matching)} nodes of type {kind}{shown}, one is allowed; export one network")
+    return matching[0]
 
 
 def _pairs(graph: Tree, where: str) -> list[tuple[str, str]]:
@@ -138,7 +140,7 @@ def loops(graph: Graph) -> Late:
     it takes the chip a step for each.
     """
     every = set(graph.edges)
-    found: dict[str, tuple[str, ...]] = {}
+    recurrent: dict[str, tuple[str, ...]] = {}
     for members in nx.strongly_connected_components(nx.DiGraph(graph.edges)):
         if len(members) == 1 and not every & {(name, name) for name in members}:
             continue
@@ -161,8 +163,8 @@ def loops(graph: Graph) -> Late:
                     f"is in the loop of {printable(neurons[0])} and receives {printable(source)} too, of which nothing "
                     "tells the step; give each a stage of its own"
                 )
-        found[neurons[0]] = tuple(source for source, target in pairs if target == neurons[0])
-    return found
+        recurrent[neurons[0]] = tuple(source for source, target in pairs if target == neurons[0])
+    return recurrent
 
 
 def in_order(graph: Graph, late: Late) -> tuple[str, ...]:

@@ -34,7 +34,8 @@ from spikeloom.compiler.targets.loihi1.registers import (
 )
 from spikeloom.compiler.types import FloatArray, IntArray
 
-AXES, ELEMENTS = 8, 2**20
+AXES = 8
+ELEMENTS = 2**20
 """Of an input."""
 
 SOFT = ("subtract", "soft")
@@ -74,7 +75,8 @@ def network_of(
     graph: Graph, steps: stages.Steps, polarities: int | None = None, polarities_first: bool | None = None
 ) -> ReadNetwork[Network]:
     """Network of a graph that was read; parameters and errors as of :func:`read_nir`, without the path."""
-    entry, end = only(graph.nodes, INPUT_NODE), only(graph.nodes, OUTPUT_NODE)
+    entry = only(graph.nodes, INPUT_NODE)
+    end = only(graph.nodes, OUTPUT_NODE)
     shape = tuple(entry.integers("shape").ravel().tolist()) if entry.has("shape") else ()
     if not shape or len(shape) > AXES or min(shape) < 1 or math.prod(shape) > ELEMENTS:
         raise entry.fail(f"has the shape {list(shape[:AXES])}, allowed are up to {ELEMENTS} values; export it again")
@@ -83,8 +85,8 @@ def network_of(
     if not spiking:
         raise ModelError("has no spiking neurons, so nothing can be counted; export a spiking network")
     voters, label = _readout(end, result, spiking)
-    layers, held = _layers(spiking, positions)
-    layers, sensor = _with_held(layers, held, sensor)
+    layers, constant = _layers(spiking, positions)
+    layers, sensor = _with_held(layers, constant, sensor)
     bins, length = (stages.stated_steps(graph, name) for name in ("bins", "length"))
     sensor = replace(sensor, bins=bins or 1, clocks=replace(sensor.clocks, length=length))
     network = assemble(layers, sensor, voters, label)
@@ -102,19 +104,20 @@ def network_of(
 
 def _forms(spiking: Sequence[Neurons], network: Network) -> tuple[Form, ...] | None:
     """Storage that a network was fine-tuned for, where all nodes say so; ModelError if no chip has it."""
-    found = {}
+    forms = {}
     for name, one in zip(unique_names([one.node.name for one in spiking]), spiking, strict=True):
         stored = replace(one.node, values=one.node.metadata)
         if not stored.has("bits"):
             return None
-        bits, exponents = stored.few("bits")[0], stored.integers("exponents").ravel().tolist()
+        bits = stored.few("bits")[0]
+        exponents = stored.integers("exponents").ravel().tolist()
         gaps = (0 < after - before <= plane_distance(bits) for before, after in pairwise(exponents))
         within = 2 <= bits <= 8 and exponents and -8 <= exponents[0] and exponents[-1] < 8 and all(gaps)
         whole = np.all(one.theta == np.rint(one.theta)) and one.theta.max() <= THRESHOLD_MANTISSA_MAX
         if not within or not whole:
             raise stored.fail("has no usable storage, or thresholds that are not whole; fine-tune it again")
-        found[name] = Form(bits=bits, exponents=tuple(exponents), threshold=read_only(one.theta))
-    return tuple(found[each.name] for each in network.populations) if len(found) == len(network.populations) else None
+        forms[name] = Form(bits=bits, exponents=tuple(exponents), threshold=read_only(one.theta))
+    return tuple(forms[each.name] for each in network.populations) if len(forms) == len(network.populations) else None
 
 
 def _walk(graph: Graph, steps: stages.Steps, shape: tuple[int, ...]) -> tuple[list[Neurons], stages.Value]:
@@ -142,25 +145,25 @@ def _walk(graph: Graph, steps: stages.Steps, shape: tuple[int, ...]) -> tuple[li
         else:
             known = ", ".join(sorted([*SPIKING, *stages.STAGES]))
             raise node.fail(f"is of a type that has no place here, allowed are {known}; replace it")
-    found = []
+    neurons = []
     for node, value in spiking:
         with named(node):
             every = stages.added([value, *(values[source] for source in late.get(node.name, ()))])
-        found.append(_neurons(node, every, steps))
-    return found, values[only(graph.nodes, OUTPUT_NODE).name]
+        neurons.append(_neurons(node, every, steps))
+    return neurons, values[only(graph.nodes, OUTPUT_NODE).name]
 
 
 def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer], list[Sparse | None]]:
     """A layer for each node, and what flows into its currents in every step, (neurons, 1)."""
     layers: list[Layer] = []
-    held = []
+    constant = []
     for place, (one, name) in enumerate(zip(spiking, unique_names([one.node.name for one in spiking]), strict=True)):
         # Neurons of other thresholds are those of one, with their weights and biases in its units.
         theta = float(one.theta[0])
         value = scaled(one.value, theta / one.theta)
         sources = dict(value.terms)
         always = sources.pop(stages.ALWAYS, None)
-        held.append(always if always is not None and always.count_nonzero() else None)
+        constant.append(always if always is not None and always.count_nonzero() else None)
         for weight in sources.values():
             weight.eliminate_zeros()
         if INPUT in sources:
@@ -168,7 +171,7 @@ def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer
         reached = {source: weight for source, weight in sources.items() if weight.nnz}
         sources = reached if reached.keys() - {place} else sources
         layers.append(Layer(name=name, beta=one.beta, theta=theta, bias=value.bias, sources=sources, alpha=value.alpha))
-    return layers, held
+    return layers, constant
 
 
 def _with_held(layers: list[Layer], held: list[Sparse | None], sensor: Input) -> tuple[list[Layer], Input]:
@@ -180,24 +183,25 @@ def _with_held(layers: list[Layer], held: list[Sparse | None], sensor: Input) ->
 
     def with_channel(size: int, weight: Sparse | None, channel: Sparse | None) -> Sparse:
         """Weights of the input into so many neurons, if there are any, and beside them those of the channel."""
-        own = sparse.csr_array((size, sensor.size)) if weight is None else weight
-        return sparse.hstack([own, sparse.csr_array((size, 1)) if channel is None else channel], format="csr")
+        sensed = sparse.csr_array((size, sensor.size)) if weight is None else weight
+        return sparse.hstack([sensed, sparse.csr_array((size, 1)) if channel is None else channel], format="csr")
 
-    found = []
+    extended = []
     for index, layer in enumerate(layers):
-        sources, deep = dict(layer.sources), depth[index]
+        sources = dict(layer.sources)
+        deep = depth[index]
         if not deep or INPUT in sources:
             sources[INPUT] = with_channel(layer.size, sources.get(INPUT), None if deep else held[index])
         if deep and held[index] is not None:
             sources[len(layers) + deep - 1] = held[index]
-        found.append(replace(layer, sources=sources))
+        extended.append(replace(layer, sources=sources))
     relay = sparse.csr_array([[RELAY_WEIGHT]])
     for step in range(max(depth[index] for index in lasting)):  # one a depth, on the way to the deepest
         source = len(layers) + step - 1 if step else INPUT
         weight = relay if step else with_channel(1, None, relay)
         name = f"always{step + 1}"
-        found.append(Layer(name=name, beta=0.0, theta=1.0, bias=np.zeros(1), sources={source: weight}, relays=1))
-    return found, replace(sensor, clocks=Clocks(channels=1, steps=MOST_STEPS))
+        extended.append(Layer(name=name, beta=0.0, theta=1.0, bias=np.zeros(1), sources={source: weight}, relays=1))
+    return extended, replace(sensor, clocks=Clocks(channels=1, steps=MOST_STEPS))
 
 
 def _readout(end: Node, result: stages.Value, spiking: Sequence[Neurons]) -> tuple[int, IntArray]:
@@ -232,7 +236,8 @@ class Neurons:
 
 def _neurons(node: Node, value: stages.Value, steps: stages.Steps) -> Neurons:
     """Neurons of a node of a type in ``SPIKING`` that gets a value; ModelError if the chip has no such neurons."""
-    size, shape = value.size, value.shape
+    size = value.size
+    shape = value.shape
     if not size:
         raise node.fail("has no neurons; export it again")
     _require_reset(node)
@@ -240,12 +245,16 @@ def _neurons(node: Node, value: stages.Value, steps: stages.Steps) -> Neurons:
     def each(key: str) -> FloatArray:
         return stages.spread(node, key, size, shape)
 
-    nothing, alpha, beta = np.zeros(size), 0.0, 0.0
-    gain, drive = np.ones(size), nothing
+    nothing = np.zeros(size)
+    alpha = 0.0
+    beta = 0.0
+    gain = np.ones(size)
+    drive = nothing
     reset = each("v_reset") if node.has("v_reset") else nothing
     theta = each("threshold" if node.type == "Threshold" else "v_threshold") - reset
     if node.type == "IF":
-        beta, gain = 1.0, each("r") * steps.dt
+        beta = 1.0
+        gain = each("r") * steps.dt
     elif node.type in ("LIF", "CubaLIF"):
         key = "tau" if node.type == "LIF" else "tau_mem"
         kept = steps.keeps(node, key, size, shape)
@@ -260,8 +269,8 @@ def _neurons(node: Node, value: stages.Value, steps: stages.Steps) -> Neurons:
     if np.any(theta <= 0):
         raise node.fail(f"fires {theta.min():g} above its reset, allowed are thresholds above it; train it again")
     with named(node):
-        own = shifted(stages.filtered(value, alpha, gain, nothing), drive)  # a leak acts past the current
-    return Neurons(node=node, value=own, beta=beta, gain=gain, theta=theta, reset=reset)
+        state = shifted(stages.filtered(value, alpha, gain, nothing), drive)  # a leak acts past the current
+    return Neurons(node=node, value=state, beta=beta, gain=gain, theta=theta, reset=reset)
 
 
 def _require_reset(node: Node) -> None:
@@ -307,5 +316,6 @@ def _facts(graph: Graph, steps: stages.Steps, spiking: Sequence[Neurons], sensor
 
 
 def _span(values: FloatArray) -> str:
-    low, high = float(values.min()), float(values.max())
+    low = float(values.min())
+    high = float(values.max())
     return f"{low:.6g}" if math.isclose(low, high, rel_tol=1e-6, abs_tol=1e-12) else f"{low:.6g} … {high:.6g}"

@@ -77,9 +77,9 @@ def stated_steps(graph: Graph, name: str) -> int | None:
 
 def written_step(graph: Graph) -> float | None:
     """Step that a file was written in, as far as all of its neurons say the same."""
-    found = [_written_for(node) for node in graph.nodes.values() if node.type in SPIKING and node.type != "Threshold"]
-    steps = [step for step in found if step is not None]
-    same = len(steps) == len(found) and all(math.isclose(step, steps[0], rel_tol=1e-4) for step in steps)
+    written = [_written_for(node) for node in graph.nodes.values() if node.type in SPIKING and node.type != "Threshold"]
+    steps = [step for step in written if step is not None]
+    same = len(steps) == len(written) and all(math.isclose(step, steps[0], rel_tol=1e-4) for step in steps)
     return steps[0] if steps and same else None
 
 
@@ -154,13 +154,13 @@ def filtered(value: Value, alpha: float, gain: FloatArray, drive: FloatArray) ->
 
     ModelError if the value went through one before.
     """
-    own = shifted(scaled(value, gain), drive)
+    driven = shifted(scaled(value, gain), drive)
     if not alpha:
-        return own
+        return driven
     if value.alpha:
         raise ModelError("filters a current that is filtered before; a neuron of the chip has one current")
-    held = {ALWAYS: sparse.csr_array(own.bias[:, None])} if np.any(own.bias) else {}
-    return replace(own, alpha=alpha, terms={**own.terms, **held}, bias=np.zeros(value.size))
+    constant = {ALWAYS: sparse.csr_array(driven.bias[:, None])} if np.any(driven.bias) else {}
+    return replace(driven, alpha=alpha, terms={**driven.terms, **constant}, bias=np.zeros(value.size))
 
 
 def _linear(node: Node, value: Value, _steps: Steps) -> Value:
@@ -219,13 +219,16 @@ def _conv(node: Node, value: Value, _steps: Steps) -> Value:
         raise node.fail(
             f"weight has the shape {list(weight.shape)}, allowed are (filters, channels, *kernel); export it again"
         )
-    shape, kernel = _image(node, value, axes), weight.shape[2:]
+    shape = _image(node, value, axes)
+    kernel = weight.shape[2:]
     if node.has("input_shape"):
         declared = tuple(node.integers("input_shape").ravel().tolist())
         if declared != shape[1:]:
             raise node.fail(f"is for inputs of {list(declared)}, it gets {list(shape[1:])}; export it again")
-    stride, dilation = node.few("stride", axes), node.few("dilation", axes)
-    padding, groups = _padding(node, kernel, dilation, stride), node.few("groups")[0]
+    stride = node.few("stride", axes)
+    dilation = node.few("dilation", axes)
+    padding = _padding(node, kernel, dilation, stride)
+    groups = node.few("groups")[0]
     with named(node):
         matrix, out = convolution(shape, weight, stride=stride, padding=padding, dilation=dilation, groups=groups)
     result = through(matrix, value, out)
@@ -236,7 +239,8 @@ def _conv(node: Node, value: Value, _steps: Steps) -> Value:
 
 def _pool(node: Node, value: Value, _steps: Steps) -> Value:
     shape = _image(node, value, 2)
-    kernel, stride = node.few("kernel_size", 2), node.few("stride", 2)
+    kernel = node.few("kernel_size", 2)
+    stride = node.few("stride", 2)
     padding = _padding(node, kernel, (1, 1), stride)
     if min(kernel) < 1 or max(kernel) > max(shape) + 2 * max(max(pair) for pair in padding):
         raise node.fail(f"has a window of {list(kernel)} for {list(shape[1:])} places; export it again")

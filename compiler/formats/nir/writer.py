@@ -57,7 +57,8 @@ def export(network: IntegerNetwork, dt: float, *, training: str | None = None, o
         for number, (pre, weight) in enumerate(sorted(sources.items())):
             source = "input" if pre == INPUT else names[pre]
             synapses = f"{source}_to_{name}"
-            dense, added = _dense(population, weight), np.zeros(population.size)
+            dense = _dense(population, weight)
+            added = np.zeros(population.size)
             if always and pre == INPUT:
                 dense, added = dense[:, :-1], dense[:, -1].astype(np.float64)
             if population.decay_u == FORGETS and not number:
@@ -70,7 +71,8 @@ def export(network: IntegerNetwork, dt: float, *, training: str | None = None, o
         if training is not None:
             form = network.forms[post]
             nodes[name]["metadata"] = {"bits": np.array(form.bits), "exponents": np.array(form.exponents)}
-    voters, label = names[network.readout.population], network.readout.label
+    voters = names[network.readout.population]
+    label = network.readout.label
     if np.array_equal(label, np.arange(network.classes)):
         edges.append((voters, "output"))
     else:
@@ -80,7 +82,8 @@ def export(network: IntegerNetwork, dt: float, *, training: str | None = None, o
         edges += [(voters, "votes"), ("votes", "output")]
     nodes["output"] = {"type": "Output", "shape": np.array([network.classes])}
     said: Tree = {"dt": np.array(dt), "writer": "spikeloom"}
-    bins, length = network.input.bins, network.input.clocks.length
+    bins = network.input.bins
+    length = network.input.clocks.length
     said |= {"bins": np.array(bins)} if bins > 1 else {}
     said |= {"length": np.array(length)} if length is not None else {}
     if (known := training or origin) is not None:
@@ -103,10 +106,10 @@ def _neurons(population: IntegerPopulation, bias: FloatArray, dt: float) -> Tree
     def each(value: float) -> Float32:
         return np.full(population.size, value, np.float32)
 
-    lost = 1 - population.realised_beta
+    leak = 1 - population.realised_beta
     common = {"v_threshold": population.threshold.astype(np.float32), "v_reset": each(0)}
     if population.decay_u != FORGETS:
-        if not lost:
+        if not leak:
             raise ModelError(
                 f"{population.name}: keeps its whole membrane and has a current that outlasts its step, NIR's CubaLIF "
                 "always leaks; train with a decay below 1"
@@ -115,12 +118,12 @@ def _neurons(population: IntegerPopulation, bias: FloatArray, dt: float) -> Tree
         return {
             "type": "CubaLIF",
             "tau_syn": each(dt / drained),
-            "tau_mem": each(dt / lost),
-            "r": each(1 / lost),
+            "tau_mem": each(dt / leak),
+            "r": each(1 / leak),
             "w_in": each(1 / drained),
-            "v_leak": (bias / lost).astype(np.float32),
+            "v_leak": (bias / leak).astype(np.float32),
             **common,
         }
-    if not lost:
+    if not leak:
         return {"type": "IF", "r": each(1 / dt), **common}
-    return {"type": "LIF", "tau": each(dt / lost), "r": each(1 / lost), "v_leak": each(0), **common}
+    return {"type": "LIF", "tau": each(dt / leak), "r": each(1 / leak), "v_leak": each(0), **common}

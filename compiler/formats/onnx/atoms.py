@@ -18,7 +18,8 @@ from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.ir import Sparse
 from spikeloom.compiler.types import AnyArray, FloatArray, IntArray
 
-VALUE_LIMIT, COEFFICIENT_LIMIT = 2**22, 2**24
+VALUE_LIMIT = 2**22
+COEFFICIENT_LIMIT = 2**24
 """Elements of a value, and coefficients of an operator: more than the synapses of a chip."""
 
 DIMENSIONS = 32
@@ -26,7 +27,10 @@ DIMENSIONS = 32
 ATOM_LIMIT = 2**20
 """Elements of an input, over all steps, or of a layer."""
 
-INPUT_ATOM, MEMBRANE, SPIKE, PRODUCT = "input", "membrane", "spike", "product"
+INPUT_ATOM = "input"
+MEMBRANE = "membrane"
+SPIKE = "spike"
+PRODUCT = "product"
 
 NOT_AFFINE = "is not affine in its input; only affine operators between two spiking layers can become synapses"
 
@@ -85,8 +89,8 @@ class Table:
 
     def value(self, atom: int, shape: tuple[int, ...]) -> Affine:
         """The atom itself as a value."""
-        found = self.atoms[atom]
-        return Affine(shape=shape, terms={atom: found.eye}, bias=np.zeros(found.size))
+        atom_type = self.atoms[atom]
+        return Affine(shape=shape, terms={atom: atom_type.eye}, bias=np.zeros(atom_type.size))
 
     def spike(self, membrane: int, theta: FloatArray, *, strict: bool) -> int:
         """The atom of the spikes of a membrane by a threshold."""
@@ -147,7 +151,8 @@ def multiplied(table: Table, a: Affine, b: Affine) -> Affine:
 
 def _pair(table: Table, first: int, second: int) -> int:
     """Atom of a product of two atoms, where it may be a reset."""
-    one, other = table.atoms[first], table.atoms[second]
+    one = table.atoms[first]
+    other = table.atoms[second]
     if first == second and one.binary:
         return first
     inputs = one.kind == other.kind == INPUT_ATOM and first != second
@@ -161,7 +166,8 @@ def _one_each(terms: Sparse) -> tuple[FloatArray, IntArray]:
     counts = np.diff(terms.indptr)
     if np.any(counts > 1):
         raise ModelError(NOT_AFFINE)
-    coefficient, column = np.zeros(terms.shape[0]), np.full(terms.shape[0], -1, np.int64)
+    coefficient = np.zeros(terms.shape[0])
+    column = np.full(terms.shape[0], -1, np.int64)
     coefficient[counts == 1], column[counts == 1] = terms.data, terms.indices
     return coefficient, column
 

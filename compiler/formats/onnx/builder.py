@@ -112,8 +112,10 @@ def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes
     onnx = _onnx()
     nodes, inputs, left = step
     states = inputs[2:]
-    channels, drain = inputs[0].shape[1], max(depth for _, depth in layers.values())
-    graph, sequence = Nodes(), "events"
+    channels = inputs[0].shape[1]
+    drain = max(depth for _, depth in layers.values())
+    graph = Nodes()
+    sequence = "events"
     graph.add("Shape", ["events"], "duration", start=0, end=1)
     graph.add("Shape", ["events"], "batch", start=1, end=2)
     graph.add("Squeeze", ["duration"], "length")
@@ -139,22 +141,22 @@ def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes
             body=onnx.compose.add_prefix_graph(body, INNER),
         )
     )
-    found = []
+    outputs = []
     for name, (size, depth) in layers.items():
         trains = f"{name}/fired/steps"
         if drain:
             ends = np.array([depth]), np.array([depth - drain or END])
             trains = graph.add("Slice", [trains, *ends], f"{name}/trains")
         graph.cast(trains, f"{name}.spikes", np.uint8)
-        found += [
+        outputs += [
             Port(name=f"{name}.spikes", kind=np.uint8, shape=("time", "batch", size)),
             Port(name=_counted(graph, name, size), kind=np.int32, shape=("batch", size)),
         ]
     if any(state.name == "votes" for state in states):
         graph.add("ArgMax", ["votes"], "class", axis=1, keepdims=0)  # the lowest on a tie
-        found.append(Port(name="votes", kind=np.int32, shape=("batch", classes)))
-        found.append(Port(name="class", kind=np.int64, shape=("batch",)))
-    return graph, [Port(name="events", kind=np.uint8, shape=("time", "batch", channels))], found
+        outputs.append(Port(name="votes", kind=np.int32, shape=("batch", classes)))
+        outputs.append(Port(name="class", kind=np.int64, shape=("batch",)))
+    return graph, [Port(name="events", kind=np.uint8, shape=("time", "batch", channels))], outputs
 
 
 def _counted(graph: Nodes, name: str, size: int) -> str:

@@ -97,16 +97,16 @@ def shapes_of(node: Node, table: Table, operands: Operands) -> list[tuple[int, .
     schema = defs.get_schema(node.op, table.opset, "")
     version = helper.make_opsetid("", table.opset)
     inferred = shape_inference.infer_node_outputs(schema, proto, types, small, opset_imports=[version])
-    found = []
+    shapes = []
     for name in proto.output:
         kind = inferred[name].tensor_type if name in inferred else None
         if kind is not None and kind.HasField("shape") and all(d.HasField("dim_value") for d in kind.shape.dim):
-            found.append(table.room([d.dim_value for d in kind.shape.dim]))
+            shapes.append(table.room([d.dim_value for d in kind.shape.dim]))
         elif node.op == "NonZero" and operands[0] is not None:
-            found.append(table.room([operands[0].ndim, operands[0].size]))  # at most
+            shapes.append(table.room([operands[0].ndim, operands[0].size]))  # at most
         else:
             raise ModelError("makes a value of a size that its operands do not tell; export it again")
-    return found
+    return shapes
 
 
 def _proto(node: Node) -> Any:
@@ -189,7 +189,8 @@ def _einsum_matrix(node: Node, table: Table, operands: Sequence[Any], which: int
     if "->" not in spelled or "." in spelled or spelled.count(",") > 1:
         raise ValueError("an equation that is not known")
     inputs, out = spelled.split("->")
-    labels, sides = inputs.split(","), _sides(operands, which)
+    labels = inputs.split(",")
+    sides = _sides(operands, which)
     return _contract(table, [*labels, ""][:2], out, [*sides, np.array(1.0)][:2], which)
 
 
@@ -204,7 +205,8 @@ def _reduce_axes(node: Node, operands: Sequence[Any]) -> tuple[int, ...]:
 
 
 def _reduce_matrix(node: Node, table: Table, operands: Sequence[Any], _which: int) -> Sparse:
-    shape, axes = operands[0].shape, _reduce_axes(node, operands)
+    shape = operands[0].shape
+    axes = _reduce_axes(node, operands)
     letters = string.ascii_lowercase[: len(shape)]
     out = "".join(label for axis, label in enumerate(letters) if axis not in axes)
     share = 1.0 if node.op == "ReduceSum" else 1 / math.prod([shape[axis] for axis in axes])
@@ -236,8 +238,8 @@ def _pool_matrix(node: Node, table: Table, operands: Sequence[Any], _which: int)
     depthwise = replace(node, attributes={**node.attributes, "group": data.shape[1]})
     matrix = _conv_matrix(depthwise, table, [data, ones], 0)
     inside = np.diff(matrix.indptr)
-    held = np.full(len(inside), math.prod(kernel)) if node.attributes.get("count_include_pad", 0) else inside
-    matrix.data = matrix.data / np.repeat(held, inside)
+    counted = np.full(len(inside), math.prod(kernel)) if node.attributes.get("count_include_pad", 0) else inside
+    matrix.data = matrix.data / np.repeat(counted, inside)
     return matrix
 
 

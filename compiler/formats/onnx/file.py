@@ -28,7 +28,8 @@ OPSETS = range(9, 27)
 NODE_LIMIT = 200_000
 """Nodes of a file."""
 
-BOOL, DOUBLE = 9, 11
+BOOL = 9
+DOUBLE = 11
 """Element types by their number in the format."""
 
 DAMAGED = "is truncated or damaged; export it again"
@@ -129,8 +130,8 @@ def _bring_data(graph: Any, folder: Path, digest: Any) -> None:
     from onnx.external_data_helper import load_external_data_for_tensor
 
     total = 0
-    held = (attribute.t for node in graph.node for attribute in node.attribute if attribute.HasField("t"))
-    for tensor in chain(graph.initializer, held):
+    tensors = (attribute.t for node in graph.node for attribute in node.attribute if attribute.HasField("t"))
+    for tensor in chain(graph.initializer, tensors):
         if tensor.data_location != tensor.EXTERNAL:
             continue
         location = next((entry.value for entry in tensor.external_data if entry.key == "location"), "")

@@ -54,20 +54,22 @@ def neurons_of(table: Table, outputs: Mapping[str, Affine]) -> list[Neurons]:
     for index, atom in enumerate(table.atoms):
         if atom.kind == SPIKE and table.atoms[atom.of[0]].kind == MEMBRANE:
             spikes.setdefault(atom.of[0], []).append(index)
-    found = []
+    neurons = []
     for membrane in sorted(spikes):
         with named(table.atoms[membrane].node):
-            found.append(_read(table, membrane, spikes[membrane], outputs))
-    return found
+            neurons.append(_read(table, membrane, spikes[membrane], outputs))
+    return neurons
 
 
 def _read(table: Table, membrane: int, spikes: list[int], outputs: Mapping[str, Affine]) -> Neurons:
-    atom, spike = table.atoms[membrane], table.atoms[spikes[0]]
+    atom = table.atoms[membrane]
+    spike = table.atoms[spikes[0]]
     assert atom.definition is not None
     if len(spikes) > 1:
         raise ModelError("is compared in several ways, which is no spike; compare a membrane with one threshold")
     if np.ptp(spike.theta) > 0:
-        low, high = spike.theta.min(), spike.theta.max()
+        low = spike.theta.min()
+        high = spike.theta.max()
         raise ModelError(f"has thresholds from {low:g} to {high:g} in one layer; give all its neurons the same one")
     terms = dict(atom.definition.terms)
     previous, gate, beta = _carried(table, membrane, spikes[0], terms, outputs)
@@ -103,13 +105,15 @@ def _carried(
         raise ModelError(f"holds {table.atoms[products[0]]} in a way that is no reset; {RESET}")
     previous = kept[0]
     gate = pair[0] if pair[1] == previous else pair[1]
-    beta, removed = diagonal(terms.pop(previous), EQUAL), diagonal(terms.pop(products[0]), EQUAL)
+    beta = diagonal(terms.pop(previous), EQUAL)
+    removed = diagonal(terms.pop(products[0]), EQUAL)
     if beta is None or removed is None:
         raise ModelError(f"mixes or weighs the neurons of {table.atoms[previous]} differently; {RESET}")
     if abs(beta + removed) > EQUAL * max(abs(beta), abs(removed)):
         raise ModelError(f"keeps {beta:g} of a membrane and {beta + removed:g} of it after a spike; {RESET}")
     if table.atoms[gate].kind == SPIKE:
-        old, new = table.atoms[gate], table.atoms[spike]
+        old = table.atoms[gate]
+        new = table.atoms[spike]
         if not np.array_equal(old.theta, new.theta) or old.strict != new.strict:
             raise ModelError(f"resets {table.atoms[previous]} by another threshold than it fires by; {RESET}")
     if table.atoms[previous].kind == INPUT_ATOM:
@@ -140,10 +144,10 @@ def _already_reset(
 
 def _multiple(value: Affine, wanted: Mapping[int, float]) -> float | None:
     """By what the value is a multiple of a sum of atoms, if it is."""
-    found = {atom: diagonal(own) for atom, own in value.terms.items()}
-    if set(found) != set(wanted) or np.any(value.bias) or any(factor is None for factor in found.values()):
+    factors = {atom: diagonal(own) for atom, own in value.terms.items()}
+    if set(factors) != set(wanted) or np.any(value.bias) or any(factor is None for factor in factors.values()):
         return None
-    ratios = [(found[atom] or 0.0) / factor for atom, factor in wanted.items()]
+    ratios = [(factors[atom] or 0.0) / factor for atom, factor in wanted.items()]
     return ratios[0] if all(abs(r - ratios[0]) <= EQUAL * abs(ratios[0]) for r in ratios) else None
 
 
@@ -159,16 +163,16 @@ def _require_output(outputs: Mapping[str, Affine], wanted: Mapping[int, float], 
 
 def _require_current(table: Table, atom: int, terms: Sparse, previous: int | None, membrane: int) -> None:
     """Whether the rest is a current: from the input or from spikes; says what it is where it is not."""
-    found = table.atoms[atom]
-    if found.kind == MEMBRANE:
-        raise ModelError(f"takes the membrane of {found}, not its spikes, as its input or without a reset; {RESET}")
-    if found.kind == PRODUCT:
-        raise ModelError(f"holds {found} in a way that is no reset; {RESET}")
+    source = table.atoms[atom]
+    if source.kind == MEMBRANE:
+        raise ModelError(f"takes the membrane of {source}, not its spikes, as its input or without a reset; {RESET}")
+    if source.kind == PRODUCT:
+        raise ModelError(f"holds {source} in a way that is no reset; {RESET}")
     factor = diagonal(terms, EQUAL)
-    own = found.kind == SPIKE and found.of == (previous,)
-    state = found.kind == INPUT_ATOM and previous is None and found.size == table.atoms[membrane].size
-    if factor is not None and factor < 0 and (own or state):
-        raise ModelError(f"loses {-factor:g} for a spike of {found}, a reset by subtraction; {RESET}")
+    recurrent = source.kind == SPIKE and source.of == (previous,)
+    state = source.kind == INPUT_ATOM and previous is None and source.size == table.atoms[membrane].size
+    if factor is not None and factor < 0 and (recurrent or state):
+        raise ModelError(f"loses {-factor:g} for a spike of {source}, a reset by subtraction; {RESET}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -282,22 +286,23 @@ def _sources(
     table: Table, n: Neurons, step: int, step_of: Mapping[int, tuple[int, int]], inputs: Mapping[int, IntArray]
 ) -> dict[int, Sparse]:
     """Weights from each source; of an input from its positions in this step."""
-    found = {}
+    sources = {}
     for atom, weight in n.current.items():
         if atom in inputs:
-            found[INPUT] = weight[:, inputs[atom]]
+            sources[INPUT] = weight[:, inputs[atom]]
         elif atom in step_of and step_of[atom][1] == step:
-            found[step_of[atom][0]] = weight
+            sources[step_of[atom][0]] = weight
         else:
             raise ModelError(f"{n.node}: takes {table.atoms[atom]}, which is no spike of a layer in this step; {RESET}")
-    for weight in found.values():
+    for weight in sources.values():
         weight.sort_indices()
-    return found
+    return sources
 
 
 def _require_like(layer: list[Neurons], step: int, every: list[dict[int, Sparse]]) -> None:
     """Whether a step is the first one again; a threshold and a bias that both moved are the same neuron."""
-    first, this = layer[0], layer[step]
+    first = layer[0]
+    this = layer[step]
     shift = first.theta - this.theta if step + 1 == len(layer) else 0.0
     same = (
         set(every[0]) == set(every[step])

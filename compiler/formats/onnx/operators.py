@@ -35,13 +35,13 @@ def run(graph: Graph, given: Mapping[str, atoms.Value], table: atoms.Table) -> l
     """
     values: dict[str, atoms.Value] = {**given, **graph.constants}
     order = needed(graph)
-    held = membranes(order, graph.outputs, set(given))
+    compared = membranes(order, graph.outputs, set(given))
     last = {name: index for index, node in enumerate(order) for name in reads(node)}
     for index, node in enumerate(order):
         with named(node):
             results = apply(node, table, [values[name] if name else None for name in node.inputs])
             for name, result in zip(node.outputs, results, strict=False):
-                values[name] = _set_apart(node, name, result, table) if name in held else result
+                values[name] = _set_apart(node, name, result, table) if name in compared else result
         for name in reads(node):
             if last[name] == index and name not in graph.outputs:
                 values.pop(name, None)
@@ -70,12 +70,13 @@ def reads(node: Node) -> list[str]:
 
 def needed(graph: Graph) -> list[Node]:
     """Operators that the outputs need; a file has each after those that it needs itself."""
-    wanted, found = set(graph.outputs), []
+    wanted = set(graph.outputs)
+    nodes = []
     for node in reversed(graph.nodes):
         if wanted & set(node.outputs):
             wanted |= set(reads(node))
-            found.append(node)
-    return found[::-1]
+            nodes.append(node)
+    return nodes[::-1]
 
 
 def membranes(order: list[Node], outputs: tuple[str, ...], varying: set[str]) -> set[str]:
@@ -89,7 +90,7 @@ def membranes(order: list[Node], outputs: tuple[str, ...], varying: set[str]) ->
     for node in order:
         if moving & set(reads(node)):
             moving |= set(node.outputs)
-    found = set()
+    compared = set()
     for node in order:
         if node.op not in MIRRORED:
             continue
@@ -104,8 +105,8 @@ def membranes(order: list[Node], outputs: tuple[str, ...], varying: set[str]) ->
                     break
                 place = before[0]
             if place in moving:
-                found.add(place)
-    return found
+                compared.add(place)
+    return compared
 
 
 def apply(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]) -> list[atoms.Value]:
@@ -113,7 +114,8 @@ def apply(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]
 
     Raises ModelError if it is not known, or not affine in what varies; without its name.
     """
-    op, varying = node.op, [place for place, operand in enumerate(operands) if isinstance(operand, Affine)]
+    op = node.op
+    varying = [place for place, operand in enumerate(operands) if isinstance(operand, Affine)]
     if op == "Constant":
         numbers = [value for value in node.attributes.values() if not isinstance(value, str)]
         if not numbers:
@@ -189,7 +191,8 @@ def _chosen(table: atoms.Table, operands: Sequence[atoms.Value | None]) -> Affin
 
 def _scattered(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]) -> Affine:
     """A scattering sum: data plus what the updates bring; a gathering of positions tells where each goes."""
-    start, more = atoms.as_affine(operands[0]), atoms.as_affine(operands[2])
+    start = atoms.as_affine(operands[0])
+    more = atoms.as_affine(operands[2])
     if not isinstance(operands[1], np.ndarray):
         raise ModelError("takes its indices from what varies; only a fixed graph can be lowered")
     op = node.op.replace("Scatter", "Gather")
@@ -230,7 +233,8 @@ def _linear(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | Non
     inner = [place for place in varying if not (has_bias and place == 2)]
     matrix_of, allowed = LINEAR[node.op]
     if has_bias and not inner:  # only the bias varies
-        operands, inner = [atoms.as_affine(operands[0]), *operands[1:]], [0]
+        operands = [atoms.as_affine(operands[0]), *operands[1:]]
+        inner = [0]
     if len(inner) != 1 or inner[0] not in allowed:
         raise ModelError(atoms.NOT_AFFINE)
     place = inner[0]
@@ -259,7 +263,8 @@ def _linear(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | Non
 
 def _normalised(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]) -> Affine:
     """An affine function of each element alone: read from what it does to 0 and 2**20."""
-    value, high = atoms.as_affine(operands[0]), 2.0**20
+    value = atoms.as_affine(operands[0])
+    high = 2.0**20
     at_zero, at_high = (
         evaluate(node, table, [np.full(value.shape, x), *operands[1:]])[0].ravel()  # type: ignore[list-item]
         for x in (0.0, high)
@@ -268,13 +273,15 @@ def _normalised(node: Node, table: atoms.Table, operands: Sequence[atoms.Value |
 
 
 def _elementwise(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None], varying: list[int]) -> Affine:
-    op, values = node.op, [atoms.as_affine(operand) for operand in operands]
+    op = node.op
+    values = [atoms.as_affine(operand) for operand in operands]
     weights = {"Add": 1.0, "Mean": 1 / len(values), "Neg": -1.0, "Sub": 1.0, "Sum": 1.0}
     if op not in (*weights, "Cast", "Div", "Mul", "Not"):
         raise ModelError(atoms.NOT_AFFINE)
     shape = table.room(np.broadcast_shapes(*(value.shape for value in values)))
     parts = [spread(value, shape) for value in values]
-    value, other = parts[0], parts[-1]
+    value = parts[0]
+    other = parts[-1]
     if op == "Cast":
         to = int(node.attributes["to"])
         if to not in FLOATING and not (atoms.is_binary(table, value) if to == BOOL else atoms.is_whole(table, value)):

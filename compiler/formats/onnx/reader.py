@@ -55,10 +55,10 @@ def _network(file: Graph, polarities: int | None, polarities_first: bool | None)
     outputs = {name: as_affine(value) for name, value in results}
     for name, value in outputs.items():
         require_finite(value, f"output {printable(name)}: ")
-    found = group(table, neurons_of(table, outputs), shapes)
-    voters, label, counted = readout(table, found, outputs)
-    sensor, positions, words = sensor_layout(found.shape, polarities=polarities, polarities_first=polarities_first)
-    names = _names(graph, table, found)
+    groups = group(table, neurons_of(table, outputs), shapes)
+    voters, label, counted = readout(table, groups, outputs)
+    sensor, positions, words = sensor_layout(groups.shape, polarities=polarities, polarities_first=polarities_first)
+    names = _names(graph, table, groups)
     double = any(declared.kind == DOUBLE for declared in graph.inputs)
     layers = [
         Layer(
@@ -68,10 +68,10 @@ def _network(file: Graph, polarities: int | None, polarities_first: bool | None)
             bias=layer[0].bias,
             sources={source: weight[:, positions] if source == INPUT else weight for source, weight in sources.items()},
         )
-        for name, layer, sources in zip(names, found.layers, found.sources, strict=True)
+        for name, layer, sources in zip(names, groups.layers, groups.sources, strict=True)
     ]
     network = assemble(layers, sensor, voters, label)
-    facts += _facts(file, table, found, outputs, names, words)
+    facts += _facts(file, table, groups, outputs, names, words)
     facts.append(f"classes: the spikes of {names[voters]} in output {printable(counted)}")
     return ReadNetwork(network=network, facts=tuple(facts), sha256=file.sha256)
 
@@ -94,7 +94,8 @@ def _undecided(graph: Graph, facts: list[str]) -> Graph:
     makers = {name: node for node in graph.nodes for name in node.outputs}
     outputs = []
     for output in graph.outputs:
-        name, node = output, makers.get(output)
+        name = output
+        node = makers.get(output)
         if node is not None and node.op == "ArgMax" and node.inputs and not node.attributes.get("select_last_index", 0):
             facts.append(f"output {printable(name)}: the class of the largest of {printable(node.inputs[0])}")
             name = node.inputs[0]
@@ -116,7 +117,8 @@ def _names(graph: Graph, table: Table, found: Unrolled) -> tuple[str, ...]:
     ends = {table.atoms[n.membrane].label for layer in found.layers for n in layer}
     names = []
     for layer in found.layers:
-        pending, owners = [table.atoms[layer[0].membrane].label], []
+        pending = [table.atoms[layer[0].membrane].label]
+        owners = []
         seen: set[str] = set()
         for name in pending:
             if name in graph.constants and re.search(r"[./]", name):
@@ -141,12 +143,13 @@ def _facts(
     ]
     used = {found.data}
     for name, layer in zip(names, found.layers, strict=True):
-        n, beta = layer[0], layer[-1].beta or 0.0
+        n = layer[0]
+        beta = layer[-1].beta or 0.0
         sign = ">" if n.strict else ">="
         line = f"layer {name}: {len(n.bias)} neurons, decay {beta:g}, fires at u {sign} {n.theta:g}"
         if n.previous is not None:
-            held = is_output(outputs, {n.membrane: 1.0}) or "after the reset"
-            line += f", membrane {table.atoms[n.previous]} -> {printable(held)}"
+            reset_state = is_output(outputs, {n.membrane: 1.0}) or "after the reset"
+            line += f", membrane {table.atoms[n.previous]} -> {printable(reset_state)}"
             used |= {n.previous} | ({n.gate} if n.gate is not None else set())
         if not n.strict:
             line += "; >= is read as > the next number below"

@@ -93,7 +93,8 @@ def digits(weight: IntArray) -> tuple[Digit, ...]:
     while not found or rest.any():
         low = ((rest + 128) & 255) - 128
         found.append((low.astype(np.int8), factor))
-        rest, factor = (rest - low) >> 8, factor << 8
+        rest = (rest - low) >> 8
+        factor = factor << 8
     return tuple(found)
 
 
@@ -114,8 +115,11 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
     # zeros of dense lists are no synapses
     weight = netlist.effective_weight()
     real = weight != 0
-    weight, axon, target = weight[real], netlist.axon_of_synapse()[real], netlist.synapse_compartment()[real]
-    pre, post = pre_of_axon[axon], netlist.layer[target]
+    weight = weight[real]
+    axon = netlist.axon_of_synapse()[real]
+    target = netlist.synapse_compartment()[real]
+    pre = pre_of_axon[axon]
+    post = netlist.layer[target]
     pairs = np.unique(np.stack([post, pre], axis=1), axis=0)
     place = netlist.number_in_layer()
     counts = {INPUT: netlist.n_inputs} | dict(enumerate(np.bincount(netlist.layer, minlength=len(names)).tolist()))
@@ -139,13 +143,14 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
 def _layer(netlist: Netlist, index: int, name: str, sources: dict[int, IntArray], reached: Reach) -> Layer:
     ids = netlist.compartments_of(index)
     _, current, highest, stored = (bound[ids] for bound in reached)
-    lost_u, lost_v = netlist.decay_u[ids] + 1, netlist.decay_v[ids]
+    lost_u = netlist.decay_u[ids] + 1
+    lost_v = netlist.decay_v[ids]
     bias = netlist.bias_mantissa[ids] << netlist.bias_exponent[ids]
-    held = np.minimum(stored, MEMBRANE_MAX)
+    clipped = np.minimum(stored, MEMBRANE_MAX)
     widest = max(
-        int((held * (DECAY_ONE - lost_v)).max()),
+        int((clipped * (DECAY_ONE - lost_v)).max()),
         int((current * (DECAY_ONE - lost_u)).max()),
-        int((held + current + np.abs(bias)).max()) + _gathered(sources),
+        int((clipped + current + np.abs(bias)).max()) + _gathered(sources),
     )
     return Layer(
         index=index,
@@ -201,7 +206,8 @@ def export(netlist: Netlist, form: str) -> tuple[bytes, list[Port], list[Port]]:
 
 def _input_words(netlist: Netlist) -> str:
     """What the events of a file are, for its metadata."""
-    polarities, clocks = netlist.polarities, netlist.clocks
+    polarities = netlist.polarities
+    clocks = netlist.clocks
     words = f"{netlist.taxels} taxels x {polarities} polarities; channel = taxel * {polarities} + polarity; 0 or 1"
     if netlist.bins > 1:
         words += f"; a step joins {netlist.bins} bins of the recordings"
@@ -228,7 +234,8 @@ def _chip_step(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
             states.append(Port(name=f"{layer.name}.current", kind=layer.kind, shape=size))
         spikes = [received[pre] for pre in layer.sources]
         _integrate(graph, netlist, layer, spikes, windows[layer.depth])
-    votes, voting = "votes", [layer for layer in layers if np.any(netlist.readout_class[layer.ids] >= 0)]
+    votes = "votes"
+    voting = [layer for layer in layers if np.any(netlist.readout_class[layer.ids] >= 0)]
     for layer in voting:
         poll = (netlist.readout_class[layer.ids, None] == np.arange(netlist.classes)).astype(np.uint8)
         more = graph.add("MatMulInteger", [f"{layer.name}.spikes_next", poll], f"{layer.name}/votes")
@@ -243,7 +250,8 @@ def _chip_step(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
 
 def _window(graph: Nodes, depth: int) -> str:
     """Whether layers of a depth integrate in this chip step; bool scalar."""
-    name, begin = f"window{depth}", np.int64(depth)
+    name = f"window{depth}"
+    begin = np.int64(depth)
     begun = graph.add("GreaterOrEqual", ["step", begin], f"{name}/begun")
     since = graph.add("Sub", ["step", begin], f"{name}/since")
     return graph.add("And", [begun, graph.add("Less", [since, "length"], f"{name}/lasts")], name)
@@ -251,7 +259,9 @@ def _window(graph: Nodes, depth: int) -> str:
 
 def _integrate(graph: Nodes, netlist: Netlist, layer: Layer, spikes: list[str], is_open: str) -> None:
     """One step of the neurons, as :mod:`loihi1.spec` defines them; a closed window holds all registers at zero."""
-    name, kind, ids = layer.name, layer.kind, layer.ids
+    name = layer.name
+    kind = layer.kind
+    ids = layer.ids
     window = graph.cast(is_open, f"{name}/window", kind)
     inflow = _sum(graph, layer, spikes)
     if layer.remembers:
@@ -275,15 +285,16 @@ def _integrate(graph: Nodes, netlist: Netlist, layer: Layer, spikes: list[str], 
 
 def _sum(graph: Nodes, layer: Layer, spikes: list[str]) -> str:
     """Synaptic sums, membrane units; empty where no layer feeds it."""
-    total, every = "", zip(spikes, map(digits, layer.sources.values()), strict=True)
+    total = ""
+    every = zip(spikes, map(digits, layer.sources.values()), strict=True)
     parts = [(received, digit, factor) for received, found in every for digit, factor in found]
     for count, (received, digit, factor) in enumerate(parts):
-        own = f"{layer.name}/product/{count}"
-        product = graph.add("MatMulInteger", [received, digit], own)
+        name = f"{layer.name}/product/{count}"
+        product = graph.add("MatMulInteger", [received, digit], name)
         if layer.kind is not np.int32:
-            product = graph.cast(product, f"{own}/wide", layer.kind)
-        scaled = graph.add("Mul", [product, one_each(factor << MEMBRANE_SHIFT, layer.kind)], f"{own}/scaled")
-        total = graph.add("Add", [total, scaled], f"{own}/sum") if total else scaled
+            product = graph.cast(product, f"{name}/wide", layer.kind)
+        scaled = graph.add("Mul", [product, one_each(factor << MEMBRANE_SHIFT, layer.kind)], f"{name}/scaled")
+        total = graph.add("Add", [total, scaled], f"{name}/sum") if total else scaled
     return total
 
 

@@ -31,7 +31,9 @@ from spikeloom.compiler.targets import netlist_file
 from spikeloom.compiler.targets.netlist_file import COMMON, NetlistFile, column_faults, part_of
 from spikeloom.compiler.types import IntArray
 
-RESET_TO, RESET_LINEAR, RESET_NONE = 0, 1, 2
+RESET_TO = 0
+RESET_LINEAR = 1
+RESET_NONE = 2
 """What a spike leaves: the reset value, the membrane less the threshold, the membrane."""
 
 AXON_TYPES = 4
@@ -257,4 +259,6 @@ FILE = NetlistFile(
     tables=frozenset({"weight"}),
 )
 
-crossbar_bytes, write_crossbars, read_crossbars = FILE.content, FILE.write, FILE.read
+crossbar_bytes = FILE.content
+write_crossbars = FILE.write
+read_crossbars = FILE.read

@@ -70,5 +70,6 @@ def _races(request: AnytimeRequest, machine: Stoppable) -> FloatArray | None:
     training = load_recordings(request.calibrate, replace(request, split="train", limit=None), machine.netlist)
     machine.require_sensor(training.events)
     progress("calibrating")
-    lengths, race = training.step_counts, exits.standing if request.held_out else exits.races
+    lengths = training.step_counts
+    race = exits.standing if request.held_out else exits.races
     return exits.turning_points(race(machine.cumulative(training.events, lengths).votes, lengths))

@@ -51,8 +51,8 @@ def run(request: LeanRequest) -> Outcome:
     taken = loaded.network.input
     shared: dict[str, Any] = {"bin_s": request.bin, "bins": taken.bins, "taxels": taken.taxels, "labels_for": "lean"}
     shared |= {"classes": loaded.network.classes, "trained": origin_of(loaded.training)}
-    found = (("train", None), (request.split, request.limit))
-    each = (recordings(request.data, split, limit=limit, **shared) for split, limit in found)
+    splits = (("train", None), (request.split, request.limit))
+    each = (recordings(request.data, split, limit=limit, **shared) for split, limit in splits)
     training, test = (of_length(data, taken.clocks.length) for data in each)
     result, netlist, spared = study(loaded, training, test, request.differ, request.output)
     if request.output is not None:
@@ -65,8 +65,9 @@ def run(request: LeanRequest) -> Outcome:
     if request.network is not None and loaded.checkpoint is not None:
         from spikeloom.compiler.formats.own_checkpoint import save_again
 
-        asked, given = load_graph(request, loaded.checkpoint.system), loaded.checkpoint
-        edges = asked.edges if given.edges is None and asked is not None else given.edges
+        graph = load_graph(request, loaded.checkpoint.system)
+        given = loaded.checkpoint
+        edges = graph.edges if given.edges is None and graph is not None else given.edges
         typed = repeat.words({"data": test.source, "differ": result.differ})
         made = origin_of(loaded.training) | {"command": repeat.command("lean", Path(request.checkpoint).name, *typed)}
         less = narrowed(replace(given, graph=loaded.graph, edges=edges), spared)

@@ -100,8 +100,10 @@ def _made(
     candidate: Candidate, *, sensor: Sensor, splits: tuple[Recordings, ...], request: SmallestRequest
 ) -> tuple[Checked, tuple[str, ...]]:
     """Train a candidate on the whole training split, compile and verify it, then read the test split; the commands."""
-    netlist, data = request.output, request.data
-    network, counts = str(Path(netlist).with_suffix(".pt")), candidate.system == COUNTING
+    netlist = request.output
+    data = request.data
+    network = str(Path(netlist).with_suffix(".pt"))
+    counts = candidate.system == COUNTING
     read = repeat.words({"data": data, "bin": request.bin})
     trained = [*read, *repeat.words(sensor.options_of(candidate.system)), *candidate.words]
     trained += [*([] if counts else ["--keep", "last"]), "-o", network]
@@ -123,7 +125,8 @@ def _made(
     checks = {split: request_of(VerifyRequest, [*words["verify"], "--split", split]) for split in ("train", "test")}
     verdicts = {split: verify.run(check).result for split, check in checks.items()}
     machine = machine_for(netlist)
-    bins, length = machine.netlist.bins, machine.netlist.clocks.length
+    bins = machine.netlist.bins
+    length = machine.netlist.clocks.length
     seen, held = (of_length(joined_bins(each, bins), length) for each in (some(splits[0]), splits[1]))
     right = int(np.count_nonzero(machine.run(held.events, lengths=held.lengths).decisions == held.labels))
     costs = costs_of(machine.netlist, seen)

@@ -71,7 +71,8 @@ def run(request: ExportRequest) -> Outcome:
         dt=request.dt,
     )
     export = FORMATS[request.to].write(content)
-    digest, size = hashlib.sha256(), 0
+    digest = hashlib.sha256()
+    size = 0
     with write_atomically(request.output) as file:
         for chunk in export.content:
             digest.update(chunk)
@@ -81,9 +82,9 @@ def run(request: ExportRequest) -> Outcome:
 
     def sections(result: Written) -> Iterator[Section]:
         where = "" if FORMATS[result.format].whole else " on the chip"
-        held = f"{result.facts.neurons} neurons{where} and {result.facts.synapses} synapses for {result.format}"
+        size = f"{result.facts.neurons} neurons{where} and {result.facts.synapses} synapses for {result.format}"
         form = "" if export.form is None else f", form {export.form}"
-        lines = [f"{result.path}: {held}, {result.bytes} bytes{form}", *export.lines]
+        lines = [f"{result.path}: {size}, {result.bytes} bytes{form}", *export.lines]
         yield Section("", [Text(line) for line in lines])
 
     return Outcome(written, sections)

@@ -38,11 +38,11 @@ def run(_request: Request) -> Outcome:
     folder = tempfile.mkdtemp(prefix="spikeloom-")
     for name, *words in STEPS:
         kind, run_it = COMMANDS[name]
-        found = run_it(request_of(kind, [word.format(folder=folder) for word in words]))
+        outcome = run_it(request_of(kind, [word.format(folder=folder) for word in words]))
         typed = " ".join(["spikeloom", name, *words]).replace("{folder}/", "")
-        first, *others = found.sections(found.result)
+        first, *others = outcome.sections(outcome.result)
         shown += [Section(first.title, [Code([typed]), *first.blocks]), *others]
-        results[name], worst = found.result, max(worst, found.code)
+        results[name], worst = outcome.result, max(worst, outcome.code)
     net = f"{folder}/grasps.loom"
     following = repeat.command("report", net, *STEPS[1][2:], "-o", "grasps.html")
     verdict = f"verdict: {in_a_sentence(results['verify'])}\nkept: {net}; all of it on one page:"

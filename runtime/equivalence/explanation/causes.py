@@ -187,11 +187,11 @@ def _cause(both: _Sides, evidence: _Evidence, place: int, root: Root) -> results
     post = evidence.post
     replays = evidence.replays
     population = both.network.populations[post]
-    held = not both.absent[post][root.neuron]
+    was_present = not both.absent[post][root.neuron]
     moved = evidence.moved[:, place]
     order = sorted(range(len(moved)), key=lambda variant: -moved[variant])
     enough = [variant for variant in order if evidence.enough[variant, place]]
-    cause = _name(evidence, place, next(iter(enough), order[0])) if held else both.reason_for_loss
+    cause = _name(evidence, place, next(iter(enough), order[0])) if was_present else both.reason_for_loss
     clipped = any(replays.unclipped[variant] for variant in enough)
     amounts: dict[str, float] = {}  # the largest of each cause
     for variant in order:
@@ -202,7 +202,7 @@ def _cause(both: _Sides, evidence: _Evidence, place: int, root: Root) -> results
     chip_membrane = float(evidence.register[place] / unit)
     chip_theta = float(replays.threshold[place] / unit)
     taxel, feature = taxel_and_feature(both.network, post, root.neuron)
-    remedy = REMEDIES.get(cause) or both.deviations.remedy(cause, post, clipped=clipped, held=held)
+    remedy = REMEDIES.get(cause) or both.deviations.remedy(cause, post, clipped=clipped, held=was_present)
     return results.RootCause(
         layer=population.name,
         neuron=root.neuron,
@@ -214,16 +214,16 @@ def _cause(both: _Sides, evidence: _Evidence, place: int, root: Root) -> results
         float_membrane=membrane,
         float_distance=membrane - population.theta,
         theta=population.theta,
-        chip_membrane=chip_membrane if held else None,
-        chip_distance=chip_membrane - chip_theta if held else None,
-        chip_theta=chip_theta if held else None,
-        chip_register=int(evidence.register[place]) if held else None,
-        chip_threshold_register=int(replays.threshold[place]) if held else None,
+        chip_membrane=chip_membrane if was_present else None,
+        chip_distance=chip_membrane - chip_theta if was_present else None,
+        chip_theta=chip_theta if was_present else None,
+        chip_register=int(evidence.register[place]) if was_present else None,
+        chip_threshold_register=int(replays.threshold[place]) if was_present else None,
         cause=cause,
-        held=held,
+        held=was_present,
         clipped_weights=clipped,
-        sufficient=tuple(dict.fromkeys(replays.causes[variant] for variant in enough)) if held else (),
-        moved=amounts if held else {},
+        sufficient=tuple(dict.fromkeys(replays.causes[variant] for variant in enough)) if was_present else (),
+        moved=amounts if was_present else {},
         change=remedy or "none is known",
         dragged=root.dragged,
         dragged_alone=root.alone,

@@ -100,10 +100,10 @@ def sources_in(folder: str) -> list[Path]:
 
 def simulator_for(wanted: str | None) -> str:
     """The program that is wanted, or the fastest that is installed; OptionError if there is none."""
-    found = [name for name in SIMULATORS if wanted in (None, name) and shutil.which(name)]
-    if not found:
+    installed = [name for name in SIMULATORS if wanted in (None, name) and shutil.which(name)]
+    if not installed:
         raise OptionError(f"{wanted or ' or '.join(SIMULATORS)}: not found; install it, it builds the hardware")
-    return found[0]
+    return installed[0]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -132,7 +132,7 @@ class Built:
         assert trace.membranes is not None, "membranes are kept"
         spikes = trace.spikes[0]
         membranes = trace.membranes[0] * self.terms.scale + self.terms.shift
-        ticks, cycles, lost, errors = map(int, (here / "end.txt").read_text("utf-8").split())
+        ticks, cycles, dropped, errors = map(int, (here / "end.txt").read_text("utf-8").split())
         if ticks < len(spikes):
             raise OptionError(f"--rtl: tick {max(ticks, 0)} does not end; give RANC's sources as they are")
 
@@ -143,11 +143,11 @@ class Built:
             ours = slice(*netlist.core_neurons[core : core + 2].tolist())
             words = np.fromfile(here / f"core_{place:03d}.bin", "<u4").astype(np.int64).reshape(ticks, -1)
             fired = words >> 31
-            held = words & ((1 << bits) - 1)
-            held -= (held >> (bits - 1)) << bits
+            fields = words & ((1 << bits) - 1)
+            fields -= (fields >> (bits - 1)) << bits
             count = spikes[:, ours].shape[1]
             wrong_spikes += int(np.count_nonzero(fired[:, :count] != spikes[:, ours]) + fired[:, count:].sum())
-            wrong_membranes += int(np.count_nonzero(held[:, :count] != membranes[:, ours]))
+            wrong_membranes += int(np.count_nonzero(fields[:, :count] != membranes[:, ours]))
         votes = np.zeros((ticks, netlist.classes + 1), np.int64)  # the last is the way out of neurons without a target
         np.add.at(votes.T, np.where(netlist.readout_class < 0, netlist.classes, netlist.readout_class), spikes.T)
         out = np.array((here / "out.txt").read_text("utf-8").split(), np.int64)
@@ -160,7 +160,7 @@ class Built:
             membranes=membranes.size,
             membranes_different=wrong_membranes,
             outputs_different=int(np.abs(votes[:, :-1]).sum()),
-            packets_lost=lost,
+            packets_lost=dropped,
             error_cycles=errors,
         )
 
@@ -171,8 +171,8 @@ def build(machine: TrueNorth, folder: Path, sources: Sequence[Path], simulator: 
     ModelError if RANC has not what it uses, in recordings of so many `ticks`; OptionError if the sources are no good.
     """
     terms = expressed(machine.netlist, ticks)
-    found = sizes(terms, machine.target)
-    files = {"sizes.vh": "".join(f"localparam {name} = {value};\n" for name, value in found.items()), "empty.mem": ""}
+    widths = sizes(terms, machine.target)
+    files = {"sizes.vh": "".join(f"localparam {name} = {value};\n" for name, value in widths.items()), "empty.mem": ""}
     words = [*shlex.split(SIMULATORS[simulator]), str(HARNESS), *map(str, sources)]
     parts = [SIMULATORS[simulator], files["sizes.vh"], *(each.read_text("utf-8") for each in (HARNESS, *sources))]
     made = hashlib.sha256("\0".join(parts).encode()).hexdigest()
@@ -180,10 +180,10 @@ def build(machine: TrueNorth, folder: Path, sources: Sequence[Path], simulator: 
         _write(folder, files)
         _call(words, folder)
         stamp.write_text(made, "utf-8")
-    files |= memories(terms, found)
+    files |= memories(terms, widths)
     key = hashlib.sha256("\0".join([made, *files.values()]).encode()).hexdigest()
     mesh = mesh_of(machine.netlist)
-    return Built(machine=machine, terms=terms, mesh=mesh, sizes=found, folder=folder, files=files, key=key)
+    return Built(machine=machine, terms=terms, mesh=mesh, sizes=widths, folder=folder, files=files, key=key)
 
 
 def _write(folder: Path, files: Mapping[str, str]) -> None:
@@ -213,7 +213,7 @@ def cosimulate(
     progress("building the hardware")
     built = build(machine, folder.absolute(), sources, program, netlist.ticks(data.events.shape[-1]))
     count = Progress(len(data))
-    found = dict[str, Compared]()
+    compared = dict[str, Compared]()
     for index, name in enumerate(data.files):
         count(index, f"{program} runs recording")
         events = with_clocks(data.events[index : index + 1], netlist.clocks)[0, :, : data.steps_of(index)]
@@ -221,8 +221,8 @@ def cosimulate(
         done = folder / f"{key[:16]}.json"
         if not done.is_file():
             write_json(str(done), built.run(events))
-        found[name] = read_json(Compared, done, "--work", "benchmarks/cosimulate.py")
-    total = sum(found.values(), Compared())
+        compared[name] = read_json(Compared, done, "--work", "benchmarks/cosimulate.py")
+    total = sum(compared.values(), Compared())
     result = Cosimulation(
         simulator=program,
         rtl_sha256=hashlib.sha256(b"".join(each.read_bytes() for each in sources)).hexdigest(),
@@ -234,7 +234,7 @@ def cosimulate(
         step_s=bin_s * netlist.bins,
         clock_hz=total.cycles * netlist.bin_ticks / (bin_s * netlist.bins),
         total=total,
-        recordings=found,
+        recordings=compared,
     )
     return Outcome(result, sections, 1 if total.differences else 0)
 

@@ -75,7 +75,8 @@ def inspect(path: str | os.PathLike[str]) -> Outcome:
 def describe(netlist: CrossbarNetlist, sha256: str) -> Outcome:
     """What a netlist is; `sha256` is its file's."""
     chip = load_target(netlist.target)
-    core, degree = netlist.core_of_neuron(), np.diff(netlist.axon_synapses)
+    core = netlist.core_of_neuron()
+    degree = np.diff(netlist.axon_synapses)
     fan_in = np.bincount(netlist.neuron_of_synapse(), minlength=netlist.n_neurons)
     fullest = {
         "core.neurons": np.diff(netlist.core_neurons),
@@ -94,7 +95,7 @@ def describe(netlist: CrossbarNetlist, sha256: str) -> Outcome:
             cores=len(np.unique(core[members])),
         )
 
-    found = Description(
+    description = Description(
         target=netlist.target,
         taxels=netlist.taxels,
         classes=netlist.classes,
@@ -115,7 +116,7 @@ def describe(netlist: CrossbarNetlist, sha256: str) -> Outcome:
         provenance=netlist.provenance,
         sha256=sha256,
     )
-    return Outcome(found, sections)
+    return Outcome(description, sections)
 
 
 def sections(found: Description) -> list[Section]:
@@ -176,7 +177,7 @@ class TrainedDescription:
 def describe_trained(trained: Trained) -> Outcome:
     """What a trained network is."""
     network = trained.network
-    found = TrainedDescription(
+    description = TrainedDescription(
         system=SYSTEM,
         taxels=network.taxels,
         classes=network.classes,
@@ -195,7 +196,7 @@ def describe_trained(trained: Trained) -> Outcome:
         training=trained.training,
         sha256=trained.sha256,
     )
-    return Outcome(found, trained_sections)
+    return Outcome(description, trained_sections)
 
 
 def trained_sections(found: TrainedDescription) -> list[Section]:

@@ -21,12 +21,14 @@ def _ranc(request: ExportSource) -> Export:
     netlist = load(request.source).netlist
     events = None
     if request.recordings is not None:
-        data, number = request.recordings(netlist), request.recording or 0
+        data = request.recordings(netlist)
+        number = request.recording or 0
         if not 0 <= number < len(data.files):
             raise OptionError(f"--recording {number}: --data has recordings 0 to {len(data.files) - 1}")
         events = with_clocks(data.events[number : number + 1, ..., : data.steps_of(number)], netlist.clocks)[0]
     ticks = None if events is None else netlist.ticks(events.shape[1]) + 1
-    path, out = request.output, request.output.removesuffix(".json") + ".out"
+    path = request.output
+    out = request.output.removesuffix(".json") + ".out"
     shown = "no recording, add packets" if ticks is None else f"{ticks} ticks"
     return Export(
         content=(f"{line}\n".encode() for line in ranc.export(netlist, events)),

@@ -74,7 +74,8 @@ def standing(votes: IntArray, lengths: IntArray) -> Standing:
 
 def most_votes(machine: Stoppable, steps: int) -> IntArray:
     """Most votes that each class can still get when 0 … `steps` steps are left; shape (classes, steps + 1)."""
-    netlist, interval = machine.netlist, machine.least_intervals
+    netlist = machine.netlist
+    interval = machine.least_intervals
     left = np.arange(steps + 1)
     each = np.where(interval[:, None] > 0, -(-left // np.maximum(interval, 1)[:, None]), 0)
     most = np.zeros((netlist.classes, steps + 1), np.int64)
@@ -84,7 +85,8 @@ def most_votes(machine: Stoppable, steps: int) -> IntArray:
 
 def steady_classes(machine: Stoppable) -> BoolArray:
     """Classes that get a vote in every step after their first one; shape (classes,)."""
-    classes, readout = machine.netlist.classes, machine.netlist.readout_class
+    classes = machine.netlist.classes
+    readout = machine.netlist.readout_class
     votes = readout[readout >= 0]
     counts = [np.bincount(each, minlength=classes) for each in (votes, votes[machine.steady])]
     return np.asarray((counts[0] == 1) & (counts[1] == 1))
@@ -115,7 +117,9 @@ def live(machine: Stoppable, bins: int, factor: float) -> Callable[[int, IntArra
 
     It takes a chip step, from 0, and the votes (classes,) after it, and says whether the grasp may end.
     """
-    most, steady, depth = most_votes(machine, bins), steady_classes(machine), machine.read_out_lag
+    most = most_votes(machine, bins)
+    steady = steady_classes(machine)
+    depth = machine.read_out_lag
 
     def may_end(chip_step: int, counts: IntArray) -> bool:
         seen = chip_step + 1 - depth

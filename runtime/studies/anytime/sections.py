@@ -57,18 +57,20 @@ def rule_table(result: Anytime) -> Table:
     head += [*(f"time, {name}" for name in full.costs.time_s), "differ", "right"]
 
     def cells(costs: Costs) -> list[str]:
-        found = [f"{costs.chip_steps:.1f}", f"{costs.operations:,.0f}"]
-        found += [si(costs.energy_j[name], "J") for name in full.costs.energy_j]
-        return found + [si(costs.time_s[name], "s") for name in full.costs.time_s]
+        shown = [f"{costs.chip_steps:.1f}", f"{costs.operations:,.0f}"]
+        shown += [si(costs.energy_j[name], "J") for name in full.costs.energy_j]
+        return shown + [si(costs.time_s[name], "s") for name in full.costs.time_s]
 
     def shown(count: int | None) -> str:
         return "" if count is None else str(count)
 
     rows = [["all is seen", "", *cells(full.costs), "", shown(full.correct)]]
     for rule in result.rules:
-        name, ahead = "proven", "more than can come"
+        name = "proven"
+        ahead = "more than can come"
         if rule.stop.allowed is not None:
             whose = "held-out decisions" if result.held_out else "training races"
-            name, ahead = f"sure, {_allowed(rule.stop)} of {whose}", f"{rule.stop.factor:.3f}·√left"
+            name = f"sure, {_allowed(rule.stop)} of {whose}"
+            ahead = f"{rule.stop.factor:.3f}·√left"
         rows.append([name, ahead, *cells(rule.mean), str(rule.differ), shown(rule.correct)])
     return Table(head, rows)

@@ -140,10 +140,13 @@ def study(
 
 
 def _rule(rule: exits.Calibrated, ran: Cumulative, at: exits.Standing, sure: BoolArray, labels: IntArray) -> Rule:
-    ends, last = exits.exits(sure, at, rule.factor), ran.chip_steps - 1
+    ends = exits.exits(sure, at, rule.factor)
+    last = ran.chip_steps - 1
     index = np.where(ends == ran.lengths - 1, last, np.minimum(ends + ran.depth, last))
     rows = np.arange(len(ends))
-    early, late, known = at.leader[rows, ends], at.decision, labels != UNLABELLED
+    early = at.leader[rows, ends]
+    late = at.decision
+    known = labels != UNLABELLED
 
     def saved(sums: FloatArray) -> list[float]:
         return [float(each) for each in sums[rows, last] - sums[rows, index]]

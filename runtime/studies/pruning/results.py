@@ -95,8 +95,10 @@ class Lean(Shown):
 
 def sections(result: Lean) -> list[Section]:
     """Use of layers and taxels, every row, and what is taken."""
-    trained, tested = result.samples["training"], result.samples["test"]
-    whole, taken = result.rows[0], result.rows[result.taken]
+    trained = result.samples["training"]
+    tested = result.samples["test"]
+    whole = result.rows[0]
+    taken = result.rows[result.taken]
     layers = [[e.name, *(f"{n:,}" for n in (e.neurons, e.on_chip, e.never_fired))] for e in result.layers]
     right = f"{percent(whole.test.right, tested)} on {result.split}, {whole.training.right} of {trained} in training"
     last = [f"least energy in training: {taken.name}", *_removed(taken.removed)]
@@ -129,7 +131,9 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _rows(result: Lean) -> Table:
-    trained, tested, whole = result.samples["training"], result.samples["test"], result.rows[0].costs
+    trained = result.samples["training"]
+    tested = result.samples["test"]
+    whole = result.rows[0].costs
     head = ["without", "differ in training", "differ", "right", "operations", "saved"]
     head += [word for name in whole.energy_j for word in (name, "saved")]
     head += [*(f"time, {name}" for name in whole.time_s), "neurons", "cores"]

@@ -29,9 +29,11 @@ def study(
     storage = Fixed() if forms is None else Given(forms)
     options = Options(storage=storage, training_events=training.events)
     compilation = compile_network(loaded.network, options)
-    whole, allowed = compilation.netlist, int(differ * len(training) + 1e-9)
+    whole = compilation.netlist
+    allowed = int(differ * len(training) + 1e-9)
     spikes: IntArray = machine_of(whole).run(training.events, lengths=training.lengths).counts.sum(axis=0)
-    wanted, wanted_test = trials.decisions(whole, training), trials.decisions(whole, test)
+    wanted = trials.decisions(whole, training)
+    wanted_test = trials.decisions(whole, test)
     alone = trials.changed_alone(whole, training, wanted)
 
     def fits(netlist: Netlist) -> bool:
@@ -51,7 +53,10 @@ def study(
             if (fewer := trials.without_hops(compilation, loaded, hops)) is not None:
                 yield name, Removed(hops=hops), trials.laid_out(fewer)
 
-    rows, spent, netlists, spared = [], [], [], dict[str, IntArray]()
+    rows = []
+    spent = []
+    netlists = []
+    spared = dict[str, IntArray]()
     for name, removed, netlist in tried():
         progress(f"without {name}")
         trained, training_costs = trials.priced(netlist, training)
@@ -101,7 +106,8 @@ def _hops(loaded: LoadedNetwork) -> list[tuple[int, ...]]:
 
 
 def _changed(whole: IntArray, less: IntArray, labels: IntArray) -> Changed:
-    before, after = whole == labels, less == labels
+    before = whole == labels
+    after = less == labels
     return Changed(
         differ=int(np.count_nonzero(less != whole)),
         right=int(np.count_nonzero(after)),

@@ -68,7 +68,8 @@ def spared_neurons(netlist: Netlist, spikes: IntArray, fits: Callable[[Netlist],
     share = effects(netlist, spikes)
     order = np.argsort(share, kind="stable")
     order = order[np.isfinite(share[order])]
-    sources, never = netlist.n_inputs + order, int(np.count_nonzero(share == 0))
+    sources = netlist.n_inputs + order
+    never = int(np.count_nonzero(share == 0))
     return order[: most_spared(len(order), never, lambda count: fits(silenced(netlist, sources[:count])))]
 
 
@@ -76,7 +77,8 @@ def spared_taxels(netlist: Netlist, training: Recordings, alone: IntArray, fits:
     """Taxels that may go together; those first without which, `alone`, fewest decisions change."""
     events = training.events.sum(axis=(0, 2, 3), dtype=np.int64)
     order = np.lexsort((events, alone))
-    sources, silent = channels_of(netlist, order), int(np.count_nonzero(events == 0))
+    sources = channels_of(netlist, order)
+    silent = int(np.count_nonzero(events == 0))
     return order[: most_spared(len(order), silent, lambda count: fits(silenced(netlist, sources[:count])))]
 
 
@@ -102,7 +104,8 @@ def most_spared(parts: int, least: int, fits: Callable[[int], bool]) -> int:
     >>> most_spared(4, 1, lambda count: count <= 3)
     3
     """
-    low, high = least, parts
+    low = least
+    high = parts
     while low < high:
         middle = (low + high + 1) // 2
         if fits(middle):
@@ -141,7 +144,8 @@ def narrowed(checkpoint: Checkpoint, gone: Mapping[str, IntArray]) -> Checkpoint
     dense: list[Dense] = []
     kept = np.arange(checkpoint.dense[0].weight.shape[1])
     for stage in checkpoint.dense:
-        columns, kept = kept, np.setdiff1d(np.arange(len(stage.bias)), gone.get(stage.name, ()))
+        columns = kept
+        kept = np.setdiff1d(np.arange(len(stage.bias)), gone.get(stage.name, ()))
         kept = kept if len(kept) else np.arange(1)
         weight = np.ascontiguousarray(stage.weight[np.ix_(kept, columns)])
         dense.append(Dense(name=stage.name, weight=frozen(weight), bias=frozen(stage.bias[kept])))
@@ -150,7 +154,8 @@ def narrowed(checkpoint: Checkpoint, gone: Mapping[str, IntArray]) -> Checkpoint
 
 def changed_alone(netlist: Netlist, of: Recordings, wanted: IntArray) -> IntArray:
     """Decisions that change without each taxel; shape (taxels,)."""
-    machine, changed = machine_of(netlist), np.zeros(netlist.taxels, np.int64)
+    machine = machine_of(netlist)
+    changed = np.zeros(netlist.taxels, np.int64)
     progress = Progress(netlist.taxels)
     for taxel in range(netlist.taxels):
         progress(taxel, f"{of.split}, taxels one at a time")

@@ -54,7 +54,7 @@ def lower_bound(votes: IntArray, cells: Cells, effects: Effects, known: Forgetti
         alone = effects.votes[:, other] - effects.votes[:, decision]
         partly = effects.come[:, other] + effects.gone[:, decision]
         opened = known.come[:, :, other].astype(np.int64) + known.gone[:, :, decision]
-        lost = most_lost(
+        votes_lost = most_lost(
             first,
             end,
             cells.cost,
@@ -66,7 +66,7 @@ def lower_bound(votes: IntArray, cells: Cells, effects: Effects, known: Forgetti
             known.lag,
             min(certified, most),
         )
-        certified = min(certified, int(np.searchsorted(lost, gaps[other])) - 1)
+        certified = min(certified, int(np.searchsorted(votes_lost, gaps[other])) - 1)
         if certified <= 0:
             return 0
     return certified

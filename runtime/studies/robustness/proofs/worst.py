@@ -30,7 +30,8 @@ def _begin(cluster: Any, exact: Any, begun: Any, t: int, last: int) -> None:
 @compiled
 def _go_on(cluster: Any, opened: Any, quiet: Any, t: int, lag: int) -> int:
     """Let a further event change before clusters whose last one changed at `t` are over; votes that they turn."""
-    steps, most = len(opened), cluster.shape[1] - 1
+    steps = len(opened)
+    most = cluster.shape[1] - 1
     lost = 0
     for later in range(t + 1, steps):
         if later < quiet:
@@ -78,13 +79,14 @@ def most_lost(
         for n in range(most):  # further ones in the same step
             cluster[t, n + 1] = max(cluster[t, n + 1], cluster[t, n])
         lost = _go_on(cluster, opened[t + 1], quiet[t + 1], t, lag)
-        at_rest, as_known = max(quiet[t + 1], t + 1), max(back[t + 1], t + 1)
+        at_rest = max(quiet[t + 1], t + 1)
+        as_known = max(back[t + 1], t + 1)
         for n in range(most + 1):
             still[at_rest, n] = max(still[at_rest, n], cluster[t, n] + lost)
             exact[as_known, n] = max(exact[as_known, n], cluster[t, n] + lost)
             exact[t + 1, n] = max(exact[t + 1, n], exact[t, n])
             still[t + 1, n] = max(still[t + 1, n], still[t, n])
-    found = np.zeros(most + 1, np.int64)
+    worst = np.zeros(most + 1, np.int64)
     for n in range(most + 1):
-        found[n] = max(exact[steps, n], still[steps, n], found[max(n - 1, 0)])
-    return found
+        worst[n] = max(exact[steps, n], still[steps, n], worst[max(n - 1, 0)])
+    return worst
