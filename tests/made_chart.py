@@ -6,13 +6,14 @@ from dataclasses import asdict, replace
 from itertools import product
 from typing import Any
 
-from spikeloom.runtime.studies import fronts
 from spikeloom.runtime.studies.chart import results, study
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
+from spikeloom.runtime.studies.search.budgets import parse_budgets
+from spikeloom.runtime.studies.search.results import ChosenBy, Costs, Data, share
 
 SAMPLES = {"train": 400, "test": 100}
-BY = results.ChosenBy(energy="one", time="clock")
+BY = ChosenBy(energy="one", time="clock")
 
 
 def stored(bits: int) -> Storage:
@@ -23,13 +24,15 @@ def stored(bits: int) -> Storage:
 def made_figures(right: int, samples: int, energy: float, time: float) -> results.Figures:
     """Figures of a split: recordings right, µJ and ms."""
     return results.Figures(
-        **asdict(results.share(right, samples)),
+        **asdict(share(right, samples)),
         samples=samples,
-        model=results.share(min(samples, right + samples // 50), samples),
+        model=share(min(samples, right + samples // 50), samples),
         equal=samples - 3,
-        energy_j={"one": energy * 1e-6, "two": 1.5e-6 * energy},
-        time_s={"clock": time * 1e-3},
-        synaptic_operations=1e4 * energy,
+        costs=Costs(
+            operations=1e4 * energy,
+            energy_j={"one": energy * 1e-6, "two": 1.5e-6 * energy},
+            time_s={"clock": time * 1e-3},
+        ),
         steps=250.0,
     )
 
@@ -97,12 +100,12 @@ def made_chart(*budgets: str) -> results.Chart:
         spikeloom="0.1.0",
         target="loihi1",
         command="spikeloom chart grasps.pt grasps-knn1.pt --data 'a <b>' -o out",
-        data=results.Data(path="a <b>", bin_s=0.02, sha256="cd" * 32, steps=250, **SAMPLES),
+        data=Data(path="a <b>", bin_s=0.02, sha256="cd" * 32, steps=250, **SAMPLES),
         tables={"energy": {"one": "prices <one>", "two": "prices two"}, "time": {"clock": "times"}},
         chosen_by=BY,
         grid=Grid(bits=((2,), (4,), (8,)), window=(50, 100)),
         networks=networks,
         points=tuple(points),
         refused=(results.Refused(network="grasps", cores="cores", stored=three, why=why),),
-        budget=study.pick(points, fronts.parse_budgets(budgets), BY),
+        budget=study.pick(points, parse_budgets(budgets), BY),
     )

@@ -26,10 +26,11 @@ from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.truenorth.native_file import write_trained
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import data_digest
-from spikeloom.runtime.studies import fronts
 from spikeloom.runtime.studies.chart import results, study
 from spikeloom.runtime.studies.chart import work as chart_work
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
+from spikeloom.runtime.studies.search.budgets import Budget, parse_budgets
+from spikeloom.runtime.studies.search.choice import front
 
 GRID = "bits=4,8,window=50-100%:50,cores=cores/fc1:2"
 VIOLATION = Violation(owner="core 0", rule="loihi1.core.axons_in", used=5, allowed=4, remedy="use fewer inputs")
@@ -99,7 +100,7 @@ def test_the_commands_of_a_point_give_its_netlist_and_its_figures(made, as_json,
     costs = as_json(*priced[1:])
     mean = costs["per_inference"]
     assert mean["energy_j"] == pytest.approx(point["test"]["energy_j"], rel=1e-12)
-    assert mean["synaptic_operations"] == point["test"]["synaptic_operations"]
+    assert mean["synaptic_operations"] == point["test"]["operations"]
     (clock,) = costs["time"]
     assert {clock["table"]: clock["inference_s"]["mean"]} == pytest.approx(point["test"]["time_s"], rel=1e-12)
     assert costs["chip_steps"] == point["test"]["steps"] + read_netlist(place / compiled[-1]).max_depth
@@ -199,7 +200,7 @@ def test_the_front_is_what_no_other_point_beats(pairs):
         not any(other[0] >= gain and other[1] <= cost and other != (gain, cost) for other in pairs)
         for gain, cost in pairs
     ]
-    assert fronts.front(gains, costs) == wanted
+    assert front(gains, costs) == wanted
 
 
 def test_fronts_are_of_test_accuracy_and_each_cost(points):
@@ -220,7 +221,7 @@ def test_expected_is_validation_times_what_is_kept_on_training_recordings():
 def test_the_choice_does_not_look_at_the_test_split(points):
     blind = [replace(each, test=made_figures(1, 100, 1, 1)) for each in points]
     for budgets in ((), ("energy=100uJ",), ("accuracy=89",)):
-        wanted = fronts.parse_budgets(budgets)
+        wanted = parse_budgets(budgets)
         assert study.pick(blind, wanted, BY) == study.pick(points, wanted, BY)
 
 
@@ -239,7 +240,7 @@ def test_the_choice_does_not_look_at_the_test_split(points):
     ],
 )
 def test_the_point_that_fits_all_budgets(points, budgets, number, fitting):
-    assert study.pick(points, fronts.parse_budgets(budgets), BY) == results.Pick(
+    assert study.pick(points, parse_budgets(budgets), BY) == results.Pick(
         budgets=tuple(budgets), fits=True, fitting=fitting, point=number
     )
 
@@ -248,10 +249,10 @@ def test_the_point_that_fits_all_budgets(points, budgets, number, fitting):
     ("budgets", "number"), [(["energy=20uJ"], 4), (["energy=50uJ", "time=2ms"], 3), (["accuracy=95"], 1)]
 )
 def test_the_nearest_point_of_budgets_that_nothing_fits(points, budgets, number):
-    found = study.pick(points, fronts.parse_budgets(budgets), BY)
+    found = study.pick(points, parse_budgets(budgets), BY)
     assert (found.fits, found.fitting, found.point) == (False, 0, number)
-    with pytest.raises(OptionError, match=r"--budget time: .*no time table"):
-        study.pick(points, fronts.parse_budgets(["time=1ms"]), replace(BY, time=None))
+    with pytest.raises(OptionError, match=r"--budget time=1ms: .*no time table"):
+        study.pick(points, parse_budgets(["time=1ms"]), replace(BY, time=None))
 
 
 @pytest.mark.parametrize(
@@ -265,8 +266,8 @@ def test_the_nearest_point_of_budgets_that_nothing_fits(points, budgets, number)
     ],
 )
 def test_a_budget_in_units(words, limit):
-    (budget,) = fronts.parse_budgets([words])
-    assert budget == fronts.Budget(what=words.partition("=")[0], limit=pytest.approx(limit), words=words)
+    (budget,) = parse_budgets([words])
+    assert budget == Budget(what=words.partition("=")[0], limit=pytest.approx(limit), words=words)
 
 
 @pytest.mark.parametrize(
@@ -279,9 +280,9 @@ def test_a_budget_in_units(words, limit):
     ],
 )
 def test_a_budget_that_is_none(words):
-    refused(OptionError, f"--budget {words}: ", fronts.parse_budgets, [words])
+    refused(OptionError, f"--budget {words}: ", parse_budgets, [words])
     twice = ["time=1ms", "time=2ms"]
-    refused(OptionError, "--budget time=2ms: time is limited twice; give it once", fronts.parse_budgets, twice)
+    refused(OptionError, "--budget time=2ms: time is limited twice; give it once", parse_budgets, twice)
 
 
 def parsed(text):

@@ -23,6 +23,7 @@ from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.votes import predictions
 from spikeloom.runtime.studies.pruning import trials
+from spikeloom.runtime.studies.search.measure import decisions
 
 LEAN = ("lean", "net.pt", "--data", "data")
 STEPS = 40
@@ -91,7 +92,7 @@ def test_silenced_is_as_if_it_were_gone(compiled):
         (deaf, silent),
         (trials.laid_out(compilation, gone), trials.silenced(netlist, netlist.n_inputs + gone)),
     ):
-        assert_array_equal(trials.decisions(less, seen), trials.decisions(same, seen))
+        assert_array_equal(decisions(less, seen), decisions(same, seen))
     for layer in range(4):
         kept = deaf.neuron[deaf.compartments_of(layer)]
         before = counts(silent, seen)[:, netlist.compartments_of(layer)]
@@ -103,10 +104,10 @@ def test_silenced_is_as_if_it_were_gone(compiled):
 def test_budgets_hold_and_what_does_nothing_is_spared(compiled, allowed):
     _, compilation, seen = compiled
     netlist = compilation.netlist
-    wanted, spikes = trials.decisions(netlist, seen), counts(netlist, seen).sum(axis=0)
+    wanted, spikes = decisions(netlist, seen), counts(netlist, seen).sum(axis=0)
 
     def fits(less):
-        return np.count_nonzero(trials.decisions(less, seen) != wanted) <= allowed
+        return np.count_nonzero(decisions(less, seen) != wanted) <= allowed
 
     gone = trials.spared_neurons(netlist, spikes, fits)
     assert fits(trials.laid_out(compilation, gone))

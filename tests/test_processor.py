@@ -27,8 +27,9 @@ PRICE = processor.Price(
 def test_operations_and_decisions_are_those_of_a_plain_program(monkeypatch):
     monkeypatch.setattr(processor, "PLANS", (((1, 4), 1), ((1, 2), 5)))
     training, test = synthetic_split("train", limit=90), synthetic_split("test", limit=20)
-    rule, plan, validation = processor._rule(training, 4)
-    assert (validation > 0.8, np.abs(rule.weight).max()) == (True, 7)
+    chosen = processor._rule(training, 4)
+    rule, plan = chosen.counters, chosen.plan
+    assert (chosen.right.mean() > 0.8, np.abs(rule.weight).max()) == (True, 7)
     added, adds, decided, length = 0, 0, [], -(-rule.steps // plan.parts)
     rows = dict(zip(map(tuple, rule.counter.tolist()), rule.weight.T, strict=True))
     for recording in test.events.reshape(len(test), -1, test.steps):

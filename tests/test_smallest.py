@@ -15,8 +15,9 @@ from spikeloom.models.training.counters import Plan, counters_of, fit, run_count
 from spikeloom.runtime.commands.choose import smallest
 from spikeloom.runtime.inputs import recordings as recordings_input
 from spikeloom.runtime.studies.counting import decisions_of
-from spikeloom.runtime.studies.fronts import parse_budgets
-from spikeloom.runtime.studies.pruning.results import Costs
+from spikeloom.runtime.studies.search.budgets import parse_budgets
+from spikeloom.runtime.studies.search.choice import lead
+from spikeloom.runtime.studies.search.results import NetlistCosts
 from spikeloom.runtime.studies.smallest import baselines, space, study, work
 from spikeloom.runtime.studies.smallest.results import Tried
 from spikeloom.runtime.studies.smallest.space import Candidate
@@ -28,7 +29,7 @@ UJ = 1e-6
 def tried(number, right, joules, rung=3, other=None, cores=1, order=0):
     """A candidate that is right in the first recordings, or in others where the `order` is another."""
     decided = np.roll(np.arange(RECORDINGS) < right, order)
-    costs = Costs(
+    costs = NetlistCosts(
         operations=1e9 * joules,
         energy_j={"one": joules, "two": joules if other is None else other},
         time_s={"clock": 100 * joules},
@@ -64,23 +65,23 @@ def budgets(*words):
 
 
 def test_the_cheapest_that_is_not_shown_to_be_worse():
-    found = study.choose(POOL, ())
+    found = study.pick(POOL, ())
     assert (found.best, found.cheapest, found.allowed, found.fits) == (1, {"one": 2, "two": 3}, (1, 2, 3), True)
     assert found.ahead == 1
-    ahead, error = study.gap(POOL[0], POOL[3])
+    ahead, error = lead(POOL[0].shares, POOL[3].shares)
     wrong = np.repeat([1.0, 0.0], [4, 36])
     assert (ahead, error) == (pytest.approx(0.1), pytest.approx(wrong.std(ddof=1) / np.sqrt(40)))
     shifted = tried(6, 32, UJ, order=8)  # as good as number 4, wrong elsewhere: less is known of the difference
     assert not study.worse(tried(1, 33, UJ), shifted)
-    assert study.choose([POOL[0], POOL[3]], ()).cheapest["one"] == 1
+    assert study.pick([POOL[0], POOL[3]], ()).cheapest["one"] == 1
 
 
 def test_the_difference_is_of_recordings_that_both_decided():
     fold = work.Measured(right=(1, 0, 0, 0), tried=(1, 1, 0, 0), setting=0.1)
     assert study.accuracy(fold) == 0.5
     none = work.Measured(right=(0,) * 4, tried=(0,) * 4, setting=0.1, refused="too large")
-    assert (study.accuracy(none), study.gap(fold, none)) == (0.0, (0.0, 0.0))
-    ahead, error = study.gap(work.Measured(right=(5, 3, 0, 0), tried=(5,) * 4, setting=0.1), fold)
+    assert (study.accuracy(none), lead(fold.shares, none.shares)) == (0.0, (0.0, 0.0))
+    ahead, error = lead(work.Measured(right=(5, 3, 0, 0), tried=(5,) * 4, setting=0.1).shares, fold.shares)
     assert (ahead, error) == (pytest.approx(0.3), pytest.approx(0.3))
 
 
@@ -96,14 +97,14 @@ def test_the_difference_is_of_recordings_that_both_decided():
     ],
 )
 def test_budgets(words, chosen, fits):
-    found = study.choose(POOL, budgets(*words))
+    found = study.pick(POOL, budgets(*words))
     assert (found.cheapest["one"], found.fits, found.budgets) == (chosen, fits, tuple(words))
 
 
 def test_decisions_that_no_event_alters_are_a_budget():
     pool = [replace(each, certified=share) for each, share in zip(POOL, (0.96, 0.8, 0.9, 0.5, None), strict=True)]
     for share, chosen, fits in ((85, 3, True), (95, 1, True), (97, 1, False)):
-        found = study.choose(pool, budgets(f"certified={share}"))
+        found = study.pick(pool, budgets(f"certified={share}"))
         assert (found.cheapest["one"], found.fits) == (chosen, fits)
     assert study.promote(pool, 1, budgets("certified=99")) == study.promote(pool, 1)  # it is known on the last rung
 
@@ -114,9 +115,9 @@ def test_budgets_that_are_none():
             budgets(words)
     timeless = replace(POOL[0], costs=replace(POOL[0].costs, time_s={}))
     with pytest.raises(OptionError, match="no time table"):
-        study.choose([timeless], budgets("time=5ms"))
+        study.pick([timeless], budgets("time=5ms"))
     with pytest.raises(OptionError, match="holds no candidate; the first: too large"):
-        study.choose([replace(POOL[0], costs=None, refused="too large")], ())
+        study.pick([replace(POOL[0], costs=None, refused="too large")], ())
 
 
 def test_who_goes_on():

@@ -104,7 +104,9 @@ def _dataclass(kind: Any, value: Any) -> Any:
     hints = get_type_hints(kind)
     for field in fields(kind):
         name = field.metadata.get("key", field.name)
-        if name in _plain(dict, value):
+        if field.metadata.get("inline"):
+            entries[field.name] = decode(hints[field.name], value)
+        elif name in _plain(dict, value):
             entries[field.name] = decode(hints[field.name], value[name])
         elif field.default is MISSING and field.default_factory is MISSING:
             raise KeyError(name)

@@ -17,19 +17,20 @@ References
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import compress, product
+from itertools import product
 
 import numpy as np
 
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.targets.base import Quantity
-from spikeloom.compiler.types import BoolArray
+from spikeloom.compiler.types import BoolArray, FloatArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.counters import Plan, counter_spikes, counters_of, cross_validate, fit, run_counters
 from spikeloom.runtime.machines.base import Price
 from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.studies.search.choice import choose, is_worse
 
 SOLD = "STM32L4R5 (Cortex-M4), data sheet DS12023, typical at 3 V: "
 
@@ -126,7 +127,9 @@ def against_processor(
 
     The netlist's weights have so many `bits`; `price` and `right` (samples,) are of its run of the `test` recordings.
     """
-    rule, plan, validation = _rule(training, bits)
+    chosen = _rule(training, bits)
+    rule = chosen.counters
+    plan = chosen.plan
     spikes = counter_spikes(rule, run_counters(test, plan, rule.steps)).astype(np.int64)
     ours = (spikes @ rule.weight.T).argmax(axis=1) == test.labels
     events = float(test.events.sum()) / len(test)
@@ -155,7 +158,7 @@ def against_processor(
     return Comparison(
         plan=plan,
         counters=len(rule.counter),
-        cross_validation=validation,
+        cross_validation=float(chosen.right.mean()),
         samples=len(test),
         events=events,
         seconds=seconds,
@@ -167,10 +170,24 @@ def against_processor(
     )
 
 
-def _rule(training: Recordings, bits: int) -> tuple[Counters, Plan, float]:
-    """The cheapest rule that is not shown to be worse than the best, its plan, and its accuracy in cross-validation."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Rule:
+    """A rule, its plan, which recordings it decides rightly in cross-validation, and its spikes."""
+
+    counters: Counters
+    plan: Plan
+    right: FloatArray
+    spikes: int
+
+    @property
+    def values(self) -> dict[str, float]:
+        return {"energy": self.spikes, "accuracy": float(self.right.mean())}
+
+
+def _rule(training: Recordings, bits: int) -> _Rule:
+    """The cheapest rule that is not shown to be worse than the best."""
     classes = int(training.labels.max()) + 1
-    found = []
+    rules = []
     progress = Progress(len(PLANS))
     for done, (thresholds, parts) in enumerate(PLANS):
         progress(done, "training rules for a processor")
@@ -178,13 +195,11 @@ def _rule(training: Recordings, bits: int) -> tuple[Counters, Plan, float]:
         data = run_counters(training, plan)
         fitted = fit(data, classes)
         right = cross_validate(data, classes)[fitted.strength].argmax(axis=1) == data.labels
-        rule = counters_of(data, fitted, training, classes)
-        found.append((rule, plan, right.astype(float), int(counter_spikes(rule, data).sum(dtype=np.int64))))
-    best = max((right for _, _, right, _ in found), key=np.mean)
-    behind = [best - right for _, _, right, _ in found]
-    near = [each.mean() <= each.std(ddof=1) / np.sqrt(len(each)) for each in behind]
-    rule, plan, right, _ = min(compress(found, near), key=lambda each: each[3])
-    return rule, plan, float(right.mean())
+        counters = counters_of(data, fitted, training, classes)
+        spikes = int(counter_spikes(counters, data).sum(dtype=np.int64))
+        rules.append(_Rule(counters=counters, plan=plan, right=right.astype(float), spikes=spikes))
+    close = choose(rules, lambda rule: rule.values, lambda best, other: is_worse(best.right, other.right)).allowed
+    return min(close, key=lambda rule: rule.spikes)
 
 
 def _verdict(chip: Side, small: Side) -> str:

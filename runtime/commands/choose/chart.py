@@ -13,8 +13,8 @@ from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.choose import ChartRequest
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
 from spikeloom.runtime.studies.chart.networks import read_networks, require_grid, require_suited
-from spikeloom.runtime.studies.chart.results import data_of
-from spikeloom.runtime.studies.fronts import parse_budgets
+from spikeloom.runtime.studies.search.budgets import parse_budgets
+from spikeloom.runtime.studies.search.results import chosen_by, data_of
 
 NOTES = """\
 Axes of the grid: bits (2-6, 8, or one a layer as in 8+4+4+8), planes (1-3), groups (1-8), prune (0, 1), cores (cores,
@@ -44,9 +44,10 @@ def run(request: ChartRequest) -> Outcome:
     require_place(str(folder / STORE if folder.exists() else folder), "-o", request)
     networks = read_networks(request)
     tables = [table.name for table in target.energy]
-    energy = tables[0] if request.table is None else request.table
-    if energy not in tables:
-        raise OptionError(f"--table {energy}: {target.title} has no such energy table; give {' or '.join(tables)}")
+    if request.table not in (None, *tables):
+        raise OptionError(
+            f"--table {request.table}: {target.title} has no such energy table; give {' or '.join(tables)}"
+        )
     progress("reading the recordings")
     splits = read_splits(request.data, request.bin, networks[0])
     data = data_of(request.data, splits["test"].seconds, splits["train"], splits["test"])
@@ -56,6 +57,16 @@ def run(request: ChartRequest) -> Outcome:
     options = repeat.words(repeat.given(request, ("data", *repeat.NETWORK, "grid", "table", "bin")))
     options += [word for budget in request.budget for word in ("--budget", budget)]
     command = repeat.command("chart", *request.checkpoints, *options, "-o", request.output)
-    charted = chart(networks, target, data, grid, budgets, folder, energy=energy, command=command, jobs=request.jobs)
+    charted = chart(
+        networks,
+        target,
+        data,
+        grid,
+        budgets,
+        folder,
+        by=chosen_by(target, request.table),
+        command=command,
+        jobs=request.jobs,
+    )
     write_chart(folder, charted)
     return Outcome(charted, partial(printed, folder=str(folder)), 0 if charted.budget.fits else 1)

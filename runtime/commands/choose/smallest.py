@@ -30,8 +30,8 @@ from spikeloom.runtime.requests.choices import SensorChoice
 from spikeloom.runtime.requests.choose import SmallestRequest
 from spikeloom.runtime.requests.main_job import CompileRequest, VerifyRequest
 from spikeloom.runtime.requests.training import TrainRequest
-from spikeloom.runtime.studies.chart.results import data_of, share
-from spikeloom.runtime.studies.fronts import parse_budgets
+from spikeloom.runtime.studies.search.budgets import parse_budgets
+from spikeloom.runtime.studies.search.results import data_of, share
 from spikeloom.runtime.studies.smallest.results import Checked
 from spikeloom.runtime.studies.smallest.space import Candidate, counting, networks
 from spikeloom.runtime.studies.smallest.study import LIMITS, smallest

@@ -5,7 +5,7 @@ import math
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Section, Table, Text
 from spikeloom.runtime.studies.anytime.exits import Calibrated
-from spikeloom.runtime.studies.anytime.study import Anytime, Costs
+from spikeloom.runtime.studies.anytime.study import Anytime, StoppedCosts
 
 SHOWN = (5, 10, 25, 50, 75, 90, 100)
 """Windows in the text; JSON has more."""
@@ -56,10 +56,10 @@ def rule_table(result: Anytime) -> Table:
     head = ["stop when", "votes ahead", "steps", "operations", *full.costs.energy_j]
     head += [*(f"time, {name}" for name in full.costs.time_s), "differ", "right"]
 
-    def cells(costs: Costs) -> list[str]:
-        shown = [f"{costs.chip_steps:.1f}", f"{costs.operations:,.0f}"]
-        shown += [si(costs.energy_j[name], "J") for name in full.costs.energy_j]
-        return shown + [si(costs.time_s[name], "s") for name in full.costs.time_s]
+    def cells(costs: StoppedCosts) -> list[str]:
+        found = [f"{costs.chip_steps:.1f}", f"{costs.operations:,.0f}"]
+        found += [si(costs.energy_j[name], "J") for name in full.costs.energy_j]
+        return found + [si(costs.time_s[name], "s") for name in full.costs.time_s]
 
     def shown(count: int | None) -> str:
         return "" if count is None else str(count)

@@ -12,26 +12,24 @@ from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.studies.anytime import exits
+from spikeloom.runtime.studies.search.results import Costs
 
 WINDOWS = tuple(range(5, 101, 5))
 """Percent of the steps of each recording that are run, those of a read-out among them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Costs:
-    """Of a mean recording, or shares of them: chip steps, synaptic operations, joules and seconds by table."""
+class StoppedCosts(Costs):
+    """The same, and the chip steps."""
 
     chip_steps: float
-    operations: float
-    energy_j: Mapping[str, float]
-    time_s: Mapping[str, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Full:
     """Where nothing is stopped; right decisions are None without labels."""
 
-    costs: Costs = field(metadata=INLINE)
+    costs: StoppedCosts = field(metadata=INLINE)
     correct: int | None
 
 
@@ -54,7 +52,7 @@ class Rule:
     """
 
     stop: exits.Calibrated = field(metadata=INLINE)
-    mean: Costs
+    mean: StoppedCosts
     differ: int
     correct: int | None
     gained: int
@@ -173,15 +171,12 @@ def _correct(decisions: IntArray, labels: IntArray) -> int | None:
     return int(np.count_nonzero(known & (decisions == labels))) if known.any() else None
 
 
-def _costs(ran: Cumulative, index: IntArray) -> Costs:
+def _costs(ran: Cumulative, index: IntArray) -> StoppedCosts:
     """Means up to and with a chip step of each recording."""
     rows = np.arange(len(index))
-    return Costs(
-        chip_steps=float(np.mean(index + 1)),
-        operations=float(ran.operations[rows, index].mean()),
-        energy_j={name: float(each[rows, index].mean()) for name, each in ran.energy.items()},
-        time_s={name: float(each[rows, index].mean()) for name, each in ran.time.items()},
-    )
+    energies = {name: joules[rows, index] for name, joules in ran.energy.items()}
+    times = {name: seconds[rows, index] for name, seconds in ran.time.items()}
+    return StoppedCosts.mean(ran.operations[rows, index], energies, times, chip_steps=float(np.mean(index + 1)))
 
 
 def _window(percent: int, labels: IntArray, ran: Cumulative, at: exits.Standing) -> Window:

@@ -1,40 +1,19 @@
 """What a chart is: configurations of networks with their figures on both splits, and the one to deploy."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.runtime.report.encode import INLINE, key
-from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.studies.chart.grid import FEWEST, Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
+from spikeloom.runtime.studies.search.results import ChosenBy, Costs, Data, Share
 
-FORMAT = 3
+FORMAT = 4
 """Of what is measured; goes up when a figure means something else."""
 
 SPLITS = ("train", "test")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Share:
-    """An accuracy with its Wilson interval."""
-
-    correct: int
-    accuracy: float
-    low: float
-    high: float
-
-
-def share(correct: int, samples: int) -> Share:
-    """The share of right decisions.
-
-    >>> share(3, 4).accuracy
-    0.75
-    """
-    low, high = wilson(correct, samples)
-    return Share(correct=correct, accuracy=correct / samples, low=low, high=high)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,9 +23,7 @@ class Figures(Share):
     samples: int
     model: Share = field(metadata=key("float"))
     equal: int
-    energy_j: Mapping[str, float]  # By table
-    time_s: Mapping[str, float]  # By table
-    synaptic_operations: float
+    costs: Costs = field(metadata=INLINE)
     steps: float
 
 
@@ -105,39 +82,6 @@ class Pick:
     fits: bool
     fitting: int
     point: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Data:
-    """Recordings: where they are, their bins, a hash over both splits, how many there are, and bins of the longest."""
-
-    path: str
-    bin_s: float
-    sha256: str
-    train: int
-    test: int
-    steps: int
-
-
-def data_of(path: str, bin_s: float, training: Recordings, test: Recordings) -> Data:
-    """The recordings of both splits; their bins are of the test split, of which a chart observes parts."""
-    sizes = {"train": len(training), "test": len(test), "steps": test.steps}
-    return Data(path=path, bin_s=bin_s, sha256=data_digest(training, test), **sizes)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChosenBy:
-    """Tables by which points are chosen and drawn; none for time where nothing is timed."""
-
-    energy: str
-    time: str | None
-
-    def costs(self) -> dict[str, Callable[[Figures], float]]:
-        """Costs that accuracy is held against, by name: what gives them of figures."""
-        found: dict[str, Callable[[Figures], float]] = {"energy": lambda figures: figures.energy_j[self.energy]}
-        if (time := self.time) is not None:
-            found["time"] = lambda figures: figures.time_s[time]
-        return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

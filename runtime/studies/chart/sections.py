@@ -4,19 +4,18 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from spikeloom.compiler.files import write_atomically
 from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.report import html
-from spikeloom.runtime.report.drawing import COLOURS, GREY, MARKERS, Drawing, scale, sheet, styled
+from spikeloom.runtime.report.drawing import Drawing, sheet, styled
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Block, Code, Details, Figure, Section, Table, Text
-from spikeloom.runtime.studies.chart.results import Chart, ChosenBy, Point
+from spikeloom.runtime.studies.chart.results import Chart, Point
 from spikeloom.runtime.studies.chart.study import above_on_test
+from spikeloom.runtime.studies.search.picture import Mark, draw_front
+from spikeloom.runtime.studies.search.results import ChosenBy
 
 LISTED = 20
 """Rows of a table that a terminal shows."""
@@ -29,7 +28,7 @@ MEANINGS = (
     "Front: no other point is right more often on the test split for the same cost. It describes, nothing is chosen by "
     "it.\n"
     "Storage: bits of a weight (b), times that a synapse is stored (p), scales in a layer (g).\n"
-    "Larger marks have seen more of each recording; ring and line: the choice and its 95 % interval."
+    "Large marks: the front, with 95 % intervals; ring: the choice."
 )
 
 
@@ -74,7 +73,7 @@ def _choice(chart: Chart) -> list[Block]:
 
 
 def _fronts(chart: Chart) -> Iterator[Block]:
-    for name in chart.chosen_by.costs():
+    for name in chart.chosen.front:
         on = sorted((p for p in chart.points if p.front[name]), key=lambda point: point.test.accuracy)
         words = Text(f"front of test accuracy and {name} (a description, no choice):")
         yield Section("", [words, _table(on, chart.chosen_by, f"Front of test accuracy and {name}", LISTED)])
@@ -116,9 +115,9 @@ def _row(by: ChosenBy, point: Point) -> list[str]:
         f"{100 * test.low:.1f} … {100 * test.high:.1f}",
         f"{100 * test.model.accuracy:.2f}",
         f"{test.equal}",
-        si(test.energy_j[by.energy], "J"),
-        *([] if by.time is None else [si(test.time_s[by.time], "s")]),
-        f"{test.synaptic_operations:,.0f}",
+        si(test.costs.energy_j[by.energy], "J"),
+        *([] if by.time is None else [si(test.costs.time_s[by.time], "s")]),
+        f"{test.costs.operations:,.0f}",
         str(point.n_cores),
     ]
 
@@ -141,15 +140,16 @@ def _tip(by: ChosenBy, point: Point) -> str:
 @styled()
 def picture(chart: Chart) -> Drawing:
     """Test accuracy over energy and, where the chip has a time table, over time."""
-    by, name = chart.chosen_by, chart.data.path.rstrip("/").rsplit("/", 1)[-1]
-    drawing = sheet(
-        f"{len(chart.points)} configurations, {chart.data.test} test recordings of {name}",
-        3 * len(by.costs()) + 1,
-        width=6.4,
-    )
-    panels = drawing.figure.subplots(len(by.costs()), squeeze=False, sharey=True)[:, 0]
-    for panel, cost in zip(panels, by.costs(), strict=True):
-        _scatter(drawing, panel, chart, cost)
+    by = chart.chosen_by
+    name = chart.data.path.rstrip("/").rsplit("/", 1)[-1]
+    title = f"{len(chart.points)} configurations, {chart.data.test} test recordings of {name}"
+    axes = {"energy": ("J", f"dynamic energy of a mean inference ({by.energy})"), "time": ("s", f"time ({by.time})")}
+    costs = list(by.of(chart.chosen.test.costs))
+    drawing = sheet(title, 3 * len(costs) + 1, width=6.4)
+    panels = drawing.figure.subplots(len(costs), squeeze=False, sharey=True)[:, 0]
+    for panel, cost in zip(panels, costs, strict=True):
+        marks = _marks(chart, cost)
+        draw_front(drawing, panel, marks, marks[chart.budget.point - 1], *axes[cost])
     drawing.figure.supylabel("test accuracy on the chip (%)", fontsize=9)
     handles, series = panels[0].get_legend_handles_labels()
     drawing.figure.legend(handles, series, loc="outside lower center", ncols=5, fontsize=8)
@@ -163,41 +163,23 @@ def series_of(points: Sequence[Point]) -> str:
     return next((name for name in names if len({getattr(point, name) for point in points}) > 1), "network")
 
 
-def _scatter(drawing: Drawing, panel: Any, chart: Chart, name: str) -> None:
-    """Points over a cost, small but for those on the front; a ring and an interval around the choice."""
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    by, series = chart.chosen_by, series_of(chart.points)
-    cost = by.costs()[name]
-    place = {point.number: (cost(point.test), 100 * point.test.accuracy) for point in chart.points}
-    points = sorted((point for point in chart.points if cost(point.test) > 0), key=lambda point: place[point.number][0])
-    for index, value in enumerate(dict.fromkeys(str(getattr(point, series)) for point in chart.points)):
-        colour, hollow = COLOURS[index % len(COLOURS)], index // len(COLOURS) % 2 == 1
-        for on in (False, True):
-            there = [place[p.number] for p in points if str(getattr(p, series)) == value and p.front[name] is on]
-            look: dict[str, Any] = {"s": 12, "linewidths": 0.5, "alpha": 0.4}
-            look = {"s": 42, "linewidths": 0.9, "zorder": 4, "label": value} if on else look
-            look |= {"facecolors": "none" if hollow else colour, "edgecolors": "black" if on else colour}
-            xs, ys = np.reshape(there, (-1, 2)).T
-            panel.scatter(xs, ys, marker=MARKERS[index % len(MARKERS)], **look)
-    front = sorted(place[point.number] for point in points if point.front[name])
-    if front:
-        panel.step(*zip(*front, strict=True), where="post", color="black", lw=1.2, label="front on the test split")
-    chosen = chart.chosen
-    x, y = place[chosen.number]
-    panel.set_xscale("log")
-    panel.autoscale(False)  # the interval may reach far beyond the points
-    panel.plot([x, x], [100 * chosen.test.low, 100 * chosen.test.high], color=GREY, lw=1.0, zorder=1)
-    panel.plot(x, y, "o", ms=12, mfc="none", mec="black", ls="none", label=f"choice, #{chosen.number}", zorder=5)
-    drawing.tips += [(panel, *place[point.number], _tip(by, point)) for point in points]
-    unit, what = "s", f"time ({by.time})"
-    if name == "energy":
-        unit, what = "J", f"dynamic energy of a mean inference ({by.energy})"
-    panel.set_xlabel(what)
-    panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    panel.xaxis.set_minor_formatter(NullFormatter())
-    scale(panel.xaxis, unit)
-    panel.grid(True)
+def _marks(chart: Chart, cost: str) -> list[Mark]:
+    """Points over a cost, those on the front large."""
+    by = chart.chosen_by
+    series = series_of(chart.points)
+    return [
+        Mark(
+            cost=by.of(point.test.costs)[cost],
+            accuracy=point.test.accuracy,
+            low=point.test.low,
+            high=point.test.high,
+            series=str(getattr(point, series)),
+            large=point.front[cost],
+            front=point.front[cost],
+            tip=_tip(by, point),
+        )
+        for point in chart.points
+    ]
 
 
 def write_chart(folder: Path, chart: Chart) -> None:

@@ -6,6 +6,7 @@ split: they describe.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,13 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.runtime.studies.chart import work
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile
-from spikeloom.runtime.studies.chart.results import Chart, ChosenBy, Data, Pick, Point, Refused
-from spikeloom.runtime.studies.fronts import Budget, front, parse_budgets
+from spikeloom.runtime.studies.chart.results import Chart, Pick, Point, Refused
 from spikeloom.runtime.studies.jobs import sweep
+from spikeloom.runtime.studies.search.budgets import Budget, parse_budgets
+from spikeloom.runtime.studies.search.choice import NEAR, choose, front
+from spikeloom.runtime.studies.search.results import ChosenBy, Data, titles_of
 
 STORE = "points.sqlite"
-
-NEAR = 1e-9
-"""Shares closer than this are equal."""
 
 LOSS = 0.01
 """Accuracy that may be given up for less energy: a point."""
@@ -36,7 +36,7 @@ def chart(
     budgets: Sequence[Budget],
     folder: Path,
     *,
-    energy: str,
+    by: ChosenBy,
     command: str,
     jobs: int | None = None,
 ) -> Chart:
@@ -79,15 +79,13 @@ def chart(
     if not points:
         why = f"refuses all {len(refused)} configurations; the first: {refused[0].why[0]}"
         raise OptionError(f"--grid: {target.name} {why}")
-    times = {table.name: table.title for table in target.time}
-    by = ChosenBy(energy=energy, time=next(iter(times), None))
     points = with_fronts(with_expectations(points, networks), by)
     return Chart(
         spikeloom=__version__,
         target=target.name,
         command=command,
         data=data,
-        tables={"energy": {table.name: table.title for table in target.energy}, "time": times},
+        tables=titles_of(target),
         chosen_by=by,
         grid=grid,
         networks=tuple(networks),
@@ -121,7 +119,8 @@ def with_expectations(points: Sequence[Point], networks: Sequence[NetworkFile]) 
 def with_fronts(points: Sequence[Point], by: ChosenBy) -> list[Point]:
     """Points that know on which fronts of test accuracy and a cost they are."""
     gains = [point.test.accuracy for point in points]
-    on = {name: front(gains, [cost(point.test) for point in points]) for name, cost in by.costs().items()}
+    costs = [by.of(point.test.costs) for point in points]
+    on = {name: front(gains, [each[name] for each in costs]) for name in costs[0]}
     return [replace(point, front={name: marks[i] for name, marks in on.items()}) for i, point in enumerate(points)]
 
 
@@ -132,37 +131,23 @@ def pick(points: Sequence[Point], budgets: Sequence[Budget], by: ChosenBy) -> Pi
     fits; where an accuracy is wanted, the cheapest that fits. If nothing fits, the point that misses by the smallest
     factor.
     """
-    costs = by.costs()
-    if any(budget.what not in (*costs, "accuracy") for budget in budgets):
-        raise OptionError("--budget time: the chip has no time table, nothing is timed; omit it")
-
-    def energy(point: Point) -> float:
-        return costs["energy"](point.train)
-
-    fitting = [point for point in points if _excess(point, budgets, by) <= 1 + NEAR]
-    if not fitting:
-        chosen = min(points, key=lambda point: (_excess(point, budgets, by), energy(point)))
-    else:
-        wanted = any(budget.what == "accuracy" for budget in budgets)
-        enough = 0.0 if wanted else max(point.expected for point in fitting) - LOSS - NEAR
-        chosen = min((point for point in fitting if point.expected >= enough), key=energy)
+    choice = choose(points, partial(_values, by=by), _less_accurate, budgets)
+    chosen = min(choice.allowed, key=lambda point: point.train.costs.energy_j[by.energy])
     words = tuple(budget.words for budget in budgets)
-    return Pick(budgets=words, fits=bool(fitting), fitting=len(fitting), point=chosen.number)
+    return Pick(budgets=words, fits=bool(choice.fitting), fitting=len(choice.fitting), point=chosen.number)
 
 
 def above_on_test(chart: Chart) -> list[Point]:
     """Points that fit the budgets and whose test intervals lie above the chosen one's: reported, never chosen by."""
-    budgets = parse_budgets(chart.budget.budgets)
-    higher = [point for point in chart.points if point.test.low > chart.chosen.test.high]
-    return [point for point in higher if _excess(point, budgets, chart.chosen_by) <= 1 + NEAR]
+    values = partial(_values, by=chart.chosen_by)
+    fitting = choose(chart.points, values, _less_accurate, parse_budgets(chart.budget.budgets)).fitting
+    return [point for point in fitting if point.test.low > chart.chosen.test.high]
 
 
-def _excess(point: Point, budgets: Sequence[Budget], by: ChosenBy) -> float:
-    """Factor by which a point misses budgets, on the training split; at most 1 where it fits."""
-    factors = [0.0]
-    for budget in budgets:
-        if budget.what == "accuracy":
-            factors.append(budget.limit / point.expected if point.expected else float("inf"))
-        else:
-            factors.append(by.costs()[budget.what](point.train) / budget.limit)
-    return max(factors)
+def _values(point: Point, by: ChosenBy) -> dict[str, float]:
+    """What budgets limit, on the training split."""
+    return by.of(point.train.costs) | {"accuracy": point.expected}
+
+
+def _less_accurate(best: Point, other: Point) -> bool:
+    return best.expected - other.expected > LOSS + NEAR

@@ -4,7 +4,7 @@ Everything here is a function of files and of a request, so that a netlist is th
 ``compile`` would write. A network is rounded once for any number of layouts.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +17,7 @@ from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.compartments import Compilation, Options, lay_out_again, to_integers, write_netlist
-from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
+from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part
 from spikeloom.runtime.equivalence.reference import votes_so_far
@@ -26,13 +26,15 @@ from spikeloom.runtime.inputs.compilation import parse_cores, provenance, storag
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
 from spikeloom.runtime.machines.backends import machine_of
-from spikeloom.runtime.machines.base import Machine, Price
+from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.requests.main_job import CompileRequest
 from spikeloom.runtime.studies.chart.grid import FEWEST, Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
-from spikeloom.runtime.studies.chart.results import FORMAT, SPLITS, Data, Figures, Share, share
+from spikeloom.runtime.studies.chart.results import FORMAT, SPLITS, Figures
 from spikeloom.runtime.studies.jobs import Job, content_key
+from spikeloom.runtime.studies.search.measure import measure as measure_costs
+from spikeloom.runtime.studies.search.results import Data, Share, share
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,22 +211,13 @@ def _compile_request(work: Measurement, layout: str) -> CompileRequest:
 
 
 def _figures(machine: Machine, data: Recordings, bin_s: float, decided: IntArray) -> Figures:
-    """Decisions, and the mean inference: operations, energy by table, time by table."""
-    steps, size = data.step_counts, machine.batch(data.steps)
-    parts = [slice(first, first + size) for first in range(0, len(data), size)]
-    priced = [machine.price(data.events[part], bin_s=bin_s, lengths=steps[part]) for part in parts]
-    prices, decisions = [price for _, price in priced], np.concatenate([ran.decisions for ran, _ in priced])
-
-    def mean(of: Callable[[Price], Mapping[str, FloatArray]]) -> dict[str, float]:
-        return {name: float(np.concatenate([of(price)[name] for price in prices]).mean()) for name in of(prices[0])}
-
+    """Decisions beside those of the float model, and the costs of a mean inference."""
+    decisions, costs = measure_costs(machine, data, bin_s)
     return Figures(
         **asdict(_share(decisions, data.labels)),
         samples=len(data),
         model=_share(decided, data.labels),
         equal=int(np.count_nonzero(decisions == decided)),
-        energy_j=mean(lambda price: price.energy_j),
-        time_s=mean(lambda price: price.time_s),
-        synaptic_operations=float(np.concatenate([price.synaptic_operations for price in prices]).mean()),
-        steps=float(steps.mean()),
+        costs=costs,
+        steps=float(data.step_counts.mean()),
     )

@@ -7,23 +7,7 @@ from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Section, Table, Text
 from spikeloom.runtime.report.shown import Shown
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Costs:
-    """Of a mean inference, and the size of the netlist; joules and seconds by table."""
-
-    operations: float
-    energy_j: Mapping[str, float]
-    time_s: Mapping[str, float]
-    cores: int
-    neurons: int
-    synapses: int
-
-    @property
-    def least(self) -> float:
-        """Joules by the first table, or operations where no table prices them."""
-        return next(iter(self.energy_j.values()), self.operations)
+from spikeloom.runtime.studies.search.results import NetlistCosts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +37,7 @@ class Row:
     removed: Removed
     training: Changed
     test: Changed
-    costs: Costs = field(metadata=INLINE)
+    costs: NetlistCosts = field(metadata=INLINE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -28,25 +28,6 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.report.console import Progress
-from spikeloom.runtime.studies.pruning.results import Costs
-
-
-def decisions(netlist: Netlist, of: Recordings) -> IntArray:
-    """Class of each recording."""
-    return machine_of(netlist).run(of.events, lengths=of.lengths).decisions
-
-
-def priced(netlist: Netlist, of: Recordings) -> tuple[IntArray, Costs]:
-    """Class of each recording, and what an inference costs."""
-    run, price = machine_of(netlist).price(of.events, bin_s=1.0, lengths=of.lengths)  # at full speed, whatever the pace
-    return run.decisions, Costs(
-        operations=float(price.synaptic_operations.mean()),
-        energy_j={name: float(each.mean()) for name, each in price.energy_j.items()},
-        time_s={name: float(each.mean()) for name, each in price.time_s.items()},
-        cores=netlist.n_cores,
-        neurons=len(netlist.readout_class),
-        synapses=netlist.n_synapses,
-    )
 
 
 def silenced(netlist: Netlist, sources: IntArray) -> Netlist:

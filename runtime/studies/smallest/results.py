@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 
 from spikeloom.runtime.report.encode import HIDDEN, INLINE
 from spikeloom.runtime.report.shown import Shown
-from spikeloom.runtime.studies.chart.results import ChosenBy, Data, Share
-from spikeloom.runtime.studies.pruning.results import Costs
+from spikeloom.runtime.studies.search.results import ChosenBy, Data, NetlistCosts, Share
 from spikeloom.runtime.studies.smallest.space import Candidate
 from spikeloom.runtime.studies.smallest.work import Measured
 
@@ -62,8 +61,8 @@ class Checked:
     netlist_sha256: str
     different: Mapping[str, int]
     right: Share
-    costs: Costs
-    stopped: Costs | None
+    costs: NetlistCosts
+    stopped: NetlistCosts | None
     pace: str
 
 

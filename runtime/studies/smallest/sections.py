@@ -6,10 +6,11 @@ from functools import partial
 
 from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.report import html
-from spikeloom.runtime.report.drawing import COLOURS, GREY, MARKERS, Drawing, scale, sheet, styled
+from spikeloom.runtime.report.drawing import COLOURS, Drawing, sheet, styled
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Block, Code, Details, Figure, Section, Table, Text
 from spikeloom.runtime.studies.processor import price_table
+from spikeloom.runtime.studies.search.picture import Mark, draw_front
 from spikeloom.runtime.studies.smallest import baselines
 from spikeloom.runtime.studies.smallest.results import Smallest, Tried
 from spikeloom.runtime.studies.smallest.study import energy, worse
@@ -20,7 +21,7 @@ LOWER = 12
 
 MEANINGS = (
     "Accuracy by cross-validation inside the training split, with 95 % intervals (Wilson). Small marks were dropped "
-    "before the last rung, the dashed line is its front, the ring the choice. Where the chip can be stopped, costs are "
+    "before the last rung, the line is its front, the ring the choice. Where the chip can be stopped, costs are "
     "those until the decision is proven; none changes. Bars are support vector machines, on a small processor "
     "between arithmetic and memory accesses alone, and all cycles of one that can be bought."
 )
@@ -162,38 +163,37 @@ def _checked(result: Smallest) -> str:
 @styled()
 def picture(result: Smallest) -> Drawing:
     """Accuracy over energy; baselines of the last rung between what they take on a processor at least and at most."""
-    from matplotlib.ticker import NullFormatter
-
     drawing = sheet("Accuracy of candidates over energy", 4.6)
     panel = drawing.figure.subplots()
-    priced = [each for each in result.tried if each.costs is not None]
-    for index, system in enumerate(dict.fromkeys(each.candidate.system for each in priced)):
-        colour, marker = COLOURS[index], MARKERS[index]
-        for last, size, alpha, name in ((False, 9, 0.35, f"{system}, dropped"), (True, 34, 1.0, system)):
-            members = [each for each in priced if each.candidate.system == system and (each.rung == RUNGS) is last]
-            x, y = list(map(energy, members)), [100 * each.accuracy for each in members]
-            if members:
-                panel.scatter(x, y, size, marker=marker, color=colour, alpha=alpha, linewidths=0, label=name, zorder=3)
-            if last:
-                low, high = [100 * each.low for each in members], [100 * each.high for each in members]
-                panel.vlines(x, low, high, color=colour, alpha=0.5, lw=1.0, zorder=2)
-    front = sorted((energy(each), 100 * each.accuracy) for each in priced if each.rung == RUNGS and each.front)
-    panel.step(*zip(*front, strict=True), where="post", color=GREY, lw=1.0, ls=(0, (5, 2)), label="front", zorder=1)
-    at = energy(result.chosen), 100 * result.chosen.accuracy
-    panel.plot(*at, "o", ms=13, mfc="none", mec=COLOURS[4], mew=1.8, ls="none", label="choice", zorder=5)
-    drawing.tips += [(panel, energy(each), 100 * each.accuracy, _tip(each)) for each in sorted(priced, key=energy)]
-    shown = [each for each in (*result.tried, *result.baselines) if each.rung == RUNGS]
-    for index, each in enumerate(each for each in result.baselines if each.rung == RUNGS):
+    marks = {each.number: _mark(each) for each in result.tried if each.costs is not None}
+    label = f"energy of a mean inference ({result.chosen_by.energy})"
+    draw_front(drawing, panel, list(marks.values()), marks[result.chosen.number], "J", label)
+    last = [each for each in result.baselines if each.rung == RUNGS]
+    for index, each in enumerate(last):
         assert each.processor is not None, "these are priced"
-        ends, height = (each.processor.least_j, each.processor.most_j), 100 * each.accuracy
-        label, colour = each.candidate.system, COLOURS[2 + index % 2]
-        panel.hlines(height, *ends, color=colour, lw=3.0, alpha=0.8, label=label, zorder=4)
+        ends = (each.processor.least_j, each.processor.most_j)
+        height = 100 * each.accuracy
+        colour = COLOURS[2 + index % 2]
+        panel.hlines(height, *ends, color=colour, lw=3.0, alpha=0.8, label=each.candidate.system, zorder=4)
         drawing.tips += [(panel, joules, height, _tip(each)) for joules in ends]
+    panel.autoscale(True, axis="x")
+    shown = [*(each for each in result.tried if each.rung == RUNGS), *last]
     panel.set_ylim(100 * min(each.low for each in shown) - LOWER, min(100, 100 * max(each.high for each in shown) + 2))
-    panel.set(xscale="log", ylabel="accuracy by cross-validation (%)")
-    panel.set_xlabel(f"energy of a mean inference ({result.chosen_by.energy})")
-    panel.xaxis.set_minor_formatter(NullFormatter())
-    scale(panel.xaxis, "J")
-    panel.grid(True)
+    panel.set_ylabel("accuracy by cross-validation (%)")
     drawing.figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
     return drawing
+
+
+def _mark(each: Tried) -> Mark:
+    """A candidate, large if it came to the last rung."""
+    last = each.rung == RUNGS
+    return Mark(
+        cost=energy(each),
+        accuracy=each.accuracy,
+        low=each.low,
+        high=each.high,
+        series=each.candidate.system,
+        large=last,
+        front=last and each.front,
+        tip=_tip(each),
+    )

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,9 +16,10 @@ from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
 from spikeloom.runtime.report.numbers import wilson
-from spikeloom.runtime.studies.chart.results import ChosenBy, Data
-from spikeloom.runtime.studies.fronts import Budget, front
 from spikeloom.runtime.studies.jobs import sweep
+from spikeloom.runtime.studies.search.budgets import SHARES, Budget, excess
+from spikeloom.runtime.studies.search.choice import NEAR, choose, front, is_worse, lead
+from spikeloom.runtime.studies.search.results import Data, chosen_by, titles_of
 from spikeloom.runtime.studies.smallest import work
 from spikeloom.runtime.studies.smallest.baselines import baselines
 from spikeloom.runtime.studies.smallest.results import Checked, Choice, Smallest, Tried
@@ -27,17 +27,11 @@ from spikeloom.runtime.studies.smallest.space import Candidate, variants
 from spikeloom.runtime.studies.smallest.trained import Sensor
 from spikeloom.runtime.studies.smallest.work import RUNGS, Measured
 
-NEAR = 1e-9
-"""Shares closer than this are equal."""
-
 POINT = 0.01
 """Accuracy whose price is told."""
 
 LIMITS = ("energy", "time", "operations", "cores", "accuracy", "certified")
 """What ``--budget`` limits."""
-
-SHARES = ("accuracy", "certified")
-"""Those of which there is to be as much at least; the second is known on the last rung."""
 
 KEPT = {1: 20, 2: 14}
 """Candidates that go on from a rung."""
@@ -73,18 +67,17 @@ def smallest(
     on = partial(promote, budgets=budgets)
     beside = search(baselines(), most_accurate, trial, store, jobs=jobs)
     tried = search(candidates, on, trial, store, jobs=jobs)
-    taken = choose(tried, budgets)
+    taken = pick(tried, budgets)
     best = tried[taken.best - 1]
     tried = [_beside(each, best, tried) for each in tried]
-    times = {table.name: table.title for table in target.time}
-    by = ChosenBy(energy=next(iter(taken.cheapest)), time=next(iter(times), None))
+    by = chosen_by(target)
     checked, commands = make(tried[taken.cheapest[by.energy] - 1].candidate)
     return Smallest(
         spikeloom=__version__,
         command=command,
         target=target.name,
         data=data,
-        tables={"energy": {table.name: table.title for table in target.energy}, "time": times},
+        tables=titles_of(target),
         chosen_by=by,
         tried=tuple(tried),
         baselines=tuple(_beside(each, best, ()) for each in beside),
@@ -128,43 +121,26 @@ def most_accurate(tried: Sequence[Tried], rung: int) -> list[Tried]:
 
 
 def _tried(number: int, trial: work.Trial, measured: Measured) -> Tried:
-    found: dict[str, Any] = {each.name: getattr(measured, each.name) for each in fields(measured)}
-    right, recordings = accuracy(measured), int(np.count_nonzero(measured.tried))
+    about = {each.name: getattr(measured, each.name) for each in fields(measured)}
+    recordings = int(np.count_nonzero(measured.tried))
+    right = accuracy(measured)
     low, high = wilson(right * recordings, recordings)
-    found |= {"number": number, "candidate": trial.candidate, "rung": trial.rung}
-    return Tried(**found, accuracy=right, low=low, high=high)
+    about |= {"number": number, "candidate": trial.candidate, "rung": trial.rung}
+    return Tried(**about, accuracy=right, low=low, high=high)
+
+
+def accuracy(measured: Measured) -> float:
+    """Share of right decisions, over recordings that were decided at all, each with the same weight."""
+    return float(np.nanmean(measured.shares)) if any(measured.tried) else 0.0
 
 
 def _beside(each: Tried, best: Tried, tried: Sequence[Tried]) -> Tried:
     """A candidate with what the best has ahead of it, and whether it is on the front of those that came as far."""
-    behind, error = gap(best, each)
+    behind, error = lead(best.shares, each.shares)
     peers = [other for other in tried if other.rung == each.rung and other.costs is not None]
     marks = front([other.accuracy for other in peers], [energy(other) for other in peers])
     on = any(mark and other.number == each.number for mark, other in zip(marks, peers, strict=True))
     return replace(each, behind=behind, behind_error=error, front=on)
-
-
-def accuracy(found: Measured) -> float:
-    """Share of right decisions, over recordings that were decided at all, each with the same weight."""
-    right, tried = np.array([found.right, found.tried])
-    return float((right[tried > 0] / tried[tried > 0]).mean()) if tried.any() else 0.0
-
-
-def gap(best: Measured, other: Measured) -> tuple[float, float]:
-    """What one has ahead of another, over recordings that both decided, and the standard error of that.
-
-    >>> best = Measured(right=(5, 5, 5, 0), tried=(5, 5, 5, 5), setting=0.1)
-    >>> gap(best, Measured(right=(5, 5, 0, 5), tried=(5, 5, 5, 5), setting=0.1))
-    (0.0, 0.408248290463863)
-    """
-    tried = np.array([best.tried, other.tried])
-    both = (tried > 0).all(axis=0)
-    share = (np.array([best.right, other.right]) / np.maximum(tried, 1))[:, both]
-    ahead = share[0] - share[1]
-    if not len(ahead):
-        return 0.0, 0.0
-    error = ahead.std(ddof=1) / np.sqrt(len(ahead)) if len(ahead) > 1 else 0.0
-    return float(ahead.mean()), float(error)
 
 
 def promote(tried: Iterable[Tried], rung: int, budgets: Sequence[Budget] = ()) -> list[Tried]:
@@ -174,7 +150,7 @@ def promote(tried: Iterable[Tried], rung: int, budgets: Sequence[Budget] = ()) -
     """
     priced = [each for each in tried if each.costs is not None]
     limits = [budget for budget in budgets if budget.what not in SHARES]
-    able = [each for each in priced if all(excess(each, budget) <= SLACK for budget in limits)] or priced
+    able = [each for each in priced if all(excess(values(each), budget) <= SLACK for budget in limits)] or priced
     top = max((each.accuracy for each in able), default=0.0)
 
     def lag(each: Tried) -> float:
@@ -190,7 +166,7 @@ def energy(tried: Tried, table: str | None = None) -> float:
     return tried.costs.least if table is None else tried.costs.energy_j[table]
 
 
-def choose(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
+def pick(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
     """The cheapest of the last rung, by each table, that fits the budgets and is not shown to be worse than the best.
 
     Worse is one whose accuracy is lower by more than a standard error of the difference, recording by recording. Where
@@ -201,24 +177,20 @@ def choose(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
     if not priced:
         raise OptionError(f"the chip holds no candidate; the first: {tried[0].refused}")
     pool = [each for each in priced if each.rung == RUNGS]
-
-    def fitting(each: Tried) -> bool:
-        return all(excess(each, budget) <= 1 + NEAR for budget in budgets)
-
-    fits = [each for each in pool if fitting(each)] or [each for each in priced if fitting(each)]
-    allowed = fits or [min(pool, key=lambda each: (max(excess(each, b) for b in budgets), energy(each)))]
-    best = min(allowed, key=lambda each: (-each.accuracy, energy(each)))
-    if not any(budget.what == "accuracy" for budget in budgets):
-        allowed = [each for each in allowed if not worse(best, each)]
-    assert best.costs is not None, "all of these are priced"
-    tables = list(best.costs.energy_j)
+    selection = choose(pool, values, worse, budgets)
+    if not selection.fitting:
+        earlier = choose(priced, values, worse, budgets)
+        selection = earlier if earlier.fitting else selection
+    allowed = selection.allowed
+    assert selection.best.costs is not None, "all of these are priced"
+    tables = list(selection.best.costs.energy_j)
     cheapest = {table: min(allowed, key=lambda each: (energy(each, table), -each.accuracy)).number for table in tables}
     chosen = next(each for each in allowed if each.number == cheapest[tables[0]])
     above = [each for each in pool if each.accuracy >= chosen.accuracy + POINT - NEAR]
     return Choice(
         budgets=tuple(budget.words for budget in budgets),
-        fits=bool(fits),
-        best=best.number,
+        fits=bool(selection.fitting),
+        best=selection.best.number,
         cheapest=cheapest,
         allowed=tuple(each.number for each in allowed),
         ahead=min(above, key=energy).number if above else None,
@@ -227,20 +199,13 @@ def choose(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
 
 def worse(best: Tried, other: Tried) -> bool:
     """Whether one is shown to be worse than another."""
-    ahead, error = gap(best, other)
-    return ahead > error + NEAR
+    return is_worse(best.shares, other.shares)
 
 
-def excess(tried: Tried, budget: Budget) -> float:
-    """Factor by which a candidate misses a budget; at most 1 where it fits."""
+def values(tried: Tried) -> dict[str, float]:
+    """What budgets limit."""
     costs = tried.costs
     assert costs is not None, "what the chip does not hold has no price"
-    if budget.what in SHARES:
-        share = tried.accuracy if budget.what == "accuracy" else tried.certified
-        return budget.limit / share if share else float("inf")
-    if budget.what == "time":
-        if not costs.time_s:
-            raise OptionError(f"--budget {budget.words}: the chip has no time table, nothing is timed; omit it")
-        return next(iter(costs.time_s.values())) / budget.limit
-    found = {"energy": costs.least, "operations": costs.operations, "cores": costs.cores}[budget.what]
-    return found / budget.limit
+    known = {"energy": costs.least, "operations": costs.operations, "cores": float(costs.cores)}
+    known |= {"accuracy": tried.accuracy, "certified": tried.certified or 0.0}
+    return known | ({"time": next(iter(costs.time_s.values()))} if costs.time_s else {})

@@ -32,13 +32,12 @@ from spikeloom.runtime.machines.backends import backend_of, machine_of
 from spikeloom.runtime.machines.capabilities import Stoppable
 from spikeloom.runtime.report.encode import OPTIONAL, encode
 from spikeloom.runtime.studies.anytime.study import study
-from spikeloom.runtime.studies.chart.results import Data
 from spikeloom.runtime.studies.jobs import Job, content_key
 from spikeloom.runtime.studies.processor import Processor
-from spikeloom.runtime.studies.pruning.results import Costs
-from spikeloom.runtime.studies.pruning.trials import decisions as decisions_on_chip
-from spikeloom.runtime.studies.pruning.trials import priced
 from spikeloom.runtime.studies.robustness.exhaustive import share_robust_to_one_event
+from spikeloom.runtime.studies.search.measure import decisions as decisions_on_chip
+from spikeloom.runtime.studies.search.measure import measure_netlist
+from spikeloom.runtime.studies.search.results import Data, NetlistCosts
 from spikeloom.runtime.studies.smallest import baselines
 from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF
 from spikeloom.runtime.studies.smallest.space import Candidate
@@ -80,11 +79,18 @@ class Measured:
     right: tuple[int, ...]
     tried: tuple[int, ...]
     setting: float  # Strength of the rule
-    costs: Costs | None = field(default=None, metadata=OPTIONAL)
-    whole: Costs | None = field(default=None, metadata=OPTIONAL)
+    costs: NetlistCosts | None = field(default=None, metadata=OPTIONAL)
+    whole: NetlistCosts | None = field(default=None, metadata=OPTIONAL)
     refused: str | None = field(default=None, metadata=OPTIONAL)  # Why the chip does not hold it
     processor: Processor | None = field(default=None, metadata=OPTIONAL)  # Costs of a baseline
     certified: float | None = field(default=None, metadata=OPTIONAL)  # Share that no event alters, of some left out
+
+    @property
+    def shares(self) -> FloatArray:
+        """How often each recording was decided rightly; NaN where it was not decided; shape (recordings,)."""
+        right, tried = np.array([self.right, self.tried], np.float64)
+        shares: FloatArray = np.divide(right, tried, out=np.full(len(tried), np.nan), where=tried > 0)
+        return shares
 
 
 def trial(
@@ -215,9 +221,10 @@ def decisions(made: Counters, data: Counted) -> IntArray:
     return np.asarray(np.where(crossing > made.ramp, np.inf, crossing).argmin(axis=1))
 
 
-def costs_of(netlist: Any, of: Recordings) -> dict[str, Costs]:
+def costs_of(netlist: Any, of: Recordings) -> dict[str, NetlistCosts]:
     """`costs` of a mean inference until its decision is proven, where the chip can be stopped there, and `whole`."""
-    machine, costs = machine_of(netlist), priced(netlist, of)[1]
+    machine = machine_of(netlist)
+    costs = measure_netlist(netlist, of)[1]
     if not isinstance(machine, Stoppable):
         return {"costs": costs}
     proven = study(machine, of, machine.cumulative(of.events, of.step_counts)).rules[0].mean

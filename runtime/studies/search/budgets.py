@@ -1,25 +1,10 @@
-"""Which of many configurations no other one beats, and the words of ``--budget``."""
+"""The words of ``--budget``: limits of a mean inference."""
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from spikeloom.compiler.errors import OptionError
-
-
-def front(gains: Sequence[float], costs: Sequence[float]) -> list[bool]:
-    """Which points no other one beats: at least as much gain for at most the cost, and better in one of them."""
-    order = sorted(range(len(gains)), key=lambda i: (costs[i], -gains[i]))
-    on = [False] * len(gains)
-    best = float("-inf")
-    best_cost = float("nan")
-    for i in order:
-        on[i] = gains[i] > best or (gains[i] == best and costs[i] == best_cost)
-        if gains[i] > best:
-            best = gains[i]
-            best_cost = costs[i]
-    return on
-
 
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
 
@@ -35,6 +20,9 @@ LIMITED = {
     "cores": (_NUMBER, "as in 1"),
 }
 """What can be limited, its units and how it is written; both letters for micro are in use."""
+
+SHARES = ("accuracy", "certified")
+"""Those of which there is to be as much at least."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,3 +62,13 @@ def parse_budgets(given: Sequence[str], limits: Collection[str] = ("energy", "ti
             raise OptionError(f"--budget {words}: allowed is {'0 to 100' if units is _SHARE else 'more than 0'}")
         budgets[what] = Budget(what=what, limit=limit, words=words)
     return tuple(budgets.values())
+
+
+def excess(values: Mapping[str, float], budget: Budget) -> float:
+    """Factor by which values, by what is limited, miss a budget; at most 1 where they fit."""
+    if budget.what not in values:
+        raise OptionError(f"--budget {budget.words}: the chip has no time table, nothing is timed; omit it")
+    value = values[budget.what]
+    if budget.what in SHARES:
+        return budget.limit / value if value else float("inf")
+    return value / budget.limit
