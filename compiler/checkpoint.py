@@ -6,7 +6,7 @@ Files are read and written by :mod:`compiler.formats`; :mod:`passes.expand` writ
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -86,8 +86,16 @@ class Checkpoint:
         return Readout(population=len(self.dense), label=label)
 
 
-def layers_of(arrays: Mapping[str, AnyArray]) -> dict[str, Any]:
-    """Fields of a :class:`Checkpoint` that hold its weights, from tensors by name; read-only copies."""
+class Weights(TypedDict):
+    """Fields of a :class:`Checkpoint` that hold its weights."""
+
+    hops: Float32Array
+    conv_bias: Float32Array
+    dense: tuple[Dense, ...]
+
+
+def layers_of(arrays: Mapping[str, AnyArray]) -> Weights:
+    """Weights from tensors by name; read-only copies."""
     layers_read = {name: frozen(np.array(array, np.float32, order="C")) for name, array in arrays.items()}
     stages = sorted(
         (name.removesuffix(".weight") for name in layers_read if name.startswith("fc") and name.endswith(".weight")),
@@ -96,7 +104,7 @@ def layers_of(arrays: Mapping[str, AnyArray]) -> dict[str, Any]:
     dense = tuple(
         Dense(name=name, weight=layers_read[f"{name}.weight"], bias=layers_read[f"{name}.bias"]) for name in stages
     )
-    return {"hops": layers_read["conv1.hops"], "conv_bias": layers_read["conv1.bias"], "dense": dense}
+    return Weights(hops=layers_read["conv1.hops"], conv_bias=layers_read["conv1.bias"], dense=dense)
 
 
 def constant_faults(beta: float | None, theta: float | None) -> list[str]:

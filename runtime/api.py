@@ -603,7 +603,7 @@ def _data(given: Mapping[str, Any], split: str | None = None) -> Any:
     return data.split(split or given["split"]) if isinstance(data, Data) else data
 
 
-def _place(data: Source, bin: float | None) -> dict[str, Any]:
+def _place(data: Source, bin: float | None) -> dict[str, object]:
     """Where recordings are, and their bins, for questions that read more than one split."""
     if isinstance(data, Data):
         return {"data": data.source, "bin": data.bin if bin is None else bin}

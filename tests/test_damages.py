@@ -33,7 +33,10 @@ def made(seed=0, packing=None, taxels=6):
     """What the chip stores of a small TactileSGNet."""
     checkpoint = random_checkpoint(taxels=taxels, features=4, sizes=(9, 8, 4), seed=seed)
     network = expand(checkpoint, normalised_adjacency(ring(taxels).edges, taxels))
-    return Pair(netlist=compile_network(network, Options(storage=Fixed(packing))).netlist, network=network).memory
+    return Pair(
+        netlist=compile_network(network, Options(storage=Fixed() if packing is None else Fixed(packing))).netlist,
+        network=network,
+    ).memory
 
 
 def timed(folder):

@@ -70,10 +70,8 @@ def verify(
     floats = source if original is None and isinstance(source, Network) else original
     begin = progress or (lambda _part, _done: None)
     _require_fit(machine, source, floats, data, spec_samples)
+    lowered, reference = _tallies(machine, source, floats, len(data), begin)
     engines = _compare_engines(machine, data, min(spec_samples, len(data)), engine_name, begin)
-    model = machine.model(source)
-    lowered = None if model is None else ModelTally(machine, model, begin)
-    reference = None if floats is None else FloatTally(machine, floats, len(data), begin)
     votes, saturated = _run(machine, data, [tally for tally in (lowered, reference) if tally is not None], begin)
     return Verdict(
         target=netlist.target,
@@ -88,6 +86,17 @@ def verify(
         required={} if required is None else required,
         **engines,
         **({} if reference is None else _of_floats(reference, votes, data.files)),
+    )
+
+
+def _tallies(
+    machine: Machine, source: Any, floats: Network | None, recordings: int, begin: Begin
+) -> tuple[ModelTally | None, FloatTally | None]:
+    """What counts spikes of E1 and of E2, where the network has them."""
+    model = machine.model(source)
+    return (
+        None if model is None else ModelTally(machine, model, begin),
+        None if floats is None else FloatTally(machine, floats, recordings, begin),
     )
 
 

@@ -163,6 +163,18 @@ def _held(twins: Twins, aims: IntArray) -> tuple[IntArray, IntArray]:
     return rows, twins.axon[aims[rows]]
 
 
+def _checked_steps(netlist: CrossbarNetlist, events: EventArray, lengths: IntArray | None) -> IntArray:
+    """Data steps of each recording; raises as :func:`simulate`."""
+    require_channels(netlist, events.shape[1])
+    samples, _, whole = events.shape
+    steps = np.full(samples, whole) if lengths is None else np.asarray(lengths, np.int64)
+    require_below("length", steps, whole + 1)
+    most = netlist.ticks(whole)
+    if most >= MOST_TICKS:
+        raise NumericRangeError(f"recordings of {whole} data steps take {most} ticks, {MOST_TICKS - 1} can be counted")
+    return steps
+
+
 def simulate(
     network: CrossbarNetlist | Engine,
     events: EventArray,
@@ -181,13 +193,9 @@ def simulate(
     """
     engine = network if isinstance(network, Engine) else prepare(network)
     netlist = engine.netlist
-    require_channels(netlist, events.shape[1])
-    samples, _, whole = events.shape
-    steps = np.full(samples, whole) if lengths is None else np.asarray(lengths, np.int64)
-    require_below("length", steps, whole + 1)
-    most = netlist.ticks(whole)
-    if most >= MOST_TICKS:
-        raise NumericRangeError(f"recordings of {whole} data steps take {most} ticks, {MOST_TICKS - 1} can be counted")
+    samples = len(events)
+    steps = _checked_steps(netlist, events, lengths)
+    most = netlist.ticks(events.shape[2])
     twins = engine.twins
     neurons = len(twins.first_neuron)
     axons = np.zeros((samples, len(twins.first_axon)), np.int64)

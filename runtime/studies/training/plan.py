@@ -10,6 +10,7 @@ from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
 from spikeloom.compiler.targets.native import DEFAULT_COPIES
 from spikeloom.compiler.targets.native import SYSTEM as NATIVE
+from spikeloom.compiler.types import JsonObject
 from spikeloom.models.graphs import CHOICES, Graph
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import SYNTHETIC
@@ -141,7 +142,7 @@ def _words(request: TrainRequest, first: dict[str, Any], last: dict[str, Any]) -
     return ["spikeloom", "train", *repeat.words(first | options | last)]
 
 
-def _changed(options: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+def _changed(options: Mapping[str, Any], defaults: Mapping[str, Any]) -> JsonObject:
     """Options that differ from their defaults."""
     return {name: value for name, value in options.items() if value != defaults.get(name)}
 
