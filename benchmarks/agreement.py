@@ -57,10 +57,16 @@ def later(events: Any, steps: int, *, first: int) -> Any:
     return padded
 
 
-def compare(name: str, python: str, netlist: Netlist, events: Any, folder: Path, _first: int) -> dict[str, Any]:
+def compare(
+    name: str, python: str, netlist: Netlist, events: Any, folder: Path, _first: int
+) -> dict[str, Any]:
     """Spikes of a simulator that is handed matrices; CPU seconds of its process, without others that it starts."""
     stages = workload.stages_of(netlist)
-    arrays: dict[str, Any] = {"layers": len(stages), "events": events.transpose(0, 2, 1), "few": np.arange(len(events))}
+    arrays: dict[str, Any] = {
+        "layers": len(stages),
+        "events": events.transpose(0, 2, 1),
+        "few": np.arange(len(events)),
+    }
     for index, stage in enumerate(stages):
         arrays |= stage.arrays(index)
     for first in (0, 1):
@@ -68,7 +74,8 @@ def compare(name: str, python: str, netlist: Netlist, events: Any, folder: Path,
         trace = simulate(without_windows(netlist), given, spikes=True)
         assert trace.spikes is not None
         arrays |= {
-            f"piped{first}{i}": np.packbits(trace.spikes[:, :, netlist.compartments_of(i)]) for i in range(len(stages))
+            f"piped{first}{i}": np.packbits(trace.spikes[:, :, netlist.compartments_of(i)])
+            for i in range(len(stages))
         }
     np.savez(folder / "task.npz", **arrays)
     entry = Entry(name=name, rival=name, options=RIVALS[name], computes="", together=False)
@@ -77,7 +84,11 @@ def compare(name: str, python: str, netlist: Netlist, events: Any, folder: Path,
     worker.close()
     if "skipped" in answer:
         raise SystemExit(f"{name}: {answer['skipped']}")
-    return {"tool": answer["tool"], "differing_spikes": sum(answer["differing_spikes"]), "cpu_s": answer["first_cpu_s"]}
+    return {
+        "tool": answer["tool"],
+        "differing_spikes": sum(answer["differing_spikes"]),
+        "cpu_s": answer["first_cpu_s"],
+    }
 
 
 def simple_times(chip: timing_oracle.Chip, spikes: Any, updated: Any, events: Any) -> Any:
@@ -102,7 +113,9 @@ def simple_times(chip: timing_oracle.Chip, spikes: Any, updated: Any, events: An
     return sums.max(axis=(0, 2)) + table.barrier(len(set(chip.tile)))
 
 
-def compare_sanafe(_name: str, python: str, netlist: Netlist, events: Any, folder: Path, first: int) -> dict[str, Any]:
+def compare_sanafe(
+    _name: str, python: str, netlist: Netlist, events: Any, folder: Path, first: int
+) -> dict[str, Any]:
     """Spikes, energy and times of SANA-FE for some recordings, by its conventions and as ``estimate`` prints them."""
     target, models = load_target(netlist.target), ("simple",) if first else ("simple", "detailed")
     version = "from importlib.metadata import version as v; print(v('sanafe'))"
@@ -125,7 +138,9 @@ def compare_sanafe(_name: str, python: str, netlist: Netlist, events: Any, folde
     updated = timing_oracle.updates(netlist, shifted, trace.spikes, trace.membranes)
     tiles, dense = sanafe.input_tiles(netlist, target), timing_oracle.dense_synapses(netlist)
     chip = timing_oracle.Chip(netlist, target, target.time[0], tiles, dense)
-    parts = timing_oracle.parts_of_energy(netlist, target, trace.counts, updated.sum(axis=(1, 2)), steps, tiles, dense)
+    parts = timing_oracle.parts_of_energy(
+        netlist, target, trace.counts, updated.sum(axis=(1, 2)), steps, tiles, dense
+    )
     _, printed = estimate(netlist, target, events, detail="cycle")
     ours = {"simple": printed.simple["sanafe"].seconds, "detailed": printed.detailed["sanafe"].seconds}
     names, number = sanafe.group_names(netlist), netlist.number_in_layer()
@@ -162,7 +177,9 @@ def merged(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
     whole = dict(other)
     for key, value in one.items():
         if key.startswith("printed"):
-            whole[key] = value if key not in other else (min(value[0], other[key][0]), max(value[1], other[key][1]))
+            whole[key] = (
+                value if key not in other else (min(value[0], other[key][0]), max(value[1], other[key][1]))
+            )
         elif key != "tool":
             whole[key] = max(value, other[key]) if key.endswith("off") else value + other[key]
     return whole
@@ -170,11 +187,15 @@ def merged(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
 
 def options() -> argparse.Namespace:
     """Read the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", help="folder or zip in the released layout, 39 taxels")
     parser.add_argument("output", help="JSON file to write, or to go on with")
     parser.add_argument("netlists", nargs="+", metavar="NET.loom")
-    parser.add_argument("--python", action="append", required=True, metavar="NAME=PATH", help="interpreter of a rival")
+    parser.add_argument(
+        "--python", action="append", required=True, metavar="NAME=PATH", help="interpreter of a rival"
+    )
     parser.add_argument("--limit", type=int, help="of the recordings")
     return parser.parse_args()
 
@@ -196,7 +217,9 @@ def main() -> None:
         netlist = read_netlist(path)
         shown = of_length(joined_bins(data, netlist.bins), netlist.clocks.length)
         events = np.ascontiguousarray(with_clocks(shown.events, netlist.clocks) != 0).view(np.uint8)
-        trace = simulate(without_windows(netlist), later(events, events.shape[2] + len(netlist.layers), first=0))
+        trace = simulate(
+            without_windows(netlist), later(events, events.shape[2] + len(netlist.layers), first=0)
+        )
         facts = networks.setdefault(Path(path).stem, {})
         facts |= {
             "recordings": len(events),
@@ -213,7 +236,11 @@ def main() -> None:
                 with tempfile.TemporaryDirectory() as folder:
                     found = {"recordings": len(part)} | run(name, python, netlist, part, Path(folder), first)
                 facts[name] = merged(facts[name], found) if name in facts else found
-                print(f"{path}, {name}, {time.monotonic() - begun:.0f} s: {facts[name]}", file=sys.stderr, flush=True)
+                print(
+                    f"{path}, {name}, {time.monotonic() - begun:.0f} s: {facts[name]}",
+                    file=sys.stderr,
+                    flush=True,
+                )
                 write(output, made(train, data) | {"networks": networks})
     write(output, made(train, data) | {"networks": networks})
 

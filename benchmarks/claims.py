@@ -22,7 +22,9 @@ def main() -> None:
         made = {"command": "python benchmarks/paper/tables.py"}
         if name.endswith(".json"):
             made = json.loads((FOLDER / "results" / name).read_text("utf-8"))
-        command = made.get("command", "python benchmarks/paper/train.py Ev-Objects.zip Ev-Containers.zip -o FOLDER")
+        command = made.get(
+            "command", "python benchmarks/paper/train.py Ev-Objects.zip Ev-Containers.zip -o FOLDER"
+        )
         for text in claim["texts"]:
             shown = re.sub(r"\{[^{}]+\}", "…", text).replace("|", "/")
             print(f"| {claim['page']} | {shown} | {name} | `{command}` |")

@@ -81,7 +81,9 @@ class Tree:
             return [sys.executable, "-m", "spikeloom"], str(source)
         return [sys.executable, "-m", "runtime"], str(self.path)
 
-    def start(self, words: str, values: Mapping[str, str], core: int, cache: Path, limit: float) -> dict[str, float]:
+    def start(
+        self, words: str, values: Mapping[str, str], core: int, cache: Path, limit: float
+    ) -> dict[str, float]:
         """Run a command to its end: seconds, gigabytes and exit code, 124 after the limit."""
         start, path = self.command()
         given = [word.format(folder=self.folder, **values) for word in words.split()]
@@ -112,7 +114,9 @@ class Tree:
         """A file that jobs read, made where it is missing."""
         file = folder / name
         if not file.exists():
-            done = self.start(MAKE[name], dict(values) | {"file": str(file)}, core, self.folder / "machine code", 3600)
+            done = self.start(
+                MAKE[name], dict(values) | {"file": str(file)}, core, self.folder / "machine code", 3600
+            )
             if done["exit_code"]:
                 raise SystemExit(f"{name}: {(self.folder / 'log').read_text()}")
         return str(file)
@@ -122,7 +126,11 @@ def medians(turns: list[dict[str, float]]) -> dict[str, float]:
     """Of the turns that went well."""
     return {
         "exit_code": max(turn["exit_code"] for turn in turns),
-        **{key: round(statistics.median(turn[key] for turn in turns), 3) for key in turns[0] if key != "exit_code"},
+        **{
+            key: round(statistics.median(turn[key] for turn in turns), 3)
+            for key in turns[0]
+            if key != "exit_code"
+        },
     }
 
 
@@ -152,12 +160,16 @@ def measure(
 
 def main() -> None:
     """Measure, print a line for each job, and store what is known after each."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("checkpoint")
     parser.add_argument("recordings")
     parser.add_argument("--old", type=Path, required=True)
     parser.add_argument("--new", type=Path, default=Path(__file__).parents[1])
-    parser.add_argument("--only", nargs="+", choices=JOBS, default=list(JOBS), metavar="NAME", help=", ".join(JOBS))
+    parser.add_argument(
+        "--only", nargs="+", choices=JOBS, default=list(JOBS), metavar="NAME", help=", ".join(JOBS)
+    )
     parser.add_argument("--turns", type=int, default=5)
     parser.add_argument("--core", type=int, default=0)
     parser.add_argument("--limit", type=float, default=900, metavar="SECONDS")
@@ -174,7 +186,9 @@ def main() -> None:
     for tree in (old, new):
         tree.folder.mkdir(parents=True, exist_ok=True)
         tree.make("objects.loom", tree.folder, values, arguments.core)
-    values["wide"] = old.make("wide.pt", folder, values, arguments.core) if "wide" in " ".join(arguments.only) else ""
+    values["wide"] = (
+        old.make("wide.pt", folder, values, arguments.core) if "wide" in " ".join(arguments.only) else ""
+    )
     results = made(*(load_data(arguments.recordings, each) for each in ("train", "test"))) | {
         "jobs": json.loads(output.read_text())["jobs"] if output.exists() else {}
     }
@@ -183,7 +197,10 @@ def main() -> None:
         before, after = found["old"], found["new"]
         seconds = f"{before['wall_s']:8.2f} -> {after['wall_s']:7.2f} s, {found['times_faster']:6.1f} times as fast"
         memory = f"{before['peak_gb']:.2f} -> {after['peak_gb']:.2f} GB"
-        print(f"{job:<18} {seconds}, {memory}, exit codes {before['exit_code']}, {after['exit_code']}", flush=True)
+        print(
+            f"{job:<18} {seconds}, {memory}, exit codes {before['exit_code']}, {after['exit_code']}",
+            flush=True,
+        )
         output.write_text(json.dumps(results, indent=2) + "\n")
 
 

@@ -62,7 +62,8 @@ def figures(file: str, data: Path, options: dict[str, Any]) -> dict[str, Any]:
         "cores": facts.cores,
         "compartments": facts.compartments,
         "per_inference": {
-            key: getattr(price.per_inference, key) for key in ("synaptic_operations", "spikes", "packets", "energy_j")
+            key: getattr(price.per_inference, key)
+            for key in ("synaptic_operations", "spikes", "packets", "energy_j")
         },
     }
 
@@ -81,8 +82,14 @@ def main(folder: str, *words: str) -> None:
         ]
         for each in public_networks.NETWORKS:
             if each.name in PUBLIC:
-                options = {"dt": 1.0} if PUBLIC[each.name] == "NIR" else {"polarities": 3, "polarities_first": True}
-                networks.append((each.name, PUBLIC[each.name], str(Path(folder, each.repository, each.path)), options))
+                options = (
+                    {"dt": 1.0}
+                    if PUBLIC[each.name] == "NIR"
+                    else {"polarities": 3, "polarities_first": True}
+                )
+                networks.append(
+                    (each.name, PUBLIC[each.name], str(Path(folder, each.repository, each.path)), options)
+                )
         networks.append(("two convolutions", "ONNX", onnx, {}))
         for name, kind, file, options in networks:
             row = {"name": name, "format": kind, "shared": figures(file, Path(place, name), options)}

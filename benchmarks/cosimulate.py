@@ -36,13 +36,20 @@ def main(arguments: argparse.Namespace) -> Outcome:
         folder = Path(arguments.work or temporary)
         folder.mkdir(parents=True, exist_ok=True)
         return cosimulate(
-            machine, data, rtl=arguments.rtl, simulator=arguments.simulator, folder=folder, bin_s=data.seconds
+            machine,
+            data,
+            rtl=arguments.rtl,
+            simulator=arguments.simulator,
+            folder=folder,
+            bin_s=data.seconds,
         )
 
 
 def options(words: list[str] | None = None) -> argparse.Namespace:
     """What was typed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("netlist")
     parser.add_argument("data")
     parser.add_argument("--rtl", required=True)

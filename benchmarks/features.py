@@ -31,7 +31,9 @@ BINS = (2, 5, 10, 25, 50)
 def counts(data: Recordings, parts: int) -> np.ndarray:
     """Events per channel and part of the trial, (samples, channels * parts) float64."""
     pieces = np.array_split(data.events, parts, axis=-1)
-    return np.stack([piece.sum(axis=-1, dtype=np.float64) for piece in pieces], axis=-1).reshape(len(data), -1)
+    return np.stack([piece.sum(axis=-1, dtype=np.float64) for piece in pieces], axis=-1).reshape(
+        len(data), -1
+    )
 
 
 def main() -> None:
@@ -48,14 +50,21 @@ def main() -> None:
         for name, scale in (("events", np.asarray), ("log(1 + events)", np.log1p)):
             features[f"{parts:2} × {name}"] = [scale(counts(data, parts)) for data in (training, test)]
     for steps in BINS:
-        features[f"bins of {steps} steps"] = [counts(joined_bins(data, steps), 1) for data in (training, test)]
+        features[f"bins of {steps} steps"] = [
+            counts(joined_bins(data, steps), 1) for data in (training, test)
+        ]
     found = []
     for words, (shown, held) in features.items():
         for kernel, machine in KERNELS.items():
             model = make_pipeline(StandardScaler(), machine)
             across = cross_val_score(model, shown, training.labels, cv=folds).mean()
             right = int(np.sum(model.fit(shown, training.labels).predict(held) == test.labels))
-            row = {"features": words.strip(), "kernel": kernel, "cross_validation": round(across, 4), "correct": right}
+            row = {
+                "features": words.strip(),
+                "kernel": kernel,
+                "cross_validation": round(across, 4),
+                "correct": right,
+            }
             found.append(row)
             print(f"{words:20} {kernel:8} {across:16.1%}   {right} of {len(test)} ({right / len(test):.1%})")
     if arguments.output:

@@ -61,7 +61,9 @@ def order(data: Counted, polarities: int, classes: int) -> dict[int, np.ndarray]
 
 def only(data: Counted, columns: np.ndarray) -> Counted:
     """Some of the counters."""
-    return replace(data, counter=data.counter[columns], spikes=data.spikes[:, columns], at=data.at[:, columns])
+    return replace(
+        data, counter=data.counter[columns], spikes=data.spikes[:, columns], at=data.at[:, columns]
+    )
 
 
 def measured(data: Recordings, of_window: dict[int, Counted], rows: np.ndarray, held: np.ndarray) -> Json:
@@ -133,7 +135,9 @@ def main() -> None:
             "test_correct": sum(own["right"]),
         }
         mean, low, high = (100 * value for value in points[point]["accuracy"])
-        print(f"{point:18} {mean:.2f} ({low:.2f} … {high:.2f})   test {sum(own['right'])} of {len(own['right'])}")
+        print(
+            f"{point:18} {mean:.2f} ({low:.2f} … {high:.2f})   test {sum(own['right'])} of {len(own['right'])}"
+        )
     halves = data.part(slice(training)), data.part(slice(training, None))
     found: Json = made_by(*halves) | {
         "data": Path(arguments.recordings).name,

@@ -93,7 +93,18 @@ SHOWN = re.compile(r"^\$ (spikeloom .+)\n((?:(?!\$ |```).*\n)*)", re.MULTILINE)
 IN_HARDWARE = {"counters": 20, "native": 20}
 """First test recordings that run in RANC's hardware, by kind of network."""
 
-PAGES = ("anytime", "chart", "compile", "cost", "counting", "data", "formats", "stress", "truenorth", "verify")
+PAGES = (
+    "anytime",
+    "chart",
+    "compile",
+    "cost",
+    "counting",
+    "data",
+    "formats",
+    "stress",
+    "truenorth",
+    "verify",
+)
 """Those that show some."""
 
 POINT = ("number", "network", "storage", "cores", "window", "n_cores", "test")
@@ -143,7 +154,11 @@ def pretrained(session: Session) -> Json:
     for name in NETWORKS:
         record = session.run(f"inspect pretrained:{name}")["training"]
         samples = record["test_samples"]
-        found[name] = {"made_by": record["command"], "test_samples": samples, "validation": record["validation"]}
+        found[name] = {
+            "made_by": record["command"],
+            "test_samples": samples,
+            "validation": record["validation"],
+        }
         for which in ("last", "best", "clean"):
             epoch, right = record[which]["epoch"], record[which]["correct"]
             low, high = wilson(right, samples)
@@ -210,7 +225,11 @@ def free_running(session: Session) -> Json:
             trained = session.run(f"run net.loom --data {data} --split train")
             decided.append(trained["predictions"])
             right = sum(a == b for a, b in zip(trained["predictions"], trained["labels"], strict=True))
-            rows[row] = {"train_right": right, "left": made.get("free_running"), **stored(session, network, data)}
+            rows[row] = {
+                "train_right": right,
+                "left": made.get("free_running"),
+                **stored(session, network, data),
+            }
         equal = sum(a == b for a, b in zip(*decided, strict=True))
         found[name] = rows | {"train_equal": equal, "train_samples": trained["samples"]}
     return found
@@ -220,7 +239,9 @@ def layouts(session: Session) -> Json:
     """What more cores cost and bring, message by message."""
     found = {}
     for options in LAYOUTS:
-        session.run(f"compile {MANUAL} --graph manual --calibrate {OBJECTS} {options} -o net.loom".replace("  ", " "))
+        session.run(
+            f"compile {MANUAL} --graph manual --calibrate {OBJECTS} {options} -o net.loom".replace("  ", " ")
+        )
         found[options or "default"] = session.costs(OBJECTS, "--detail cycle")
     return found
 
@@ -232,7 +253,9 @@ def chart(session: Session, data: str) -> Json:
     if data == OBJECTS:
         (RESULTS / "chart-objects.png").write_bytes((session.folder / "chart" / "chart.png").read_bytes())
     points = {str(point["number"]): {key: point[key] for key in POINT} for point in found["points"]}
-    usual = next(each for each in points.values() if (each["storage"], each["cores"], each["window"]) == USUAL)
+    usual = next(
+        each for each in points.values() if (each["storage"], each["cores"], each["window"]) == USUAL
+    )
     for point in points.values():
         whole, energy = usual["test"]["energy_j"], point["test"]["energy_j"]
         point["times_less"] = {table: whole[table] / energy[table] for table in energy}
@@ -245,7 +268,9 @@ def anytime(session: Session, data: str) -> Json:
     session.run(f"compile {network} --calibrate {data} --weight-bits 8 -o net.loom")
     found = session.run(f"anytime net.loom --data {data} --calibrate {data} -o anytime.json", "anytime.json")
     windows = {str(each["percent"]): each["chip"]["correct"] for each in found["windows"]}
-    rules = {str(each["allowed"]): {key: each[key] for key in each if key != "samples"} for each in found["rules"]}
+    rules = {
+        str(each["allowed"]): {key: each[key] for key in each if key != "samples"} for each in found["rules"]
+    }
     for rule in rules.values():
         rule["steps_saved"] = 1 - rule["mean"]["chip_steps"] / found["full"]["chip_steps"]
     return {"full": found["full"], "windows": windows, "rules": rules}
@@ -273,7 +298,8 @@ def stress(session: Session, network: str, calibrate: str = "") -> Json:
     for name, each in result["perturbations"].items():
         verdict = {key: each[key] for key in ("verdict", "breaks", "same_place")}
         levels = {
-            f"{level['level']:g}": {side: level[side]["mean"] for side in ("float", "chip")} | {"equal": level["equal"]}
+            f"{level['level']:g}": {side: level[side]["mean"] for side in ("float", "chip")}
+            | {"equal": level["equal"]}
             for level in each["levels"]
         }
         found[name] = verdict | {"levels": levels}
@@ -285,7 +311,9 @@ def truenorth(session: Session) -> Json:
     found: Json = {}
     for data in (OBJECTS, CONTAINERS):
         for bits in (8, 5, 4):
-            made = session.run(f"train --data {data} --system counters --weight-bits {bits} -o net.pt")["record"]
+            made = session.run(f"train --data {data} --system counters --weight-bits {bits} -o net.pt")[
+                "record"
+            ]
             session.run(f"compile net.pt {'' if bits == 8 else '--target truenorth '}-o net.loom")
             costs = session.run(f"estimate net.loom --data {data}")
             found[f"{data}, {bits} bits"] = {
@@ -349,17 +377,27 @@ def confusion(session: Session) -> Json:
     pairs = list(zip(found["labels"], found["predictions"], strict=True))
     other = sum(label // FILLINGS != decided // FILLINGS for label, decided in pairs)
     wrong = sum(label != decided for label, decided in pairs)
-    near = sum(label // FILLINGS == decided // FILLINGS and abs(label - decided) == 1 for label, decided in pairs)
+    near = sum(
+        label // FILLINGS == decided // FILLINGS and abs(label - decided) == 1 for label, decided in pairs
+    )
     counts = np.zeros((CONTAINER_CLASSES, CONTAINER_CLASSES), np.int64)
     np.add.at(counts, tuple(np.transpose(pairs)), 1)
-    drawing = matrices("Containers in rows of five fillings", {"Containers, five fillings of each of four": counts})
+    drawing = matrices(
+        "Containers in rows of five fillings", {"Containers, five fillings of each of four": counts}
+    )
     drawing.figure.set_size_inches(4.8, 4.8)
     for axes in drawing.figure.axes:
         for edge in range(FILLINGS, CONTAINER_CLASSES, FILLINGS):
             axes.axhline(edge - 0.5, color="0.6", lw=0.8)
             axes.axvline(edge - 0.5, color="0.6", lw=0.8)
     (RESULTS / "confusion-containers.png").write_bytes(drawing.file("png"))
-    return {"test_samples": len(pairs), "wrong": wrong, "other_container": other, "next_filling": near, "pairs": pairs}
+    return {
+        "test_samples": len(pairs),
+        "wrong": wrong,
+        "other_container": other,
+        "next_filling": near,
+        "pairs": pairs,
+    }
 
 
 def longer_bins(session: Session) -> Json:
@@ -387,7 +425,9 @@ def processor(session: Session, data: str) -> Json:
     found = {}
     for name, network in PROCESSOR[data].items():
         session.run(f"compile {network} --calibrate {data} -o net.loom")
-        found[name] = session.run(f"estimate net.loom --data {data} --against-processor")["against_processor"]
+        found[name] = session.run(f"estimate net.loom --data {data} --against-processor")[
+            "against_processor"
+        ]
     return found
 
 
@@ -419,18 +459,25 @@ STUDIES: dict[str, Callable[[Session], Json]] = {
 
 def main() -> None:
     """Make the studies that are named, or all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("studies", nargs="*", metavar="STUDY", help=", ".join(STUDIES))
     arguments = parser.parse_args()
     code = subprocess.run(
-        ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True, check=True
+        ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
     )
     for name in arguments.studies or STUDIES:
         with tempfile.TemporaryDirectory() as folder:
             session = Session(arguments.folder, Path(folder))
             figures = STUDIES[name](session)
-            read = [data for data in (OBJECTS, CONTAINERS) if any(data in words for words in session.commands)]
+            read = [
+                data for data in (OBJECTS, CONTAINERS) if any(data in words for words in session.commands)
+            ]
             read = read or [OBJECTS, CONTAINERS]  # of records
             hashes = {
                 data: data_digest(*(load_data(arguments.folder / data, each) for each in ("train", "test")))

@@ -58,14 +58,23 @@ def main() -> None:
             reference = np.array(rounded.verify(data.test).float_predictions)
             tuned = Path(folder, f"{place}-{name.split()[0]}.nir")
             if not tuned.exists():
-                asked = {key: int(value) if key == "scale_groups" else value for key, value in storage.items()}
+                asked = {
+                    key: int(value) if key == "scale_groups" else value for key, value in storage.items()
+                }
                 spikeloom.finetune(path, data, str(tuned), epochs=EPOCHS, **step, **asked)
             after = spikeloom.load(str(tuned.with_suffix(".loom")), network=str(tuned))
-            rows[name] = {"before": measured(rounded, data.test), "after": measured(after, data.test, reference)}
+            rows[name] = {
+                "before": measured(rounded, data.test),
+                "after": measured(after, data.test, reference),
+            }
             print(place, name, rows[name], flush=True)
         right = int(np.count_nonzero(reference == data.test.labels))
         found.append({"name": Path(path).name, "float_right": right, "storages": rows})
-        result = made(data.train, data.test) | {"epochs": EPOCHS, "samples": len(data.test), "networks": found}
+        result = made(data.train, data.test) | {
+            "epochs": EPOCHS,
+            "samples": len(data.test),
+            "networks": found,
+        }
         with write_atomically(Path(output)) as file:
             file.write(json.dumps(result, indent=1).encode())
 

@@ -65,7 +65,9 @@ def least(run: Callable[[], object], clock: Callable[[], float], repeats: int) -
     return min(found)
 
 
-def measure(engine: Engine, events: workload.SpikeArray, *, repeats: int, threads: int = 1) -> dict[str, Any]:
+def measure(
+    engine: Engine, events: workload.SpikeArray, *, repeats: int, threads: int = 1
+) -> dict[str, Any]:
     """Time of one recording, and what happened in it."""
     netlist = engine.netlist
     given = np.ascontiguousarray(events.transpose(0, 2, 1)).view(np.uint8)
@@ -96,14 +98,18 @@ def threads_of_host(engine: Engine, *, repeats: int) -> list[dict[str, Any]]:
     given = np.ascontiguousarray(events.transpose(0, 2, 1)).view(np.uint8)
     found = []
     for threads in range(1, len(os.sched_getaffinity(0)) + 1):
-        seconds = least(lambda n=threads: simulate(engine, given, threads=n, spikes=True), time.perf_counter, repeats)
+        seconds = least(
+            lambda n=threads: simulate(engine, given, threads=n, spikes=True), time.perf_counter, repeats
+        )
         found.append({"threads": threads, "ms": float(f"{1e3 * seconds / len(events):.4g}")})
     return found
 
 
 def main() -> None:
     """Measure, write, draw."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("-o", "--output", required=True, help="JSON file to write")
     parser.add_argument("--chart", help="also draw CHART-activity.svg and .png, and so on")
     parser.add_argument("--repeats", type=int, default=5)

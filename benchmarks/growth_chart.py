@@ -52,7 +52,9 @@ def draw(result: dict[str, Any], stem: str) -> None:
     threads = [row["threads"] for row in result["threads"]]
     speed = [1e3 / row["ms"] for row in result["threads"]]
     figure, panel = plt.subplots(figsize=(5.6, 4), layout="constrained")
-    panel.plot([0, *threads], [0, *(speed[0] * n for n in threads)], "--", color=GUIDE, lw=1, label="proportional")
+    panel.plot(
+        [0, *threads], [0, *(speed[0] * n for n in threads)], "--", color=GUIDE, lw=1, label="proportional"
+    )
     panel.plot(threads, speed, "o-", color=OURS, label="measured")
     panel.set_xticks(threads)
     panel.set_xlim(0, threads[-1] + 0.5)
@@ -76,7 +78,9 @@ def draw_skins(result: dict[str, Any], stem: str) -> None:
         cost = np.array([row["run_ms"] / 1e3 if key == "run_s" else row[key] for row in rows])
         panel.loglog(synapses, cost[-1] * synapses / synapses[-1], "--", color=GUIDE, lw=1)
         panel.loglog(synapses, cost, f"{mark}-", color=colour)
-        panel.annotate(label, (synapses[1], cost[1]), (6, -12), textcoords="offset points", color=colour, fontsize=9)
+        panel.annotate(
+            label, (synapses[1], cost[1]), (6, -12), textcoords="offset points", color=colour, fontsize=9
+        )
     panel.set(ylabel="seconds (dashed: in proportion)", xlabel="synapses", xticks=[2e6, 5e6, 1e7, 2e7, 3e7])
     panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1e6:g} M")
     panel.xaxis.set_minor_formatter(NullFormatter())

@@ -48,7 +48,10 @@ ROUNDS, DRAWS = 5, 10_000
 FOUR, EIGHT = (1, 4, 16, 64), (1, 2, 4, 8, 16, 32, 64, 128)
 TWELVE = (1, 2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 130)
 
-SMALL = [(bins, parts, events) for bins, parts, events in product((1, 5, 10, 25), (1, 2, 3), (FOUR, EIGHT, TWELVE))]
+SMALL = [
+    (bins, parts, events)
+    for bins, parts, events in product((1, 5, 10, 25), (1, 2, 3), (FOUR, EIGHT, TWELVE))
+]
 LARGE = [(bins, parts, TWELVE) for bins, parts in product((1, 5), (6, 10))]
 STRENGTHS = (0.03, 0.1, 0.3)
 LONG_RAMP = 256
@@ -86,7 +89,10 @@ def price(data: Counted, classes: int) -> int:
 def tried(data: Counted, classes: int, seeds: Sequence[int] = (0,)) -> tuple[float, np.ndarray, float]:
     """Best strength of a plan on training recordings, how often each is right, and the lowest largest sum."""
     sums = [cross_validate(data, classes, seed=seed) for seed in seeds]
-    right = {name: np.mean([each[name].argmax(axis=1) == data.labels for each in sums], axis=0) for name in sums[0]}
+    right = {
+        name: np.mean([each[name].argmax(axis=1) == data.labels for each in sums], axis=0)
+        for name in sums[0]
+    }
     best = max(right, key=lambda strength: right[strength].mean())
     return best, right[best], min(float(each[best].max(axis=1).min()) for each in sums)
 
@@ -111,11 +117,16 @@ def measured(
         rule = fit_rules(own, classes, [strength])[strength]
         own_of[name] = own
         correct = rule.right(each.part(held))
-        found["rules"][name] = {"held_out": float(trials[name].mean()), "right": correct.astype(int).tolist()}
+        found["rules"][name] = {
+            "held_out": float(trials[name].mean()),
+            "right": correct.astype(int).tolist(),
+        }
     prices = {name: price(own, classes) for name, own in own_of.items()}
     for levels in sorted({each.plan.levels for each in all_counted.values()}):
         names = able({name: trials[name] for name in trials if all_counted[name].plan.levels == levels}, 2.0)
-        tried_again = {name: tried(own_of[name], classes, range(again)) if again > 1 else once[name] for name in names}
+        tried_again = {
+            name: tried(own_of[name], classes, range(again)) if again > 1 else once[name] for name in names
+        }
         right = {name: each[1] for name, each in tried_again.items()}
         chosen = min(able(right), key=prices.__getitem__)
         best = max(right, key=lambda name: (right[name].mean(), -prices[name]))
@@ -146,7 +157,9 @@ def machines(data: Recordings, rows: np.ndarray, held: np.ndarray) -> Json:
         trials: dict[tuple[int, float], tuple[float, list[int]]] = {}
         for parts in SVM_PARTS:
             pieces = np.array_split(data.events, parts, axis=-1)
-            seen = np.log1p(np.stack([each.sum(axis=-1, dtype=float) for each in pieces])).transpose(1, 0, 2, 3)
+            seen = np.log1p(np.stack([each.sum(axis=-1, dtype=float) for each in pieces])).transpose(
+                1, 0, 2, 3
+            )
             seen = seen.reshape(len(data), -1)
             seen = seen[:, seen[rows].std(axis=0) > 0]
             seen = (seen - seen[rows].mean(axis=0)) / seen[rows].std(axis=0)
@@ -160,7 +173,9 @@ def machines(data: Recordings, rows: np.ndarray, held: np.ndarray) -> Json:
                 right = 0
                 for each in range(FOLDS):
                     inner, outer = rows[fold != each], rows[fold == each]
-                    machine = SVC(C=constant, kernel="precomputed").fit(alike[np.ix_(inner, inner)], data.labels[inner])
+                    machine = SVC(C=constant, kernel="precomputed").fit(
+                        alike[np.ix_(inner, inner)], data.labels[inner]
+                    )
                     right += int((machine.predict(alike[np.ix_(outer, inner)]) == data.labels[outer]).sum())
                 machine = SVC(C=constant, kernel="precomputed").fit(alike[np.ix_(rows, rows)], label)
                 correct = machine.predict(alike[np.ix_(held, rows)]) == data.labels[held]
@@ -189,12 +204,17 @@ def summary(parts: Sequence[Json], tests: Sequence[np.ndarray], samples: int) ->
         found[kind] = {name: {"accuracy": spread(each, draws)} for name, each in share.items()}
         if kind == "systems":
             for name, each in share.items():
-                ahead = {other: spread(each - theirs, draws) for other, theirs in share.items() if other != name}
+                ahead = {
+                    other: spread(each - theirs, draws) for other, theirs in share.items() if other != name
+                }
                 plans: dict[str, int] = {}
                 for part in parts:
                     plan = part[kind][name].get("plan", "")
                     plans[plan] = plans.get(plan, 0) + 1
-                found[kind][name] |= {"ahead_of": ahead, "plans": dict(sorted(plans.items(), key=lambda p: -p[1]))}
+                found[kind][name] |= {
+                    "ahead_of": ahead,
+                    "plans": dict(sorted(plans.items(), key=lambda p: -p[1])),
+                }
     return found
 
 
@@ -203,7 +223,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("recordings")
     parser.add_argument("output", type=Path)
-    parser.add_argument("--levels", type=int, default=1, help="classes in a row that are levels of one thing")
+    parser.add_argument(
+        "--levels", type=int, default=1, help="classes in a row that are levels of one thing"
+    )
     parser.add_argument("--again", type=int, default=1, help="cross-validations of plans near the best one")
     parser.add_argument("--ramp", type=int, default=32, help="steps of the read-out; twice for levels")
     arguments = parser.parse_args()
@@ -229,7 +251,9 @@ def main() -> None:
         split |= {f"{number}.{each}": fold == each for each in range(FOLDS)}
     for name, held in split.items():
         if name not in done:
-            done[name] = measured(data, all_counted, np.flatnonzero(~held), np.flatnonzero(held), arguments.again)
+            done[name] = measured(
+                data, all_counted, np.flatnonzero(~held), np.flatnonzero(held), arguments.again
+            )
             store.write_text(json.dumps(done))
         rights = {system: sum(each["right"]) for system, each in done[name]["systems"].items()}
         print(name, f"of {held.sum()}:", rights, flush=True)
@@ -241,7 +265,9 @@ def main() -> None:
         "rounds": ROUNDS,
         "folds": FOLDS,
     }
-    found |= {"nested": summary([done[name] for name in nested], [split[name] for name in nested], len(data))}
+    found |= {
+        "nested": summary([done[name] for name in nested], [split[name] for name in nested], len(data))
+    }
     own = done["split"]
     found["split"] = {
         kind: {
@@ -256,7 +282,9 @@ def main() -> None:
     for name, each in found["nested"]["systems"].items():
         mean, low, high = (100 * value for value in each["accuracy"])
         test = found["split"]["systems"][name]
-        print(f"{name:16} {mean:.2f} ({low:.2f} … {high:.2f})   test {test['test_correct']} of {test['test_samples']}")
+        print(
+            f"{name:16} {mean:.2f} ({low:.2f} … {high:.2f})   test {test['test_correct']} of {test['test_samples']}"
+        )
 
 
 if __name__ == "__main__":

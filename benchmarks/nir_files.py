@@ -35,13 +35,17 @@ def drawn(net: nn.Module, gain: float) -> nn.Module:
         for module in net.modules():
             if isinstance(module, nn.Linear | nn.Conv2d | nn.Conv1d):
                 fan_in = module.weight[0].numel()
-                module.weight.copy_(torch.randn(module.weight.shape, generator=generator) * gain / fan_in**0.5)
+                module.weight.copy_(
+                    torch.randn(module.weight.shape, generator=generator) * gain / fan_in**0.5
+                )
                 if module.bias is not None:
                     module.bias.copy_(torch.randn(module.bias.shape, generator=generator) * 0.1)
     return net
 
 
-def run(net: nn.Module, given: torch.Tensor, step: Callable[[torch.Tensor], object], kinds: tuple[type, ...]) -> dict:
+def run(
+    net: nn.Module, given: torch.Tensor, step: Callable[[torch.Tensor], object], kinds: tuple[type, ...]
+) -> dict:
     """Spikes of each module of the kinds, by its name, (steps, neurons) bool."""
     found: dict[str, list[np.ndarray]] = {}
 
@@ -52,7 +56,11 @@ def run(net: nn.Module, given: torch.Tensor, step: Callable[[torch.Tensor], obje
 
         return hook
 
-    hooks = [module.register_forward_hook(hear(name)) for name, module in net.named_modules() if type(module) in kinds]
+    hooks = [
+        module.register_forward_hook(hear(name))
+        for name, module in net.named_modules()
+        if type(module) in kinds
+    ]
     with torch.no_grad():
         for now in given:
             step(now)
@@ -139,7 +147,9 @@ def snntorch(folder: Path) -> None:
         ),
     }
     for name, loop in loops.items():
-        net = nn.Sequential(nn.Linear(INPUTS, HIDDEN), loop, nn.Linear(HIDDEN, CLASSES), leaky(0.9, (CLASSES,)))
+        net = nn.Sequential(
+            nn.Linear(INPUTS, HIDDEN), loop, nn.Linear(HIDDEN, CLASSES), leaky(0.9, (CLASSES,))
+        )
         given = events((INPUTS,))
         graph = export_to_nir(drawn(net, 2.0), given[0], ignore_dims=[0])
         for module in (net[1], net[3]):
@@ -161,7 +171,10 @@ def norse(folder: Path) -> None:
 
     nets = {
         "norse_lif": SequentialState(
-            nn.Linear(INPUTS, HIDDEN), box(0.002, 0.3, HIDDEN), nn.Linear(HIDDEN, CLASSES), box(0.01, 0.05, CLASSES)
+            nn.Linear(INPUTS, HIDDEN),
+            box(0.002, 0.3, HIDDEN),
+            nn.Linear(HIDDEN, CLASSES),
+            box(0.01, 0.05, CLASSES),
         ),
         "norse_iaf": SequentialState(
             nn.Linear(INPUTS, HIDDEN), plain(HIDDEN), nn.Linear(HIDDEN, CLASSES), plain(CLASSES)
@@ -191,10 +204,16 @@ def sinabs(folder: Path) -> None:
         "sinabs_lif": (
             nn.Sequential(
                 nn.Linear(INPUTS, HIDDEN),
-                neuron(sl.LIFSqueeze, tau_mem=torch.full((HIDDEN,), 4.0), spike_threshold=torch.full((HIDDEN,), 0.3)),
+                neuron(
+                    sl.LIFSqueeze,
+                    tau_mem=torch.full((HIDDEN,), 4.0),
+                    spike_threshold=torch.full((HIDDEN,), 0.3),
+                ),
                 nn.Linear(HIDDEN, CLASSES),
                 neuron(
-                    sl.LIFSqueeze, tau_mem=torch.full((CLASSES,), 10.0), spike_threshold=torch.full((CLASSES,), 0.1)
+                    sl.LIFSqueeze,
+                    tau_mem=torch.full((CLASSES,), 10.0),
+                    spike_threshold=torch.full((CLASSES,), 0.1),
                 ),
             ),
             (INPUTS,),

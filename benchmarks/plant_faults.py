@@ -84,7 +84,9 @@ Edit = tuple[str, str, ast.expr | None, ast.expr]
 def files(tree: Path, *but: str) -> list[Path]:
     """List the Python files of a tree, except for hidden folders and those named."""
     there = ((p, p.relative_to(tree).parts) for p in sorted(tree.rglob("*.py")))
-    return [p for p, parts in there if not {*parts} & {*but} and not any(part.startswith(".") for part in parts)]
+    return [
+        p for p, parts in there if not {*parts} & {*but} and not any(part.startswith(".") for part in parts)
+    ]
 
 
 def _walk(node: ast.AST, function: str) -> Iterator[tuple[str, ast.AST]]:
@@ -135,7 +137,9 @@ def _edits(node: ast.AST) -> Iterator[Edit]:
         case ast.AugAssign():
             yield from _between(node.op, node.target, node.value, "arithmetic")
         case ast.Compare():
-            for op, left, right in zip(node.ops, [node.left, *node.comparators], node.comparators, strict=False):
+            for op, left, right in zip(
+                node.ops, [node.left, *node.comparators], node.comparators, strict=False
+            ):
                 yield from _between(op, left, right, "comparison")
         case ast.BoolOp():
             for left, right in zip(node.values, node.values[1:], strict=False):
@@ -183,10 +187,14 @@ def faults_of(source: str) -> Iterator[tuple[int, Fault]]:
                 first = at(left.end_lineno, left.end_col_offset) + len(gap[: gap.index(old)].encode())
                 end = first + len(old)
             number = max(k for k, start in enumerate(starts) if start <= first)
-            mutated = (whole[starts[number] : first] + new.encode() + whole[end : starts[number + 1]]).decode()
+            mutated = (
+                whole[starts[number] : first] + new.encode() + whole[end : starts[number + 1]]
+            ).decode()
             text = whole[starts[number] : starts[number + 1]].decode()
             try:
-                ast.parse((whole[: starts[number]] + mutated.encode() + whole[starts[number + 1] :]).decode())
+                ast.parse(
+                    (whole[: starts[number]] + mutated.encode() + whole[starts[number + 1] :]).decode()
+                )
             except SyntaxError:
                 continue
             if end > starts[number + 1] or _bare(text) == _bare(mutated):
@@ -194,7 +202,13 @@ def faults_of(source: str) -> Iterator[tuple[int, Fault]]:
             around = [_bare(lines[k]) if 0 <= k < len(lines) else "" for k in (number - 1, number + 1)]
             yield (
                 number,
-                {"function": function, "kind": kind, "text": text.strip(), "mutated": mutated.strip(), "near": around},
+                {
+                    "function": function,
+                    "kind": kind,
+                    "text": text.strip(),
+                    "mutated": mutated.strip(),
+                    "near": around,
+                },
             )
 
 
@@ -246,7 +260,8 @@ class Places:
         spans = [
             (node.lineno, node.name)
             for node in ast.walk(ast.parse("\n".join(self.lines[path])))
-            if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.lineno - 1 <= number < (node.end_lineno or 0)
+            if isinstance(node, ast.FunctionDef | ast.ClassDef)
+            and node.lineno - 1 <= number < (node.end_lineno or 0)
         ]
         return max(spans)[1] if spans else ""
 
@@ -256,7 +271,9 @@ class Places:
         same = self.where.get(_bare(fault["text"]), [])
         for path, number in same:
             lines = ["", *map(_bare, self.lines[path]), ""]
-            near = sum(a == b for a, b in zip((lines[number], lines[number + 2]), fault["near"], strict=True))
+            near = sum(
+                a == b for a, b in zip((lines[number], lines[number + 2]), fault["near"], strict=True)
+            )
             named = self._function(path, number) == fault["function"].split(".")[-1] != ""
             if named or near or (len(same) == 1 and len(fault["text"]) >= 20):
                 ranked[named + near, path.name == Path(fault["module"]).name].append((path, number))
@@ -267,7 +284,9 @@ def imports(tree: Path) -> dict[Path, set[Path]]:
     """Which file of the tree imports which others, anywhere in it."""
     names, graph = {}, {}
     for path in files(tree):
-        parts = [part for part in path.relative_to(tree).with_suffix("").parts if part not in {"src", "__init__"}]
+        parts = [
+            part for part in path.relative_to(tree).with_suffix("").parts if part not in {"src", "__init__"}
+        ]
         names[".".join(parts[1:] if parts[:1] == ["tests"] else parts)] = path
     for path in files(tree):
         wanted: set[str] = set()
@@ -277,8 +296,12 @@ def imports(tree: Path) -> dict[Path, set[Path]]:
                 wanted |= {alias.name.removeprefix("spikeloom.") for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 above = package[: len(package) - node.level + 1] if node.level else []
-                start = ".".join([*above, *([node.module] if node.module else [])]).removeprefix("spikeloom.")
-                wanted |= {f"{start}.{a.name}" if f"{start}.{a.name}" in names else start for a in node.names}
+                start = ".".join([*above, *([node.module] if node.module else [])]).removeprefix(
+                    "spikeloom."
+                )
+                wanted |= {
+                    f"{start}.{a.name}" if f"{start}.{a.name}" in names else start for a in node.names
+                }
         graph[path] = {names[name] for name in wanted if name in names} - {path}
     return graph
 
@@ -288,14 +311,18 @@ def map_tests(tree: Path, out: Path, limit: float, also: list[str]) -> None:
     known = json.loads(out.read_text()) if out.exists() else {"seconds": {}, "failing": {}, "deselected": []}
     graph = imports(tree)
     tests = [p for p in graph if p.name.startswith("test_") and "tests" in p.parts]
-    doctests = [p for p in files(tree, *OTHER) if re.search(r"^\s*>>> ", p.read_text(encoding="utf-8"), re.MULTILINE)]
+    doctests = [
+        p for p in files(tree, *OTHER) if re.search(r"^\s*>>> ", p.read_text(encoding="utf-8"), re.MULTILINE)
+    ]
     for path in sorted(tests + doctests):
         name = str(path.relative_to(tree))
         if name not in known["seconds"]:
             code, told, known["seconds"][name] = run(tree, [name], limit)
             print(name, known["seconds"][name], code, *told, sep="\n    ", flush=True)
             if code == 1:  # fails without a fault, on this machine
-                known["deselected"] += [t.split(" - ")[0].split(maxsplit=1)[1] for t in told if not t.startswith("E ")]
+                known["deselected"] += [
+                    t.split(" - ")[0].split(maxsplit=1)[1] for t in told if not t.startswith("E ")
+                ]
             elif code not in {0, 5}:  # 5: all of them are slow
                 known["failing"][name] = code
             out.write_text(json.dumps(known, indent=1))
@@ -364,7 +391,9 @@ def run(
                 start_new_session=True,
             )
             resource.prlimit(process.pid, resource.RLIMIT_CPU, (int(limit) + 1, int(limit) + 2))
-            resource.prlimit(process.pid, resource.RLIMIT_AS, (MEMORY, MEMORY))  # a fault may ask for any amount
+            resource.prlimit(
+                process.pid, resource.RLIMIT_AS, (MEMORY, MEMORY)
+            )  # a fault may ask for any amount
             code: int | None = None
             try:
                 with contextlib.suppress(subprocess.TimeoutExpired):
@@ -380,13 +409,18 @@ def run(
     return None if code == -signal.SIGXCPU else code, [line[:300] for line in telling], seconds
 
 
-def score(tree: Path, fault: Fault, tests: dict[str, Any], tried: list[str], limit: float, share: float) -> Fault:
+def score(
+    tree: Path, fault: Fault, tests: dict[str, Any], tried: list[str], limit: float, share: float
+) -> Fault:
     """Plant one fault, run the tests, take it out again."""
     places = Places(tree)
     found = places.find(fault)
     if len(found) <= fault["nth"]:
         closest = difflib.get_close_matches(_bare(fault["text"]), places.where, 1, 0.7)
-        return {"result": "gone", "closest": [(str(places.where[c][0][0].relative_to(tree)), c) for c in closest]}
+        return {
+            "result": "gone",
+            "closest": [(str(places.where[c][0][0].relative_to(tree)), c) for c in closest],
+        }
     path, number = found[fault["nth"]]
     stamp, source = path.stat(), path.read_bytes()
     text = source.decode()
@@ -410,7 +444,14 @@ def score(tree: Path, fault: Fault, tests: dict[str, Any], tried: list[str], lim
         path.write_bytes(source)
         os.utime(path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))  # caches go by the stamp
     result = {None: "timeout", 0: "survived", 5: "survived"}.get(code, "caught")
-    return {"result": result, "module": module, "exit": code, "seconds": seconds, "told": told, "tests": tried + chosen}
+    return {
+        "result": result,
+        "module": module,
+        "exit": code,
+        "seconds": seconds,
+        "told": told,
+        "tests": tried + chosen,
+    }
 
 
 def summary(scores: list[Fault]) -> str:
@@ -421,7 +462,10 @@ def summary(scores: list[Fault]) -> str:
         for s in sorted(scores, key=lambda s: (s["result"], s["id"]))
         if s["result"] != "caught"
     ]
-    n = {result: sum(s["result"] == result for s in scores) for result in ("caught", "timeout", "survived", "gone")}
+    n = {
+        result: sum(s["result"] == result for s in scores)
+        for result in ("caught", "timeout", "survived", "gone")
+    }
     there = len(scores) - n["gone"]
     caught = f"{n['caught'] + n['timeout']} of {there} faults caught ({n['timeout']} by the time limit)"
     return "\n".join([*said, f"{caught}, {n['survived']} survived, {n['gone']} gone"])
@@ -429,18 +473,30 @@ def summary(scores: list[Fault]) -> str:
 
 def main() -> None:
     """Draw faults, map tests, or score."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--tree", type=Path, required=True, help="checkout to read, and to plant faults in")
     parser.add_argument("--list", type=int, metavar="N", help="draw N faults, print them as JSON")
     parser.add_argument("--seed", type=int, default=2026)
-    parser.add_argument("--map", type=Path, metavar="JSON", help="run each test file once, write which to run for what")
-    parser.add_argument("--also", nargs="*", default=[], metavar="FILE", help="test files that matter to all modules")
+    parser.add_argument(
+        "--map", type=Path, metavar="JSON", help="run each test file once, write which to run for what"
+    )
+    parser.add_argument(
+        "--also", nargs="*", default=[], metavar="FILE", help="test files that matter to all modules"
+    )
     parser.add_argument("--faults", type=Path, metavar="JSON", help="what --list has printed")
     parser.add_argument("--tests", type=Path, metavar="JSON", help="what --map has written")
-    parser.add_argument("--out", type=Path, metavar="JSON", help="scores; those that are there already are kept")
-    parser.add_argument("--again", action="store_true", help="show what survived to the test files that come next")
+    parser.add_argument(
+        "--out", type=Path, metavar="JSON", help="scores; those that are there already are kept"
+    )
+    parser.add_argument(
+        "--again", action="store_true", help="show what survived to the test files that come next"
+    )
     parser.add_argument("--limit", type=float, default=240, help="seconds for the tests of one fault (240)")
-    parser.add_argument("--share", type=float, default=0.5, help="part of them that the tests take without it (0.5)")
+    parser.add_argument(
+        "--share", type=float, default=0.5, help="part of them that the tests take without it (0.5)"
+    )
     options = parser.parse_args()
     tree = options.tree.resolve()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
@@ -462,7 +518,11 @@ def main() -> None:
             result = score(tree, fault, tests, known.get("tests", []), options.limit, options.share)
             scores[fault["id"]] = {**fault, "planned": fault["module"], **result}
             options.out.write_text(json.dumps([*scores.values()], indent=1, ensure_ascii=False))
-            print(fault["id"], *(result.get(key, "") for key in ("result", "module", "seconds", "told")), flush=True)
+            print(
+                fault["id"],
+                *(result.get(key, "") for key in ("result", "module", "seconds", "told")),
+                flush=True,
+            )
     print(summary([*scores.values()]))
 
 

@@ -42,9 +42,19 @@ NIR_STEP = ("--dt", "1e-4")
 ONE = (*NIR_STEP, "--polarities", "1")
 FIRST = ("--polarities", "3", "--polarities-first")
 NETWORKS = (
-    Published("Braille, reset to zero", "snnTorch", "NIR", "paper/03_rnn/braille_noDelay_bias_zero.nir", NIR_STEP),
-    Published("Braille, subtracting", "snnTorch", "NIR", "paper/03_rnn/braille_noDelay_noBias_subtract.nir", NIR_STEP),
-    Published("Braille, nested", "snnTorch", "NIR", "paper/03_rnn/extras/braille_noDelay_bias_zero_subgraph.nir"),
+    Published(
+        "Braille, reset to zero", "snnTorch", "NIR", "paper/03_rnn/braille_noDelay_bias_zero.nir", NIR_STEP
+    ),
+    Published(
+        "Braille, subtracting",
+        "snnTorch",
+        "NIR",
+        "paper/03_rnn/braille_noDelay_noBias_subtract.nir",
+        NIR_STEP,
+    ),
+    Published(
+        "Braille, nested", "snnTorch", "NIR", "paper/03_rnn/extras/braille_noDelay_bias_zero_subgraph.nir"
+    ),
     Published(
         "Braille, no resets in the file",
         "Rockpool",
@@ -55,13 +65,25 @@ NETWORKS = (
     Published("N-MNIST convolutions", "sinabs", "NIR", "paper/02_cnn/cnn_sinabs.nir", ("--dt", "1")),
     Published("one LIF neuron", "Norse", "NIR", "paper/01_lif/lif_norse.nir", ONE),
     Published("one LIF neuron", "Rockpool", "NIR", "paper/01_lif/lif_rockpool.nir", ONE),
-    Published("two LIF neurons", "snnTorch", "NIR", "paper/01_lif/debug_spike_representation/two_lif_neurons.nir", ONE),
+    Published(
+        "two LIF neurons",
+        "snnTorch",
+        "NIR",
+        "paper/01_lif/debug_spike_representation/two_lif_neurons.nir",
+        ONE,
+    ),
     Published("Oxford", "lava-dl", "lava-dl", f"{NETX}/netx/oxford/Trained/network.net"),
     Published("MNIST", "lava-dl", "lava-dl", f"{NETX}/netx/mnist/trained_mnist_network.net"),
     Published("tiny", "lava-dl", "lava-dl", "tests/lava/lib/dl/netx/tiny.net", FIRST),
-    Published("PilotNet, LIF", "lava-dl", "lava-dl", "tests/lava/lib/dl/netx/gts/pilotnet_lif/network.net", FIRST),
     Published(
-        "PilotNet, sigma-delta", "lava-dl", "lava-dl", "tests/lava/lib/dl/netx/gts/pilotnet_sdnn/network.net", FIRST
+        "PilotNet, LIF", "lava-dl", "lava-dl", "tests/lava/lib/dl/netx/gts/pilotnet_lif/network.net", FIRST
+    ),
+    Published(
+        "PilotNet, sigma-delta",
+        "lava-dl",
+        "lava-dl",
+        "tests/lava/lib/dl/netx/gts/pilotnet_sdnn/network.net",
+        FIRST,
     ),
     Published("MNIST, rates", "lava-dl", "lava-dl", f"{NETX}/bootstrap/mnist/Trained/network.net"),
 )
@@ -80,7 +102,9 @@ def recordings(folder: Path, taxels: int, polarities: int, classes: int, rate: f
         (folder / split).mkdir(parents=True, exist_ok=True)
         for number in range(RECORDINGS):
             events = generator.random((taxels, polarities, STEPS)) < rate
-            np.save(folder / split / f"sample_{number}_label_{number % classes}.npy", events.astype(np.uint8))
+            np.save(
+                folder / split / f"sample_{number}_label_{number % classes}.npy", events.astype(np.uint8)
+            )
 
 
 def tried(folder: Path, network: Published) -> dict[str, object]:
@@ -99,7 +123,9 @@ def tried(folder: Path, network: Published) -> dict[str, object]:
         for rate in RATES:
             recordings(data, *sensor, rate)
             if not integers:
-                again = spikeloom("compile", file, *network.options, "--calibrate", str(data), "-o", netlist, "--json")
+                again = spikeloom(
+                    "compile", file, *network.options, "--calibrate", str(data), "-o", netlist, "--json"
+                )
                 again.check_returncode()
                 made = json.loads(again.stdout)
                 row |= {"storage": [{k: t[k] for k in t if k != "layers"} for t in made.get("trials", [])]}
@@ -115,7 +141,9 @@ def tried(folder: Path, network: Published) -> dict[str, object]:
                 checked = json.loads(verdict.stdout)
                 spikes = list(checked["spikes"].values())[-1]
                 row |= {"decisions_equal": checked["decision_agreement"], "recordings": checked["samples"]}
-                common = (spikes["float"] + spikes["chip"] - spikes["different"]) / (2 * max(spikes["float"], 1))
+                common = (spikes["float"] + spikes["chip"] - spikes["different"]) / (
+                    2 * max(spikes["float"], 1)
+                )
                 row |= {"spikes": spikes, "in_common": common}
                 if spikes["float"]:
                     faithful = verdict.returncode == 0 and common >= IN_COMMON
@@ -132,7 +160,12 @@ def main(folder: str, out: str) -> None:
     rows = []
     for network in NETWORKS:
         rows.append(tried(Path(folder), network))
-        print(*(rows[-1].get(key, "") for key in ("name", "made_by", "word", "why", "decisions_equal", "spikes")))
+        print(
+            *(
+                rows[-1].get(key, "")
+                for key in ("name", "made_by", "word", "why", "decisions_equal", "spikes")
+            )
+        )
     Path(out).write_text(json.dumps(what_made_it() | {"networks": rows}, indent=1) + "\n")
 
 

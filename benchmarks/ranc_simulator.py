@@ -55,7 +55,9 @@ def main() -> None:
     found: dict[str, Any] = made() | {"data_sha256": {}, "networks": {}}
     for path, data in pairs:
         found["networks"][Path(path).stem] = compared(asked.simulator, path, data, asked.limit)
-        found["data_sha256"][data] = data_digest(*(load_data(data, split, taxels=39) for split in ("train", "test")))
+        found["data_sha256"][data] = data_digest(
+            *(load_data(data, split, taxels=39) for split in ("train", "test"))
+        )
     with write_atomically(asked.output) as file:
         file.write((json.dumps(found, indent=1) + "\n").encode())
 

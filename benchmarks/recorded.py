@@ -28,18 +28,25 @@ CHANNELS, HIDDEN, STEPS = 250, 25, 500
 NEURON = {"decay_u": 1023, "decay_v": 128, "threshold": 80}
 """Registers of its settings iDecay 1024, vDecay 128, vThMant 80."""
 
-VOLTAGES = {"loihiHiddenVoltage": 0, "loihiHiddenVoltage23": 23, "loihiHiddenVoltage24": 24, "loihiOutputVoltage": 25}
+VOLTAGES = {
+    "loihiHiddenVoltage": 0,
+    "loihiHiddenVoltage23": 23,
+    "loihiHiddenVoltage24": 24,
+    "loihiOutputVoltage": 25,
+}
 """Files of recorded voltages, and whose they are."""
 
 
 def make_network(folder: Path) -> Netlist:
     """The trained weights, rounded to even numbers as its own test does."""
     first, second = (
-        2 * np.round(2 * np.loadtxt(folder / "snnData" / f"w{i}learned.txt", ndmin=2)).astype(int) for i in (1, 2)
+        2 * np.round(2 * np.loadtxt(folder / "snnData" / f"w{i}learned.txt", ndmin=2)).astype(int)
+        for i in (1, 2)
     )
     axons = [Axon(source=i, targets=tuple(enumerate(column))) for i, column in enumerate(first.T.tolist())]
     axons += [
-        Axon(source=CHANNELS + i, targets=((HIDDEN, weight),)) for i, weight in enumerate(second.ravel().tolist())
+        Axon(source=CHANNELS + i, targets=((HIDDEN, weight),))
+        for i, weight in enumerate(second.ravel().tolist())
     ]
     neurons = [Neuron(layer=int(i == HIDDEN), **NEURON) for i in range(HIDDEN + 1)]
     return build(neurons, axons, n_inputs=CHANNELS, depths=[0, 0])
@@ -65,7 +72,9 @@ def compare(slayer: Path, simulate: Callable[[Netlist, np.ndarray], Trace]) -> d
         silent = ~trace.spikes[1:, neuron]
         differing = np.loadtxt(folder / "LoihiData" / f"{name}.txt") != trace.membranes[1:, neuron]
         voltages, wrong = voltages + int(silent.sum()), wrong + int((differing & silent).sum())
-    response = np.array((folder / "LoihiData" / "LoihiVth05.txt").read_text("ascii").splitlines()[1].split(","), int)
+    response = np.array(
+        (folder / "LoihiData" / "LoihiVth05.txt").read_text("ascii").splitlines()[1].split(","), int
+    )
     single = build([Neuron(**NEURON)], [Axon(source=0, targets=((0, 2),))], n_inputs=1, depths=[0])
     ours = simulate(single, np.eye(1, len(response), 1, np.uint8)).membranes[:, 0]
     return {
@@ -80,7 +89,9 @@ def compare(slayer: Path, simulate: Callable[[Netlist, np.ndarray], Trace]) -> d
 if __name__ == "__main__":
     slayer = Path(sys.argv[1])
     files = [slayer / DATA / part for part in ("LoihiData", "snnData")]
-    digest = hashlib.sha256(b"".join(path.read_bytes() for folder in files for path in sorted(folder.iterdir())))
+    digest = hashlib.sha256(
+        b"".join(path.read_bytes() for folder in files for path in sorted(folder.iterdir()))
+    )
     result = made() | {"data_sha256": digest.hexdigest()} | compare(slayer, spec.simulate)
     print(result)
     with write_atomically(sys.argv[2]) as file:

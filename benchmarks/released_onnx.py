@@ -52,7 +52,9 @@ def main(code: str, checkpoint: str, out: str) -> None:
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             step = OneStep(released, net)
-            torch.onnx.export(step, (torch.zeros(39, 2), *state), str(Path(out) / f"step_{name}.onnx"), dynamo=dynamo)
+            torch.onnx.export(
+                step, (torch.zeros(39, 2), *state), str(Path(out) / f"step_{name}.onnx"), dynamo=dynamo
+            )
             events = torch.zeros(39, 2, STEPS)
             torch.onnx.export(net, (events,), str(Path(out) / f"steps_{name}.onnx"), dynamo=dynamo)
 

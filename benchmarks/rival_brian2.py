@@ -33,7 +33,11 @@ def prepare_job(task: Task, _options: list[str]) -> Job:
     always = LoihiSpikeGeneratorGroup(1, np.zeros(steps, int), np.arange(steps))
     groups = [
         LoihiNeuronGroup(
-            layer.size, refractory=1, threshold_v_mant=layer.common_threshold() >> 6, decay_v=layer.decay, decay_I=4096
+            layer.size,
+            refractory=1,
+            threshold_v_mant=layer.common_threshold() >> 6,
+            decay_v=layer.decay,
+            decay_I=4096,
         )
         for layer in task.layers
     ]

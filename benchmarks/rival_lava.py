@@ -60,7 +60,11 @@ def prepare_job(task: Task, _options: list[str]) -> Job:
         return task.differing("piped1", [np.stack(layers) for layers in zip(*results, strict=True)])
 
     return Job(
-        name=f"lava {version('lava-nc')}", units=len(task.few), recordings=len(task.few), run=run, differing=differing
+        name=f"lava {version('lava-nc')}",
+        units=len(task.few),
+        recordings=len(task.few),
+        run=run,
+        differing=differing,
     )
 
 

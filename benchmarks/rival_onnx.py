@@ -14,7 +14,11 @@ from worker import Job, Task, serve
 
 def step_graph(task: Task) -> bytes:
     """The model of one step, serialised: inputs ``s``, ``v0``, ``v1`` …; outputs ``s0``, ``w0`` and so on."""
-    constants = {"kept": np.array(819, np.int32), "whole": np.array(4096, np.int32), "rest": np.array(0, np.int32)}
+    constants = {
+        "kept": np.array(819, np.int32),
+        "whole": np.array(4096, np.int32),
+        "rest": np.array(0, np.int32),
+    }
     inputs = [helper.make_tensor_value_info("s", TensorProto.UINT8, ["batch", task.events.shape[2]])]
     outputs, nodes, source = [], [], "s"
     for i, layer in enumerate(task.layers):
@@ -41,7 +45,9 @@ def step_graph(task: Task) -> bytes:
         source = f"s{i}"
     initial = [numpy_helper.from_array(array, name) for name, array in constants.items()]
     graph = helper.make_graph(nodes, "step", inputs, outputs, initial)
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8).SerializeToString()
+    return helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8
+    ).SerializeToString()
 
 
 def prepare_job(task: Task, options: list[str]) -> Job:

@@ -68,7 +68,12 @@ def cycle(netlist: Netlist) -> Run:
     return run
 
 
-MODES: dict[str, Callable[[Netlist], Run]] = {"spikes": spikes, "totals": totals, "counts": counts, "cycle": cycle}
+MODES: dict[str, Callable[[Netlist], Run]] = {
+    "spikes": spikes,
+    "totals": totals,
+    "counts": counts,
+    "cycle": cycle,
+}
 """What can be measured, under the names that rivals.py asks for."""
 
 

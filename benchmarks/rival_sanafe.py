@@ -40,14 +40,18 @@ def make_network(task: Task, architecture: Any) -> Any:
                 "force_update": True,
             },
         )
-        for neuron, (bias, threshold, core) in enumerate(zip(layer.bias, layer.threshold, layer.core, strict=True)):
+        for neuron, (bias, threshold, core) in enumerate(
+            zip(layer.bias, layer.threshold, layer.core, strict=True)
+        ):
             group[neuron].set_attributes(model_attributes={"bias": bias / 64, "threshold": threshold / 64})
             group[neuron].map_to_core(cores[1 + core])
     for i, layer in enumerate(task.layers):
         for before, weight in layer.weights.items():
             to, frm = np.nonzero(weight)
             pairs = list(zip(frm.tolist(), to.tolist(), strict=True))
-            groups[before].connect_neurons_sparse(groups[i], {"weight": weight[to, frm].astype(float).tolist()}, pairs)
+            groups[before].connect_neurons_sparse(
+                groups[i], {"weight": weight[to, frm].astype(float).tolist()}, pairs
+            )
     return network
 
 
@@ -80,7 +84,9 @@ def prepare_job(task: Task, options: list[str]) -> Job:
             reset(unit)
             for step, fired in enumerate(simulate(trace=True)["spike_trace"]):
                 for neuron in fired:
-                    layers[int(neuron.group_name.removeprefix("layer"))][unit, step, neuron.neuron_offset] = True
+                    layers[int(neuron.group_name.removeprefix("layer"))][
+                        unit, step, neuron.neuron_offset
+                    ] = True
         return task.differing("piped1", layers)
 
     return Job(

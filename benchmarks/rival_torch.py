@@ -49,13 +49,19 @@ def by_steps(stages: list[Stage], events: torch.Tensor) -> list[torch.Tensor]:
     return found
 
 
-LOOPS: dict[str, Callable[[list[Stage], torch.Tensor], list[torch.Tensor]]] = {"layers": by_layers, "steps": by_steps}
+LOOPS: dict[str, Callable[[list[Stage], torch.Tensor], list[torch.Tensor]]] = {
+    "layers": by_layers,
+    "steps": by_steps,
+}
 
 
 def prepare_job(task: Task, options: list[str]) -> Job:
     loop, share = options
     stages = [
-        tuple(torch.tensor(array.astype(np.float32)) for array in (layer.weight, layer.bias / 64, layer.threshold / 64))
+        tuple(
+            torch.tensor(array.astype(np.float32))
+            for array in (layer.weight, layer.bias / 64, layer.threshold / 64)
+        )
         for layer in task.layers
     ]
     events = torch.tensor(task.events.astype(np.float32))

@@ -154,10 +154,20 @@ ENTRIES = (
         against="spikes",
     ),
     Entry(
-        name="SANA-FE, simple", rival="sanafe", options=("simple",), computes=COUNTS, together=False, against="counts"
+        name="SANA-FE, simple",
+        rival="sanafe",
+        options=("simple",),
+        computes=COUNTS,
+        together=False,
+        against="counts",
     ),
     Entry(
-        name="SANA-FE, detailed", rival="sanafe", options=("detailed",), computes=CYCLE, together=False, against="cycle"
+        name="SANA-FE, detailed",
+        rival="sanafe",
+        options=("detailed",),
+        computes=CYCLE,
+        together=False,
+        against="cycle",
     ),
 )
 
@@ -310,7 +320,9 @@ def text(name: str, facts: dict[str, Any]) -> str:
                 entry,
                 digits(result["cpu_ms"]["median"]),
                 digits(result["cpu_ms"]["min"]),
-                f"{digits(ratio['median'])} ({digits(ratio['min'])} … {digits(ratio['max'])})" if ratio else "",
+                f"{digits(ratio['median'])} ({digits(ratio['min'])} … {digits(ratio['max'])})"
+                if ratio
+                else "",
                 f"{result['peak_mb']:.0f}",
                 f"{sum(result['differing_spikes'])}",
             ]
@@ -329,16 +341,22 @@ def text(name: str, facts: dict[str, Any]) -> str:
 
 def options() -> argparse.Namespace:
     """Read the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("recordings", help="folder or zip in the released layout, 39 taxels")
     parser.add_argument("--netlist", help="a compiled network to run as well")
     parser.add_argument("--no-busy", action="store_true", help="leave the busy network out")
     parser.add_argument("-o", "--output", required=True, help="JSON file to write")
     parser.add_argument("--chart", help="also draw CHART.svg and CHART.png")
-    parser.add_argument("--python", action="append", default=[], metavar="NAME=PATH", help="interpreter of a rival")
+    parser.add_argument(
+        "--python", action="append", default=[], metavar="NAME=PATH", help="interpreter of a rival"
+    )
     parser.add_argument("--only", help="rivals to run, comma-separated, of " + ", ".join(rivals()))
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--few", type=int, default=3, help="typical recordings for what runs them one by one")
+    parser.add_argument(
+        "--few", type=int, default=3, help="typical recordings for what runs them one by one"
+    )
     parser.add_argument("--processor", type=int, default=max(os.sched_getaffinity(0)))
     return parser.parse_args()
 
@@ -354,14 +372,20 @@ def main() -> None:
     pythons = dict(pair.split("=", 1) for pair in asked.python)
     only = asked.only.split(",") if asked.only else list(rivals())
     if unknown := {*pythons, *only} - set(rivals()):
-        raise SystemExit(f"rivals: {', '.join(sorted(unknown))}: no such rival; there are {', '.join(rivals())}")
+        raise SystemExit(
+            f"rivals: {', '.join(sorted(unknown))}: no such rival; there are {', '.join(rivals())}"
+        )
     os.sched_setaffinity(0, {asked.processor})  # every worker inherits it
     data = load_data(asked.recordings, "test", taxels=39)
     # by number, as the busy network was defined, not by letter
-    order = sorted(range(len(data)), key=lambda i: [int(digits) for digits in re.findall(r"\d+", data.files[i])])
+    order = sorted(
+        range(len(data)), key=lambda i: [int(digits) for digits in re.findall(r"\d+", data.files[i])]
+    )
     events = data.events[order].reshape(len(data), -1, data.steps).transpose(0, 2, 1).astype(np.bool_)
     few = workload.typical(events, asked.few)
-    netlists = {} if asked.no_busy else {"busy": workload.place_chain(workload.build_chain(events), taxels=39)}
+    netlists = (
+        {} if asked.no_busy else {"busy": workload.place_chain(workload.build_chain(events), taxels=39)}
+    )
     if asked.netlist:
         netlists[Path(asked.netlist).name] = read_netlist(asked.netlist)
     result: dict[str, Any] = made(load_data(asked.recordings, "train", taxels=39), data) | {

@@ -44,7 +44,9 @@ def draw(result: dict[str, Any], stem: str) -> None:
         rows = sorted(entries.items(), key=lambda item: item[1]["cpu_ms"]["median"])
         for row, (entry, r) in enumerate(rows):
             colour, cpu = OURS if entry.startswith("spikeloom") else RIVAL, r["cpu_ms"]
-            panel.plot([cpu["min"], cpu["max"]], [row, row], color=colour, lw=3, alpha=0.4, solid_capstyle="butt")
+            panel.plot(
+                [cpu["min"], cpu["max"]], [row, row], color=colour, lw=3, alpha=0.4, solid_capstyle="butt"
+            )
             panel.plot([cpu["median"]], [row], "o", color=colour, ms=6)
             ratio = f",  {digits(r['ratio']['median'])} × ours" if "ratio" in r else ""
             label = f"{digits(cpu['median'])} ms{ratio}"

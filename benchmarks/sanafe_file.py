@@ -26,7 +26,11 @@ def main() -> None:
             for neuron, train in zip(chip.mapped_neuron_groups["input"], events, strict=True):
                 neuron.set_attributes(model_attributes={"spikes": [bool(bit) for bit in train]})
             run = chip.sim(
-                int(arrays["steps"]), timing_model=str(model), processing_threads=1, spike_trace=True, perf_trace=True
+                int(arrays["steps"]),
+                timing_model=str(model),
+                processing_threads=1,
+                spike_trace=True,
+                perf_trace=True,
             )
             fired = [
                 [step, spike.group_name, spike.neuron_offset]

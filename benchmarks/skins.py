@@ -69,7 +69,9 @@ def skin(taxels: int, seed: int = 0) -> Network:
     rng = np.random.default_rng(seed)
     conv = convolution(lattice(taxels), rng.normal(0, 0.7, (HOPS, FEATURES, 2)))
     sizes = [min(SIDE * SIDE, taxels - first) * FEATURES for first in range(0, taxels, SIDE * SIDE)]
-    hidden = sparse.block_diag([rng.normal(0, 3 / size**0.5, (HIDDEN, size)) for size in sizes], format="csr")
+    hidden = sparse.block_diag(
+        [rng.normal(0, 3 / size**0.5, (HIDDEN, size)) for size in sizes], format="csr"
+    )
     votes = sparse.block_diag([rng.normal(0, 0.3, (CLASSES, HIDDEN)) for _ in sizes], format="csr")
     weights = [conv, sparse.csr_array(hidden), sparse.csr_array(votes)]
     return Network(
@@ -79,7 +81,8 @@ def skin(taxels: int, seed: int = 0) -> Network:
             for name, weight in zip(("conv1", "fc1", "fc2"), weights, strict=True)
         ),
         projections=tuple(
-            Projection(pre=post - 1 if post else INPUT, post=post, weight=weight) for post, weight in enumerate(weights)
+            Projection(pre=post - 1 if post else INPUT, post=post, weight=weight)
+            for post, weight in enumerate(weights)
         ),
         readout=Readout(population=2, label=np.tile(np.arange(CLASSES), len(sizes))),
         classes=CLASSES,
@@ -111,7 +114,9 @@ def measure(taxels: int) -> dict[str, Any]:
     held()
     prepared = engine.prepare(netlist)
     ready, prepare_bytes = time.perf_counter(), held()
-    events = (np.random.default_rng(1).random((RECORDINGS, netlist.n_inputs, STEPS)) < DENSITY).astype(np.uint8)
+    events = (np.random.default_rng(1).random((RECORDINGS, netlist.n_inputs, STEPS)) < DENSITY).astype(
+        np.uint8
+    )
     engine.simulate(prepared, events[:1], threads=1)
     warm = time.perf_counter()
     trace = engine.simulate(prepared, events, threads=1)

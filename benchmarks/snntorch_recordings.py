@@ -103,7 +103,9 @@ def main() -> None:
             optimiser.step()
             right += int((rates.argmax(1) == labels[part]).sum())
         if epoch % 5 == 4:
-            print(f"epoch {epoch + 1}: {100 * right / len(events):.1f} % in training, {time.monotonic() - begun:.0f} s")
+            print(
+                f"epoch {epoch + 1}: {100 * right / len(events):.1f} % in training, {time.monotonic() - begun:.0f} s"
+            )
     with torch.no_grad():
         given = torch.from_numpy(test["events"]).float()
         hidden, out = run(net, given)

@@ -39,7 +39,9 @@ def main() -> None:
     parser.add_argument("--brute", metavar="FILE")
     arguments = parser.parse_args()
     test = load_data(arguments.recordings, "test")
-    found: Json = made(load_data(arguments.recordings, "train"), test) | {"data": Path(arguments.recordings).name}
+    found: Json = made(load_data(arguments.recordings, "train"), test) | {
+        "data": Path(arguments.recordings).name
+    }
     results = {}
     for each in arguments.verdicts:
         name, _, file = each.partition("=")
@@ -60,7 +62,9 @@ def fallen(results: list[Certificates], kind: str) -> Json:
 def summary(result: Certificates) -> Json:
     """Counts over recordings, and a short line for each."""
     found = result.certificates
-    sizes = {kind: [each.kinds[kind].least for each in found] for kind in ("shifted", "start cut", "end cut")}
+    sizes = {
+        kind: [each.kinds[kind].least for each in found] for kind in ("shifted", "start cut", "end cut")
+    }
     return {
         "recordings": len(found),
         "right": sum(each.right for each in found),
@@ -68,11 +72,15 @@ def summary(result: Certificates) -> Json:
         "least_certified": statistics.median(each.at_least for each in found),
         "exact": sum(each.exact for each in found),
         "attacked": sum(each.at_most is not None for each in found),
-        "ratio": statistics.median(each.at_most / max(each.at_least + 1, 1) for each in found if each.at_most),
+        "ratio": statistics.median(
+            each.at_most / max(each.at_least + 1, 1) for each in found if each.at_most
+        ),
         "stand": {kind: result.unaltered(kind) for kind in EXHAUSTIVE},
         "tried": {kind: sum(each.kinds[kind].tried for each in found) for kind in EXHAUSTIVE},
         "alter": {kind: sum(each.kinds[kind].alter for each in found) for kind in EXHAUSTIVE},
-        "stand_sizes": {kind: statistics.median(999 if n is None else n for n in each) for kind, each in sizes.items()},
+        "stand_sizes": {
+            kind: statistics.median(999 if n is None else n for n in each) for kind, each in sizes.items()
+        },
         "hanging": {kind: each.tolist() for kind, each in hanging_on(result).items()},
         "phases": [sum(each.phases[phase] for each in found) for phase in range(PHASES)],
         "fallen_by_label": Counter(str(each.label) for each in found if not each.at_least),
@@ -103,7 +111,13 @@ def brute_force(file: str, test: Any, count: int = 3) -> Json:
         seconds[1] += time.process_time() - between
         differ += int((quick != slow).sum())
         tried += len(slow)
-    return {"recordings": count, "changes": tried, "differ": differ, "quick_s": seconds[0], "slow_s": seconds[1]}
+    return {
+        "recordings": count,
+        "changes": tried,
+        "differ": differ,
+        "quick_s": seconds[0],
+        "slow_s": seconds[1],
+    }
 
 
 if __name__ == "__main__":

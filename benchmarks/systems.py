@@ -50,13 +50,18 @@ def measured(name: str, network: str, data: Any) -> dict[str, Any]:
 
 def draw(place: str, files: list[str]) -> None:
     """One panel for each data set, small labels beside each mark."""
-    figure, panels = plt.subplots(len(files), figsize=(5.2, 3.2 * len(files)), layout="constrained", squeeze=False)
+    figure, panels = plt.subplots(
+        len(files), figsize=(5.2, 3.2 * len(files)), layout="constrained", squeeze=False
+    )
     for axes, file in zip(panels[:, 0], files, strict=True):
         found = json.loads(Path(file).read_text())
         title = found["data"].removesuffix(".zip").removeprefix("Ev-")
         machines = json.loads((RESULTS / f"features-{title.lower()}.json").read_text())
         best = {
-            kernel: max((m for m in machines["machines"] if m["kernel"] == kernel), key=lambda m: m["cross_validation"])
+            kernel: max(
+                (m for m in machines["machines"] if m["kernel"] == kernel),
+                key=lambda m: m["cross_validation"],
+            )
             for kernel in SVM
         }
         for kernel, one in best.items():

@@ -124,7 +124,9 @@ class Task:
         with np.load(self.path) as arrays:
             steps = arrays["events"].shape[1] + (0 if kind == "aligned" else len(self.layers))
             shape = (len(self.few), steps, self.layers[layer].size)
-            return np.unpackbits(arrays[f"{kind}{layer}"], count=math.prod(shape)).reshape(shape).view(np.bool_)
+            return (
+                np.unpackbits(arrays[f"{kind}{layer}"], count=math.prod(shape)).reshape(shape).view(np.bool_)
+            )
 
     def differing(self, kind: str, spikes: Sequence[Any]) -> list[int]:
         """Spikes of each layer that are not those of the reference."""

@@ -74,8 +74,12 @@ class Stage:
 
     def arrays(self, index: int) -> dict[str, object]:
         """What a task file holds of it."""
-        held: dict[str, object] = {f"weight{index} {source}": weight for source, weight in self.weights.items()}
-        return held | {f"{key}{index}": getattr(self, key) for key in ("bias", "threshold", "core", "decay", "dense")}
+        held: dict[str, object] = {
+            f"weight{index} {source}": weight for source, weight in self.weights.items()
+        }
+        return held | {
+            f"{key}{index}": getattr(self, key) for key in ("bias", "threshold", "core", "decay", "dense")
+        }
 
 
 Chain = tuple[Stage, ...]
@@ -273,7 +277,9 @@ def place_chain(layers: Sequence[tuple[IntArray, IntArray, int]], *, taxels: int
     populations, projections = [], []
     for index, (weight, bias, threshold) in enumerate(layers):
         mantissa, exponent = encode_bias(bias * 64.0)
-        assert np.array_equal(mantissa << exponent, bias << 6), "biases of whole weight units need no rounding"
+        assert np.array_equal(mantissa << exponent, bias << 6), (
+            "biases of whole weight units need no rounding"
+        )
         populations.append(
             IntegerPopulation(
                 name="conv1" if index == 0 else f"fc{index}",
@@ -322,4 +328,6 @@ def synaptic_operations(chain: Chain, events: SpikeArray, spikes: Sequence[Spike
     """Non-zero synapses that spikes visit, per recording."""
     sources = [events, *spikes[:-1]]
     fan_out = [np.count_nonzero(stage.weight, axis=0) for stage in chain]
-    return float(sum(s.sum(axis=(0, 1)) @ fan for s, fan in zip(sources, fan_out, strict=True)) / len(events))
+    return float(
+        sum(s.sum(axis=(0, 1)) @ fan for s, fan in zip(sources, fan_out, strict=True)) / len(events)
+    )

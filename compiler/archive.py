@@ -1,7 +1,7 @@
 """Archives of arrays: an uncompressed ``.npz`` with a JSON manifest and a hash, which numpy alone can read.
 
-What all netlist files share, whatever chip they are for. Equal members give equal bytes: they are stored, not
-compressed, in the order given and with a fixed date. Nothing is ever pickled.
+What all netlist files share, whatever chip they are for. Equal members give equal bytes: they are stored,
+not compressed, in the order given and with a fixed date. Nothing is ever pickled.
 """
 
 import hashlib
@@ -169,7 +169,9 @@ def stated(path: Path, name: str) -> str | None:
             return None
         with zipfile.ZipFile(path) as archive, archive.open("manifest.npy") as member:
             manifest = json.loads(str(np.lib.format.read_array(member, allow_pickle=False)))
-    except Exception:  # zipfile and numpy raise whatever they meet; a header may announce more than the memory holds
+    except (
+        Exception
+    ):  # zipfile and numpy raise whatever they meet; a header may announce more than the memory holds
         return None
     value = manifest.get(name) if isinstance(manifest, dict) else None
     return value if isinstance(value, str) else None
@@ -184,9 +186,9 @@ LETTERS = 1000
 """That a word of a manifest may have, the name of a layer, say."""
 
 Kind = type | tuple[int, int] | frozenset[str] | dict[str, Any] | list[Any]
-"""What an entry of a manifest must be: of a type (``float``: from 0, finite), a whole number within bounds (both
-allowed), one of some words, an object of exactly these entries (``NAME?`` may be missing), or a list of such things,
-``[kind, ...]`` of at least one, ``[kind, 2]`` of two."""
+"""What an entry of a manifest must be: of a type (``float``: from 0, finite), a whole number within bounds
+(both allowed), one of some words, an object of exactly these entries (``NAME?`` may be missing), or a list
+of such things, ``[kind, ...]`` of at least one, ``[kind, 2]`` of two."""
 
 GRAPH: Kind = {"name": str, "edges": [[(0, 2**31), 2]]}
 
@@ -203,7 +205,9 @@ def entry_faults(manifest: Mapping[str, Any], kinds: Mapping[str, Kind]) -> list
     return [f"the manifest has no usable {', '.join(odd)}"] if odd else []
 
 
-def array_faults(arrays: Mapping[str, Array], axes: Mapping[str, int], floats: Iterable[str] = ()) -> list[str]:
+def array_faults(
+    arrays: Mapping[str, Array], axes: Mapping[str, int], floats: Iterable[str] = ()
+) -> list[str]:
     """Arrays with other axes than one, or than `axes` says, and those that are no integers, or `floats` no reals."""
     faults = []
     for name, array in arrays.items():
@@ -227,7 +231,9 @@ def _is(value: Any, kind: Kind) -> bool:  # noqa: PLR0911 - one for each kind
             return isinstance(value, str) and value in kind
         case dict():
             known = {name.removesuffix("?"): name for name in kind}
-            if not isinstance(value, dict) or not {name for name in kind if name in known} <= set(value) <= set(known):
+            if not isinstance(value, dict) or not {name for name in kind if name in known} <= set(
+                value
+            ) <= set(known):
                 return False
             return all(_is(each, kind[known[name]]) for name, each in value.items())
     size = len(value) if isinstance(value, list) else -1
@@ -244,8 +250,9 @@ def read_archive(
 ) -> tuple[dict[str, Any], dict[str, Array]]:
     """Manifest and arrays of a file of a format, one of ``FORMATS``, that matches its hash.
 
-    Entries of the manifest are of these `kinds`; `names` gives from it the names of all arrays, in their order.
-    FileFault, or what parsing raises, if the file is missing, damaged, altered, or of another format or version.
+    Entries of the manifest are of these `kinds`; `names` gives from it the names of all arrays, in their
+    order. FileFault, or what parsing raises, if the file is missing, damaged, altered, or of another format
+    or version.
     """
     members = read_members(path)
     what = "network" if wanted in (TRAINED, COUNTERS) else "netlist"
@@ -260,7 +267,9 @@ def read_archive(
     if kind != wanted:
         raise FileFault(f"is not a {what}")
     if (found := manifest.get("version")) != version:
-        raise FileFault(f"has format version {found!r:.40}, this program reads {version}: another spikeloom wrote it")
+        raise FileFault(
+            f"has format version {found!r:.40}, this program reads {version}: another spikeloom wrote it"
+        )
     require_none(entry_faults(manifest, kinds))
     expected = tuple(names(manifest))
     if odd := sorted(set(expected) ^ set(members)):

@@ -1,6 +1,7 @@
 """Trained weights as all systems have them: filters of the first layer, fully connected stages, constants.
 
-Files are read and written by :mod:`compiler.formats`; :mod:`passes.expand` writes the first layer out as synapses.
+Files are read and written by :mod:`compiler.formats`; :mod:`passes.expand` writes the first layer out as
+synapses.
 """
 
 import math
@@ -25,7 +26,8 @@ class Dense:
     """A fully connected stage."""
 
     name: str  # ``fc1`` …
-    # (outputs, inputs) float32; of a joined network with the inputs of one tower: no row has weights from another one
+    # (outputs, inputs) float32; of a joined network with the inputs of one tower: no row has weights from
+    # another one
     weight: Float32Array
     bias: Float32Array  # (outputs,) float32
 
@@ -48,7 +50,9 @@ class Checkpoint:
     sets: tuple[str, ...] = ("last",)  # All epochs that the file holds
     runs: int = 1  # Trainings that the file holds; this is one of them
     training: Mapping[str, Any] | None = None  # JSON values: how it was made and what it reached
-    forms: tuple[Form, ...] | None = None  # How the chip stores each layer, where the network was fine-tuned for it
+    forms: tuple[Form, ...] | None = (
+        None  # How the chip stores each layer, where the network was fine-tuned for it
+    )
     system: str = TACTILESGNET  # One of ``SYSTEMS``
     grid: Grid | None = None  # Of a grid-based CNN
     dynamics: Dynamics = PLAIN  # Decays of single layers, and clocks
@@ -98,11 +102,16 @@ def layers_of(arrays: Mapping[str, AnyArray]) -> Weights:
     """Weights from tensors by name; read-only copies."""
     layers_read = {name: frozen(np.array(array, np.float32, order="C")) for name, array in arrays.items()}
     stages = sorted(
-        (name.removesuffix(".weight") for name in layers_read if name.startswith("fc") and name.endswith(".weight")),
+        (
+            name.removesuffix(".weight")
+            for name in layers_read
+            if name.startswith("fc") and name.endswith(".weight")
+        ),
         key=lambda name: int(name[2:]),
     )
     dense = tuple(
-        Dense(name=name, weight=layers_read[f"{name}.weight"], bias=layers_read[f"{name}.bias"]) for name in stages
+        Dense(name=name, weight=layers_read[f"{name}.weight"], bias=layers_read[f"{name}.bias"])
+        for name in stages
     )
     return Weights(hops=layers_read["conv1.hops"], conv_bias=layers_read["conv1.bias"], dense=dense)
 
@@ -111,7 +120,9 @@ def constant_faults(beta: float | None, theta: float | None) -> list[str]:
     """What is wrong about a decay or a threshold that no neuron has."""
     faults = []
     if beta is not None and not 0 <= beta < 1:
-        faults.append(f"beta {beta:g}: allowed are 0 <= beta < 1; it is the share of the membrane that a step keeps")
+        faults.append(
+            f"beta {beta:g}: allowed are 0 <= beta < 1; it is the share of the membrane that a step keeps"
+        )
     if theta is not None and not 0 < theta < math.inf:
         faults.append(f"theta {theta:g}: allowed are numbers above 0; it is the threshold of a spike")
     return faults

@@ -30,7 +30,9 @@ class Counters:
     # slope, threshold: Of the sums: what each step adds to them, and where they spike
     slope: float
     threshold: float
-    training: Mapping[str, Any] = field(default_factory=dict)  # JSON values: how it was made and what it reached
+    training: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # JSON values: how it was made and what it reached
 
     @property
     def clocks(self) -> Clocks:

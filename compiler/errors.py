@@ -1,7 +1,7 @@
 """The error tree: one base, one child per party that must act.
 
-Every message is *where: what was found, what is allowed; what to do*, on one line. The command line prints it
-and exits with 2; nothing here carries a traceback to a user.
+Every message is *where: what was found, what is allowed; what to do*, on one line. The command line prints
+it and exits with 2; nothing here carries a traceback to a user.
 """
 
 from __future__ import annotations

@@ -30,9 +30,9 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a new file beside `path`; rename it onto `path` when the block ends well.
 
     Whatever stops the block (an error, a full disk, an interrupt) leaves an existing `path` as it was and no
-    half-written file behind. A file that is replaced hands its permissions on; of a link the target is replaced.
-    OSError if the folder does not exist or cannot be written, or the disk is full; its ``filename`` is `path`, unless
-    the block raised it for another file.
+    half-written file behind. A file that is replaced hands its permissions on; of a link the target is
+    replaced. OSError if the folder does not exist or cannot be written, or the disk is full; its
+    ``filename`` is `path`, unless the block raised it for another file.
     """
     target = Path(path).resolve()
     part = beside(target)
@@ -79,8 +79,8 @@ class FileFault(SpikeloomError):  # noqa: N818 - the file's, no error of the pro
 def reading(where: object, error: type[SpikeloomError], remedy: str) -> Iterator[None]:
     """Let whatever is raised while a file is read be one line of `MOST_SAID` letters: name, what was found, remedy.
 
-    A :class:`FileFault`, and all that parsing libraries raise, becomes an `error`; other errors of ours keep their kind
-    and words, those about options pass.
+    A :class:`FileFault`, and all that parsing libraries raise, becomes an `error`; other errors of ours keep
+    their kind and words, those about options pass.
     """
     try:
         yield

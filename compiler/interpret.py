@@ -101,7 +101,9 @@ def float_layer(
     """
     registers = tuple(np.array([population.alpha, population.beta, population.theta], dtype))
     pres, synapses = synapses_of([(p, p.weight) for p in projections], dtype, loops=loops)
-    return Layer(pres=pres, size=population.size, fixed=(*synapses, population.bias.astype(dtype), registers))
+    return Layer(
+        pres=pres, size=population.size, fixed=(*synapses, population.bias.astype(dtype), registers)
+    )
 
 
 def synapses_of(
@@ -128,7 +130,9 @@ class Simulation:
         def batch(start: int) -> list[tuple[BoolArray, AnyArray]]:
             done: list[tuple[BoolArray, AnyArray]] = []
             for layer in self.layers:
-                sources = [events[start : start + BATCH] if pre == ir.INPUT else done[pre][0] for pre in layer.pres]
+                sources = [
+                    events[start : start + BATCH] if pre == ir.INPUT else done[pre][0] for pre in layer.pres
+                ]
                 done.append(layer.run(sources, membranes=membranes))
             return done
 
@@ -147,7 +151,9 @@ def threads() -> ThreadPoolExecutor:
 def float_simulation(network: ir.Network, dtype: npt.DTypeLike = np.float64) -> Simulation:
     """The float stage, in the arithmetic of `dtype`."""
     into = [[p for p in network.projections if p.post == post] for post in range(len(network.populations))]
-    return Simulation(layers=tuple(float_layer(*each, dtype) for each in zip(network.populations, into, strict=True)))
+    return Simulation(
+        layers=tuple(float_layer(*each, dtype) for each in zip(network.populations, into, strict=True))
+    )
 
 
 def run_float(
@@ -179,7 +185,9 @@ def cut(spikes: BoolArray, lengths: IntArray | None) -> BoolArray:
     >>> cut(np.ones((2, 3, 1), bool), np.array([3, 1])).sum(axis=1).ravel().tolist()
     [3, 1]
     """
-    return spikes if lengths is None else spikes & (np.arange(spikes.shape[1]) < lengths[:, None])[:, :, None]
+    return (
+        spikes if lengths is None else spikes & (np.arange(spikes.shape[1]) < lengths[:, None])[:, :, None]
+    )
 
 
 def vote(counts: IntArray) -> IntArray:

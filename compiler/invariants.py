@@ -21,7 +21,9 @@ def _names_are_unique(network: ir.Graph) -> Faults:
 
 
 def _projections_fit(network: ir.Graph) -> Faults:
-    sizes = {i: population.size for i, population in enumerate(network.populations)} | {ir.INPUT: network.input.size}
+    sizes = {i: population.size for i, population in enumerate(network.populations)} | {
+        ir.INPUT: network.input.size
+    }
     for i, p in enumerate(network.projections):
         expected = (sizes.get(p.post), sizes.get(p.pre))
         if p.post == ir.INPUT or p.weight.shape != expected:
@@ -40,7 +42,9 @@ def _steps_are_kept(network: ir.Graph) -> Faults:
     depth = {ir.INPUT: -1} | dict(enumerate(ir.depths(network)))
     for i, p in enumerate(projections):
         early = depth[p.post] - depth[p.pre] - 1
-        if p.pre != p.post and early > 0:  # of a recurrent one, what a step fires arrives in the next here, too
+        if (
+            p.pre != p.post and early > 0
+        ):  # of a recurrent one, what a step fires arrives in the next here, too
             yield f"projection {i} skips a layer: a spike takes one step on the chip, so it would arrive {early} early"
     reached = {ir.INPUT}
     for post, pre in sorted((p.post, p.pre) for p in projections):  # a recurrent one after the others

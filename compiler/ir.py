@@ -50,7 +50,9 @@ class Readout:
     """Spike-count vote over one population."""
 
     population: int  # Index of the population that votes
-    label: IntArray  # (neurons,) int64; class that each votes for; most spikes win, the lowest index on a tie
+    label: (
+        IntArray  # (neurons,) int64; class that each votes for; most spikes win, the lowest index on a tie
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,7 +67,9 @@ class Population:
     theta: float  # Threshold, in the model's membrane units
     bias: FloatArray  # (neurons,) float64; added in every step
     alpha: float = 0.0  # Share of the synaptic current that a step keeps, 0 to below 1
-    relays: int = 0  # Neurons at the end that relay a clock each: whatever is rounded, they must spike when it ticks
+    relays: int = (
+        0  # Neurons at the end that relay a clock each: whatever is rounded, they must spike when it ticks
+    )
 
     @property
     def size(self) -> int:
@@ -118,7 +122,9 @@ class Network:
     projections: tuple[Projection, ...]
     readout: Readout
     classes: int
-    forms: tuple[Form, ...] | None = None  # How the chip stores each population, where it was fine-tuned for it
+    forms: tuple[Form, ...] | None = (
+        None  # How the chip stores each population, where it was fine-tuned for it
+    )
     # Where it comes from a checkpoint; whatever changes weights leaves it out. Not printed: it says nothing
     # new
     convolution: Convolution | None = field(default=None, repr=False)

@@ -290,7 +290,9 @@ def decay(values: Any, keep: Any) -> None:
 
 
 @compiled
-def _integrate_integer(membrane: Any, current: Any, sums: Any, bias: Any, registers: Any, fired: Any) -> None:
+def _integrate_integer(
+    membrane: Any, current: Any, sums: Any, bias: Any, registers: Any, fired: Any
+) -> None:
     threshold, keep_u, keep_v, limit = registers
     zero = membrane.dtype.type(0)
     for i in range(len(bias)):
@@ -349,7 +351,13 @@ def run_layer(
             now = fired[recording % kept, t % last]
             arrive(arriving, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
             if len(own.run) and t:  # a plain 0 is a type of its own: all would be compiled once more
-                arrive(arriving, own, before, np.int64(0), list_fired(fired[recording % kept, (t - 1) % last], before))
+                arrive(
+                    arriving,
+                    own,
+                    before,
+                    np.int64(0),
+                    list_fired(fired[recording % kept, (t - 1) % last], before),
+                )
             if len(registers) == 3:
                 integrate_float(membrane, current, bias, registers[1], registers[2], now)
             else:

@@ -57,7 +57,8 @@ class Grid:
     def places(self, kernel: int) -> tuple[int, int]:
         """Positions of a square window, down and across; zero where it is larger than the grid."""
         down, across = (
-            max(0, (side + 2 * self.padding - kernel) // self.stride + 1) for side in (self.rows, self.columns)
+            max(0, (side + 2 * self.padding - kernel) // self.stride + 1)
+            for side in (self.rows, self.columns)
         )
         return down, across
 
@@ -102,7 +103,9 @@ def shape_faults(system: str, filters: int, places: int, taxels: int, grid: Grid
         case "gcn" if filters != 1:
             return [f"a GCN has 1 filter, conv1.hops has {filters}"]
         case "mlp" if filters != taxels or places != 1:
-            return [f"an MLP has a filter for each of its {taxels} taxels and one place, here {filters} and {places}"]
+            return [
+                f"an MLP has a filter for each of its {taxels} taxels and one place, here {filters} and {places}"
+            ]
         case "grid-cnn":
             kernel = math.isqrt(filters)
             if kernel**2 != filters or grid is None:

@@ -60,7 +60,9 @@ def check_coordinates(coordinates: ArrayLike) -> FloatArray:
     """Return the coordinates as (n, d) float64; ModelError if they are not, or not finite."""
     array = np.asarray(coordinates, dtype=np.float64)
     if array.ndim != 2 or 0 in array.shape:
-        raise ModelError(f"coordinates: shape {array.shape}, allowed is (taxels, dimensions); give one row per taxel")
+        raise ModelError(
+            f"coordinates: shape {array.shape}, allowed is (taxels, dimensions); give one row per taxel"
+        )
     if not np.isfinite(array).all():
         row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
         raise ModelError(f"coordinates: taxel {row} has a position that is not finite; give millimetres")
@@ -71,7 +73,9 @@ def check_edges(edges: ArrayLike, n: int) -> IntArray:
     """Return the edges of a graph with `n` taxels as (e, 2) int64; ModelError if they are none."""
     array = np.asarray(edges)
     if array.ndim != 2 or array.shape[1] != 2:
-        raise ModelError(f"edges: shape {array.shape}, allowed is (edges, 2); give source and target taxel per row")
+        raise ModelError(
+            f"edges: shape {array.shape}, allowed is (edges, 2); give source and target taxel per row"
+        )
     if array.dtype.kind not in "iu":
         raise ModelError(f"edges: dtype {array.dtype}, allowed are integers; give taxel indices")
     outside = ((array < 0) | (array >= n)).any(axis=1)
@@ -149,7 +153,9 @@ def _read_k(name: str, value: str, n: int) -> int:
     most = min(MAX_NEIGHBOURS, n - 1)
     if not (value.isascii() and value.isdigit() and len(value) < 4 and 1 <= int(value) <= most):
         why = "" if most == MAX_NEIGHBOURS else f" (the layout has {n} taxels)"
-        raise OptionError(f"graph {name!r}: K is {value!r}, allowed are whole numbers 1..{most}{why}; choose another K")
+        raise OptionError(
+            f"graph {name!r}: K is {value!r}, allowed are whole numbers 1..{most}{why}; choose another K"
+        )
     return int(value)
 
 

@@ -27,7 +27,9 @@ def read_taxels(path: str | os.PathLike[str]) -> FloatArray:
     table = read_table(path, ("x", "y"), ("z",))
     places = np.stack([table.columns[name] for name in ("x", "y", "z") if name in table.columns], axis=1)
     if len(places) > MAX_TAXELS:
-        raise DataError(f"{table.where}: {len(places)} taxels, the limit is {MAX_TAXELS}; give a part of the sensor")
+        raise DataError(
+            f"{table.where}: {len(places)} taxels, the limit is {MAX_TAXELS}; give a part of the sensor"
+        )
     broken = ~(np.abs(places) <= MAX_MILLIMETRES)  # true for NaN too
     if broken.any():
         row, axis = (int(index) for index in np.argwhere(broken)[0])
@@ -53,7 +55,9 @@ def read_layout(taxels: str | os.PathLike[str]) -> tuple[int, FloatArray | None]
         places = read_taxels(taxels)
         return len(places), places
     if len(word) > len(str(MAX_TAXELS)) or not 1 <= int(word) <= MAX_TAXELS:
-        raise OptionError(f"--taxels {word}: allowed are 1..{MAX_TAXELS} taxels; give another number, or a CSV file")
+        raise OptionError(
+            f"--taxels {word}: allowed are 1..{MAX_TAXELS} taxels; give another number, or a CSV file"
+        )
     return int(word), None
 
 
@@ -113,7 +117,9 @@ def sensor_graph(
         if taxels is None:
             return build_graph(graph), None
         if places is None:
-            raise OptionError(f"--taxels {taxels}: --graph {graph} needs positions; give a CSV file with x,y in mm")
+            raise OptionError(
+                f"--taxels {taxels}: --graph {graph} needs positions; give a CSV file with x,y in mm"
+            )
         built = build_graph(graph, places)
         return built, parts_warning(f"{Path(taxels).name}, {built.name}", built.edges, built.n_taxels)
     drawn = read_edges(edges, count, directed=directed)

@@ -1,7 +1,7 @@
 """The library: what ``import spikeloom`` offers. A function asks one question; the command of its name is its client.
 
-Every function takes the options of its command as keywords, builds its request, and returns the dataclass that
-``--json`` prints. Wrong values are an OptionError that names keyword, value and what is allowed.
+Every function takes the options of its command as keywords, builds its request, and returns the dataclass
+that ``--json`` prints. Wrong values are an OptionError that names keyword, value and what is allowed.
 """
 
 from __future__ import annotations
@@ -153,8 +153,8 @@ class Compiled:
     ) -> Verdict:
         """Compare chip and float model, spike for spike.
 
-        Raises SpikeloomError if network, netlist and recordings do not belong together, and ModelError if the netlist
-        is so unlike its network that nothing can be compared: :meth:`check` says how.
+        Raises SpikeloomError if network, netlist and recordings do not belong together, and ModelError if
+        the netlist is so unlike its network that nothing can be compared: :meth:`check` says how.
         """
         from spikeloom.runtime.commands.main_job import verify
         from spikeloom.runtime.equivalence.verdict import Verdict
@@ -372,7 +372,8 @@ def compile(
     example : Tensor, optional
         Input of one step, for a module.
     storage : Fixed, Cheapest or Exact, optional
-        How weights are stored, in place of `weight_bits`, `planes`, `scale_groups`, `spike_exact` and `keep`.
+        How weights are stored, in place of `weight_bits`, `planes`, `scale_groups`, `spike_exact` and
+        `keep`.
 
     Raises
     ------
@@ -461,7 +462,8 @@ def finetune(
 ) -> Compiled:
     """Train a network further on the integers of its chip, and give the netlist of what came of it.
 
-    Of a checkpoint `output` is another one, ``.pt``; of any other network NIR, ``.nir``, its netlist beside it.
+    Of a checkpoint `output` is another one, ``.pt``; of any other network NIR, ``.nir``, its netlist beside
+    it.
 
     Raises
     ------
@@ -477,7 +479,9 @@ def finetune(
     if tuned.netlist is None:
         again = {"graph": graph, "taxels": taxels, "edges": edges, "directed": directed}
         return compile(output, **again)  # type: ignore[arg-type]
-    return Compiled(Path(output).with_name(tuned.netlist), output, NetworkChoice(polarities=polarities), tuned)
+    return Compiled(
+        Path(output).with_name(tuned.netlist), output, NetworkChoice(polarities=polarities), tuned
+    )
 
 
 @documented(TrainRequest)
@@ -610,7 +614,9 @@ def _place(data: Source, bin: float | None) -> dict[str, object]:
     return {"data": data, "bin": bin}
 
 
-def _network(what: str, network: str | os.PathLike[str] | nn.Module | Network, example: Tensor | None) -> str | Network:
+def _network(
+    what: str, network: str | os.PathLike[str] | nn.Module | Network, example: Tensor | None
+) -> str | Network:
     """File of a network, or what a module means."""
     if isinstance(network, str | os.PathLike):
         return os.fspath(network)
@@ -622,5 +628,7 @@ def _network(what: str, network: str | os.PathLike[str] | nn.Module | Network, e
     if isinstance(network, FloatNetwork):
         return network
     if not isinstance(example, Tensor):
-        raise OptionError(f"{what}: a module needs the input of one step; give example=torch.zeros(1, CHANNELS)")
+        raise OptionError(
+            f"{what}: a module needs the input of one step; give example=torch.zeros(1, CHANNELS)"
+        )
     return module_network(network, example)

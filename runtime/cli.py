@@ -1,8 +1,7 @@
 """The command line: name the commands, import the one that is chosen, run it, print what it returns.
 
-Exit codes: 0 fine, 1 a check failed, 2 an interrupt or a user's mistake (one line on stderr, a traceback only with
-``--debug``).
-Results go to stdout, progress to stderr when it is a terminal.
+Exit codes: 0 fine, 1 a check failed, 2 an interrupt or a user's mistake (one line on stderr, a traceback
+only with ``--debug``). Results go to stdout, progress to stderr when it is a terminal.
 """
 
 import argparse
@@ -73,7 +72,9 @@ class Parser(argparse.ArgumentParser):
         if self._subparsers is None:
             known = list(self._option_string_actions)
             for word in args:
-                if word.startswith("--") and not any(name.startswith(word.partition("=")[0]) for name in known):
+                if word.startswith("--") and not any(
+                    name.startswith(word.partition("=")[0]) for name in known
+                ):
                     raise OptionError(f"{word}: unknown option{near(word, known)}; see {self.prog} --help")
         return super().parse_known_args(args, namespace)
 
@@ -111,9 +112,13 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("-V", "--version", action="version", version=f"spikeloom {__version__}")
-    parser.add_argument("--print-completion", choices=("bash", "zsh", "tcsh"), help="print a completion script")
+    parser.add_argument(
+        "--print-completion", choices=("bash", "zsh", "tcsh"), help="print a completion script"
+    )
     hidden = argparse.SUPPRESS if chosen == "" else None  # the overview names them, by group
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", help=hidden, prog="spikeloom")
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="COMMAND", help=hidden, prog="spikeloom"
+    )
     for name in COMMANDS if chosen is None else filter(None, [chosen]):
         sub = commands.add_parser(name, description=COMMANDS[name][1], help=COMMANDS[name][1])
         _describe(sub, _module(name))
@@ -182,7 +187,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         from spikeloom.runtime.report.encode import encode  # with numpy, which help need not wait for
 
         outcome: Outcome = arguments.action(arguments.request.of(vars(arguments)))
-        text = json.dumps(encode(outcome.result)) if arguments.json else terminal(outcome.sections(outcome.result))
+        text = (
+            json.dumps(encode(outcome.result))
+            if arguments.json
+            else terminal(outcome.sections(outcome.result))
+        )
         progress("")
         show(text)
         return outcome.code

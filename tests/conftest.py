@@ -26,7 +26,9 @@ def _shared(relative: str) -> Path:
     path = SHARED / relative
     if not path.exists():
         if os.environ.get("SPIKELOOM_REQUIRE_RECORDINGS"):
-            pytest.fail(f"the released file {relative} is missing, and SPIKELOOM_REQUIRE_RECORDINGS forbids to skip")
+            pytest.fail(
+                f"the released file {relative} is missing, and SPIKELOOM_REQUIRE_RECORDINGS forbids to skip"
+            )
         pytest.skip(f"the released file {relative} is not on this machine (set SPIKELOOM_SHARED)")
     return path
 
@@ -44,7 +46,9 @@ checkpoints = _released("checkpoints")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the option that writes golden texts anew."""
-    parser.addoption("--update-golden", action="store_true", help="write tests/golden anew instead of comparing")
+    parser.addoption(
+        "--update-golden", action="store_true", help="write tests/golden anew instead of comparing"
+    )
 
 
 @pytest.fixture

@@ -46,7 +46,13 @@ def ring(taxels: int = TAXELS) -> Graph:
 
 
 def weights(
-    seed: int = 0, *, taxels: int = TAXELS, features: int = FEATURES, hops: int = 4, sizes=(9, 8, CLASSES), gain=1.6
+    seed: int = 0,
+    *,
+    taxels: int = TAXELS,
+    features: int = FEATURES,
+    hops: int = 4,
+    sizes=(9, 8, CLASSES),
+    gain=1.6,
 ) -> dict[str, np.ndarray]:
     """Random float32 weights of a TactileSGNet under the names of our own format; lively at the default gain."""
     rng = np.random.default_rng(seed)
@@ -54,7 +60,10 @@ def weights(
     def draw(*shape, spread):
         return rng.normal(0, spread, shape).astype(np.float32)
 
-    found = {"conv1.hops": draw(hops, features, 2, spread=0.5 * gain), "conv1.bias": draw(features, spread=0.1)}
+    found = {
+        "conv1.hops": draw(hops, features, 2, spread=0.5 * gain),
+        "conv1.bias": draw(features, spread=0.1),
+    }
     widths = (taxels * features, *sizes)
     for i, (before, size) in enumerate(zip(widths[:-1], sizes, strict=True), 1):
         found[f"fc{i}.weight"] = draw(size, before, spread=gain * before**-0.5)
@@ -136,5 +145,7 @@ def csv_folder(folder: Path, *, taxels: int = TAXELS, samples: int = 8, classes:
         rng = np.random.default_rng(i)
         taxel = np.where(rng.random(90) < 0.5, i % classes, np.arange(90)) % taxels
         lines = [f"{0.011 * k:.3f},{taxel[k]},{rng.integers(0, 2)}" for k in range(90)]
-        (folder / f"tap_{i}_label_{i % classes}.csv").write_text("\n".join(["time_s,taxel,polarity", *lines]))
+        (folder / f"tap_{i}_label_{i % classes}.csv").write_text(
+            "\n".join(["time_s,taxel,polarity", *lines])
+        )
     return folder

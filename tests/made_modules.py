@@ -10,7 +10,9 @@ from torch import nn
 from spikeloom.models.networks.lif import LIF, reset
 
 TAXELS, CLASSES = 6, 3
-RING = np.array([[i, (i + 1) % TAXELS] for i in range(TAXELS)] + [[(i + 1) % TAXELS, i] for i in range(TAXELS)])
+RING = np.array(
+    [[i, (i + 1) % TAXELS] for i in range(TAXELS)] + [[(i + 1) % TAXELS, i] for i in range(TAXELS)]
+)
 """Edges of a ring of taxels, (source, target), both ways."""
 
 
@@ -93,7 +95,9 @@ def graph_net(layer):
 
 def mlp():
     return seeded(
-        lambda: nn.Sequential(nn.Linear(2 * TAXELS, 16), LIF(0.9, 1.0), nn.Linear(16, CLASSES), LIF(0.3, 0.25))
+        lambda: nn.Sequential(
+            nn.Linear(2 * TAXELS, 16), LIF(0.9, 1.0), nn.Linear(16, CLASSES), LIF(0.3, 0.25)
+        )
     )
 
 

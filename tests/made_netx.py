@@ -6,7 +6,14 @@ import numpy as np
 
 def neuron(*, u=4096, v=1024, threshold=25, kind="CUBA", **more):
     """Entries of a neuron."""
-    return {"type": kind, "iDecay": u, "vDecay": v, "vThMant": threshold, "refDelay": 1, "gradedSpike": False} | more
+    return {
+        "type": kind,
+        "iDecay": u,
+        "vDecay": v,
+        "vThMant": threshold,
+        "refDelay": 1,
+        "gradedSpike": False,
+    } | more
 
 
 def dense(weight, *, bias=None, **more):

@@ -17,7 +17,11 @@ def tree_of(graph):
 
     def plain(value):
         if isinstance(value, dict):
-            return {str(key): plain(entry) for key, entry in value.items() if not (key == "metadata" and not entry)}
+            return {
+                str(key): plain(entry)
+                for key, entry in value.items()
+                if not (key == "metadata" and not entry)
+            }
         if isinstance(value, str) or value is None:
             return value
         if isinstance(value, list) and (not value or isinstance(value[0], tuple)):
@@ -49,14 +53,21 @@ def graph_with(nodes, edges, shape, out, first=None, last=None):
 
 def lif(size, tau=0.05, r=1.0, threshold=0.5, leak=0.0, reset=0.0):
     """A LIF node; numbers or arrays."""
-    full = [np.broadcast_to(np.asarray(value, float), size).copy() for value in (tau, r, leak, threshold, reset)]
+    full = [
+        np.broadcast_to(np.asarray(value, float), size).copy() for value in (tau, r, leak, threshold, reset)
+    ]
     return nir.LIF(tau=full[0], r=full[1], v_leak=full[2], v_threshold=full[3], v_reset=full[4])
 
 
 def cuba(size, tau_syn=0.06, tau_mem=0.05, r=1.0, threshold=0.5, leak=0.0, weight=1.0):
     """A CubaLIF node, likewise."""
-    full = [np.broadcast_to(np.asarray(v, float), size).copy() for v in (tau_syn, tau_mem, r, leak, threshold, weight)]
-    return nir.CubaLIF(tau_syn=full[0], tau_mem=full[1], r=full[2], v_leak=full[3], v_threshold=full[4], w_in=full[5])
+    full = [
+        np.broadcast_to(np.asarray(v, float), size).copy()
+        for v in (tau_syn, tau_mem, r, leak, threshold, weight)
+    ]
+    return nir.CubaLIF(
+        tau_syn=full[0], tau_mem=full[1], r=full[2], v_leak=full[3], v_threshold=full[4], w_in=full[5]
+    )
 
 
 def affine(rng, rows, columns, gain=1.0, bias=0.3):
@@ -68,7 +79,10 @@ def affine(rng, rows, columns, gain=1.0, bias=0.3):
 def simulate(graph, events, dt, convention="euler", late=()):
     """Spikes (steps, neurons) of each spiking node by name, from rest; edges in `late` bring what was sent before."""
     received = {name: [a for a, b in graph.edges if b == name] for name in graph.nodes}
-    order, ready = [], {name: [a for a in sources if (a, name) not in late] for name, sources in received.items()}
+    order, ready = (
+        [],
+        {name: [a for a in sources if (a, name) not in late] for name, sources in received.items()},
+    )
     while len(order) < len(received):
         order += [n for n in ready if n not in order and all(source in order for source in ready[n])]
     state, spikes = {}, {}
@@ -103,7 +117,9 @@ def stepped(node, x, state, dt, convention):  # noqa: PLR0911 one return a node
             return x * node.scale
         case nir.Conv1d() | nir.Conv2d():
             run = functional.conv1d if isinstance(node, nir.Conv1d) else functional.conv2d
-            kinds = [torch.from_numpy(np.asarray(value, float)) for value in (x[None], node.weight, node.bias)]
+            kinds = [
+                torch.from_numpy(np.asarray(value, float)) for value in (x[None], node.weight, node.bias)
+            ]
             plain = {key: _plain(getattr(node, key)) for key in ("stride", "padding", "dilation")}
             return run(*kinds, **plain, groups=int(node.groups))[0].numpy()
         case nir.SumPool2d() | nir.AvgPool2d():

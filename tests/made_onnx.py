@@ -26,16 +26,23 @@ def value(name, shape, kind=FLOAT):
 
 def node(op, inputs, outputs, **attributes):
     inputs, outputs = inputs.split(), outputs.split()
-    return helper.make_node(op, ["" if i == "-" else i for i in inputs], outputs, name=outputs[0], **attributes)
+    return helper.make_node(
+        op, ["" if i == "-" else i for i in inputs], outputs, name=outputs[0], **attributes
+    )
 
 
 def model(nodes, inputs, outputs, constants=None, *, opset=20, domains=()):
     """Serialised model; inputs and outputs as (name, shape) or (name, shape, kind)."""
     tensors = [numpy_helper.from_array(np.asarray(a), n) for n, a in (CONSTANTS | (constants or {})).items()]
-    ends = [[value(*end) if isinstance(end, tuple) else value(end, None) for end in side] for side in (inputs, outputs)]
+    ends = [
+        [value(*end) if isinstance(end, tuple) else value(end, None) for end in side]
+        for side in (inputs, outputs)
+    ]
     graph = helper.make_graph(nodes, "net", *ends, tensors)
     imports = [helper.make_opsetid("", opset), *(helper.make_opsetid(d, 1) for d in domains)]
-    return helper.make_model(graph, opset_imports=imports, ir_version=9, producer_name="hand").SerializeToString()
+    return helper.make_model(
+        graph, opset_imports=imports, ir_version=9, producer_name="hand"
+    ).SerializeToString()
 
 
 def written(text, **names):
@@ -63,7 +70,11 @@ def neuron(k, source, spelling="product"):
     """Nodes of a layer whose current is `source`: u0 -> u0_new and so on."""
     names = {name: f"{name}{k}" for name in "usdqrk"} | {"new": f"u{k}_new", "source": source}
     names |= {"fired": f"s{k}_new", "bool": f"s{k}_new_b", "kept": f"u{k}_kept"}
-    fire = "fired = Greater(new, theta)" if spelling == "truth" else "bool = Greater(new, theta); fired = Cast(bool)"
+    fire = (
+        "fired = Greater(new, theta)"
+        if spelling == "truth"
+        else "bool = Greater(new, theta); fired = Cast(bool)"
+    )
     after = "; kept = Where(bool, zero, new)" if spelling == "after" else ""
     return written(f"{RESETS[spelling]}; new = Add(k, source); {fire}{after}", **names)
 

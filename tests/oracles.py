@@ -27,13 +27,17 @@ def assert_same_network(found, expected):
         ours, theirs = dense_weights(found, post), dense_weights(expected, post)
         for pre in set(ours) | set(theirs):
             nothing = np.zeros(1, np.int64)
-            np.testing.assert_array_equal(*np.broadcast_arrays(ours.get(pre, nothing), theirs.get(pre, nothing)))
+            np.testing.assert_array_equal(
+                *np.broadcast_arrays(ours.get(pre, nothing), theirs.get(pre, nothing))
+            )
 
 
 def load_weights(network, weights):
     """Give a TactileSGNet the weights of a checkpoint."""
     network.gains = ()
-    network.load_state_dict({n: torch.tensor(w.T if n.endswith(".weight") else w) for n, w in weights.items()})
+    network.load_state_dict(
+        {n: torch.tensor(w.T if n.endswith(".weight") else w) for n, w in weights.items()}
+    )
 
 
 def refused(error, words, call, *given, **options):

@@ -9,7 +9,13 @@ from random_netlists import assert_equal
 from spikeloom.compiler.dynamics import clocks_over
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron
-from spikeloom.compiler.targets.truenorth.native import UNIT, NativeNetwork, Stage, highest_level, steepest_leak
+from spikeloom.compiler.targets.truenorth.native import (
+    UNIT,
+    NativeNetwork,
+    Stage,
+    highest_level,
+    steepest_leak,
+)
 from spikeloom.runtime.machines.truenorth import engine, spec
 from spikeloom.runtime.machines.truenorth.spec import Counts, Trace
 
@@ -74,7 +80,9 @@ def crossbars(draw, neurons=NEURONS, *, channels=3):
     cores = draw(st.integers(1, 3))
     for core in range(cores):
         draft.core(draw(st.integers(0, 4)), core)
-        held = [draft.neuron(core, draw(neurons), layer=f"layer{core}") for _ in range(draw(st.integers(1, 4)))]
+        held = [
+            draft.neuron(core, draw(neurons), layer=f"layer{core}") for _ in range(draw(st.integers(1, 4)))
+        ]
         for _ in range(draw(st.integers(1, 4))):
             draft.axon(core, draw(st.integers(0, 3)), draw(st.lists(st.sampled_from(held), unique=True)))
 
@@ -107,7 +115,9 @@ def recording_of(batch: Trace, sample: int = 0) -> Trace:
     """One recording of a batch, cut to its own ticks."""
     counts = Counts(**{field.name: getattr(batch.counts, field.name)[sample] for field in fields(Counts)})
     ticks = int(counts.ticks)
-    return Trace(counts=counts, spikes=batch.spikes[sample, :ticks], membranes=batch.membranes[sample, :ticks])
+    return Trace(
+        counts=counts, spikes=batch.spikes[sample, :ticks], membranes=batch.membranes[sample, :ticks]
+    )
 
 
 def both(netlist, recording) -> Trace:

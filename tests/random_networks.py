@@ -15,7 +15,12 @@ from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout
 from spikeloom.compiler.targets.base import Quantity, Target, load_target
 from spikeloom.compiler.targets.loihi1.emit import emit
-from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerPopulation, IntegerProjection, run_integer
+from spikeloom.compiler.targets.loihi1.integers import (
+    IntegerNetwork,
+    IntegerPopulation,
+    IntegerProjection,
+    run_integer,
+)
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.registers import weight_step
 from spikeloom.models.graphs import normalised_adjacency
@@ -60,7 +65,8 @@ def chain(*weights, beta=0.2, theta=0.5, biases=None, polarities=1) -> Network:
             for i, bias in enumerate(biases)
         ),
         projections=tuple(
-            Projection(pre=i - 1 if i else INPUT, post=i, weight=stored(weight)) for i, weight in enumerate(weights)
+            Projection(pre=i - 1 if i else INPUT, post=i, weight=stored(weight))
+            for i, weight in enumerate(weights)
         ),
         readout=Readout(population=len(weights) - 1, label=np.arange(len(weights[-1]))),
         classes=len(weights[-1]),
@@ -94,7 +100,11 @@ def integer_chain(*weights, bits=8, exponent=0, thresholds=None, polarities=1) -
         ),
         projections=tuple(
             IntegerProjection(
-                pre=i - 1 if i else INPUT, post=i, weight=stored(weight, weight != 0), exponent=exponent, bits=bits
+                pre=i - 1 if i else INPUT,
+                post=i,
+                weight=stored(weight, weight != 0),
+                exponent=exponent,
+                bits=bits,
             )
             for i, weight in enumerate(weights)
         ),
@@ -122,7 +132,9 @@ def ring(taxels):
     return normalised_adjacency(np.concatenate([edges, edges[:, ::-1]]), taxels)
 
 
-def random_checkpoint(*, taxels=5, features=3, hops=4, sizes=(6, 5, 4), seed=0, beta=0.2, theta=0.5) -> Checkpoint:
+def random_checkpoint(
+    *, taxels=5, features=3, hops=4, sizes=(6, 5, 4), seed=0, beta=0.2, theta=0.5
+) -> Checkpoint:
     """A small TactileSGNet with random float32 weights."""
     rng = np.random.default_rng(seed)
 
@@ -158,7 +170,9 @@ def _wiring(draw):
     pairs = [(INPUT, post) for post in ids[0]]
     for before, after in itertools.pairwise(ids):
         for post in after:
-            pairs += [(pre, post) for pre in draw(st.lists(st.sampled_from(before), min_size=1, unique=True))]
+            pairs += [
+                (pre, post) for pre in draw(st.lists(st.sampled_from(before), min_size=1, unique=True))
+            ]
     pairs += [(post, post) for post in draw(st.lists(st.integers(0, len(sizes) - 1), unique=True))]
     sensor = Input(taxels=draw(st.integers(1, 5)), polarities=draw(st.sampled_from([1, 2])))
     every = {INPUT: sensor.size} | dict(enumerate(sizes))
@@ -292,7 +306,10 @@ def counted(netlist, target=LOIHI, chunks=None):
             first, last = (int(bound) for bound in netlist.axon_synapses[axon : axon + 2])
             form = int(netlist.axon_format[axon])
             index = int(netlist.format_index_bits[form])
-            places, weights = netlist.synapse_target[first:last].tolist(), netlist.synapse_weight[first:last].tolist()
+            places, weights = (
+                netlist.synapse_target[first:last].tolist(),
+                netlist.synapse_weight[first:last].tolist(),
+            )
             low, source = min(places, default=0), int(netlist.axon_source[axon]) - netlist.n_inputs
             layer = int(netlist.layer[source]) if source >= 0 else -1
             where = (layer, sum(low >= start for start in starts)) if chunks else ()
@@ -301,7 +318,9 @@ def counted(netlist, target=LOIHI, chunks=None):
                 low // reach,
                 *((place - low, weight) for place, weight in zip(places, weights, strict=True)),
             )
-            memory[where, content] = words_of_list(last - first, int(netlist.format_weight_bits[form]), index)
+            memory[where, content] = words_of_list(
+                last - first, int(netlist.format_weight_bits[form]), index
+            )
             formats.add(form)
             if index == 0:
                 base = max(base, int(netlist.synapse_target[first]))
@@ -309,7 +328,9 @@ def counted(netlist, target=LOIHI, chunks=None):
             {
                 "core.compartments": len(compartments),
                 "core.axons_in": len(axons),
-                "core.axons_out": sum(int(s) - netlist.n_inputs in compartments for s in netlist.axon_source),
+                "core.axons_out": sum(
+                    int(s) - netlist.n_inputs in compartments for s in netlist.axon_source
+                ),
                 "core.synapse_words": sum(memory.values()),
                 "core.threshold_slots": len({int(netlist.threshold[c]) for c in compartments}),
                 "core.synapse_formats": len(formats),

@@ -127,7 +127,11 @@ def recording_zip() -> list[bytes]:
 
 
 def npz() -> list[bytes]:
-    events = {"time_s": np.array([0.0, 0.02, 0.1]), "taxel": np.array([0, 2, 1]), "polarity": np.array([1, 0, 1])}
+    events = {
+        "time_s": np.array([0.0, 0.02, 0.1]),
+        "taxel": np.array([0, 2, 1]),
+        "polarity": np.array([1, 0, 1]),
+    }
     return [archive.zip_bytes({f"{name}.npy": archive.npy_bytes(array) for name, array in events.items()})]
 
 
@@ -139,11 +143,17 @@ def netx_files() -> list[bytes]:
     rng, file = np.random.default_rng(0), io.BytesIO()
 
     def even(*shape, **more):
-        return made_netx.dense(made_netx.even(rng, *shape), bias=made_netx.even(rng, shape[0], most=16), **more)
+        return made_netx.dense(
+            made_netx.even(rng, *shape), bias=made_netx.even(rng, shape[0], most=16), **more
+        )
 
     kernel = made_netx.even(rng, 3, 2, 2, 2, most=18)
     recurrent = even(6, 27, type=["dense_rec"], weight_rec=rng.integers(-60, 60, (6, 6)))
-    image = made_netx.given_input(2, 4, 4), made_netx.conv(kernel, (3, 3, 3), bias=[2, 4, 6]), made_netx.flatten(27)
+    image = (
+        made_netx.given_input(2, 4, 4),
+        made_netx.conv(kernel, (3, 3, 3), bias=[2, 4, 6]),
+        made_netx.flatten(27),
+    )
     made_netx.write(file, *image, recurrent, even(4, 6))
     return [file.getvalue()]
 
@@ -185,7 +195,17 @@ def stress_file() -> list[bytes]:
     made_files.recordings_folder(Path("data"))
     made_files.own_file(Path("net.pt"))
     commands.run("compile", "net.pt", "-o", "net.loom")
-    words = ["net.loom", "--checkpoint", "net.pt", "--data", "data", "--only", "taxels_dead,longer", "--seeds", "1"]
+    words = [
+        "net.loom",
+        "--checkpoint",
+        "net.pt",
+        "--data",
+        "data",
+        "--only",
+        "taxels_dead,longer",
+        "--seeds",
+        "1",
+    ]
     code, _, err = commands.run("stress", *words, "-o", "stress.json")
     assert code == 0, err
     return [Path("stress.json").read_bytes()]
@@ -230,12 +250,16 @@ def parts_of_archive(content: bytes) -> dict[str, Any]:
 
 def archive_of(parts: dict[str, Any]) -> bytes:
     arrays = {name: np.asarray(value) for name, value in parts.items() if name not in ("manifest", "sha256")}
-    return archive.archive_bytes(parts["manifest"], {name: a for name, a in arrays.items() if a.dtype.kind in "biuf"})
+    return archive.archive_bytes(
+        parts["manifest"], {name: a for name, a in arrays.items() if a.dtype.kind in "biuf"}
+    )
 
 
 def parts_of_zip(content: bytes) -> dict[str, Any]:
     with zipfile.ZipFile(io.BytesIO(content)) as file:
-        return {name: np.load(io.BytesIO(file.read(name))) for name in file.namelist() if name.endswith(".npy")}
+        return {
+            name: np.load(io.BytesIO(file.read(name))) for name in file.namelist() if name.endswith(".npy")
+        }
 
 
 def zip_of(parts: dict[str, Any]) -> bytes:
@@ -282,7 +306,9 @@ def cells(content: bytes) -> list[list[str]]:
 
 
 def lines_of(parts: list[Any]) -> bytes:
-    return "\n".join(",".join(map(str, line)) if isinstance(line, list) else str(line) for line in parts).encode()
+    return "\n".join(
+        ",".join(map(str, line)) if isinstance(line, list) else str(line) for line in parts
+    ).encode()
 
 
 # -- readers -----------------------------------------------------------------------------------------------------------
@@ -298,7 +324,9 @@ def runs(path: Path) -> Any:
 
 def checkpoint(path: Path) -> bytes:
     found = read_checkpoint(path)
-    return b"".join(each.tobytes() for each in (found.hops, found.conv_bias, *(one.weight for one in found.dense)))
+    return b"".join(
+        each.tobytes() for each in (found.hops, found.conv_bias, *(one.weight for one in found.dense))
+    )
 
 
 def recordings(path: Path) -> bytes:
@@ -326,8 +354,31 @@ def kept(path: Path) -> str:
     return repr(sweep(points, lambda job: KEPT[job.key], path, jobs=1, label="x", kind=Mapping[str, Built]))
 
 
-NIR_WORDS = ("Affine", "AvgPool2d", "Conv1d", "Conv2d", "CubaLIF", "Delay", "Flatten", "I", "IF", "Input", "LI", "LIF")
-NIR_WORDS += ("Linear", "NIRGraph", "Output", "Scale", "SumPool2d", "Threshold", "a\nb", "\x1b[31m", "ä" * 200)
+NIR_WORDS = (
+    "Affine",
+    "AvgPool2d",
+    "Conv1d",
+    "Conv2d",
+    "CubaLIF",
+    "Delay",
+    "Flatten",
+    "I",
+    "IF",
+    "Input",
+    "LI",
+    "LIF",
+)
+NIR_WORDS += (
+    "Linear",
+    "NIRGraph",
+    "Output",
+    "Scale",
+    "SumPool2d",
+    "Threshold",
+    "a\nb",
+    "\x1b[31m",
+    "ä" * 200,
+)
 NETX_WORDS = ("conv", "dense", "dense_rec", "flatten", "input")
 TOML_WORDS = ("[energy.x]", "[time.y]", "hops = 1", 'hop = { value = inf, unit = "pJ", source = "x" }')
 TOML_WORDS += ("a.b = {}", "", "[")
@@ -336,7 +387,9 @@ OPERATORS = tuple(sorted({schema.name for schema in defs.get_all_schemas()}))
 
 signed = partial(Reader, apart=parts_of_archive, together=archive_of, sealed=True)
 pickled = partial(Reader, read=checkpoint, apart=unpickled, words=("fc9.weight", "fc1"))
-zipped = partial(Reader, apart=parts_of_zip, together=zip_of, words=("test/sample_5_label_2.npy", "../x"), sealed=True)
+zipped = partial(
+    Reader, apart=parts_of_zip, together=zip_of, words=("test/sample_5_label_2.npy", "../x"), sealed=True
+)
 table = partial(Reader, ".csv", apart=cells, together=lines_of, words=CELLS)
 nir = partial(network, partial(read_nir, dt=1e-4, convention="exponential"))
 
@@ -353,16 +406,24 @@ READERS = {
     "training state": Reader(".state", states, trains, unpickled, torch_bytes, share=0.25),
     "ONNX": Reader(".onnx", onnx, partial(network, read_onnx), message, message_of, OPERATORS),
     "NIR": Reader(".nir", nir_files, nir, tree_of, hdf5_of, NIR_WORDS, share=0.25),
-    "netx": Reader(".net", netx_files, partial(network, read_netx), tree_of, hdf5_of, NETX_WORDS, share=0.25),
+    "netx": Reader(
+        ".net", netx_files, partial(network, read_netx), tree_of, hdf5_of, NETX_WORDS, share=0.25
+    ),
     "recordings": zipped(".zip", recording_zip, recordings),
     "events": zipped(".npz", npz, recordings),
     "bins": Reader(".npy", npy, recordings, lambda data: {"x": archive.read_npy(data)}, npy_of),
-    "event table": table(lambda: [b"time_s,taxel,polarity,label\n0,1,1,2\n0.5,0,0,2\n", b"0,1,1\n2,3,0"], recordings),
+    "event table": table(
+        lambda: [b"time_s,taxel,polarity,label\n0,1,1,2\n0.5,0,0,2\n", b"0,1,1\n2,3,0"], recordings
+    ),
     "taxel table": table(lambda: [b"x,y,z\n1,2,3\n4,5,6\n", b"1,2\n3,4"], read_taxels),
     "edge table": table(lambda: [b"source,target\n0,1\n1,2\n"], partial(read_edges, n=4)),
-    "price tables": Reader(".toml", tables, priced, lines, lambda parts: "\n".join(parts).encode(), TOML_WORDS),
+    "price tables": Reader(
+        ".toml", tables, priced, lines, lambda parts: "\n".join(parts).encode(), TOML_WORDS
+    ),
     "stress": Reader(".json", stress_file, stress, json.loads, json_of, share=0.1),
-    "store of a chart": Reader(".sqlite", lambda: [store(KEPT)], kept, rows_of, store, sealed=True, share=0.25),
+    "store of a chart": Reader(
+        ".sqlite", lambda: [store(KEPT)], kept, rows_of, store, sealed=True, share=0.25
+    ),
 }
 
 
@@ -379,7 +440,26 @@ def apart(name: str, index: int) -> Any:
 
 
 # -- damage ------------------------------------------------------------------------------------------------------------
-NUMBERS = (-(2**63), -(2**31), -100, -2, -1, 0, 1, 2, 3, 4, 7, 100, 2**20, 2**31, 2**40, 2**62, 2**63 - 1, 10**30)
+NUMBERS = (
+    -(2**63),
+    -(2**31),
+    -100,
+    -2,
+    -1,
+    0,
+    1,
+    2,
+    3,
+    4,
+    7,
+    100,
+    2**20,
+    2**31,
+    2**40,
+    2**62,
+    2**63 - 1,
+    10**30,
+)
 REALS = (1e-300, 1e300, float("nan"), float("inf"), 0.5, -0.5, 1.0)
 
 
@@ -426,12 +506,16 @@ def strange(old: Any, rng: random.Random, words: Sequence[str]) -> Any:
                 one = rng.choice(REALS if numbers.dtype.kind == "f" and rng.random() < 0.5 else NUMBERS[:-1])
                 numbers.flat[rng.randrange(numbers.size)] = np.array(one).astype(numbers.dtype)
         cut = old.ravel()[: rng.randrange(old.size + 1)]
-        return rng.choice([numbers, numbers, numbers, cut, old[None], old.T.copy(), np.zeros(0), numbers.astype("f4")])
+        return rng.choice(
+            [numbers, numbers, numbers, cut, old[None], old.T.copy(), np.zeros(0), numbers.astype("f4")]
+        )
     if isinstance(old, bytes):
         return changed_bytes(old, rng)
     if isinstance(old, str) and rng.random() < 0.7:
         text = base64.b64encode(rng.randbytes(rng.choice((0, 4, 8)))).decode()
-        return rng.choice([*(words or ("", "a", "x" * 400)), text, "<img src=x onerror=alert(1)>", "7", "1e999"])
+        return rng.choice(
+            [*(words or ("", "a", "x" * 400)), text, "<img src=x onerror=alert(1)>", "7", "1e999"]
+        )
     if isinstance(old, int | float) and rng.random() < 0.7:
         return rng.choice(NUMBERS if isinstance(old, int) else REALS)
     return rng.choice([None, True, "", "a\nb\x1b[31m", [], {}, [[1, "b"]], {"a": 1}, *NUMBERS, *REALS])

@@ -86,9 +86,13 @@ def test_all_figures_of_a_stopped_chip(report, place, monkeypatch):
             left = whole.costs.synaptic_operations[i].sum() - found.synaptic_operations.sum()
             assert rule["samples"]["saved_operations"][i] == left
             for name, each in found.energy.items():
-                assert_allclose(rule["samples"]["saved_energy_j"][name][i], joule[name][i] - each.sum(), atol=1e-18)
+                assert_allclose(
+                    rule["samples"]["saved_energy_j"][name][i], joule[name][i] - each.sum(), atol=1e-18
+                )
             spent = whole.simple["sanafe"].duration_ns[i, :ends].sum() * 1e-9
-            assert_allclose(rule["samples"]["saved_time_s"]["sanafe"][i], second["sanafe"][i] - spent, atol=1e-15)
+            assert_allclose(
+                rule["samples"]["saved_time_s"]["sanafe"][i], second["sanafe"][i] - spent, atol=1e-15
+            )
     proof = report["rules"][0]
     assert proof["differ"] == proof["gained"] == proof["lost"] == 0
     assert proof["samples"]["decisions"] == report["decisions"]
@@ -142,7 +146,9 @@ def test_held_out_recordings_calibrate_by_their_decisions(as_json, report, place
 def gains(draw):
     """Votes of each step: (samples, steps, classes) 0 or 1, and the steps of each recording."""
     samples, steps, classes = draw(st.integers(1, 4)), draw(st.integers(1, 12)), draw(st.integers(1, 4))
-    bits = draw(st.lists(st.booleans(), min_size=samples * steps * classes, max_size=samples * steps * classes))
+    bits = draw(
+        st.lists(st.booleans(), min_size=samples * steps * classes, max_size=samples * steps * classes)
+    )
     found = np.array(bits, np.int64).reshape(samples, steps, classes)
     lengths = np.array(draw(st.lists(st.integers(1, steps), min_size=samples, max_size=samples)))
     return found * (np.arange(steps) < lengths[:, None])[:, :, None], lengths
@@ -212,7 +218,10 @@ def test_calibration_allows_what_it_says():
 def two_classes(*neurons):
     """Output neurons of classes 0, 1, …; input 0 excites all of them by 100."""
     netlist = build(
-        list(neurons), [Axon(source=0, targets=tuple((i, 100) for i in range(len(neurons))))], n_inputs=1, depths=[0]
+        list(neurons),
+        [Axon(source=0, targets=tuple((i, 100) for i in range(len(neurons))))],
+        n_inputs=1,
+        depths=[0],
     )
     return replace(netlist, classes=len(neurons), readout_class=read_only(range(len(neurons))))
 
@@ -233,7 +242,10 @@ def test_how_often_an_output_neuron_can_spike():
     assert most.tolist() == [[0, 1, 2, 3, 4, 5], [0, 1, 1, 2, 2, 3], [0, 1, 1, 1, 1, 2], [0] * 6]
     slow = two_classes(Neuron(threshold=2**17 - 1, decay_v=0), Neuron(threshold=1))
     quiet = replace(slow, bias_mantissa=read_only([0, 0]), synapse_weight=read_only([2, 2]))
-    assert require_stoppable(machine_of(quiet)).least_intervals.tolist() == [LONGEST, 1]  # looked at only so far
+    assert require_stoppable(machine_of(quiet)).least_intervals.tolist() == [
+        LONGEST,
+        1,
+    ]  # looked at only so far
 
 
 @given(st.data())

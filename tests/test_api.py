@@ -54,7 +54,9 @@ def test_results_are_those_of_the_commands(data, net, as_json):
         "estimate": ["net.loom", "--data", "data"],
         "run": ["net.loom", "--data", "data"],
     }
-    found = {name: getattr(net, name)(data.test) for name in ("verify", "estimate", "run")} | {"compile": net.facts}
+    found = {name: getattr(net, name)(data.test) for name in ("verify", "estimate", "run")} | {
+        "compile": net.facts
+    }
     for name, options in words.items():
         assert as_json(name, *options, codes=(0, 1)) == json.loads(found[name].to_json())
     net.save("copy.loom")
@@ -90,19 +92,37 @@ def test_what_does_not_suit_is_refused(data, net):
     assert len(net.run(data.test, limit=2).files) == 2
     refused(DataError, "has 39 taxels, the network has 6", net.run, api.recordings("synthetic").test)
     refused(OptionError, "data |: ndarray found, allowed: text", net.run, data.test.events)
-    refused(OptionError, "limit 'x': str found, allowed: a whole number; give one", lambda: net.run(data, limit="x"))
-    refused(OptionError, "engine 'gpu': allowed: spikeloom, onnx; give one", lambda: net.verify(data, engine="gpu"))
+    refused(
+        OptionError,
+        "limit 'x': str found, allowed: a whole number; give one",
+        lambda: net.run(data, limit="x"),
+    )
+    refused(
+        OptionError,
+        "engine 'gpu': allowed: spikeloom, onnx; give one",
+        lambda: net.verify(data, engine="gpu"),
+    )
     refused(OptionError, "data None: NoneType found, allowed: text", net.run, None)
-    refused(OptionError, "keep 'first': allowed: last, best, clean", lambda: api.train(data, "x.pt", keep="first"))
+    refused(
+        OptionError,
+        "keep 'first': allowed: last, best, clean",
+        lambda: api.train(data, "x.pt", keep="first"),
+    )
     refused(OptionError, "storage 8: allowed: Fixed, Cheapest", lambda: api.compile("x.pt", storage=8))
-    refused(OptionError, "spike_exact 1: int found, allowed: True or False", lambda: api.compile("x.pt", spike_exact=1))
+    refused(
+        OptionError,
+        "spike_exact 1: int found, allowed: True or False",
+        lambda: api.compile("x.pt", spike_exact=1),
+    )
     refused(OptionError, "save none/x.loom: the folder does not exist", net.save, "none/x.loom")
     refused(OptionError, "save x.pt: has to end in .loom", net.save, "x.pt")
     module = nn.Sequential(nn.Linear(2 * TAXELS, 4), api.LIF())
     refused(OptionError, "give example=", lambda: api.compile(module, example="x"))
     refused(ModelError, "example of shape (1, 3)", lambda: api.compile(module, example=torch.zeros(1, 3)))
     example = torch.zeros(1, 2 * TAXELS)
-    refused(CapacityError, "truenorth.neuron.", lambda: api.compile(module, example=example, target="truenorth"))
+    refused(
+        CapacityError, "truenorth.neuron.", lambda: api.compile(module, example=example, target="truenorth")
+    )
 
 
 def test_values_of_python_are_those_of_the_words(place, data, net):
@@ -146,7 +166,9 @@ OF_NETLISTS = {"netlist", "checkpoint", "bin", *(each.name for each in NetworkCh
 @pytest.mark.parametrize("name", QUESTIONS)
 def test_keywords_are_the_options_of_the_request(name):
     function = getattr(api, name, None) or getattr(api.Compiled, name)
-    keywords = {key: each for key, each in inspect.signature(function).parameters.items() if key not in BESIDE}
+    keywords = {
+        key: each for key, each in inspect.signature(function).parameters.items() if key not in BESIDE
+    }
     options = {each.name: each for each in QUESTIONS[name].options()}
     assert set(keywords) <= set(options)
     known = OF_NETLISTS if hasattr(api.Compiled, name) else set()
@@ -164,7 +186,12 @@ def test_keywords_are_the_options_of_the_request(name):
 )
 def test_a_storage_is_what_its_options_say(storage):
     unsaid = dict.fromkeys(STORED)
-    asked = {"checkpoint": "net.pt", "output": "net.loom", "calibrate": "data", **options_of(storage, unsaid)}
+    asked = {
+        "checkpoint": "net.pt",
+        "output": "net.loom",
+        "calibrate": "data",
+        **options_of(storage, unsaid),
+    }
     assert storage_of(CompileRequest(**asked)) == storage
     refused(OptionError, "storage and planes", lambda: options_of(storage, unsaid | {"planes": 2}))
 
@@ -172,15 +199,25 @@ def test_a_storage_is_what_its_options_say(storage):
 def test_the_readme_and_the_notebook_pass_a_strict_type_checker(tmp_path):
     root = Path(__file__).parent.parent
     blocks = re.findall(r"```python\n(.*?)```", (root / "README.md").read_text("utf-8"), re.DOTALL)
-    shown = [line[4:] for block in blocks for line in block.splitlines() if line.startswith((">>> ", "... "))]
+    shown = [
+        line[4:] for block in blocks for line in block.splitlines() if line.startswith((">>> ", "... "))
+    ]
     cells = json.loads((root / "examples" / "touch.ipynb").read_text("utf-8"))["cells"]
     code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     (tmp_path / "readme.py").write_text("\n".join(shown), "utf-8")
     (tmp_path / "notebook.py").write_text(
         "\n".join(line for each in code for line in each.splitlines() if line[:1] not in "%!"), "utf-8"
     )
-    words = ["--strict", "--config-file", root / "pyproject.toml", tmp_path / "readme.py", tmp_path / "notebook.py"]
-    done = subprocess.run([sys.executable, "-m", "mypy", *words], capture_output=True, text=True, cwd=root, check=False)
+    words = [
+        "--strict",
+        "--config-file",
+        root / "pyproject.toml",
+        tmp_path / "readme.py",
+        tmp_path / "notebook.py",
+    ]
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", *words], capture_output=True, text=True, cwd=root, check=False
+    )
     assert done.returncode == 0, done.stdout
 
 
@@ -202,7 +239,9 @@ def test_a_folder_of_the_same_name_is_in_nobodys_way(tmp_path):
 
 
 def test_only_one_name_is_on_the_path():
-    code = "import importlib.util as u, sys; sys.exit(any(map(u.find_spec, ('compiler', 'runtime', 'models'))))"
+    code = (
+        "import importlib.util as u, sys; sys.exit(any(map(u.find_spec, ('compiler', 'runtime', 'models'))))"
+    )
     assert subprocess.run([sys.executable, "-I", "-c", code], check=False).returncode == 0
 
 
@@ -213,7 +252,18 @@ RIGHT = 127  # of 144, by the released code's own outputs
 def compiled(tmp_path_factory, released_checkpoint, objects_zip) -> tuple[Path, dict]:
     """Netlist of the released checkpoint as a user compiles it, and what the command said."""
     path = tmp_path_factory.mktemp("objects") / "objects.loom"
-    words = ["--graph", "manual", "--target", "loihi1", "--weight-bits", 8, "--calibrate", objects_zip, "-o", path]
+    words = [
+        "--graph",
+        "manual",
+        "--target",
+        "loihi1",
+        "--weight-bits",
+        8,
+        "--calibrate",
+        objects_zip,
+        "-o",
+        path,
+    ]
     return path, as_json("compile", released_checkpoint, *words)
 
 

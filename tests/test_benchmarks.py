@@ -66,7 +66,10 @@ def test_matrices_of_any_wiring_give_our_spikes(workload):
     stages = workload.stages_of(netlist)
     ids = [netlist.compartments_of(layer) for layer in range(len(stages))]
     assert any(layer in stage.weights for layer, stage in enumerate(stages))
-    membranes, fired = [np.zeros(len(each), np.int64) for each in ids], [np.zeros(len(each), int) for each in ids]
+    membranes, fired = (
+        [np.zeros(len(each), np.int64) for each in ids],
+        [np.zeros(len(each), int) for each in ids],
+    )
     for step in range(30):
         sources = {-1: events[0, :, step], **dict(enumerate(fired))}
         fired = []
@@ -100,7 +103,9 @@ def task(module, workload, busy, tmp_path_factory):
     return module("worker").read_task(str(path))
 
 
-@pytest.mark.parametrize(("mode", "share"), [("spikes", "all"), ("totals", "few"), ("counts", "few"), ("cycle", "few")])
+@pytest.mark.parametrize(
+    ("mode", "share"), [("spikes", "all"), ("totals", "few"), ("counts", "few"), ("cycle", "few")]
+)
 def test_our_runner_agrees_in_every_mode(module, task, mode, share):
     job = module("rival_ours").prepare_job(task, [mode, share])
     assert job.recordings == (6 if share == "all" else 2)
@@ -132,13 +137,22 @@ def test_workers_run_in_pairs_and_those_that_cannot_are_skipped(module, task):
             name=name, rival="ours", options=(mode, "few"), computes="", together=False, against=against
         )
 
-    entries = [entry("ours", "spikes"), entry("rival", "totals", "spikes"), entry("odd", "fastest", "counts")]
+    entries = [
+        entry("ours", "spikes"),
+        entry("rival", "totals", "spikes"),
+        entry("odd", "fastest", "counts"),
+    ]
     found = rivals.measure(task.path, entries, {}, rounds=1)
     assert found["odd"]["skipped"].startswith("there is no mode fastest")
     assert found["rival"]["against"] == "ours"
     assert found["ours"]["differing_spikes"] == found["rival"]["differing_spikes"] == [0, 0, 0, 0]
     assert [found[name]["laps"] for name in ("ours", "rival")] == [1, 1]
-    assert 0 < found["rival"]["ratio"]["min"] <= found["rival"]["ratio"]["median"] <= found["rival"]["ratio"]["max"]
+    assert (
+        0
+        < found["rival"]["ratio"]["min"]
+        <= found["rival"]["ratio"]["median"]
+        <= found["rival"]["ratio"]["max"]
+    )
     assert found["rival"]["peak_mb"] > 1
 
 
@@ -162,7 +176,9 @@ def test_stored_tables_are_those_of_the_stored_cells(module, cells):
 
 def test_every_planned_cell_is_there_and_adds_up(module, cells):
     planned = [module("cells").planned(table) for table in ("methods", "graphs")]
-    assert {row.cell(seed) for rows in planned for row, seeds in rows.items() for seed in range(seeds)} == set(cells)
+    assert {
+        row.cell(seed) for rows in planned for row, seeds in rows.items() for seed in range(seeds)
+    } == set(cells)
     for cell in cells.values():
         for which in ("last", "best", "clean"):
             assert cell[which]["accuracy"] == cell[which]["correct"] / cell["test_samples"]

@@ -33,7 +33,9 @@ from spikeloom.runtime.studies.search.budgets import Budget, parse_budgets
 from spikeloom.runtime.studies.search.choice import front
 
 GRID = "bits=4,8,window=50-100%:50,cores=cores/fc1:2"
-VIOLATION = Violation(owner="core 0", rule="loihi1.core.axons_in", used=5, allowed=4, remedy="use fewer inputs")
+VIOLATION = Violation(
+    owner="core 0", rule="loihi1.core.axons_in", used=5, allowed=4, remedy="use fewer inputs"
+)
 
 CHART = ("chart", "ring.pt", "--data", "data", "--grid", GRID, "--jobs", "1")
 
@@ -45,14 +47,22 @@ def place(tmp_path_factory):
     train = np.concatenate([events(1, samples=12), events(3, samples=4, rate=0.05)])
     recordings_folder(folder / "data", train=train, test=events(2, samples=8))
     digest = data_digest(load_data(folder / "data", "train"), load_data(folder / "data", "test"))
-    known = {"data_sha256": digest, "validation": {"correct": 3, "samples": 4}, "command": "spikeloom train …"}
+    known = {
+        "data_sha256": digest,
+        "validation": {"correct": 3, "samples": 4},
+        "command": "spikeloom train …",
+    }
     own_file(folder / "ring.pt", training=known)
     own_file(folder / "unknown.pt", last=weights(4))
     forms = tuned(read_checkpoint(folder / "ring.pt")).forms
-    save_checkpoint(folder / "tuned.pt", {"last": weights()}, ring(), beta=0.2, theta=0.5, training=known, forms=forms)
+    save_checkpoint(
+        folder / "tuned.pt", {"last": weights()}, ring(), beta=0.2, theta=0.5, training=known, forms=forms
+    )
     own_file(folder / "elsewhere.pt", training={"data_sha256": "0" * 64, "data": "Grasps.zip"})
     network = random_network(4, taxels=6, classes=CLASSES, steps=24)
-    write_trained(folder / "native.pt", {"last": network}, graph="ring", edges=np.zeros((0, 2), int), training=known)
+    write_trained(
+        folder / "native.pt", {"last": network}, graph="ring", edges=np.zeros((0, 2), int), training=known
+    )
     own_file(folder / "small.pt", last=weights(taxels=4), graph=ring(4))
     (folder / "file").write_text("")
     return folder
@@ -80,7 +90,9 @@ def test_every_point_of_the_grid_is_there(made, place):
         assert point["expected"] == pytest.approx(0.75 * point["train"]["accuracy"] / whole)
         assert point["test"]["low"] <= point["test"]["accuracy"] <= point["test"]["high"]
         figures = [point[split][key] for split in ("train", "test") for key in ("correct", "equal")]
-        assert decided.setdefault((str(point["bits"]), point["window"]), figures) == figures, "layouts decide alike"
+        assert decided.setdefault((str(point["bits"]), point["window"]), figures) == figures, (
+            "layouts decide alike"
+        )
     assert any(point["front"]["energy"] for point in made["points"])
     assert len({point["n_cores"] for point in made["points"]}) > 1
     assert (place / "out" / "chart.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
@@ -102,9 +114,20 @@ def test_the_commands_of_a_point_give_its_netlist_and_its_figures(made, as_json,
     assert mean["energy_j"] == pytest.approx(point["test"]["energy_j"], rel=1e-12)
     assert mean["synaptic_operations"] == point["test"]["operations"]
     (clock,) = costs["time"]
-    assert {clock["table"]: clock["inference_s"]["mean"]} == pytest.approx(point["test"]["time_s"], rel=1e-12)
+    assert {clock["table"]: clock["inference_s"]["mean"]} == pytest.approx(
+        point["test"]["time_s"], rel=1e-12
+    )
     assert costs["chip_steps"] == point["test"]["steps"] + read_netlist(place / compiled[-1]).max_depth
-    words = ("--checkpoint", "ring.pt", "--data", "data", "--window", f"{point['window']}%", "--spec-samples", "1")
+    words = (
+        "--checkpoint",
+        "ring.pt",
+        "--data",
+        "data",
+        "--window",
+        f"{point['window']}%",
+        "--spec-samples",
+        "1",
+    )
     found = as_json("verify", compiled[-1], *words, codes=(0, 1))
     assert found["accuracy"]["float"] == point["test"]["float"]["accuracy"]
     assert found["decision_agreement"] == point["test"]["equal"] / 8
@@ -126,7 +149,9 @@ def test_once_more_nothing_is_measured_and_one_more_width_nothing_else(made, spi
     assert spikeloom(*words, "-o", "again", "--json")[0] == 0
     assert [work.storage.bits for work in worked] == [(6,)]
     points = json.loads((place / "again" / "chart.json").read_text())["points"]
-    assert [point["test"] for point in points if point["bits"] != [6]] == [point["test"] for point in made["points"]]
+    assert [point["test"] for point in points if point["bits"] != [6]] == [
+        point["test"] for point in made["points"]
+    ]
 
 
 def test_what_the_chip_refuses_is_listed(as_json, refusal, place, monkeypatch):
@@ -159,11 +184,23 @@ def test_a_fine_tuned_network_keeps_its_storage(as_json):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("ring.pt --data data --grid bits=8+4", r"bits=8\+4: 2 widths, ring.pt has 4 layers \(conv1, fc1, fc2, fc3\)"),
-        ("ring.pt --data data --grid cores=fc9:2", "fc9:2: ring.pt has no layer fc9; it has conv1, fc1, fc2, fc3"),
+        (
+            "ring.pt --data data --grid bits=8+4",
+            r"bits=8\+4: 2 widths, ring.pt has 4 layers \(conv1, fc1, fc2, fc3\)",
+        ),
+        (
+            "ring.pt --data data --grid cores=fc9:2",
+            "fc9:2: ring.pt has no layer fc9; it has conv1, fc1, fc2, fc3",
+        ),
         ("ring.pt ring.pt --data data", "ring.pt: is given twice"),
-        ("elsewhere.pt --data data", r"elsewhere.pt: was trained on other recordings \(Grasps.zip\) than data"),
-        ("unknown.pt small.pt --data data", f"small.pt: has 4 taxels and {CLASSES} classes, unknown.pt has 6"),
+        (
+            "elsewhere.pt --data data",
+            r"elsewhere.pt: was trained on other recordings \(Grasps.zip\) than data",
+        ),
+        (
+            "unknown.pt small.pt --data data",
+            f"small.pt: has 4 taxels and {CLASSES} classes, unknown.pt has 6",
+        ),
         ("native.pt --data data", "native.pt: is a network trained for TrueNorth, .*; only compile, verify"),
         ("net.onnx --data data", "net.onnx: is an ONNX file"),
         ("ring.pt --data data -o file", "-o file: is not a folder"),
@@ -177,7 +214,10 @@ def test_a_mistake_is_named(refusal, place, words, told):
 
 def point(number, train, test, energy, time, *, bits=4, **about):
     """Right of 400 training and of 100 test recordings, µJ and ms of both splits."""
-    figures = {"train": made_figures(train, 400, energy, time), "test": made_figures(test, 100, energy, time)}
+    figures = {
+        "train": made_figures(train, 400, energy, time),
+        "test": made_figures(test, 100, energy, time),
+    }
     return made_point(number, stored=stored(bits), **figures, **about)
 
 
@@ -209,13 +249,18 @@ def test_fronts_are_of_test_accuracy_and_each_cost(points):
 
 
 def test_expected_is_validation_times_what_is_kept_on_training_recordings():
-    made = [point(1, 380, 50, 1, 1), point(2, 190, 50, 1, 1, window=50)]  # the float model has 8 more on whole ones
+    made = [
+        point(1, 380, 50, 1, 1),
+        point(2, 190, 50, 1, 1, window=50),
+    ]  # the float model has 8 more on whole ones
     assert [each.expected for each in study.with_expectations(made, [made_network()])] == pytest.approx(
         [0.9 * 380 / 388, 0.9 * 190 / 388]
     )
     # where one checkpoint knows no validation, training figures stand for all
     networks = [made_network(), made_network("other", validation=None)]
-    assert [each.expected for each in study.with_expectations(made, networks)] == pytest.approx([0.95, 0.475])
+    assert [each.expected for each in study.with_expectations(made, networks)] == pytest.approx(
+        [0.95, 0.475]
+    )
 
 
 def test_the_choice_does_not_look_at_the_test_split(points):
@@ -323,7 +368,10 @@ def test_values_of_axes(text, axes):
         ("planes=4", "planes=4: allowed are 1 to 3 planes"),
         ("groups=0", "groups=0: allowed are 1 to 8 scale groups"),
         ("prune=2", "prune=2: allowed are 0 (keep) and 1 (leave out)"),
-        *((f"window={value}", "1 to 100 per cent") for value in ("50-101%", "0", "80-20%", "20-80%:0", "50%:5")),
+        *(
+            (f"window={value}", "1 to 100 per cent")
+            for value in ("50-101%", "0", "80-20%", "20-80%:0", "50%:5")
+        ),
         *((f"cores={value}", "cores, or LAYER:N") for value in ("fast", "a:2+:3", "a:2+a:3", "a:0")),
     ],
 )

@@ -63,7 +63,9 @@ def own(**changes: object) -> bytes:
     return checkpoint_bytes(sets, options.pop("graph", ring()), **options)
 
 
-def rebuilt(content: bytes, change: object, *, sign: bool = True, compression: int = zipfile.ZIP_STORED) -> bytes:
+def rebuilt(
+    content: bytes, change: object, *, sign: bool = True, compression: int = zipfile.ZIP_STORED
+) -> bytes:
     """Our own format with changed members; signed anew unless told otherwise."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
@@ -119,7 +121,9 @@ def test_run_selects_a_state_dict_and_its_figures(tmp_path):
 
 def test_half_and_double_precision_become_float32(tmp_path):
     for kind in (torch.float64, torch.float16, torch.bfloat16):
-        path = write(tmp_path / "x.t7", torch_bytes({key: value.to(kind) for key, value in tensors().items()}))
+        path = write(
+            tmp_path / "x.t7", torch_bytes({key: value.to(kind) for key, value in tensors().items()})
+        )
         expected = tensors()["fc2.weight"].to(kind).to(torch.float32)
         np.testing.assert_array_equal(read_checkpoint(path).dense[1].weight, expected)
 
@@ -137,7 +141,11 @@ def test_the_released_checkpoint(released_checkpoint):
     read = read_checkpoint(released_checkpoint)
     assert (read.layout, read.taxels, read.classes, read.hops.shape) == ("released", 39, 36, (4, 64, 2))
     assert [dense.weight.shape for dense in read.dense] == [(128, 2496), (256, 128), (36, 256)]
-    assert (read.training["epochs"], read.training["last_acc"], read.training["best_acc"]) == (100, 88.1944, 90.2778)
+    assert (read.training["epochs"], read.training["last_acc"], read.training["best_acc"]) == (
+        100,
+        88.1944,
+        90.2778,
+    )
 
 
 def changed(*, old: bool = False, **tensors_too: object) -> bytes:
@@ -149,7 +157,10 @@ def changed(*, old: bool = False, **tensors_too: object) -> bytes:
 NEITHER = "holds neither net_list nor weights of a TactileSGNet, but"
 REFUSED = {
     "pickle of an empty dict": (lambda: b"\x80\x02}q\x00.", DAMAGED),
-    "other manifest": (lambda: zipped({"manifest.json": '{"format": "other", "files": []}'}), NOT_A_CHECKPOINT),
+    "other manifest": (
+        lambda: zipped({"manifest.json": '{"format": "other", "files": []}'}),
+        NOT_A_CHECKPOINT,
+    ),
     "manifest that is no JSON": (lambda: zipped({"manifest.json": "{"}), DAMAGED),
     "nested": (lambda: torch_bytes({"epoch": 3, "model": tensors()}), f"{NEITHER} epoch, model"),
     "odd name": (lambda: torch_bytes({"a\nb": 1}), f"{NEITHER} 'a\\nb'"),
@@ -162,7 +173,10 @@ REFUSED = {
         lambda: changed(fc1__weight=torch.ones(5, TAXELS * FEATURES + 1)),
         "fc1.weight has 25 inputs, not a whole number of taxels with 4",
     ),
-    "sparse": (lambda: changed(fc3__bias=torch.ones(3).to_sparse()), "fc3.bias is a tensor of float32, wanted plain"),
+    "sparse": (
+        lambda: changed(fc3__bias=torch.ones(3).to_sparse()),
+        "fc3.bias is a tensor of float32, wanted plain",
+    ),
     "expanded": (
         lambda: changed(fc3__weight=torch.ones(1).expand(10**6, 10**6)),
         "fc3.weight claims 1000000000000 values, more than the file holds",
@@ -206,7 +220,9 @@ def test_every_fault_of_the_tensors_is_listed(tmp_path):
 
 def test_own_format_round_trip(tmp_path):
     path = tmp_path / "x.pt"
-    save_checkpoint(path, {"last": weights(), "best": weights(2)}, ring(), beta=0.25, theta=0.75, training={"seed": 4})
+    save_checkpoint(
+        path, {"last": weights(), "best": weights(2)}, ring(), beta=0.25, theta=0.75, training={"seed": 4}
+    )
     for which, seed in (("last", 1), ("best", 2)):
         read = read_checkpoint(path, weights=which)
         expected = weights(seed)
@@ -261,7 +277,10 @@ ALTERED = "its content does not match its hash, so it was altered"
     ("change", "words"),
     [
         *[
-            (lambda m, _, version=version: m.update(version=version), f"has format version {version!r}, this program")
+            (
+                lambda m, _, version=version: m.update(version=version),
+                f"has format version {version!r}, this program",
+            )
             for version in (7, 0, None, "1\n")
         ],
         (lambda m, _: m.update(beta=0.3), ALTERED),
@@ -284,10 +303,15 @@ def test_altered_files(tmp_path, change, words):
     [
         (lambda m, _: m.pop("taxels"), "the manifest has no usable taxels"),
         (lambda m, _: m.update(beta=1.5), "beta 1.5: allowed are 0 <= beta < 1"),
-        (lambda m, _: m.update(graph={"name": "x", "edges": [[0, 6]]}), "the graph joins taxels outside 0..5"),
+        (
+            lambda m, _: m.update(graph={"name": "x", "edges": [[0, 6]]}),
+            "the graph joins taxels outside 0..5",
+        ),
         (lambda m, _: m.update(classes=4), "made for 6 taxels and 3 classes, the manifest says 6 taxels"),
         (
-            lambda _, members: members.update({"last/fc2.bias.npy": npy_bytes(np.array([1, np.nan, 2], np.float32))}),
+            lambda _, members: members.update(
+                {"last/fc2.bias.npy": npy_bytes(np.array([1, np.nan, 2], np.float32))}
+            ),
             "fc2.bias has 1 of 3 values NaN or infinite",
         ),
         (lambda _, members: members.pop("last/conv1.hops.npy"), "conv1.hops is missing"),

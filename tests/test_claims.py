@@ -53,7 +53,8 @@ def value_at(content, path):
             return value_at(content[int(head)], rest)
         wanted = dict(each.split("=") for each in head.split(","))
         return value_at(
-            next(each for each in content if all(str(each[key]) == value for key, value in wanted.items())), rest
+            next(each for each in content if all(str(each[key]) == value for key, value in wanted.items())),
+            rest,
         )
     key = max((key for key in content if f"{path}/".startswith(f"{key}/")), key=len, default=path)
     return value_at(content[key], path[len(key) + 1 :])
@@ -94,10 +95,14 @@ def test_texts_are_those_of_the_stored_results(claim):
 @pytest.mark.parametrize("page", PAGES)
 def test_every_number_is_that_of_a_result_or_a_definition(page):
     text = plain(FENCED.sub("", (ROOT / page).read_text("utf-8")))
-    defined = [each for definition in DEFINITIONS if definition["page"] == page for each in definition["texts"]]
+    defined = [
+        each for definition in DEFINITIONS if definition["page"] == page for each in definition["texts"]
+    ]
     assert all(each in text for each in defined)
     said = [*defined, *(each for claim in CLAIMS if claim["page"] == page for each in bound(claim))]
-    known = [found.span() for each in (CODE.pattern, *map(re.escape, said)) for found in re.finditer(each, text)]
+    known = [
+        found.span() for each in (CODE.pattern, *map(re.escape, said)) for found in re.finditer(each, text)
+    ]
     places = {place for span in known for place in range(*span)}
     loose = [found for found in NUMBER.finditer(text) if not places.issuperset(range(*found.span()))]
     assert [text[max(0, found.start() - 40) : found.end()] for found in loose] == []
@@ -107,7 +112,9 @@ def test_every_number_is_that_of_a_result_or_a_definition(page):
 def test_sessions_print_what_the_docs_show(page):
     for command, text in SHOWN.findall((ROOT / page).read_text("utf-8")):
         if text.strip(" \n…"):
-            lines = "".join("(.*\n)*" if line == "…" else f"{re.escape(line)}\n" for line in text.rstrip().splitlines())
+            lines = "".join(
+                "(.*\n)*" if line == "…" else f"{re.escape(line)}\n" for line in text.rstrip().splitlines()
+            )
             assert re.fullmatch(lines, stored(f"shown/{Path(page).stem}.json")["figures"][command]), command
 
 

@@ -38,7 +38,9 @@ SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
 
 
 def test_compile_counts_and_says_what_was_realised(as_json, tmp_path, place):
-    report = as_json("compile", "net.pt", "--calibrate", "data", "--weight-bits", 8, "-o", tmp_path / "out.loom")
+    report = as_json(
+        "compile", "net.pt", "--calibrate", "data", "--weight-bits", 8, "-o", tmp_path / "out.loom"
+    )
     content = (tmp_path / "out.loom").read_bytes()
     assert content == (place / "net.loom").read_bytes()
     assert report["sha256"] == hashlib.sha256(content).hexdigest()
@@ -67,7 +69,12 @@ def test_provenance_names_everything_that_decided(as_json, place):
     report = as_json("inspect", "net.loom")
     source = {"checkpoint_sha256": hashlib.sha256((place / "net.pt").read_bytes()).hexdigest()}
     source |= {"spikeloom": __version__, "run": 0, "weights": "last", "graph": "ring"}
-    storage = {"weight_bits": 8, "planes": 1, "scale_groups": 1, "compensated": ["conv1", "fc1", "fc2", "fc3"]}
+    storage = {
+        "weight_bits": 8,
+        "planes": 1,
+        "scale_groups": 1,
+        "compensated": ["conv1", "fc1", "fc2", "fc3"],
+    }
     options = {"spike_exact": False, "keep_all": False, "prune_unused": False, "calibrated": True}
     options |= {"data": "data", "digests": report["provenance"]["digests"]}
     assert report["provenance"] == source | storage | options
@@ -159,7 +166,9 @@ def shipped_grasps(monkeypatch, tmp_path):
     last = made_weights(taxels=39, sizes=(6, 5, 6))
     path = str(own_file(tmp_path / "grasps.pt", last=last, graph=build_graph("manual")))
     monkeypatch.setattr(network, "shipped", lambda name: path if name == "pretrained:grasps" else name)
-    monkeypatch.setattr(recordings_input, "synthetic_split", lambda split, **_: synthetic_split(split, limit=6))
+    monkeypatch.setattr(
+        recordings_input, "synthetic_split", lambda split, **_: synthetic_split(split, limit=6)
+    )
 
 
 @pytest.mark.usefixtures("shipped_grasps")
@@ -189,7 +198,8 @@ def test_help_names_every_command(capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "shown"), [(["-V"], f"spikeloom {__version__}"), (["help"], "COMMAND"), (["help", "run"], "NET.loom")]
+    ("words", "shown"),
+    [(["-V"], f"spikeloom {__version__}"), (["help"], "COMMAND"), (["help", "run"], "NET.loom")],
 )
 def test_short_words_for_help_and_version(capsys, words, shown):
     with pytest.raises(SystemExit) as stop:
@@ -200,7 +210,11 @@ def test_short_words_for_help_and_version(capsys, words, shown):
 
 @pytest.mark.parametrize(
     ("words", "meant"),
-    [(["verfy"], "verify"), (["estimate", "x.loom", "--lable"], "--table"), (["run", "--dta", "x"], "--data")],
+    [
+        (["verfy"], "verify"),
+        (["estimate", "x.loom", "--lable"], "--table"),
+        (["run", "--dta", "x"], "--data"),
+    ],
 )
 def test_a_misspelt_word_is_answered_with_the_near_one(capsys, words, meant):
     assert cli.main(words) == 2

@@ -145,7 +145,9 @@ def test_every_kernel_is_the_specification(name):
         expected = specified(name, index)
         for simulate in (by_engine, by_steps):
             assert_equal(simulate(netlist, recording), expected)
-        total += [expected.counts.spikes[netlist.compartments_of(layer)].sum() for layer in range(len(total))]
+        total += [
+            expected.counts.spikes[netlist.compartments_of(layer)].sum() for layer in range(len(total))
+        ]
     assert total.all(), "a layer is silent, so nothing is tested here"
 
 
@@ -176,7 +178,9 @@ def test_the_integer_network_of_a_netlist_is_the_engine(name):
     for layer in range(len(netlist.layers)):
         held = netlist.neuron[netlist.compartments_of(layer)]
         assert_array_equal(aligned(netlist, trace.spikes, layer), found.spikes[layer])
-        assert_array_equal(aligned(netlist, trace.membranes, layer)[..., held], found.membranes[layer][..., held])
+        assert_array_equal(
+            aligned(netlist, trace.membranes, layer)[..., held], found.membranes[layer][..., held]
+        )
 
 
 @over(MAKERS)
@@ -253,7 +257,9 @@ def test_the_lowered_model_is_the_chip(name, monkeypatch, tmp_path):
     made, lowered = specimen(name), []
     backend = backend_of(made.machine.netlist.target)
     lower = backend.lower
-    monkeypatch.setattr(type(backend), "lower", lambda _, *words: lowered.append(lower(*words)) or lowered[0])
+    monkeypatch.setattr(
+        type(backend), "lower", lambda _, *words: lowered.append(lower(*words)) or lowered[0]
+    )
     assert run(*made.compilation, "-o", tmp_path / "net.loom")[0] == 0
     (found,) = lowered
     data = made.recordings
@@ -280,7 +286,9 @@ def test_verify_holds_every_network_to_its_file(name):
         return
     assert not any(found["ladder"][0]["different"].values()), "the float network in float64"
     assert all(layer["float"] > 0 for layer in found["spikes"].values())
-    assert found["ladder"][-1]["different"] == {name: each["different"] for name, each in found["spikes"].items()}
+    assert found["ladder"][-1]["different"] == {
+        name: each["different"] for name, each in found["spikes"].items()
+    }
     first = next(iter(found["spikes"].values()))
     assert first["different"] < 0.1 * first["float"] + 5
 
@@ -315,10 +323,16 @@ COMMANDS = {
     "report": ("timed", "report {net} --checkpoint {file} --data {data} -o {out}/page.html"),
     "anytime": ("timed", "anytime {net} --data {data}"),
     "lean": ("joined-timed", "lean {file} --data {data} -o {out}/lean.loom"),
-    "stress": ("recurrent", "stress {net} --checkpoint {file} --dt 0.02 --data {data} --seeds 1 --only taxels_dead"),
+    "stress": (
+        "recurrent",
+        "stress {net} --checkpoint {file} --dt 0.02 --data {data} --seeds 1 --only taxels_dead",
+    ),
     "chart": ("binned", "chart {file} --data {data} --grid bits=8 --jobs 1 -o {out}/chart"),
     "train": ("mlp", "train --data {data} --system mlp --features 2 --epochs 1 -o {out}/x.pt"),
-    "finetune": ("recurrent", "finetune {file} --dt 0.02 --data {data} --weight-bits 4 --epochs 1 -o {out}/x.nir"),
+    "finetune": (
+        "recurrent",
+        "finetune {file} --dt 0.02 --data {data} --weight-bits 4 --epochs 1 -o {out}/x.nir",
+    ),
     "join": ("joined", "join {folder}/1.pt {folder}/2.pt -o {out}/x.pt"),
     "data": ("mlp", "data describe {data}"),
     **{
@@ -337,7 +351,13 @@ COMMANDS = {
 def test_other_commands_print_the_keys_of_the_table(command, tmp_path):
     name, words = COMMANDS[command]
     made = specimen(name)
-    places = {"net": made.netlist, "file": made.network, "data": made.data, "folder": made.folder, "out": tmp_path}
+    places = {
+        "net": made.netlist,
+        "file": made.network,
+        "data": made.data,
+        "folder": made.folder,
+        "out": tmp_path,
+    }
     require_keys(command, as_json(*words.format(**places).split(), codes=(0, 1)))
 
 
@@ -348,9 +368,19 @@ def test_watch_decides_as_run(name, tmp_path):
     for recording in made.events:
         step, taxel, polarity = np.nonzero(recording.transpose(2, 0, 1))
         bin_s = 0.02 * made.machine.netlist.bins
-        lines += [f"{bin_s * (s + 0.5):.3f},{x},{p}" for s, x, p in zip(step, taxel, polarity, strict=True)] + [""]
+        lines += [
+            f"{bin_s * (s + 0.5):.3f},{x},{p}" for s, x, p in zip(step, taxel, polarity, strict=True)
+        ] + [""]
     (tmp_path / "lines.csv").write_text("\n".join(lines) + "\n")
-    words = ["watch", made.netlist, "--input", tmp_path / "lines.csv", "--bins", made.events.shape[-1], "--json"]
+    words = [
+        "watch",
+        made.netlist,
+        "--input",
+        tmp_path / "lines.csv",
+        "--bins",
+        made.events.shape[-1],
+        "--json",
+    ]
     shown = [json.loads(line) for line in run(*words)[1].splitlines()]
     for entry in shown:
         require_keys(f"watch {entry['kind']}", entry)

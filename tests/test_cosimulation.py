@@ -43,8 +43,12 @@ def chain():
     draft = Draft()
     for place in ((2, 3), (3, 3), (2, 4)):
         draft.core(*place)
-    draft.neuron(0, Neuron(weights=(3, -4), threshold=3, negative_threshold=5, negative_saturates=True), layer="held")
-    draft.neuron(1, Neuron(weights=(2,), threshold=1, reset_mode=RESET_NONE, negative_threshold=9), layer="kept")
+    draft.neuron(
+        0, Neuron(weights=(3, -4), threshold=3, negative_threshold=5, negative_saturates=True), layer="held"
+    )
+    draft.neuron(
+        1, Neuron(weights=(2,), threshold=1, reset_mode=RESET_NONE, negative_threshold=9), layer="kept"
+    )
     draft.neuron(2, Neuron(weights=(1, 1), threshold=2, leak=-1, initial=1), layer="out")
     draft.neuron(2, Neuron(weights=(1, 1)), layer="lost")
     draft.axon(0, 0, [0])
@@ -70,7 +74,9 @@ def place(tmp_path):
 
 
 def wrong(found) -> int:
-    return sum(count for name, count in found.items() if name.endswith(("different", "lost", "error_cycles")))
+    return sum(
+        count for name, count in found.items() if name.endswith(("different", "lost", "error_cycles"))
+    )
 
 
 def cosimulated(*words):
@@ -79,7 +85,16 @@ def cosimulated(*words):
 
 
 def test_the_script(place, rtl):
-    words = [place / "net.loom", place / "data", "--rtl", rtl, "--simulator", "iverilog", "--work", place / "work"]
+    words = [
+        place / "net.loom",
+        place / "data",
+        "--rtl",
+        rtl,
+        "--simulator",
+        "iverilog",
+        "--work",
+        place / "work",
+    ]
     found = json.loads(cosimulated(*words, "--json").stdout)
     assert wrong(found) == 0
     assert found["spikes"] > 10
@@ -146,7 +161,9 @@ def defective(place, right, wrong):
 def built(netlist, rtl, folder, ticks):
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
-    return cosimulation.build(TrueNorth(netlist), folder, cosimulation.sources_in(str(rtl)), "iverilog", ticks)
+    return cosimulation.build(
+        TrueNorth(netlist), folder, cosimulation.sources_in(str(rtl)), "iverilog", ticks
+    )
 
 
 @settings(max_examples=8)
@@ -170,7 +187,9 @@ def test_ranc_loses_what_comes_while_a_core_clears(rtl, tmp_path, monkeypatch):
     netlist, recording = draft.netlist(taxels=256, polarities=1, classes=1), np.ones((256, 3), np.uint8)
     assert built(netlist, rtl, tmp_path / "even", 3).run(recording).differences == 0
     shifted = tmp_path / "harness.v"
-    shifted.write_text(cosimulation.HARNESS.read_text("utf-8").replace("since == 16", "since == 17"), "utf-8")
+    shifted.write_text(
+        cosimulation.HARNESS.read_text("utf-8").replace("since == 16", "since == 17"), "utf-8"
+    )
     monkeypatch.setattr(cosimulation, "HARNESS", shifted)
     found = built(netlist, rtl, tmp_path / "odd", 3).run(recording)
     assert (found.packets_lost, found.membranes_different) == ((0, 0) if rtl == OURS else (2, 2))

@@ -116,7 +116,10 @@ def test_counted_by_hand():
     pico = 1e12 * np.concatenate([costs.energy["davies2018"], costs.energy["sanafe"]])
     expected = [
         [5 * 23.6 + 2 * 52 + 4 * 81 + 4 * 1.7 + 12 * 3.0 + 8 * 4.0, 6 * 23.6 + 2 * 52 + 10 * 81],
-        [5 * 33.6 + 2 * 51.2 + 4 * 72.8 + 2 * 69.3 + 4 * 111 + 12 * 3.0 + 8 * 4.2, 6 * 33.6 + 2 * 51.2 + 10 * 72.8],
+        [
+            5 * 33.6 + 2 * 51.2 + 4 * 72.8 + 2 * 69.3 + 4 * 111 + 12 * 3.0 + 8 * 4.2,
+            6 * 33.6 + 2 * 51.2 + 10 * 72.8,
+        ],
     ]
     np.testing.assert_allclose(pico, expected, rtol=1e-12)
     dense = dataclasses.replace(netlist, format_index_bits=np.zeros_like(netlist.format_index_bits))
@@ -127,7 +130,9 @@ def table(name, **prices):
     return EnergyTable(
         name=name,
         title=name,
-        prices={event: Quantity(value=value, unit="pJ", source="made up") for event, value in prices.items()},
+        prices={
+            event: Quantity(value=value, unit="pJ", source="made up") for event, value in prices.items()
+        },
     )
 
 
@@ -144,7 +149,9 @@ def priced_by(*tables, silent=False):
     return found.costs, cost_report(netlist, chip, found, bin_s=0.02)
 
 
-@pytest.mark.parametrize("event", [name for name in cost.EVENTS if name not in ("synaptic_operation_dense", "spike")])
+@pytest.mark.parametrize(
+    "event", [name for name in cost.EVENTS if name not in ("synaptic_operation_dense", "spike")]
+)
 def test_a_table_without_a_price_is_left_out(event):
     lacking = {name: price for name, price in FULL.items() if name != event}
     costs, report = priced_by(table("lacking", **lacking), table("full", **FULL))
@@ -161,7 +168,13 @@ def test_every_lacking_price_is_named():
     assert costs.energy == {}
     # nothing was stored dense here, and a spike may be priced with its neuron's update
     assert costs.unpriced == {
-        "poor": ("synaptic_operation_sparse", "neuron_idle", "neuron_active", "hop_east_west", "hop_north_south")
+        "poor": (
+            "synaptic_operation_sparse",
+            "neuron_idle",
+            "neuron_active",
+            "hop_east_west",
+            "hop_north_south",
+        )
     }
 
 
@@ -189,7 +202,9 @@ def test_report_has_means_and_extremes_over_recordings(tmp_path):
     found = [report[part]["synaptic_operations"] for part in ("min", "per_inference", "max")]
     assert found == [min(operations), pytest.approx(np.mean(operations)), max(operations)]
     layers = [layer["synaptic_operations"] for layer in report["layers"]]
-    expected = np.mean([np.add(s["synaptic_operation_dense"], s["synaptic_operation_sparse"]) for s in samples], axis=0)
+    expected = np.mean(
+        [np.add(s["synaptic_operation_dense"], s["synaptic_operation_sparse"]) for s in samples], axis=0
+    )
     np.testing.assert_allclose(layers, expected)
     updates = [sum(s["neuron_active"]) for s in samples]
     assert report["max"]["neuron_updates"] == max(updates)
@@ -205,7 +220,9 @@ LENGTHS = np.array([30, 7, 1, 30])
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
-    netlist = compile_network(expand(checkpoint, adjacency), Options(storage=Fixed((Packing(planes=2),)))).netlist
+    netlist = compile_network(
+        expand(checkpoint, adjacency), Options(storage=Fixed((Packing(planes=2),)))
+    ).netlist
     recordings = events(5, samples=4, steps=30)
     return netlist, recordings.reshape(4, netlist.n_inputs, -1)
 
@@ -214,7 +231,8 @@ def small(tmp_path_factory):
 def found(small):
     netlist, recordings = small
     return {
-        detail: estimate(netlist, LOIHI, recordings, lengths=LENGTHS, detail=detail) for detail in ("counts", "cycle")
+        detail: estimate(netlist, LOIHI, recordings, lengths=LENGTHS, detail=detail)
+        for detail in ("counts", "cycle")
     }
 
 
@@ -223,7 +241,9 @@ def test_all_details_have_the_same_spikes_and_events(small, found):
     plain = engine.simulate(netlist, recordings, lengths=LENGTHS)
     for trace, priced in found.values():
         for field in dataclasses.fields(trace.counts):
-            np.testing.assert_array_equal(getattr(trace.counts, field.name), getattr(plain.counts, field.name))
+            np.testing.assert_array_equal(
+                getattr(trace.counts, field.name), getattr(plain.counts, field.name)
+            )
         for name, energy in found["counts"][1].costs.energy.items():
             np.testing.assert_array_equal(priced.costs.energy[name], energy)
 
@@ -245,8 +265,13 @@ def test_the_report_says_power_and_pace(small, found):
     netlist, _ = small
     _, cost = found["cycle"]
     report = encode(cost_report(netlist, LOIHI, cost, bin_s=0.02))
-    energy, seconds = cost.costs.energy["sanafe"].sum(axis=1), cost.simple["sanafe"].duration_ns.sum(axis=1) * 1e-9
-    (entry,) = [e for e in report["pace"]["full_speed"] if (e["energy_table"], e["model"]) == ("sanafe", "simple")]
+    energy, seconds = (
+        cost.costs.energy["sanafe"].sum(axis=1),
+        cost.simple["sanafe"].duration_ns.sum(axis=1) * 1e-9,
+    )
+    (entry,) = [
+        e for e in report["pace"]["full_speed"] if (e["energy_table"], e["model"]) == ("sanafe", "simple")
+    ]
     assert entry["power_w"] == pytest.approx((energy / seconds).mean())
     assert entry["energy_delay_js"] == pytest.approx((energy * seconds).mean())
     assert report["pace"]["real_time_w"]["sanafe"] == pytest.approx((energy / (LENGTHS * 0.02)).mean())
@@ -266,7 +291,9 @@ def test_the_range_names_both_ends(small, found):
     for end, choose in (("low", min), ("high", max)):
         assert ends[end]["energy_j"] == pytest.approx(choose(means.values()))
         assert means[ends[end]["table"]] == pytest.approx(choose(means.values()))
-    single = dataclasses.replace(cost, costs=dataclasses.replace(cost.costs, energy={"one": cost.costs.zeros}))
+    single = dataclasses.replace(
+        cost, costs=dataclasses.replace(cost.costs, energy={"one": cost.costs.zeros})
+    )
     assert cost_report(netlist, LOIHI, single, bin_s=0.02).energy_range_j is None
 
 

@@ -88,7 +88,9 @@ def test_network_decides_as_its_rule_and_the_chip_has_every_spike(plan):
     data = run_counters(training, plan)
     fitted = fit(data, CLASSES)
     counters = counters_of(data, fitted, training, CLASSES)
-    whole = counters.weight @ data.spikes[:, [*map(data.counter.tolist().index, counters.counter.tolist())]].T
+    whole = (
+        counters.weight @ data.spikes[:, [*map(data.counter.tolist().index, counters.counter.tolist())]].T
+    )
     decided = decisions_of(counters, training)
     tie = np.sort(whole, axis=0)[-1] - np.sort(whole, axis=0)[-2] < 2 * counters.slope
     assert_array_equal(decided[~tie], whole.argmax(axis=0)[~tie])
@@ -113,7 +115,12 @@ def test_stress_runs_them_to_the_end_of_their_ramp(plan):
     lengths = np.full(len(other), STEPS)
     nearness = distances(TAXELS, None, None)
     bench = Bench(
-        pair=pair, distance=nearness, events=other.events, labels=other.labels, files=other.files, lengths=lengths
+        pair=pair,
+        distance=nearness,
+        events=other.events,
+        labels=other.labels,
+        files=other.files,
+        lengths=lengths,
     )
     late = SAMPLED["start_late"](other.events, 5)
     for found, recordings in (
@@ -203,7 +210,8 @@ def test_levels_are_told_apart_by_their_boundaries():
     plan = Plan(thresholds=(1,), strengths=(0.3,))
     right = [
         np.mean(
-            cross_validate(run_counters(replace(data, events=events), each), CLASSES)[0.3].argmax(axis=1) == data.labels
+            cross_validate(run_counters(replace(data, events=events), each), CLASSES)[0.3].argmax(axis=1)
+            == data.labels
         )
         for each in (plan, replace(plan, levels=3))
     ]
@@ -221,7 +229,19 @@ def test_folds_share_out_every_class():
 
 def test_commands_take_a_counting_network(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    train = ["train", "--data", "synthetic", "--system", "counters", "--join", "5", "--window", "50", "--parts", "2"]
+    train = [
+        "train",
+        "--data",
+        "synthetic",
+        "--system",
+        "counters",
+        "--join",
+        "5",
+        "--window",
+        "50",
+        "--parts",
+        "2",
+    ]
     record = as_json(*train, "-o", "c.pt")["record"]
     assert record["test_correct"] > 100
     assert as_json("inspect", "c.pt")["training"]["plan"]["bins"] == 5
@@ -245,7 +265,10 @@ def test_commands_take_a_counting_network(monkeypatch, tmp_path):
     right = sum(map(int.__eq__, half["predictions"], half["labels"]))
     assert chart["points"][0]["test"]["correct"] == right
     assert chart["points"][1]["test"]["correct"] == record["test_correct"]
-    assert json.loads(str(read_members(tmp_path / "c.pt")["manifest"]))["training"]["strength"] == record["strength"]
+    assert (
+        json.loads(str(read_members(tmp_path / "c.pt")["manifest"]))["training"]["strength"]
+        == record["strength"]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -295,7 +318,10 @@ def test_live_it_runs_to_the_end_of_the_ramp(trained, tmp_path):
     for _ in range(80):
         stream.step(events[0, ..., 0])
     refused(DataError, "a step after the network's 80 found; call finish()", stream.step, events[0, ..., 0])
-    lines = [f"{t * 0.02:.2f},{taxel},{polarity}\n" for t, taxel, polarity in np.argwhere(events[0].transpose(2, 0, 1))]
+    lines = [
+        f"{t * 0.02:.2f},{taxel},{polarity}\n"
+        for t, taxel, polarity in np.argwhere(events[0].transpose(2, 0, 1))
+    ]
     (tmp_path / "lines.csv").write_text("".join(lines))
     for words in ((), ("--bins", "80")):
         shown = run("watch", netlist, "--input", tmp_path / "lines.csv", *words, "--json")[1].splitlines()
@@ -310,7 +336,9 @@ def test_a_nir_file_knows_how_long_a_recording_is_run(trained, tmp_path):
     as_json("compile", tmp_path / "c.pt", "-o", tmp_path / "c.loom")
     as_json("export", tmp_path / "c.loom", "--to", "nir", "-o", tmp_path / "c.nir")
     as_json("compile", tmp_path / "c.nir", "-o", tmp_path / "n.loom")
-    decided = [as_json("run", tmp_path / f"{name}.loom", "--data", trained[2])["predictions"] for name in "cn"]
+    decided = [
+        as_json("run", tmp_path / f"{name}.loom", "--data", trained[2])["predictions"] for name in "cn"
+    ]
     assert decided[0] == decided[1]
     assert len(set(decided[0])) == CLASSES
     for form, suffix in (("onnx", "onnx"), ("sanafe", "yaml")):

@@ -34,7 +34,9 @@ def made(seed=0, packing=None, taxels=6):
     checkpoint = random_checkpoint(taxels=taxels, features=4, sizes=(9, 8, 4), seed=seed)
     network = expand(checkpoint, normalised_adjacency(ring(taxels).edges, taxels))
     return Pair(
-        netlist=compile_network(network, Options(storage=Fixed() if packing is None else Fixed(packing))).netlist,
+        netlist=compile_network(
+            network, Options(storage=Fixed() if packing is None else Fixed(packing))
+        ).netlist,
         network=network,
     ).memory
 
@@ -71,7 +73,9 @@ def in_model_units(netlist):
 def moved(before, after):
     """How far weights of both sides moved; they must have moved alike."""
     ours = [b - a for a, b in zip(weights(before.network), weights(after.network), strict=True)]
-    theirs = [b - a for a, b in zip(in_model_units(before.netlist), in_model_units(after.netlist), strict=True)]
+    theirs = [
+        b - a for a, b in zip(in_model_units(before.netlist), in_model_units(after.netlist), strict=True)
+    ]
     for one, other in zip(ours, theirs, strict=True):
         assert_allclose(one, other, atol=1e-9)
     return ours
@@ -170,12 +174,17 @@ def test_thresholds_change_on_both_sides_by_the_same_factor():
     memory = made()
     after = scale_thresholds(memory, 1.5)
     assert_array_equal(after.netlist.threshold, np.rint(1.5 * memory.netlist.threshold))
-    for post, (old, new) in enumerate(zip(memory.network.populations, after.network.populations, strict=True)):
+    for post, (old, new) in enumerate(
+        zip(memory.network.populations, after.network.populations, strict=True)
+    ):
         ids = memory.netlist.compartments_of(post)
         held = memory.netlist.neuron[ids]
         factor = memory.netlist.threshold[ids] / after.netlist.threshold[ids]
         assert_allclose(new.bias[held], old.bias[held] * factor)
-        rows = [p.weight.toarray()[held] for p in (memory.network.projections[post], after.network.projections[post])]
+        rows = [
+            p.weight.toarray()[held]
+            for p in (memory.network.projections[post], after.network.projections[post])
+        ]
         assert_allclose(rows[1], rows[0] * factor[:, None])
 
 
@@ -209,5 +218,8 @@ def test_windows_that_open_late_are_those_of_the_specification():
     assert [layer.depth for layer in memory.netlist.layers] == [0, 3, 4, 5]
     assert isinstance(lay_out_blocks(memory.netlist), str)
     events = inputs(memory, samples=1)
-    fast, slow = engine.simulate(memory.netlist, events, spikes=True), spec.simulate(memory.netlist, events[0])
+    fast, slow = (
+        engine.simulate(memory.netlist, events, spikes=True),
+        spec.simulate(memory.netlist, events[0]),
+    )
     assert_array_equal(fast.spikes[0], slow.spikes)

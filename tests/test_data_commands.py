@@ -120,10 +120,15 @@ def test_convert_what_is_converted(own):
 
 
 def test_convert_synthetic_grasps_on_the_sensor_that_is_given(own):
-    (own / "coords.csv").write_text("x,y\n" + "".join(f"{3 * i},{3 * j}\n" for j in range(3) for i in range(3)))
+    (own / "coords.csv").write_text(
+        "x,y\n" + "".join(f"{3 * i},{3 * j}\n" for j in range(3) for i in range(3))
+    )
     report, _, _ = start("convert", "synthetic", "--taxels", "coords.csv", "-o", "grasps")
     assert report["taxels"] == 9
-    assert {split: made["recordings"] for split, made in report["splits"].items()} == {"train": 360, "test": 144}
+    assert {split: made["recordings"] for split, made in report["splits"].items()} == {
+        "train": 360,
+        "test": 144,
+    }
     assert load_data(own / "grasps", "test").events.shape == (144, 9, 2, 100)
 
 
@@ -169,7 +174,9 @@ def server(monkeypatch, tmp_path):
 
 def test_fetches_once_and_is_found(server, tmp_path):
     path = tmp_path / "data" / "Ev-Objects.zip"
-    refused(DataError, "objects: not on this machine|run 'spikeloom data fetch objects'", find_data, "objects")
+    refused(
+        DataError, "objects: not on this machine|run 'spikeloom data fetch objects'", find_data, "objects"
+    )
     report, _, code = start("fetch", "objects")
     assert (code, report["new"], report["path"], report["data"]) == (0, True, str(path), "objects")
     assert path.read_bytes() == CONTENT
@@ -204,7 +211,10 @@ def test_a_stranger_under_the_final_name_is_left_alone(server, tmp_path):
     path = tmp_path / "data" / "Ev-Objects.zip"
     path.parent.mkdir()
     path.write_bytes(b"my own")
-    for action, words in ((fetch_data, "exists and is not the released file"), (find_data, "not the released file")):
+    for action, words in (
+        (fetch_data, "exists and is not the released file"),
+        (find_data, "not the released file"),
+    ):
         refused(DataError, words, action, "objects")
     assert path.read_bytes() == b"my own"
 

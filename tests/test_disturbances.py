@@ -45,7 +45,9 @@ def test_harsher_choices_contain_milder_ones(taxels, seed):
     places = np.random.default_rng(seed).random((taxels, 2))
     distance = np.linalg.norm(places[:, None] - places, axis=2)
     for count in range(1, taxels):
-        fewer, more = (set(p.random_taxels(np.zeros((1, taxels)), n, drawn(seed)).tolist()) for n in (count, count + 1))
+        fewer, more = (
+            set(p.random_taxels(np.zeros((1, taxels)), n, drawn(seed)).tolist()) for n in (count, count + 1)
+        )
         assert fewer < more
         near, nearer = (p.neighbours(distance, n, drawn(seed)).tolist() for n in (count + 1, count))
         assert near[:count] == nearer
@@ -53,7 +55,10 @@ def test_harsher_choices_contain_milder_ones(taxels, seed):
 
 def test_neighbours_are_the_nearest_ones_the_lower_number_first():
     line = np.abs(np.arange(5.0)[:, None] - np.arange(5.0))
-    centres = {p.neighbours(line, 3, drawn(seed))[0]: p.neighbours(line, 3, drawn(seed)).tolist() for seed in range(40)}
+    centres = {
+        p.neighbours(line, 3, drawn(seed))[0]: p.neighbours(line, 3, drawn(seed)).tolist()
+        for seed in range(40)
+    }
     assert centres == {0: [0, 1, 2], 1: [1, 0, 2], 2: [2, 1, 3], 3: [3, 2, 4], 4: [4, 3, 2]}
 
 
@@ -106,7 +111,9 @@ def test_a_late_start_and_an_early_one_undo_each_other_but_for_the_ends(events, 
     assert not late[..., :steps].any()
     assert_array_equal(late[..., steps:], events[..., : max(length - steps, 0)])
     assert not early[..., max(length - steps, 0) :].any()
-    assert_array_equal(p.start_early(late, steps)[..., : max(length - steps, 0)], events[..., : max(length - steps, 0)])
+    assert_array_equal(
+        p.start_early(late, steps)[..., : max(length - steps, 0)], events[..., : max(length - steps, 0)]
+    )
 
 
 def test_playing_faster_and_slower():
@@ -200,5 +207,7 @@ def test_only_the_proportions_of_a_layout_matter(shift, power):
     """Positions on a grid of 1/8 mm, so that moving and doubling them is exact."""
     layout = np.round(NEUTOUCH * 8) / 8
     there = (layout + np.array(shift)) * 2.0**power
-    first, second = (synthetic_grasps(coordinates=place, per_class=1, steps=20, seed=1) for place in (layout, there))
+    first, second = (
+        synthetic_grasps(coordinates=place, per_class=1, steps=20, seed=1) for place in (layout, there)
+    )
     assert np.array_equal(first.events, second.events)

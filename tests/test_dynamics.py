@@ -76,14 +76,18 @@ def network_step_by_step(network, events, surrogate):
     sizes = network.architecture
     dynamics = sizes.dynamics
     weights = dict(network.named_parameters())
-    for alpha, name in zip(dynamics.alphas, ("conv1.hops", "fc1.weight", "fc2.weight", "fc3.weight"), strict=False):
+    for alpha, name in zip(
+        dynamics.alphas, ("conv1.hops", "fc1.weight", "fc2.weight", "fc3.weight"), strict=False
+    ):
         weights[name] = weights[name] * (1 - alpha)
     steps = len(events)
     powers = [torch.linalg.matrix_power(network.adjacency.double(), k) for k in range(sizes.hops + 1)]
     seen = torch.stack([torch.einsum("ij,tnjc->tnic", power, events) for power in powers])
     drive = torch.einsum("ktnic,kfc->tnif", seen, weights["conv1.hops"]).flatten(2)
     bias = weights["conv1.bias"].repeat(39)
-    spikes = neurons_step_by_step(drive, bias, dynamics.alpha(0), dynamics.beta(0, 0.2), sizes.theta, surrogate)
+    spikes = neurons_step_by_step(
+        drive, bias, dynamics.alpha(0), dynamics.beta(0, 0.2), sizes.theta, surrogate
+    )
     ticks = torch.zeros(steps, events.shape[1], dynamics.clocks.channels, dtype=torch.float64)
     for t in range(steps):
         if t // dynamics.clocks.steps < dynamics.clocks.channels:
@@ -99,7 +103,9 @@ def network_step_by_step(network, events, surrogate):
 @pytest.mark.parametrize(
     "surrogate", [RECTANGLE, SIGMOID, replace(SIGMOID, reset=True), replace(RECTANGLE, reset=False)]
 )
-@pytest.mark.parametrize("dynamics", [TIMING, replace(TIMING, alphas=()), Dynamics(alphas=(0.6, 0.0, 0.0, 0.9)), PLAIN])
+@pytest.mark.parametrize(
+    "dynamics", [TIMING, replace(TIMING, alphas=()), Dynamics(alphas=(0.6, 0.0, 0.0, 0.9)), PLAIN]
+)
 def test_gradients_of_a_whole_network_equal_plain_autograd(surrogate, dynamics):
     sizes = replace(SMALL, dynamics=dynamics)
     network = SpikingNet(sizes, ADJACENCY, seed=3, surrogate=surrogate).double()
@@ -144,24 +150,42 @@ def test_a_checkpoint_holds_the_dynamics_and_its_float_model_is_the_network(tmp_
 def test_a_lasting_current_starts_as_loud_as_none():
     """What a spike brings in all, W / (1 - alpha), is drawn alike, and so an optimizer's step moves it."""
     loud = SpikingNet(SMALL, ADJACENCY, seed=4).export_weights()
-    plain = SpikingNet(replace(SMALL, dynamics=replace(TIMING, alphas=())), ADJACENCY, seed=4).export_weights()
-    for name, alpha in zip(("conv1.hops", "fc1.weight", "fc2.weight", "fc3.weight"), TIMING.alphas, strict=True):
+    plain = SpikingNet(
+        replace(SMALL, dynamics=replace(TIMING, alphas=())), ADJACENCY, seed=4
+    ).export_weights()
+    for name, alpha in zip(
+        ("conv1.hops", "fc1.weight", "fc2.weight", "fc3.weight"), TIMING.alphas, strict=True
+    ):
         assert_allclose(loud[name], plain[name] * (1 - alpha), rtol=1e-6)
 
 
 def test_what_a_file_cannot_have_is_refused(tmp_path):
     path = tmp_path / "x.pt"
     written(path)
-    refused(OptionError, "--beta 0.5:|has a decay for each layer, 0.2, 0.3, 0, 0.4", read_checkpoint, path, beta=0.5)
+    refused(
+        OptionError,
+        "--beta 0.5:|has a decay for each layer, 0.2, 0.3, 0, 0.4",
+        read_checkpoint,
+        path,
+        beta=0.5,
+    )
     written(path, dynamics=replace(TIMING, alphas=(0.0, 1.5, 0.0, 0.0)))
-    with pytest.raises(ModelError, match=r"unusable .* dynamics .a current decay of 1.5, allowed are 0 <= decay < 1"):
+    with pytest.raises(
+        ModelError, match=r"unusable .* dynamics .a current decay of 1.5, allowed are 0 <= decay < 1"
+    ):
         read_checkpoint(path)
 
 
 def test_the_released_recipe_is_the_released_code():
     assert RECIPES == {"released": RELEASED, "timed": TIMED}
     assert RELEASED == Recipe(
-        name="released", epochs=100, batch=1, loss="mse", optimizer="adam", learning_rate=1e-3, schedule="steps"
+        name="released",
+        epochs=100,
+        batch=1,
+        loss="mse",
+        optimizer="adam",
+        learning_rate=1e-3,
+        schedule="steps",
     )
     assert RELEASED.surrogate == Surrogate(shape="rectangular", width=0.5, reset=True)
     assert RELEASED.dynamics(("conv1", "fc1"), 0.2, 250) == PLAIN
@@ -187,7 +211,9 @@ def test_decays_that_are_none_are_refused(words, telling):
 
 
 def grasps(seed, per_class=3, steps=14):
-    return replace(synthetic_grasps(per_class=per_class, steps=steps, seed=seed), split="train" if seed else "test")
+    return replace(
+        synthetic_grasps(per_class=per_class, steps=steps, seed=seed), split="train" if seed else "test"
+    )
 
 
 def small_timed(recordings, **values):
@@ -235,11 +261,15 @@ def test_activity_is_the_share_of_synapses_that_carry_a_spike():
     network = SpikingNet(sizes, ADJACENCY, seed=2)
     layers = network.layers(torch.from_numpy(training.events.transpose(3, 0, 1, 2).astype(np.float32)))
     fan_out = {"conv1": 8, "fc1": 6, "fc2": sizes.classes}
-    carried = sum(layers[name][0].detach().numpy().mean((0, 1)).sum() * synapses for name, synapses in fan_out.items())
+    carried = sum(
+        layers[name][0].detach().numpy().mean((0, 1)).sum() * synapses for name, synapses in fan_out.items()
+    )
     synapses = (39 * 4 + recipe.clocks) * 8 + 8 * 6 + 6 * sizes.classes
     assert float(network.activity(layers).detach()) == pytest.approx(carried / synapses, rel=1e-5)
     # steps that were filled up do not count
-    one, other = (torch.from_numpy(training.events[i : i + 1].transpose(3, 0, 1, 2).astype(np.float32)) for i in (0, 3))
+    one, other = (
+        torch.from_numpy(training.events[i : i + 1].transpose(3, 0, 1, 2).astype(np.float32)) for i in (0, 3)
+    )
     short = other[:9]
     alone = [float(network.activity(network.layers(events)).detach()) for events in (one, short)]
     together = torch.cat([one, torch.cat([short, torch.zeros_like(other[9:])])], dim=1)
@@ -275,9 +305,14 @@ def test_a_penalty_on_spikes_makes_them_fewer():
 
 def test_train_writes_what_the_recipe_asks_for(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    splits = [replace(synthetic_grasps(per_class=2, steps=14, seed=s), split=n) for n, s in (("train", 1), ("test", 2))]
+    splits = [
+        replace(synthetic_grasps(per_class=2, steps=14, seed=s), split=n)
+        for n, s in (("train", 1), ("test", 2))
+    ]
     write_released(tmp_path / "data", splits)
-    words = "train --data data --graph manual --recipe timed --current-decay fc1=0.5 --membrane-decay fc3=0.75"
+    words = (
+        "train --data data --graph manual --recipe timed --current-decay fc1=0.5 --membrane-decay fc3=0.75"
+    )
     words = f"{words} --clocks 4 --features 6 --batch 3 --spike-penalty 0.5 --epochs 1"
     assert main([*words.split(), "-o", "x.pt", "--json"]) == 0
     (run,) = json.loads(capsys.readouterr().out)["runs"]

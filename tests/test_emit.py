@@ -81,7 +81,9 @@ def test_layers_are_those_of_the_network(network, target):
         assert layer.weight_bits == max(p.bits for p in into)
     assert (netlist.taxels, netlist.polarities) == (network.input.taxels, network.input.polarities)
     assert (netlist.classes, netlist.provenance, netlist.target) == (network.classes, {"seed": 1}, "loihi1")
-    assert all(not getattr(netlist, name).flags.writeable for name in ("neuron", "axon_source", "synapse_weight"))
+    assert all(
+        not getattr(netlist, name).flags.writeable for name in ("neuron", "axon_source", "synapse_weight")
+    )
 
 
 def test_lists_are_sparse_where_that_saves_visits():
@@ -197,13 +199,19 @@ OPTIONS = [
     ("--prune-unused|--keep-all", compiling(prune_unused=True, training_events=EVENTS, keep_all=True)),
     ("--spike-exact|--calibrate", compiling(storage=Exact())),
     (f"--weight-bits 7|{WIDTHS}", compiling(storage=Exact(7), training_events=EVENTS)),
-    *((f"--weight-bits {bits}|{WIDTHS}", rounding(packings=(Packing(bits=bits),))) for bits in (-1, 0, 1, 7, 9)),
+    *(
+        (f"--weight-bits {bits}|{WIDTHS}", rounding(packings=(Packing(bits=bits),)))
+        for bits in (-1, 0, 1, 7, 9)
+    ),
     *((f"--planes {planes}|1 to 3", rounding(packings=(Packing(planes=planes),))) for planes in (0, 4)),
     *((f"--scale-groups {n}|8 thresholds|1 to 8", rounding(packings=(Packing(groups=n),))) for n in (0, 9)),
     ("--weight-bits: 2 layers|the network has 1", rounding(packings=(Packing(), Packing()))),
     ("--cores-for fc1=2|3 cores at least", laying_out((2496, 128), fc1=2)),
     # four neurons of seven output axons a core: three listening cores each let two of them sit together
-    ("--cores-for fc1=1|2 cores at least", laying_out((1, 4, 9), nets.small_target(core_axons_out=7), fc1=1, fc2=3)),
+    (
+        "--cores-for fc1=1|2 cores at least",
+        laying_out((1, 4, 9), nets.small_target(core_axons_out=7), fc1=1, fc2=3),
+    ),
     (
         "--cores-for fc1=7|3 chips|6 cores",
         lambda: least_cores(full(6, 8), {"fc1": 7}, nets.small_target(chip_cores=2), 3),
@@ -244,7 +252,9 @@ CAPACITIES = [
 TABLE = {OptionError: OPTIONS, ModelError: NETWORKS, DataError: RECORDINGS, CapacityError: CAPACITIES}
 
 
-@pytest.mark.parametrize(("error", "words", "call"), [(error, *row) for error, rows in TABLE.items() for row in rows])
+@pytest.mark.parametrize(
+    ("error", "words", "call"), [(error, *row) for error, rows in TABLE.items() for row in rows]
+)
 def test_what_cannot_be_had_is_refused(error, words, call):
     refused(error, words, call)
 

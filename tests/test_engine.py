@@ -58,7 +58,13 @@ def assert_twins_agree(netlist, events, *, gated=True, blank=0) -> Trace | str:
 @pytest.mark.parametrize(
     ("exponents", "length", "gated", "blank"),
     # few with small exponents overflow, so traces are compared and not messages
-    [(None, 10, True, 0), (None, 10, False, 0), (None, 10, True, 1), ((-1, 0), 20, True, 0), ((-1, 0), 20, True, 3)],
+    [
+        (None, 10, True, 0),
+        (None, 10, False, 0),
+        (None, 10, True, 1),
+        ((-1, 0), 20, True, 0),
+        ((-1, 0), 20, True, 3),
+    ],
     ids=["any", "without windows", "free-running", "small exponents", "free-running, small exponents"],
 )
 @given(data=st.data())
@@ -133,7 +139,9 @@ def test_any_split_into_steps_is_the_batch(cuts, seed):
 
 
 def test_the_first_recording_that_overflows_is_named():
-    netlist = build([Neuron()], [Axon(source=0, exponent=7, targets=((0, 254), (0, 254)))], n_inputs=1, depths=[0])
+    netlist = build(
+        [Neuron()], [Axon(source=0, exponent=7, targets=((0, 254), (0, 254)))], n_inputs=1, depths=[0]
+    )
     events = np.zeros((40, 1, 5), np.uint8)
     events[30, 0, 1] = events[12, 0, 3] = 1
     with pytest.raises(NumericRangeError) as caught:
@@ -183,7 +191,11 @@ def pipeline(
     compartment = {index: c for c, index in enumerate(order)}
     first_of_core = {core: sum(n.core < core for n in neurons) for core in range(cores)}
     for depth in range(len(sizes)):
-        sources = range(inputs) if depth == 0 else [i for i, n in enumerate(neurons) if depths[n.layer] == depth - 1]
+        sources = (
+            range(inputs)
+            if depth == 0
+            else [i for i, n in enumerate(neurons) if depths[n.layer] == depth - 1]
+        )
         for source in sources:
             for core in range(cores):
                 targets = [
@@ -206,10 +218,14 @@ def assert_kernels_agree(netlist: Netlist, events: np.ndarray) -> None:
     rng = np.random.default_rng(events.size)
     rows = {"sources": netlist.n_inputs + netlist.n_compartments, "updates": netlist.n_compartments}
     sums = int(rng.choice([1, 16, 17]))
-    largest = int(rng.choice([2**31, 2**20]))  # sums of the first leave 32 bits, those of the second never do
+    largest = int(
+        rng.choice([2**31, 2**20])
+    )  # sums of the first leave 32 bits, those of the second never do
     charges = Charges(**{name: rng.integers(-largest, largest, (size, sums)) for name, size in rows.items()})
     if rng.random() < 0.5:
-        charges.updates[:] = charges.updates[rng.integers(0, min(3, len(charges.updates)), len(charges.updates))]
+        charges.updates[:] = charges.updates[
+            rng.integers(0, min(3, len(charges.updates)), len(charges.updates))
+        ]
     wanted = (
         expected.spikes.astype(np.int64) @ charges.sources[netlist.n_inputs :]
         + expected.updated.astype(np.int64) @ charges.updates
@@ -220,7 +236,9 @@ def assert_kernels_agree(netlist: Netlist, events: np.ndarray) -> None:
         found = engine.simulate(prepared, events[None], packed=True, charges=charges)
         np.testing.assert_array_equal(found.charged[0], wanted, strict=True)
         np.testing.assert_array_equal(found.packed[0], pack(expected.spikes), strict=True)
-        np.testing.assert_array_equal(unpack(found.packed[0], netlist.n_compartments), expected.spikes, strict=True)
+        np.testing.assert_array_equal(
+            unpack(found.packed[0], netlist.n_compartments), expected.spikes, strict=True
+        )
 
 
 SHAPES = (((3,),), ((64,), (65,)), ((70, 5), (1,), (130,)), ((20,), (2, 3, 4), (6,)))
@@ -237,7 +255,9 @@ SHAPES = (((3,),), ((64,), (65,)), ((70, 5), (1,), (130,)), ((20,), (2, 3, 4), (
 )
 def test_any_pipeline(seed, inputs, sizes, density, biases, rate, lasting):
     netlist = pipeline(seed, inputs=inputs, sizes=sizes, density=density, biases=biases, lasting=lasting)
-    assume(isinstance(lay_out_blocks(netlist), Blocks))  # currents that last for ever may leave their registers
+    assume(
+        isinstance(lay_out_blocks(netlist), Blocks)
+    )  # currents that last for ever may leave their registers
     rng = np.random.default_rng(seed)
     assert_kernels_agree(netlist, (rng.random((inputs, 12)) < rate).astype(np.uint8))
 
@@ -250,7 +270,9 @@ def test_the_random_pipelines_reach_every_way_of_storage():
     assert [blocks.weight.dtype for blocks in found] == [np.int8, np.int8, np.int16]
     assert [blocks.dense.tolist() for blocks in found[:2]] == [[False, False, True], [True] * 3]
     assert any(blocks.restful.any() for blocks in found)
-    whole = lay_out_blocks(build([Neuron()] * 70, [Axon(source=0, targets=((0, 1),))], n_inputs=1, depths=[0])).whole
+    whole = lay_out_blocks(
+        build([Neuron()] * 70, [Axon(source=0, targets=((0, 1),))], n_inputs=1, depths=[0])
+    ).whole
     assert whole.tolist() == [0, 64]
 
 
@@ -264,7 +286,9 @@ def test_recordings_of_any_length_together():
         found = recording_of(together, index)
         window = len(expected.spikes)
         for name in KEPT:
-            np.testing.assert_array_equal(getattr(found, name)[:window], getattr(expected, name), strict=True)
+            np.testing.assert_array_equal(
+                getattr(found, name)[:window], getattr(expected, name), strict=True
+            )
             assert not getattr(found, name)[window:].any()
         np.testing.assert_array_equal(found.counts.updates, expected.counts.updates)
         np.testing.assert_array_equal(found.counts.spikes, expected.counts.spikes)
@@ -321,7 +345,10 @@ def test_a_sum_beyond_sixteen_bits_takes_the_other_kernel():
         ({"threshold": 100, "decay_u": 4094}, True),  # a current with a memory
         # 380 weight units a step, 24,320 membrane units, that add up to 24,320 * 4096 / 12 = 8,301,226 of 8,388,607
         ({"threshold": 1, "decay_u": 11, "decay_v": 4096}, True),
-        ({"threshold": 1, "decay_u": 10, "decay_v": 4096}, False),  # to 9,055,884: beyond the current's register
+        (
+            {"threshold": 1, "decay_u": 10, "decay_v": 4096},
+            False,
+        ),  # to 9,055,884: beyond the current's register
         ({"threshold": 2000, "decay_u": 11, "decay_v": 2048}, True),  # and 64,000 that the membrane keeps
         ({"threshold": 3000, "decay_u": 11, "decay_v": 2048}, False),  # and 96,000: it may saturate
     ],
@@ -336,7 +363,12 @@ def test_membranes_at_the_end_of_32_bits(neuron, fits):
 
 def test_what_receives_more_than_the_depth_before_takes_the_other_kernel():
     neurons = [Neuron(layer=0), Neuron(layer=1)]
-    for source, depths in ((1, [0, 0]), (0, [0, 1]), (2, [0, 1]), (1, [0, 2])):  # same depth, input, itself, skipped
+    for source, depths in (
+        (1, [0, 0]),
+        (0, [0, 1]),
+        (2, [0, 1]),
+        (1, [0, 2]),
+    ):  # same depth, input, itself, skipped
         axons = [Axon(source=0, targets=((0, 10),)), Axon(source=source, targets=((1, 10),))]
         netlist = build(neurons, axons, n_inputs=1, depths=depths)
         assert lay_out_blocks(netlist).startswith("a layer is recurrent or receives from others")
@@ -348,10 +380,15 @@ def test_scattered_synapses_take_the_other_kernel():
     """One synapse in each of a hundred thousand rows of 64."""
     rng = np.random.default_rng(0)
     axons = [
-        Axon(source=source, targets=tuple((int(c), 1) for c in np.unique(rng.integers(0, 1000, 200) // 64 * 64 % 1000)))
+        Axon(
+            source=source,
+            targets=tuple((int(c), 1) for c in np.unique(rng.integers(0, 1000, 200) // 64 * 64 % 1000)),
+        )
         for source in range(6000)
     ]
-    assert isinstance(lay_out_blocks(build([Neuron() for _ in range(1000)], axons, n_inputs=6000, depths=[0])), str)
+    assert isinstance(
+        lay_out_blocks(build([Neuron() for _ in range(1000)], axons, n_inputs=6000, depths=[0])), str
+    )
 
 
 @pytest.mark.parametrize("layer", [0, 1, 2])

@@ -37,7 +37,9 @@ def rungs(verdict):
 def small(tmp_path_factory):
     """A checkpoint, its propagation matrix and a coarse netlist that often strays from it."""
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
-    netlist = compile_network(expand(checkpoint, adjacency), Options(storage=Fixed((Packing(bits=4),)))).netlist
+    netlist = compile_network(
+        expand(checkpoint, adjacency), Options(storage=Fixed((Packing(bits=4),)))
+    ).netlist
     return checkpoint, adjacency, netlist
 
 
@@ -86,8 +88,13 @@ def test_spikes_and_decisions(small, verdict):
 def test_the_first_divergence_is_the_first(tmp_path, seed, bits):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
     options = Options(storage=Fixed((Packing(bits=bits),)), keep_all=bits == 6)
-    netlist, recordings = compile_network(expand(checkpoint, adjacency), options).netlist, events(2 + seed, samples=3)
-    found = verify(netlist, expand(checkpoint, adjacency), recorded(recordings), spec_samples=1).first_divergence
+    netlist, recordings = (
+        compile_network(expand(checkpoint, adjacency), options).netlist,
+        events(2 + seed, samples=3),
+    )
+    found = verify(
+        netlist, expand(checkpoint, adjacency), recorded(recordings), spec_samples=1
+    ).first_divergence
     reference = list(float_spikes(expand(checkpoint, adjacency), recordings).values())
     chip, registers = by_specification(netlist, recordings)
     sample, step, layer, neuron = next(
@@ -99,13 +106,21 @@ def test_the_first_divergence_is_the_first(tmp_path, seed, bits):
         if reference[layer][sample, step, neuron] != chip[layer][sample, step, neuron]
     )
     compartment = netlist.compartments_of(layer)[neuron]
-    assert (found.file, found.step, found.layer, found.neuron) == (f"{sample}.npy", step, LAYERS[layer], neuron)
+    assert (found.file, found.step, found.layer, found.neuron) == (
+        f"{sample}.npy",
+        step,
+        LAYERS[layer],
+        neuron,
+    )
     assert (found.taxel, found.feature) == ((neuron // 5, neuron % 5) if layer == 0 else (None, None))
     membranes = list(float_membranes(expand(checkpoint, adjacency), recordings).values())
     assert found.float_membrane == membranes[layer][sample, step, neuron]
     assert found.chip_register == registers[layer][sample, step, neuron]
     assert found.chip_membrane == found.chip_register / (64 * netlist.scale[compartment])
-    assert (found.theta, found.chip_theta) == (0.5, netlist.threshold[compartment] / netlist.scale[compartment])
+    assert (found.theta, found.chip_theta) == (
+        0.5,
+        netlist.threshold[compartment] / netlist.scale[compartment],
+    )
     # one side fired, the other did not
     assert (found.float_membrane > found.theta) != (found.chip_membrane > found.chip_theta)
     assert not found.ill_posed
@@ -126,7 +141,12 @@ def test_each_rung_adds_one_deviation(small):
     for index in range(len(netlist.layers)):
         ids = netlist.compartments_of(index)
         plain, decayed, weighed, shifted = (n.populations[index] for n in (network, beta, scaled, full))
-        assert (plain.beta, decayed.beta, weighed.beta, shifted.beta) == (0.2, 819 / 4096, 819 / 4096, 819 / 4096)
+        assert (plain.beta, decayed.beta, weighed.beta, shifted.beta) == (
+            0.2,
+            819 / 4096,
+            819 / 4096,
+            819 / 4096,
+        )
         assert decayed.theta == weighed.theta == plain.theta == 0.5
         assert shifted.theta == 0.5
         scale = netlist.scale[ids[0]]
@@ -177,7 +197,9 @@ def test_ill_posed_spikes_are_told_from_faults(tmp_path):
     assert (first.layer, first.step, first.neuron, first.ill_posed) == ("fc2", 0, 0, True)
 
 
-@pytest.mark.parametrize("field", ["spikes", "membranes", "inputs", "counted spikes", "updates", "saturations"])
+@pytest.mark.parametrize(
+    "field", ["spikes", "membranes", "inputs", "counted spikes", "updates", "saturations"]
+)
 def test_a_single_wrong_bit_is_found_out(small, monkeypatch, field):
     checkpoint, adjacency, netlist = small
     simulate = engine.simulate

@@ -34,7 +34,11 @@ message = partial(refused, DataError, "")
 
 def made(events, **changes) -> Recordings:
     """Recordings of these events in the test split."""
-    known = {"labels": np.arange(len(events)), "files": tuple("abcdefghijklmnop"[: len(events)]), "split": "test"}
+    known = {
+        "labels": np.arange(len(events)),
+        "files": tuple("abcdefghijklmnop"[: len(events)]),
+        "split": "test",
+    }
     return Recordings(events=np.asarray(events, np.uint8), source="made", **known | changes)
 
 
@@ -73,7 +77,10 @@ def test_what_is_odd_is_counted(write):
         ("0,0,1\n0,39,1\n", "a.csv: line 3: taxel 39, allowed are whole numbers 0..38; count from 0"),
         ("0,1.5,1\n", "a.csv: line 2: taxel 1.5, allowed are whole numbers 0..38"),
         ("0,0,1\n0,0,2\n", "a.csv: line 3: polarity 2, allowed are 0 and 1, or -1 and 1"),
-        ("0,0,1\n0,0,0\n0,0,-1\n", "a.csv: polarities -1 and 0 in one file, allowed are 0 and 1, or -1 and 1"),
+        (
+            "0,0,1\n0,0,0\n0,0,-1\n",
+            "a.csv: polarities -1 and 0 in one file, allowed are 0 and 1, or -1 and 1",
+        ),
         ("0,0,up\n", "a.csv: line 2: polarity is 'up', not a number"),
         ("", "a.csv: no rows, expected are lines of time_s, taxel, polarity[, label]"),
     ],
@@ -137,7 +144,9 @@ def test_who_needs_labels_says_so(write):
 
 @pytest.mark.parametrize("dtype", ["f8", "f4", "i4", ">i2", "u1"])
 def test_npz(save, dtype):
-    path = save("a.npz", time_s=np.array([0.5, 0.1]), taxel=np.array([2, 0], dtype), polarity=np.array([1, 0], dtype))
+    path = save(
+        "a.npz", time_s=np.array([0.5, 0.1]), taxel=np.array([2, 0], dtype), polarity=np.array([1, 0], dtype)
+    )
     found, counts = one(path)
     assert found == [[0, 0, 5], [2, 1, 25]]
     assert counts.out_of_order == 1
@@ -147,7 +156,10 @@ def test_npz(save, dtype):
     ("change", "words"),
     [
         ({"polarity": None}, "a.npz: holds taxel, time_s, without polarity"),
-        ({"taxel": [0, 1]}, "a.npz: shapes time_s (1,), taxel (2,), polarity (1,), allowed is one number per event"),
+        (
+            {"taxel": [0, 1]},
+            "a.npz: shapes time_s (1,), taxel (2,), polarity (1,), allowed is one number per event",
+        ),
         ({"time_s": [[0.1]], "taxel": [[0]], "polarity": [[1]]}, "a.npz: shapes time_s (1, 1)"),
         ({"polarity": ["up"]}, "a.npz: polarity: dtype '<U2', allowed are numbers"),
         ({"taxel": np.array([0], dtype=object)}, "a.npz: taxel: holds an array of objects"),
@@ -347,7 +359,9 @@ def listed(write):
 
 
 def test_a_table_gives_labels(listed):
-    folder = listed("own/labels.csv", "File, weight ,LABEL\na.csv,3.5,7\n\nb_label_2.csv,,2\nother.csv,,1\n").parent
+    folder = listed(
+        "own/labels.csv", "File, weight ,LABEL\na.csv,3.5,7\n\nb_label_2.csv,,2\nother.csv,,1\n"
+    ).parent
     recordings = load_data(folder)
     assert recordings.files == ("a.csv", "b_label_2.csv", "c.csv")
     assert recordings.labels.tolist() == [7, 2, UNLABELLED]

@@ -85,7 +85,10 @@ def test_other_files_are_left_alone(tmp_path):
     order=st.sampled_from("CF"),
 )
 def test_what_was_written_is_read(tmp_path, events, method, dtype, order):
-    files = {f"train/sample_{n}_label_{n}.npy": npy(sample.astype(dtype, order)) for n, sample in enumerate(events)}
+    files = {
+        f"train/sample_{n}_label_{n}.npy": npy(sample.astype(dtype, order))
+        for n, sample in enumerate(events)
+    }
     recordings = load_data(archive(tmp_path / "any.zip", files, method), "train")
     assert np.array_equal(recordings.events, events)
     assert recordings.labels.tolist() == list(range(len(events)))
@@ -94,7 +97,11 @@ def test_what_was_written_is_read(tmp_path, events, method, dtype, order):
 @pytest.mark.parametrize(
     ("names", "split", "words"),
     [
-        ([f"elsewhere/{SAMPLE}"], "test", "no recordings (train/ or test/ with .csv, .npz or sample_N_label_L.npy)"),
+        (
+            [f"elsewhere/{SAMPLE}"],
+            "test",
+            "no recordings (train/ or test/ with .csv, .npz or sample_N_label_L.npy)",
+        ),
         ([f"train/{SAMPLE}"], "test", "split 'test' is missing or empty; splits with recordings: train"),
         ([f"train/{SAMPLE}", f"test/{SAMPLE}"], "val", "splits with recordings: test, train"),
         ([f"a/test/{SAMPLE}", f"b/train/{SAMPLE}"], "test", "several data sets (a, b); give one of them"),
@@ -102,7 +109,11 @@ def test_what_was_written_is_read(tmp_path, events, method, dtype, order):
             ([f"test/{name}"], "test", f"test/{name}: no label in the name, allowed is sample_N_label_L.npy")
             for name in ("sample_0.npy", "sample_0_label_.npy", "sample_0_label_-1.npy", "label_3.npy")
         ),
-        (["test/sample_0_label_36.npy"], "test", "label_36.npy: label 36, the network has 36 classes (0..35)"),
+        (
+            ["test/sample_0_label_36.npy"],
+            "test",
+            "label_36.npy: label 36, the network has 36 classes (0..35)",
+        ),
     ],
 )
 def test_data_sets_that_cannot_be(tmp_path, names, split, words):
@@ -134,7 +145,10 @@ def with_value(dtype, value) -> bytes:
         ),
         (npy(np.zeros((40, 2, 5))), "has 40 taxels, the network has 3; use recordings of its sensor"),
         *(
-            (with_value(dtype, value), f"value {shown} at taxel 1, polarity 0, step 3, allowed are 0 and 1; recordings")
+            (
+                with_value(dtype, value),
+                f"value {shown} at taxel 1, polarity 0, step 3, allowed are 0 and 1; recordings",
+            )
             for dtype, value, shown in (
                 ("float32", 0.5, "0.5"),
                 ("float64", 1 + 2**-52, "1"),
@@ -164,7 +178,9 @@ def test_arrays_that_are_no_recording(tmp_path, data, words):
 def test_what_is_no_array(tmp_path, data):
     """Neither is a thing unpickled, nor memory taken for what is only announced."""
     assert data != GOOD
-    assert refuse(tmp_path, data).startswith(("is truncated or damaged", "holds an array of objects, or one of "))
+    assert refuse(tmp_path, data).startswith(
+        ("is truncated or damaged", "holds an array of objects, or one of ")
+    )
 
 
 def test_sizes_are_bounded(tmp_path, monkeypatch):
@@ -174,7 +190,10 @@ def test_sizes_are_bounded(tmp_path, monkeypatch):
     assert load_data(tmp_path / "data.zip").files == (SAMPLE,)
     files = {f"test/sample_{n}_label_0.npy": GOOD for n in range(3)}
     monkeypatch.setattr(evtouch, "MAX_TOTAL_BYTES", 89)
-    assert message(folder(tmp_path / "three", files)) == "three: recordings of 90 bytes, limit 89; split the data set"
+    assert (
+        message(folder(tmp_path / "three", files))
+        == "three: recordings of 90 bytes, limit 89; split the data set"
+    )
     monkeypatch.setattr(evtouch, "MAX_TOTAL_BYTES", 3 * len(GOOD) - 1)
     assert f"recordings of {3 * len(GOOD)} bytes, limit" in message(archive(tmp_path / "three.zip", files))
 

@@ -60,7 +60,9 @@ def difference_graphs(draw):
     differs = [rng.random((draw(st.integers(1, 7)), size)) < density for size in sizes[:1]]
     differs += [rng.random((len(differs[0]), size)) < density for size in sizes[1:]]
     resets = [(rng.random(d.shape) < 0.3) & ~d for d in differs]
-    sources = [[(post, post)] * draw(st.booleans()) + [(post - 1, post)] * (post > 0) for post in range(len(sizes))]
+    sources = [
+        [(post, post)] * draw(st.booleans()) + [(post - 1, post)] * (post > 0) for post in range(len(sizes))
+    ]
     return (
         differs,
         resets,
@@ -78,7 +80,9 @@ def by_definition(differs, resets, sources):
         for layer, differing in enumerate(differs):
             for neuron in np.flatnonzero(differing[step]).tolist():
                 entry = layer, neuron, step
-                since = begins[entry] = max([t + 1 for t in range(step) if resets[layer][t, neuron]], default=0)
+                since = begins[entry] = max(
+                    [t + 1 for t in range(step) if resets[layer][t, neuron]], default=0
+                )
                 parents = [(layer, neuron, t) for t in range(since, step) if differing[t, neuron]]
                 for pre, connected in sources[layer]:
                     # spikes of the layer itself arrive a step later
@@ -121,7 +125,9 @@ def stored_as(network, thresholds, exponents=(0,)):
 def explained(network, integer, events, compensated=(), **options):
     """Explain what an intact machine does with one recording."""
     deviations = LoihiDeviations(network=network, integer=integer, compensated=compensated)
-    return explain(network, deviations, events, run_integer(integer, events[None], membranes=True), **options)
+    return explain(
+        network, deviations, events, run_integer(integer, events[None], membranes=True), **options
+    )
 
 
 def test_equal_spikes_have_no_diagnosis():
@@ -154,7 +160,15 @@ def test_equal_spikes_have_no_diagnosis():
         # 128, 32, 8, 2, and then nothing instead of a half
         (chain([[0.5]], beta=0.25), ([2],), "x . . . x", TRUNCATION, 4, (128, 128), 0.5 / 256),
         # the register ends at -65.5 membrane units, the float model goes down to -80
-        (chain([[-16.0, 16.0]], beta=1.0), ([1000], (7,)), "x. x. x. x. x. .x .x .x .x .x", SATURATION, 9, None, None),
+        (
+            chain([[-16.0, 16.0]], beta=1.0),
+            ([1000], (7,)),
+            "x. x. x. x. x. .x .x .x .x .x",
+            SATURATION,
+            9,
+            None,
+            None,
+        ),
         # 0.1 + 0.2 > 0.3 in float64; on the chip 10 + 20 are not more than 30
         (chain([[0.1, 0.2]], theta=0.3), ([30],), "xx", TIE, 0, (1920, 1920), None),
     ],
@@ -167,7 +181,9 @@ def test_the_only_deviation_is_the_cause(network, stored, words, cause, step, re
     assert root.sufficient == (cause,) or cause == TIE
     assert root.clipped_weights == (network.projections[0].weight.max() == 100)
     assert registers is None or (root.chip_register, root.chip_threshold_register) == registers
-    assert (root.float_distance > 0) == root.float_fires == (root.chip_register <= root.chip_threshold_register)
+    assert (
+        (root.float_distance > 0) == root.float_fires == (root.chip_register <= root.chip_threshold_register)
+    )
     assert root.chip_membrane - root.chip_theta == root.chip_distance
     if moved is not None:
         assert root.moved == {cause: pytest.approx(moved)}
@@ -202,13 +218,19 @@ def test_a_decay_of_another_network_is_a_decay(fields):
 def test_roots_after_a_common_reset_start_from_rest():
     network = chain([[0.55, 2.0]])
     found = explained(network, stored_as(network, [2]), steps("x.", ".x", "x."))
-    assert [(r.step, r.remembers_from_step, r.cause) for r in found.found] == [(0, 0, WEIGHTS), (2, 2, WEIGHTS)]
+    assert [(r.step, r.remembers_from_step, r.cause) for r in found.found] == [
+        (0, 0, WEIGHTS),
+        (2, 2, WEIGHTS),
+    ]
 
 
 def test_what_follows_is_no_root():
     network = chain([[0.55]], [[1.0]])
     found = explained(network, stored_as(network, [2, 2]), steps("x"))
-    assert [(layer.different, layer.roots, layer.propagated) for layer in found.layers] == [(1, 1, 0), (1, 0, 1)]
+    assert [(layer.different, layer.roots, layer.propagated) for layer in found.layers] == [
+        (1, 1, 0),
+        (1, 0, 1),
+    ]
     (root,) = found.found
     assert (root.layer, root.dragged, root.dragged_alone) == ("fc1", 1, 1)
     (cause,) = found.causes
@@ -220,7 +242,9 @@ def test_a_neuron_that_was_left_out():
     integer = stored_as(network, [2, 4])
     zero = [p.weight.copy() for p in integer.projections]
     zero[0].data[1] = zero[1].data[1] = 0
-    projections = tuple(dataclasses.replace(p, weight=w) for p, w in zip(integer.projections, zero, strict=True))
+    projections = tuple(
+        dataclasses.replace(p, weight=w) for p, w in zip(integer.projections, zero, strict=True)
+    )
     integer, absent = dataclasses.replace(integer, projections=projections), ([False, True], [False])
     absent = tuple(map(np.array, absent))
     silenced = explained(network, integer, steps("x"), absent=absent).found[0]
@@ -238,7 +262,16 @@ SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
 def place(place):
     """The folder with another checkpoint, and a netlist of 4 bits."""
     own_file(place / "other.pt", last=weights(7))
-    words = ["compile", place / "net.pt", "--weight-bits", "4", "--keep-all", "-o", place / "net.loom", "--json"]
+    words = [
+        "compile",
+        place / "net.pt",
+        "--weight-bits",
+        "4",
+        "--keep-all",
+        "-o",
+        place / "net.loom",
+        "--json",
+    ]
     assert cli.main([str(word) for word in words]) == 0
     return place
 
@@ -263,7 +296,12 @@ def test_the_report_counts_what_the_engine_and_the_float64_model_do(report, plac
     assert found["different"] == sum(layer["different"] for layer in found["layers"])
     assert found["roots"] == sum(cause["roots"] for cause in found["causes"])
     assert (found["sample"], found["recording"], found["searched"]) == ("sample_2_label_2.npy", 2, 1)
-    assert (found["split"], found["steps"], found["graph"], found["reference"]) == ("test", STEPS, "ring", "float64")
+    assert (found["split"], found["steps"], found["graph"], found["reference"]) == (
+        "test",
+        STEPS,
+        "ring",
+        "float64",
+    )
 
 
 def test_every_root_says_where_how_close_why_and_what_to_do(report):

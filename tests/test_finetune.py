@@ -35,7 +35,9 @@ def biased_currents(folder):
 def test_what_is_written_compiles_to_the_chip_that_was_trained(tmp_path, name, storage):
     made = biased_currents(tmp_path) if name == "biased currents" else specimen(name)
     file, data = tmp_path / ("x.pt" if name == "timed" else "x.nir"), made.data
-    found = as_json("finetune", made.network, *made.reading, "--data", data, *storage, "--epochs", "2", "-o", file)
+    found = as_json(
+        "finetune", made.network, *made.reading, "--data", data, *storage, "--epochs", "2", "-o", file
+    )
     assert found["history"][1][0] != found["history"][0][0]
     as_json("compile", file, "-o", tmp_path / "again.loom")
     if name != "timed":
@@ -46,7 +48,9 @@ def test_what_is_written_compiles_to_the_chip_that_was_trained(tmp_path, name, s
     assert not any(each["different"] for each in verdict["model"].values())
     assert all(each["spikes"] for each in verdict["model"].values())
     assert round(verdict["accuracy"]["chip"] * verdict["samples"]) == found["last"]["correct"]
-    assert "fine-tuned already" in refusal("finetune", file, "--data", data, "-o", tmp_path / f"y{file.suffix}")
+    assert "fine-tuned already" in refusal(
+        "finetune", file, "--data", data, "-o", tmp_path / f"y{file.suffix}"
+    )
 
 
 @pytest.mark.parametrize("surrogate", [RELEASED.surrogate, TIMED.surrogate])
@@ -55,7 +59,9 @@ def test_gradients_run_through_own_spikes_and_currents(surrogate):
     rng, alpha, beta, size = np.random.default_rng(0), 0.5, 3277 / 4096, 6
     weights = [rng.normal(0.1, 0.3, (size, 4)), rng.normal(0, 0.15, (size, size))]
     neurons = Population(name="a", beta=beta, theta=0.5, bias=np.full(size, 0.02), alpha=alpha)
-    into = tuple(Projection(pre=INPUT + i, post=0, weight=sparse.csr_array(w)) for i, w in enumerate(weights))
+    into = tuple(
+        Projection(pre=INPUT + i, post=0, weight=sparse.csr_array(w)) for i, w in enumerate(weights)
+    )
     shape = {"input": Input(taxels=2, polarities=2), "readout": Readout(population=0, label=np.arange(size))}
     network = Network(populations=(neurons,), projections=into, classes=size, **shape)
     model = QuantisedNet(network, [Form(bits=8, exponents=(0, 7), threshold=np.full(size, 4000))], surrogate)
@@ -91,12 +97,20 @@ def test_what_cannot_be_fine_tuned(tmp_path):
     made, counters, timed = map(specimen, ("recurrent", "counters", "timed"))
     words = ("finetune", made.network, *made.reading, "--data", made.data)
     assert "no checkpoint, it is written back as .nir" in refusal(*words, "-o", tmp_path / "x.pt")
-    assert "--scale-groups 4: is for --weight-bits" in refusal(*words, "--scale-groups", "4", "-o", tmp_path / "x.nir")
+    assert "--scale-groups 4: is for --weight-bits" in refusal(
+        *words, "--scale-groups", "4", "-o", tmp_path / "x.nir"
+    )
     assert "has 39 taxels" in refusal(*words[:-1], "synthetic", "-o", tmp_path / "x.nir")
-    assert "no gradient" in refusal("finetune", counters.network, "--data", counters.data, "-o", tmp_path / "x.nir")
-    assert "written back as .pt" in refusal("finetune", timed.network, "--data", timed.data, "-o", tmp_path / "x.nir")
+    assert "no gradient" in refusal(
+        "finetune", counters.network, "--data", counters.data, "-o", tmp_path / "x.nir"
+    )
+    assert "written back as .pt" in refusal(
+        "finetune", timed.network, "--data", timed.data, "-o", tmp_path / "x.nir"
+    )
     assert not list(tmp_path.glob("x.*"))
     few = np.zeros((CLASSES, TAXELS, 2, 15), np.uint8)
     recordings_folder(tmp_path / "few", train=few, test=few, classes=2)
-    _, _, told = run(*words[:-1], tmp_path / "few", "--weight-bits", "4", "--epochs", "1", "-o", tmp_path / "x.nir")
+    _, _, told = run(
+        *words[:-1], tmp_path / "few", "--weight-bits", "4", "--epochs", "1", "-o", tmp_path / "x.nir"
+    )
     assert f"few: their classes are 0..1, the network's 0..{CLASSES - 1}" in told

@@ -53,7 +53,10 @@ def test_where_nothing_is_left_a_row_is_each_alone(data):
     assume(not found.restless + found.unsettled)
     netlist, row = replace(netlist, blank=found.steps), [data.draw(recordings(netlist)) for _ in range(3)]
     pauses = [np.pad(events, ((0, 0), (0, netlist.blank))) for events in row]
-    whole, ends = by_engine(netlist, np.concatenate(pauses, axis=1)), np.cumsum([each.shape[1] for each in pauses])
+    whole, ends = (
+        by_engine(netlist, np.concatenate(pauses, axis=1)),
+        np.cumsum([each.shape[1] for each in pauses]),
+    )
     for events, end in zip(row, ends.tolist(), strict=True):
         alone = by_engine(netlist, events)
         for name in ("spikes", "membranes"):
@@ -65,19 +68,30 @@ def test_where_nothing_is_left_a_row_is_each_alone(data):
 
 
 def test_commands(spikeloom, as_json, refusal):
-    facts = as_json("compile", "net.pt", "--weight-bits", "8", "--free-running", "-o", "free.loom")["free_running"]
+    facts = as_json("compile", "net.pt", "--weight-bits", "8", "--free-running", "-o", "free.loom")[
+        "free_running"
+    ]
     windows, free = (as_json("estimate", name, "--data", "data") for name in ("net.loom", "free.loom"))
-    paces = [each["static"][0]["real_time_j"] / each["static"][0]["chip_w"] / 0.02 for each in (windows, free)]
+    paces = [
+        each["static"][0]["real_time_j"] / each["static"][0]["chip_w"] / 0.02 for each in (windows, free)
+    ]
     assert paces[1] - paces[0] == pytest.approx(facts["steps"])
     assert free["chip_steps"] - windows["chip_steps"] == facts["steps"] - read_netlist("net.loom").max_depth
-    assert [any("reset of" in line for line in each["not_priced"]) for each in (windows, free)] == [True, False]
+    assert [any("reset of" in line for line in each["not_priced"]) for each in (windows, free)] == [
+        True,
+        False,
+    ]
     data = ("--checkpoint", "net.pt", "--data", "data")
     verdict = as_json("verify", "free.loom", *data)
     assert (verdict["row_different"], verdict["spec_equals_engine"]) == (0, True)
     assert verdict["ladder"][-1]["stage"] == "free_running"
     for command, options in (("explain", data), ("anytime", data[2:]), ("certify", data[2:])):
-        assert refusal(command, "free.loom", *options).startswith("netlist: is free-running, which this cannot take")
-    assert refusal("export", "free.loom", "--to", "onnx", "-o", "x.onnx").startswith("onnx: a free-running netlist")
+        assert refusal(command, "free.loom", *options).startswith(
+            "netlist: is free-running, which this cannot take"
+        )
+    assert refusal("export", "free.loom", "--to", "onnx", "-o", "x.onnx").startswith(
+        "onnx: a free-running netlist"
+    )
     write_netlist(replace(read_netlist("free.loom"), blank=facts["steps"] - 1), "short.loom")
     code, out, _ = spikeloom("verify", "short.loom", "--checkpoint", "net.pt")
     assert (code, "blank steps instead of" in out) == (1, True)

@@ -12,16 +12,22 @@ from oracles import refused
 
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.models import graphs
-from spikeloom.models.graphs import NEUTOUCH, build_graph, check_coordinates, check_edges, normalised_adjacency
+from spikeloom.models.graphs import (
+    NEUTOUCH,
+    build_graph,
+    check_coordinates,
+    check_edges,
+    normalised_adjacency,
+)
 from spikeloom.models.recordings.csvtable import read_table
 from spikeloom.models.sensors import MAX_TAXELS, read_edges, read_layout, read_taxels, sensor_graph
 
 NAMES = ["manual", *(f"knn:{k}" for k in range(1, 9))]
 NAMES += [f"mst:{sigma}" for sigma in ("0", "1.5", "2", "2.5", "3", "3.5", "4")]
 
-layouts = st.lists(st.tuples(st.integers(-3, 3), st.integers(-3, 3)), min_size=2, max_size=12, unique=True).map(
-    lambda points: np.array(points) * 0.1
-)
+layouts = st.lists(
+    st.tuples(st.integers(-3, 3), st.integers(-3, 3)), min_size=2, max_size=12, unique=True
+).map(lambda points: np.array(points) * 0.1)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +43,9 @@ def test_the_coordinates_are_the_released_ones(released):
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", NAMES)
-def test_every_released_edge_list_is_reproduced_in_its_order_and_the_plain_name_collapses_repeats(released, name):
+def test_every_released_edge_list_is_reproduced_in_its_order_and_the_plain_name_collapses_repeats(
+    released, name
+):
     rows = released["edges"][name]
     assert build_graph(f"released:{name}").edges.tolist() == rows
     assert [tuple(row) for row in build_graph(name).edges.tolist()] == list(dict.fromkeys(map(tuple, rows)))
@@ -73,7 +81,9 @@ def test_neighbours_agree_with_a_plain_search(layout, k):
     for i in range(n):
         others = [(int(((cells[i] - cells[j]) ** 2).sum()), j) for j in range(n) if j != i]
         expected += [[i, j] for _, j in sorted(others)[:k]]
-    assert build_graph(f"released:knn:{k}", layout).edges.tolist() == expected + [[j, i] for i, j in expected]
+    assert build_graph(f"released:knn:{k}", layout).edges.tolist() == expected + [
+        [j, i] for i, j in expected
+    ]
 
 
 @given(layout=layouts, sigma=st.sampled_from([0.0, 0.1, 0.15, 0.25, 1.0]))
@@ -117,7 +127,10 @@ def test_names_are_canonical(given_name, canonical):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        *((name, "unknown; choose manual, knn:K (K 1..8) or mst:SIGMA") for name in ("grid", "", "knn", "released:")),
+        *(
+            (name, "unknown; choose manual, knn:K (K 1..8) or mst:SIGMA")
+            for name in ("grid", "", "knn", "released:")
+        ),
         *((f"knn:{k}", f"K is '{k}', allowed are whole numbers 1..8") for k in ("0", "9", "", "2.5")),
         *(
             (f"mst:{s}", f"SIGMA is '{s}', allowed are millimetres from 0")
@@ -175,8 +188,14 @@ def test_tables_with_and_without_names(write, text):
 @pytest.mark.parametrize(
     ("text", "telling"),
     [
-        *((text, "t.csv: no rows, expected are lines of a, b[, c]") for text in ("", "\n# nothing\n", "a,b\n")),
-        *((f"{names}\n1,2\n", "line 1: columns |expected are a, b[, c]") for names in ("a,d", "a,b,b", "a;b")),
+        *(
+            (text, "t.csv: no rows, expected are lines of a, b[, c]")
+            for text in ("", "\n# nothing\n", "a,b\n")
+        ),
+        *(
+            (f"{names}\n1,2\n", "line 1: columns |expected are a, b[, c]")
+            for names in ("a,d", "a,b,b", "a;b")
+        ),
         *((text, "in its first row, expected are a, b[, c]") for text in ("1\n2\n", "1,2,3,4\n")),
         ("a,b\n1,2,3\n", "line 2: 3 columns, expected are 2 (a, b)"),
         ("1,2\n\n3\n", "line 3: 1 column, expected are 2 (a, b)"),
@@ -205,7 +224,10 @@ def test_positions(write):
         ("0,0,0\n0,0,2e6\n", "line 2: z is 2e+06, allowed"),
         ("x,y\n0,0\n1,1\n0,0\n1,1\n", "line 4: taxels 0 and 2 share one position"),
         ("x\n0\n", "line 1: columns x, expected are x, y[, z]"),
-        ("".join(f"{i},0\n" for i in range(MAX_TAXELS + 1)), f"{MAX_TAXELS + 1} taxels, the limit is {MAX_TAXELS}"),
+        (
+            "".join(f"{i},0\n" for i in range(MAX_TAXELS + 1)),
+            f"{MAX_TAXELS + 1} taxels, the limit is {MAX_TAXELS}",
+        ),
     ],
 )
 def test_positions_that_cannot_be(write, text, telling):
@@ -264,7 +286,11 @@ def test_named_graph_on_another_sensor(write):
 def test_edges_from_a_file(write):
     edges = write("e.csv", "0,1\n1,2\n")
     graph, warning = sensor_graph(edges=edges)
-    assert (graph.name, graph.n_taxels, graph.edges.tolist()) == ("edges:e.csv", 3, [[0, 1], [1, 0], [1, 2], [2, 1]])
+    assert (graph.name, graph.n_taxels, graph.edges.tolist()) == (
+        "edges:e.csv",
+        3,
+        [[0, 1], [1, 0], [1, 2], [2, 1]],
+    )
     assert warning is None
     graph, warning = sensor_graph(edges=edges, taxels="5", directed=True)
     assert (graph.n_taxels, graph.edges.tolist()) == (5, [[0, 1], [1, 2]])
@@ -288,10 +314,16 @@ def test_a_graph_in_parts_is_noticed(write):
     ("options", "words"),
     [
         ({}, "--graph and --edges: neither was given, allowed is one of them; --graph takes manual, knn:K"),
-        ({"graph": "manual", "edges": "e.csv"}, "--graph and --edges: both were given, allowed is one of them"),
+        (
+            {"graph": "manual", "edges": "e.csv"},
+            "--graph and --edges: both were given, allowed is one of them",
+        ),
         ({"graph": "manual", "directed": True}, "--directed: only edges from a file have directions"),
         ({"graph": "knn:2", "taxels": "25"}, "--taxels 25: --graph knn:2 needs positions; give a CSV file"),
-        ({"graph": "manual", "taxels": "c.csv"}, "graph 'manual': drawn by hand for the NeuTouch layout, not for"),
+        (
+            {"graph": "manual", "taxels": "c.csv"},
+            "graph 'manual': drawn by hand for the NeuTouch layout, not for",
+        ),
     ],
 )
 def test_options_that_exclude_each_other(write, monkeypatch, options, words):

@@ -54,7 +54,9 @@ def test_the_cheapest_that_keeps_enough_is_chosen_and_what_was_tried_is_counted(
     done = compile_network(network, Options(training_events=events, storage=Cheapest(keep)))
     few, several, held = split(len(events))
     draw = np.random.default_rng(0)
-    thinned = channels_last(np.stack([one * (draw.random(one.shape, np.float32) < KEPT) for one in events[held]]))
+    thinned = channels_last(
+        np.stack([one * (draw.random(one.shape, np.float32) < KEPT) for one in events[held]])
+    )
     wanted, voted = decisions(run_float(network, thinned).spikes[-1])
     known, found = channels_last(events[few]), []
     sent = [known, *run_float(network, known).spikes]
@@ -66,7 +68,9 @@ def test_the_cheapest_that_keeps_enough_is_chosen_and_what_was_tried_is_counted(
         assert trial.cores == one.netlist.n_cores
         lists = [np.asarray((p.weight != 0).sum(axis=0)).ravel() for p in one.integer.projections]
         spikes = [sent[p.pre + 1].sum(axis=(0, 1)) for p in one.integer.projections]
-        assert trial.operations == pytest.approx(sum(a @ b for a, b in zip(lists, spikes, strict=True)) / len(few))
+        assert trial.operations == pytest.approx(
+            sum(a @ b for a, b in zip(lists, spikes, strict=True)) / len(few)
+        )
         found.append(one)
     shares = [trial.equal / trial.decisions for trial in done.trials]
     assert all(share < keep for share in shares[:-1])
@@ -104,7 +108,10 @@ def test_the_command_says_what_cheaper_storage_lost_and_what_helps(spikeloom, as
     found = as_json(*words)
     assert found["keep"] == 1
     best = max(found["trials"], key=lambda trial: trial["equal"])
-    assert [found["provenance"][name] for name in ("planes", "scale_groups")] == [best["planes"], best["groups"]]
+    assert [found["provenance"][name] for name in ("planes", "scale_groups")] == [
+        best["planes"],
+        best["groups"],
+    ]
     shown = spikeloom(*words)[1]
     for trial in found["trials"]:
         assert f"{trial['equal']} of {trial['decisions']}" in shown

@@ -46,7 +46,9 @@ def simulate(network, events, weights, step):
         for t in range(len(events)):
             for i in range(population.size):
                 arrived = sum(weights_hit(incoming, spikes, post, i, t))
-                states[i], membranes[post][t][i], spikes[post][t][i] = step(population, i, arrived, states[i])
+                states[i], membranes[post][t][i], spikes[post][t][i] = step(
+                    population, i, arrived, states[i]
+                )
     return spikes, membranes
 
 
@@ -147,7 +149,9 @@ def random_inputs(channels, seed=0, samples=4, steps=30, rate=0.3):
 def as_they_are(events):
     """Inputs of whole recordings."""
     samples, _, steps = events.shape
-    return Inputs(channels=lambda rows: events[rows], lengths=np.full(samples, steps), begin=np.zeros(samples, int))
+    return Inputs(
+        channels=lambda rows: events[rows], lengths=np.full(samples, steps), begin=np.zeros(samples, int)
+    )
 
 
 def float_spikes(network, events):
@@ -156,7 +160,9 @@ def float_spikes(network, events):
 
 def test_neurons_that_the_chip_leaves_out_are_compared_if_others_receive_them():
     network = lively(seed=2)
-    never = nets.with_population(network, 0, bias=np.where(np.arange(6) == 4, -100, network.populations[0].bias))
+    never = nets.with_population(
+        network, 0, bias=np.where(np.arange(6) == 4, -100, network.populations[0].bias)
+    )
     netlist = compile_network(never).netlist
     assert 4 not in netlist.neuron[netlist.compartments_of(0)]
     events = random_inputs(network.input.size, 2)
@@ -170,10 +176,16 @@ def test_neurons_that_the_chip_leaves_out_are_compared_if_others_receive_them():
 
 
 def test_shorter_recordings_and_late_beginnings(monkeypatch):
-    monkeypatch.setattr(spikeloom.runtime.studies.robustness.pair, "HELD", 1000)  # so that there are several parts
+    monkeypatch.setattr(
+        spikeloom.runtime.studies.robustness.pair, "HELD", 1000
+    )  # so that there are several parts
     network = lively(seed=4)
     pair = Pair(netlist=compile_network(network, Options(keep_all=True)).netlist, network=network)
-    events, lengths, begin = random_inputs(network.input.size, 4), np.array([30, 11, 1, 20]), np.array([0, 5, 0, 19])
+    events, lengths, begin = (
+        random_inputs(network.input.size, 4),
+        np.array([30, 11, 1, 20]),
+        np.array([0, 5, 0, 19]),
+    )
     found = evaluate(pair, Inputs(channels=lambda rows: events[rows], lengths=lengths, begin=begin))
     wanted = np.zeros((3, 3), int)
     for i, (length, first) in enumerate(zip(lengths.tolist(), begin.tolist(), strict=True)):
@@ -191,7 +203,9 @@ def test_shorter_recordings_and_late_beginnings(monkeypatch):
 def test_a_window_that_opens_late_misses_the_first_steps():
     network = lively(weights=2, seed=6)
     netlist = compile_network(network, Options(keep_all=True)).netlist
-    late = replace(netlist, layers=(netlist.layers[0], replace(netlist.layers[1], depth=netlist.layers[1].depth + 3)))
+    late = replace(
+        netlist, layers=(netlist.layers[0], replace(netlist.layers[1], depth=netlist.layers[1].depth + 3))
+    )
     events = random_inputs(network.input.size, 6)
     first, second = float_spikes(network, events)
     alone = nets.chain(network.projections[1].weight.toarray(), biases=[network.populations[1].bias])
@@ -214,7 +228,9 @@ def with_projection(network, index, **changes):
     return replace(network, projections=tuple(projections))
 
 
-@pytest.mark.parametrize(("make", "verify"), [(nets.chain, invariants.verify), (nets.integer_chain, integers.verify)])
+@pytest.mark.parametrize(
+    ("make", "verify"), [(nets.chain, invariants.verify), (nets.integer_chain, integers.verify)]
+)
 def test_a_sound_network_passes(make, verify):
     verify(make([[2, 4, 6], [8, 10, 12]], [[2, 0], [0, 2]]))
 
@@ -252,12 +268,21 @@ FLOATS = [
     (projected(1, pre=7), "projection 1 has shape (2, 2)|(2, None)"),
     (projected(1, pre=-2), "projection 1 has shape (2, 2)|(2, None)"),
     (projected(1, post=2), "projection 1 has shape (2, 2)|(None, 2)"),
-    (projected(1, post=INPUT, weight=nets.stored(np.ones((3, 2)))), "projection 1 runs from population 0 to -1"),
+    (
+        projected(1, post=INPUT, weight=nets.stored(np.ones((3, 2)))),
+        "projection 1 runs from population 0 to -1",
+    ),
     (projected(0, weight=TWICE), "projection 0 has unsorted or repeated synapses"),
-    (more(1, 0, (2, 2)), "projection 2 runs from population 1 to 0, not forward; projection 0 skips a layer|1 early"),
+    (
+        more(1, 0, (2, 2)),
+        "projection 2 runs from population 1 to 0, not forward; projection 0 skips a layer|1 early",
+    ),
     (more(INPUT, 1, (2, 3)), "projection 2 skips a layer|1 early"),
     (lambda n: replace(n, projections=n.projections[1:]), "'fc1' is not reached|'fc2' is not reached"),
-    (lambda n: replace(more(1, 1, (2, 2))(n), projections=more(1, 1, (2, 2))(n).projections[::2]), "'fc2' is not"),
+    (
+        lambda n: replace(more(1, 1, (2, 2))(n), projections=more(1, 1, (2, 2))(n).projections[::2]),
+        "'fc2' is not",
+    ),
     (voting(2, 0, 1), "names population 2"),
     (voting(-1, 0, 1), "names population -1"),
     (voting(1, 0, 1, 2), "3 labels"),
@@ -268,7 +293,10 @@ FLOATS = [
     *((populated(0, beta=beta), f"'fc1' has beta {beta}") for beta in (-0.1, 1.1, np.nan)),
     *((populated(0, theta=theta), f"theta {theta} out of range") for theta in (0.0, -1.0, np.nan)),
     *((populated(0, alpha=alpha), f"'fc1' has alpha {alpha}") for alpha in (-0.1, 1.0)),
-    (projected(0, weight=nets.stored(np.full((2, 3), np.nan))), "projection 0 has weights that are not finite float64"),
+    (
+        projected(0, weight=nets.stored(np.full((2, 3), np.nan))),
+        "projection 0 has weights that are not finite float64",
+    ),
     (projected(0, weight=nets.stored(np.ones((2, 3), np.float32))), "projection 0 has weights"),
     (projected(0, weight=nets.stored(np.ones((2, 3), int))), "projection 0 has weights"),
 ]
@@ -293,7 +321,9 @@ def test_registers_at_their_ends_and_one_past_them(field, good, bad, words):
     network = nets.integer_chain([[2, 4]])
 
     def changed(value):
-        return nets.with_population(network, 0, **{field: value if field.startswith("decay") else np.array([value])})
+        return nets.with_population(
+            network, 0, **{field: value if field.startswith("decay") else np.array([value])}
+        )
 
     for value in good:
         integers.verify(changed(value))
@@ -309,7 +339,12 @@ def test_mantissas_of_each_width(bits, good, bad):
     for value in good:
         integers.verify(nets.integer_chain([[value]], bits=bits, exponent=-1))
     for value in bad:
-        refused(VerifyError, f"projection 0|{bits} bits", integers.verify, nets.integer_chain([[value]], bits=bits))
+        refused(
+            VerifyError,
+            f"projection 0|{bits} bits",
+            integers.verify,
+            nets.integer_chain([[value]], bits=bits),
+        )
     floats = with_projection(nets.integer_chain([[2]]), 0, weight=nets.stored(np.array([[2.0]])))
     refused(VerifyError, "projection 0|8 bits", integers.verify, floats)
     refused(VerifyError, "exponent -2|below -1", integers.verify, nets.integer_chain([[0]], exponent=-2))
@@ -321,7 +356,9 @@ def test_fan_in_counts_stored_zeros():
     assert fan_in(network, 0).tolist() == [3, 1]
     assert fan_in(network, 1).tolist() == [2, 2]
     # and a synapse once, whatever its planes
-    again = Projection(pre=INPUT, post=0, weight=nets.stored(np.ones((2, 3)), np.array([[1, 0, 0], [1, 1, 0]])))
+    again = Projection(
+        pre=INPUT, post=0, weight=nets.stored(np.ones((2, 3)), np.array([[1, 0, 0], [1, 1, 0]]))
+    )
     twice = replace(small(), projections=(*small().projections, again))
     assert fan_in(twice, 0).tolist() == [3, 3]
 

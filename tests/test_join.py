@@ -100,7 +100,10 @@ def test_joined_networks_join_again(tmp_path):
             lambda m, _: m.update(towers=2),
             "conv1.bias is (9,), not as much for each of 2 towers|conv1.hops is (3, 9, 2)",
         ),
-        (lambda m, _: m.update(classes=12), "39 taxels and 4 classes, the manifest says 39 taxels and 12 classes"),
+        (
+            lambda m, _: m.update(classes=12),
+            "39 taxels and 4 classes, the manifest says 39 taxels and 12 classes",
+        ),
     ],
 )
 def test_signed_but_wrong(tmp_path, change, expected):
@@ -127,7 +130,9 @@ def test_towers_spike_as_the_single_networks_bit_for_bit(tmp_path, system, dynam
     still = float_membranes(expand(wide, seen), events, dtype=dtype)
     single_membranes = [float_membranes(expand(single, seen), events, dtype=dtype) for single in singles]
     for name, membranes in still.items():
-        assert_array_equal(membranes, one_by_one(single_membranes, wide, name, membranes.dtype), err_msg=name)
+        assert_array_equal(
+            membranes, one_by_one(single_membranes, wide, name, membranes.dtype), err_msg=name
+        )
 
 
 @CASES
@@ -138,7 +143,9 @@ def test_the_expanded_network_is_sparse_in_blocks(tmp_path, system, dynamics):
     clocks = dynamics.clocks.channels
     for layer, projection in enumerate(network.projections):
         stored_in_all = sum(single.projections[layer].weight.nnz for single in alone)
-        assert projection.weight.nnz == stored_in_all - (0 if layer else 2 * clocks), layer  # one set of relays
+        assert projection.weight.nnz == stored_in_all - (0 if layer else 2 * clocks), (
+            layer
+        )  # one set of relays
         rows, columns = projection.weight.tocoo().coords
         if layer:
             before = owners[layer - 1][columns]
@@ -158,10 +165,17 @@ def data(tmp_path_factory):
         network, _ = written(path, seed=seed)
         last = network.export_weights()
         record = {"command": f"spikeloom train --seed {seed}", "seed": seed, "data_sha256": f"{seed:064}"}
-        known = {"beta": 0.2, "theta": 0.5, "dynamics": TIMING, "training": record | {"last": {"correct": seed}}}
+        known = {
+            "beta": 0.2,
+            "theta": 0.5,
+            "dynamics": TIMING,
+            "training": record | {"last": {"correct": seed}},
+        }
         sets = {"last": last, "clean": {key: array / 2 for key, array in last.items()}}
         path.write_bytes(checkpoint_bytes(sets, GRAPH, **known))
-    as_json("join", *(place / f"timed{seed}.pt" for seed in SEEDS), "-o", place / "timed.pt", "--weights", "last")
+    as_json(
+        "join", *(place / f"timed{seed}.pt" for seed in SEEDS), "-o", place / "timed.pt", "--weights", "last"
+    )
     return place
 
 
@@ -193,7 +207,9 @@ def test_equal_input_gives_equal_bytes_and_other_sets_other_ones(data):
 
 def test_what_disagrees_is_listed_in_one_line(tmp_path):
     written(tmp_path / "a.pt")
-    other = Dynamics(betas=(0.2, 0.3, 0.1, 0.4), alphas=(0.0, 0.9, 0.5, 0.0), clocks=Clocks(channels=2, steps=5))
+    other = Dynamics(
+        betas=(0.2, 0.3, 0.1, 0.4), alphas=(0.0, 0.9, 0.5, 0.0), clocks=Clocks(channels=2, steps=5)
+    )
     written(tmp_path / "b.pt", "gcn", other, classes=5, features=2, hidden=(8, 7))
     said = refusal(*f"join {tmp_path}/a.pt {tmp_path}/b.pt -o {tmp_path}/x.pt".split())
     for word in ("system", "classes", "layers", "membrane decays", "clocks"):
@@ -223,7 +239,10 @@ def test_what_cannot_be_joined_says_so(data, tmp_path):
         (f"join {one} -o {tmp_path}/x.pt", f"{one} is one network already; give two or more"),
         (f"join {one} {one} -o {one}", f"-o {one}: is an input of this command"),
         (f"join {one} {made.netlist} -o {tmp_path}/x.pt", f"{made.netlist}: "),
-        (f"join {one} {data}/timed.pt --weights best -o {tmp_path}/x.pt", "--weights best: the file holds last"),
+        (
+            f"join {one} {data}/timed.pt --weights best -o {tmp_path}/x.pt",
+            "--weights best: the file holds last",
+        ),
         (f"join {one} {old} -o {tmp_path}/x.pt", f"{old}: does not say its graph and constants"),
         (f"finetune {made.network} --data {made.data} --weight-bits 4 -o {tmp_path}/x.pt", "has 3 towers"),
     ):

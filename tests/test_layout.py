@@ -207,5 +207,7 @@ def test_the_traffic_of_the_page_has_the_axons_that_the_limits_count_and_the_hop
         assert sum(way.axons for way in ways if way.source == core) == used["core.axons_out", core]
     assert all(way.packets == 2 * way.axons for way in ways)
     # without rates every neuron counts as one spike a step
-    assert sum(way.axons * way.hops for way in ways if way.hops is not None) == layout.placement.spike_hops > 0
+    assert (
+        sum(way.axons * way.hops for way in ways if way.hops is not None) == layout.placement.spike_hops > 0
+    )
     assert [(way.source, way.to) for way in ways if way.source is None] == [(None, 0), (None, 1)]

@@ -4,7 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_files import CLASSES, TAXELS, events, own_file, recorded, recordings_folder, small_checkpoint, weights
+from made_files import (
+    CLASSES,
+    TAXELS,
+    events,
+    own_file,
+    recorded,
+    recordings_folder,
+    small_checkpoint,
+    weights,
+)
 from numpy.testing import assert_array_equal
 from random_netlists import Axon, Neuron, build
 
@@ -60,7 +69,9 @@ def test_what_is_written_decides_and_costs_as_reported(as_json):
     for split, key in (("train", "training"), ("test", "test")):
         data = load_data("data", split)
         flat = data.events.reshape(len(data), -1, STEPS)
-        before, after = (predictions(each, engine.simulate(each, flat).counts.spikes) for each in (whole, netlist))
+        before, after = (
+            predictions(each, engine.simulate(each, flat).counts.spikes) for each in (whole, netlist)
+        )
         assert row[key]["differ"] == np.count_nonzero(before != after)
         assert row[key]["right"] == np.count_nonzero(after == data.labels)
         lost = np.count_nonzero((before == data.labels) & (after != data.labels))
@@ -130,7 +141,9 @@ def test_without_hops(compiled):
     loaded, compilation, _ = compiled
     checkpoint = loaded.checkpoint
     same, gone = (trials.without_hops(compilation, loaded, hops).integer for hops in ((), (1, 2, 3)))
-    first = [next(p for p in network.projections if p.post == 0) for network in (compilation.integer, same, gone)]
+    first = [
+        next(p for p in network.projections if p.post == 0) for network in (compilation.integer, same, gone)
+    ]
     held = compilation.netlist.neuron[compilation.netlist.compartments_of(0)]
     before, again, lean = (p.effective().toarray()[held] for p in first)
     step = np.gcd.reduce(again.astype(int), axis=None)
@@ -148,7 +161,9 @@ def test_without_hops(compiled):
 def test_an_integer_network_without_some_channels(compiled):
     integer = compiled[1].integer
     same = without_channels(integer, np.zeros(integer.input.size, bool))
-    assert all((p.weight != q.weight).nnz == 0 for p, q in zip(same.projections, integer.projections, strict=True))
+    assert all(
+        (p.weight != q.weight).nnz == 0 for p, q in zip(same.projections, integer.projections, strict=True)
+    )
     deaf = without_channels(integer, np.ones(integer.input.size, bool))
     assert not any(p.weight.data.any() for p in deaf.projections if p.pre == INPUT)
     assert lift(compiled[1].netlist).input.size == integer.input.size
@@ -202,9 +217,14 @@ def test_what_is_pruned_can_be_trained_on(compiled, as_json, refusal):
     silent = [w.weight.copy() for w in (second, last)]
     for weight, numbers in zip(silent, gone.values(), strict=True):
         weight[:, numbers] = 0
-    dense = (first, *(replace(each, weight=weight) for each, weight in zip((second, last), silent, strict=True)))
+    dense = (
+        first,
+        *(replace(each, weight=weight) for each, weight in zip((second, last), silent, strict=True)),
+    )
     ran = [
-        float_simulation(expand(each, loaded.network.convolution.propagation)).run(channels_last(seen.events)).spikes[3]
+        float_simulation(expand(each, loaded.network.convolution.propagation))
+        .run(channels_last(seen.events))
+        .spikes[3]
         for each in (narrow, replace(checkpoint, dense=dense))
     ]
     assert ran[0].any()
@@ -213,8 +233,14 @@ def test_what_is_pruned_can_be_trained_on(compiled, as_json, refusal):
     report = as_json(*LEAN, "--differ", "0.2", "--network", "narrow.pt")
     gone = next(row for row in report["rows"] if row["name"] == "neurons")["removed"]["neurons"]
     made, whole = read_checkpoint("narrow.pt"), read_checkpoint("net.pt")
-    assert made.neurons == {name: n - gone.get(name, 0) * (name != "conv1") for name, n in whole.neurons.items()}
+    assert made.neurons == {
+        name: n - gone.get(name, 0) * (name != "conv1") for name, n in whole.neurons.items()
+    }
     assert made.neurons != whole.neurons
-    found = as_json("finetune", "narrow.pt", "--data", "data", "--weight-bits", "4", "--epochs", "1", "-o", "tuned.pt")
+    found = as_json(
+        "finetune", "narrow.pt", "--data", "data", "--weight-bits", "4", "--epochs", "1", "-o", "tuned.pt"
+    )
     assert (found["fine_tuned_from"], read_checkpoint("tuned.pt").neurons) == (made.sha256, made.neurons)
-    assert "is no single checkpoint in floats" in refusal("lean", "tuned.pt", "--data", "data", "--network", "n.pt")
+    assert "is no single checkpoint in floats" in refusal(
+        "lean", "tuned.pt", "--data", "data", "--network", "n.pt"
+    )

@@ -45,7 +45,10 @@ def folder(tmp_path, monkeypatch):
         for index, steps in enumerate(STEPS * 2 if split == "train" else STEPS):
             grid = rng.random((steps, TAXELS, 2)) < 0.3
             grid[-1, 0, 0] = True  # the last event says how long it is
-            lines = [f"{(step + 0.5) * 0.02:.2f},{taxel},{polarity}" for step, taxel, polarity in np.argwhere(grid)]
+            lines = [
+                f"{(step + 0.5) * 0.02:.2f},{taxel},{polarity}"
+                for step, taxel, polarity in np.argwhere(grid)
+            ]
             file = tmp_path / "data" / split / f"grasp_{index}_label_{index % CLASSES}.csv"
             file.write_text("\n".join(["time_s,taxel,polarity", *lines, ""]))
     assert main(["compile", "x.pt", "-o", "x.loom"]) == 0
@@ -79,11 +82,24 @@ def test_verify_compares_each_recording_at_its_own_length(folder):
     for rung, found in enumerate(together["ladder"]):
         for layer, different in found["different"].items():
             assert different == sum(part["ladder"][rung]["different"][layer] for part in parts)
-    assert together["decision_agreement"] == pytest.approx(np.mean([part["decision_agreement"] for part in parts]))
+    assert together["decision_agreement"] == pytest.approx(
+        np.mean([part["decision_agreement"] for part in parts])
+    )
 
 
 def test_the_page_draws_a_recording_at_its_own_length(folder):
-    words = ("report", "x.loom", "--checkpoint", "x.pt", "--data", "data", "-o", "x.html", "--recording", "0")
+    words = (
+        "report",
+        "x.loom",
+        "--checkpoint",
+        "x.pt",
+        "--data",
+        "data",
+        "-o",
+        "x.html",
+        "--recording",
+        "0",
+    )
     recording = as_json(*words)["recording"]
     assert (recording["file"], recording["steps"]) == (files(folder)[0].name, STEPS[0])
 
@@ -153,7 +169,9 @@ def place(tmp_path_factory):
 def test_it_is_the_network_of_recordings_in_longer_bins(place):
     own, plain = (read_checkpoint(place / f"{name}.pt") for name in ("x", "plain"))
     assert (own.bins, plain.bins) == (BINS, 1)
-    for ours, theirs in zip((own.hops, own.dense[-1].weight), (plain.hops, plain.dense[-1].weight), strict=True):
+    for ours, theirs in zip(
+        (own.hops, own.dense[-1].weight), (plain.hops, plain.dense[-1].weight), strict=True
+    ):
         assert_array_equal(ours, theirs)
     assert own.training["command"].startswith(f"spikeloom train --data fine --join {BINS} --graph manual ")
     assert own.training["history"] == plain.training["history"]
@@ -185,7 +203,10 @@ def test_unusable_bins_are_refused(place, tmp_path, bins):
             f"train --system {NATIVE} --graph manual --data fine --join 2 -o y.pt",
             f"--join 2: a network of system {NATIVE} takes bins as they are|spikeloom data convert --join",
         ),
-        ("verify plain.loom --checkpoint x.pt --data fine", f"netlist and checkpoint disagree|bins of a step {BINS}"),
+        (
+            "verify plain.loom --checkpoint x.pt --data fine",
+            f"netlist and checkpoint disagree|bins of a step {BINS}",
+        ),
     ],
 )
 def test_other_bins_are_refused(refusal, words, told):
@@ -195,7 +216,9 @@ def test_other_bins_are_refused(refusal, words, told):
 
 @pytest.mark.usefixtures("spikeloom")
 def test_it_decides_on_the_recordings_what_the_other_does_on_longer_bins():
-    ours, theirs = (as_json("run", f"{name}.loom", "--data", data) for name, data in (("x", "fine"), ("plain", "long")))
+    ours, theirs = (
+        as_json("run", f"{name}.loom", "--data", data) for name, data in (("x", "fine"), ("plain", "long"))
+    )
     assert ours["counts"] == theirs["counts"]
     assert any(map(any, ours["counts"]))
     assert ours["predictions"] == theirs["predictions"]
@@ -203,7 +226,9 @@ def test_it_decides_on_the_recordings_what_the_other_does_on_longer_bins():
     other = as_json("estimate", "plain.loom", "--data", "long")
     assert own["per_inference"]["energy_j"] == other["per_inference"]["energy_j"]
     pace, others = own["pace"], other["pace"]
-    assert pace["bin_s"] == others["bin_s"] == pytest.approx(BINS * BIN_S)  # which convert wrote beside the bins
+    assert (
+        pace["bin_s"] == others["bin_s"] == pytest.approx(BINS * BIN_S)
+    )  # which convert wrote beside the bins
     for table, watt in pace["real_time_w"].items():
         assert watt == pytest.approx(others["real_time_w"][table])
 
@@ -229,10 +254,24 @@ def test_other_commands_find_what_they_find_on_longer_bins(words, place):
 
 def _without_names(value):
     """A report without names, hashes, commands, times, and what follows from the length of a step."""
-    told = ("calibrated_on", "command", "source", "chosen", "name", "candidate", "data", "provenance", "netlist")
+    told = (
+        "calibrated_on",
+        "command",
+        "source",
+        "chosen",
+        "name",
+        "candidate",
+        "data",
+        "provenance",
+        "netlist",
+    )
     told += ("checkpoint", "sha256")
     if isinstance(value, dict):
-        return {key: _without_names(entry) for key, entry in value.items() if not any(word in key for word in told)}
+        return {
+            key: _without_names(entry)
+            for key, entry in value.items()
+            if not any(word in key for word in told)
+        }
     return [_without_names(entry) for entry in value] if isinstance(value, list) else value
 
 
@@ -249,7 +288,18 @@ def test_joined_networks_and_fine_tuned_ones_keep_them(refusal, place):
     as_json("join", "x.pt", "x.pt", "-o", "both.pt")
     assert (read_checkpoint(place / "both.pt").bins, read_checkpoint(place / "both.pt").towers) == (BINS, 2)
     as_json("finetune", "x.pt", "--data", "fine", "--weight-bits", "4", "--epochs", "1", "-o", "tuned.pt")
-    as_json("finetune", "plain.pt", "--data", "long", "--weight-bits", "4", "--epochs", "1", "-o", "plain-tuned.pt")
+    as_json(
+        "finetune",
+        "plain.pt",
+        "--data",
+        "long",
+        "--weight-bits",
+        "4",
+        "--epochs",
+        "1",
+        "-o",
+        "plain-tuned.pt",
+    )
     tuned, plain = (read_checkpoint(place / f"{name}.pt") for name in ("tuned", "plain-tuned"))
     assert (tuned.bins, plain.bins, len(tuned.forms)) == (BINS, 1, 4)
     assert_array_equal(tuned.dense[0].weight, plain.dense[0].weight)

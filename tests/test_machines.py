@@ -96,16 +96,40 @@ TEXT = (resources.files("spikeloom.compiler.targets") / "loihi1" / "chip.toml").
 
 WRONG = [
     ('title = "Intel Loihi 1"\n', "", "title: missing"),
-    ("core.axons_in = { value = 4096,", "core.axons_in = { value = -1,", "limits.core.axons_in: value is -1, a finite"),
-    ("core.axons_in = { value = 4096,", "core.axons_in = { unt = 2, value = 4096,", "core.axons_in: is {'unt': 2"),
+    (
+        "core.axons_in = { value = 4096,",
+        "core.axons_in = { value = -1,",
+        "limits.core.axons_in: value is -1, a finite",
+    ),
+    (
+        "core.axons_in = { value = 4096,",
+        "core.axons_in = { unt = 2, value = 4096,",
+        "core.axons_in: is {'unt': 2",
+    ),
     ("mesh.height = { value = 4,", "mesh.height = { value = nan,", "mesh.height: value is nan, a finite"),
     ("mesh.height = { value = 4,", 'mesh.height = { value = "4",', "mesh.height: value is '4', a finite"),
     ("synapse.word_bits = { value = 64,", "synapse.word_bits = {", "synapse.word_bits: is {'unit'"),
-    ('spike = { value = 69.3, unit = "pJ"', 'spkie = { value = 69.3, unit = "pJ"', "sanafe.spkie: unknown, allowed"),
-    ('spike = { value = 69.3, unit = "pJ"', 'spike = { value = 69, unit = "nJ"', "spike: unit is 'nJ', allowed is"),
-    ('spike = { value = 69.3, unit = "pJ"', 'spike = { value = inf, unit = "pJ"', "sanafe.spike: value is inf"),
+    (
+        'spike = { value = 69.3, unit = "pJ"',
+        'spkie = { value = 69.3, unit = "pJ"',
+        "sanafe.spkie: unknown, allowed",
+    ),
+    (
+        'spike = { value = 69.3, unit = "pJ"',
+        'spike = { value = 69, unit = "nJ"',
+        "spike: unit is 'nJ', allowed is",
+    ),
+    (
+        'spike = { value = 69.3, unit = "pJ"',
+        'spike = { value = inf, unit = "pJ"',
+        "sanafe.spike: value is inf",
+    ),
     ("neuron_access = {", "neuron_acess = {", "time.sanafe.neuron_acess: unknown|neuron_access"),
-    ('neuron_access = { value = 6.0, unit = "ns"', 'neuron_access = { value = 6.0, unit = "s"', "unit is 's'"),
+    (
+        'neuron_access = { value = 6.0, unit = "ns"',
+        'neuron_access = { value = 6.0, unit = "s"',
+        "unit is 's'",
+    ),
     ("link_buffer = {", "#", "time.sanafe: lacks link_buffer"),
     ("barrier.1 = {", "barrier.3 = {", "time.sanafe: lacks barrier.1"),
     ("barrier.2 = {", "barrier.two = {", "time.sanafe: lacks barrier.1, and others with a number"),
@@ -156,12 +180,16 @@ def test_tables_that_are_not_there_or_wrong(tmp_path):
     refused(OptionError, "energy.mine.hopp: unknown", base.with_tables, chip, str(path))
 
 
-@pytest.mark.parametrize(("joules", "said"), [(1e-9, "static power dominates"), (1e9, "events take 1e+09 J")])
+@pytest.mark.parametrize(
+    ("joules", "said"), [(1e-9, "static power dominates"), (1e9, "events take 1e+09 J")]
+)
 def test_which_power_dominates_is_said_once(joules, said):
     """Static power is not called the larger where events take more."""
     made = specimen("timed")
     outcome = made.machine.price(made.events, lengths=LENGTHS, bin_s=0.02)[1].outcome
-    mean = replace(outcome.result.per_inference, energy_j=dict.fromkeys(outcome.result.per_inference.energy_j, joules))
+    mean = replace(
+        outcome.result.per_inference, energy_j=dict.fromkeys(outcome.result.per_inference.energy_j, joules)
+    )
     text = terminal(outcome.sections(replace(outcome.result, per_inference=mean, min=mean, max=mean)))
     assert f"at the sensor's pace {said}" in text
     assert "all else" not in text

@@ -26,7 +26,9 @@ def events_of(network, samples=3):
 def as_input(name, events, step):
     """One step of a recording (taxels, polarities, steps) in the shape that a net of this name takes."""
     frame = torch.tensor(events[:, :, step], dtype=torch.float64)
-    return frame.T.reshape(example_of(name).shape) if name == "grid" else frame.reshape(example_of(name).shape)
+    return (
+        frame.T.reshape(example_of(name).shape) if name == "grid" else frame.reshape(example_of(name).shape)
+    )
 
 
 def by_torch(name, events):
@@ -65,7 +67,9 @@ def test_weights_and_constants_are_the_modules_to_the_last_bit():
         ("3", 3, 0.3, 0.25),
     ]
     assert (network.input.taxels, network.input.polarities) == (6, 2)
-    for linear, population, projection in zip([net[0], net[2]], network.populations, network.projections, strict=True):
+    for linear, population, projection in zip(
+        [net[0], net[2]], network.populations, network.projections, strict=True
+    ):
         assert np.array_equal(projection.weight.toarray(), linear.weight.detach().double().numpy())
         assert np.array_equal(population.bias, linear.bias.detach().double().numpy())
 
@@ -154,10 +158,16 @@ REFUSED = {
     ),
     "module: has no LIF layer, so nothing spikes": lambda: nn.Linear(4, 2),
     "module 1: is called 2 times in a step": twice,
-    "module: its output is no count of the spikes": lambda: nn.Sequential(nn.Linear(4, 3), LIF(), nn.Linear(3, 2)),
-    "layer lif_c: receives the input and lif_a and lif_b, which are at different depths": lambda: TwoWays(skip=True),
+    "module: its output is no count of the spikes": lambda: nn.Sequential(
+        nn.Linear(4, 3), LIF(), nn.Linear(3, 2)
+    ),
+    "layer lif_c: receives the input and lif_a and lif_b, which are at different depths": lambda: TwoWays(
+        skip=True
+    ),
     "layer 1: keeps 1.5 of its membrane in a step": lambda: nn.Sequential(nn.Linear(4, 2), LIF(beta=1.5)),
-    "layer 1: has the threshold 0, allowed are numbers above 0": lambda: nn.Sequential(nn.Linear(4, 2), LIF(theta=0)),
+    "layer 1: has the threshold 0, allowed are numbers above 0": lambda: nn.Sequential(
+        nn.Linear(4, 2), LIF(theta=0)
+    ),
 }
 
 

@@ -72,7 +72,9 @@ def without_axon(net):
 
 
 def layer_with(**changes):
-    return lambda net: dataclasses.replace(net, layers=(dataclasses.replace(net.layers[0], **changes), *net.layers[1:]))
+    return lambda net: dataclasses.replace(
+        net, layers=(dataclasses.replace(net.layers[0], **changes), *net.layers[1:])
+    )
 
 
 WEIGHTS = "weights (that are not the nearest,|than the compiler chose.*;) the farthest, from .* to neuron"
@@ -95,11 +97,17 @@ DAMAGES = {
     "bias zeroed": (changed("bias_mantissa", of_layer(1, FIRST), np.zeros_like), BIASES),
     "bias at its end": (changed("bias_exponent", of_layer(1, FIRST), lambda _: 7), f"{BIASES} that are not"),
     "neurons": (changed("neuron", of_layer(1, PAIR), np.flip), WEIGHTS),
-    "votes": (changed("readout_class", of_layer(3, PAIR), np.flip), "fc3 has 2 of 4 neurons that vote for another"),
+    "votes": (
+        changed("readout_class", of_layer(3, PAIR), np.flip),
+        "fc3 has 2 of 4 neurons that vote for another",
+    ),
     "classes": (lambda netlist: dataclasses.replace(netlist, classes=5), "it has 5 classes, the network 4"),
     "window": (layer_with(depth=1), "conv1 has a window from step 1 instead of 0"),
     "theta": (layer_with(theta=0.6), "conv1 has theta 0.6 instead of 0.5"),
-    "limit": (changed("threshold", slice(9), plus(np.arange(9))), "12 used, 8 allowed .loihi1.core.threshold_slots"),
+    "limit": (
+        changed("threshold", slice(9), plus(np.arange(9))),
+        "12 used, 8 allowed .loihi1.core.threshold_slots",
+    ),
 }
 
 
@@ -159,7 +167,9 @@ def test_whatever_the_compiler_makes_passes(tmp_path, kind, name, seed):
     network, training = random_network(kind, seed, tmp_path)
     recorded = {"prune_unused": name == "pruned"}
     for chosen in (training, *([] if name in ("pruned", "spike-exact") else [None])):
-        netlist = compile_network(network, Options(**MADE[name], provenance=recorded, training_events=chosen)).netlist
+        netlist = compile_network(
+            network, Options(**MADE[name], provenance=recorded, training_events=chosen)
+        ).netlist
         found = checked(netlist, network)
         assert found.holds, found.text
         moved = [layer for layer, each in found.layers.items() if each.nearest < each.weights]
@@ -168,9 +178,13 @@ def test_whatever_the_compiler_makes_passes(tmp_path, kind, name, seed):
         alone = checked(netlist, network, compensated=[]).holds
         assert alone == (not moved) or (name == "pruned" and not moved)  # only biases
         if chosen is None:
-            assert found.text.endswith("weight, bias, threshold and decay is the checkpoint's, rounded to the nearest")
+            assert found.text.endswith(
+                "weight, bias, threshold and decay is the checkpoint's, rounded to the nearest"
+            )
             assert all(0 < each.nearest == each.weights for each in found.layers.values())
-            assert all(0 < each.farthest_steps <= 0.5 + 1e-9 or "planes" in name for each in found.layers.values())
+            assert all(
+                0 < each.farthest_steps <= 0.5 + 1e-9 or "planes" in name for each in found.layers.values()
+            )
 
 
 def test_weights_that_the_range_cuts_off_are_at_its_end():
@@ -193,7 +207,9 @@ def rounded(request, tmp_path_factory):
 @given(st.data())
 def test_every_single_change_is_found(rounded, data):
     netlist, network = rounded
-    field = data.draw(st.sampled_from(["synapse_weight", "bias_mantissa", "threshold", "decay_v", "decay_u"]))
+    field = data.draw(
+        st.sampled_from(["synapse_weight", "bias_mantissa", "threshold", "decay_v", "decay_u"])
+    )
     values = getattr(netlist, field)
     if field.startswith("decay"):
         place = netlist.compartments_of(data.draw(st.integers(0, len(netlist.layers) - 1)))
@@ -255,8 +271,13 @@ def test_a_netlist_remembers_bins_and_data(tmp_path, monkeypatch):
     own_file(tmp_path / "net.pt", training={"data": "taps", "bin_s": 0.1})
     for words in (["c.pt"], ["c.pt", "--target", "truenorth"], ["net.pt", "--calibrate", "taps"]):
         made = as_json("compile", *words, "-o", "x.loom")
-        assert {name: made["provenance"][name] for name in ("data", "bin_s")} == {"data": "taps", "bin_s": 0.1}
-        assert run("run", "x.loom", "--data", "taps") == run("run", "x.loom", "--data", "taps", "--bin", "0.1")
+        assert {name: made["provenance"][name] for name in ("data", "bin_s")} == {
+            "data": "taps",
+            "bin_s": 0.1,
+        }
+        assert run("run", "x.loom", "--data", "taps") == run(
+            "run", "x.loom", "--data", "taps", "--bin", "0.1"
+        )
     assert run("estimate", "x.loom", "--data", "taps")[1].startswith("per inference of 13 chip steps")
     # the same, whichever command reads them and whoever made the bins
     tap = "taps/test/tap_0_label_0.csv"
@@ -271,7 +292,18 @@ def test_a_netlist_remembers_bins_and_data(tmp_path, monkeypatch):
         assert as_json("data", "describe", f"binned{width}")["bin_s"] == float(width)
     assert run("join", "net.pt", "net.pt", "-o", "wide.pt")[0] == 0
     made = {"wide.pt": (), "less.pt": ("lean", "net.pt", "--data", "taps", "--network", "less.pt")}
-    made["tuned.pt"] = "finetune", "net.pt", "--data", "taps", "--epochs", "1", "--weight-bits", "4", "-o", "tuned.pt"
+    made["tuned.pt"] = (
+        "finetune",
+        "net.pt",
+        "--data",
+        "taps",
+        "--epochs",
+        "1",
+        "--weight-bits",
+        "4",
+        "-o",
+        "tuned.pt",
+    )
     for network, words in made.items():
         assert not words or run(*words)[0] == 0
         assert read_checkpoint(network).training["bin_s"] == 0.1
@@ -310,8 +342,12 @@ def test_graph_time_step_and_names_are_the_netlists(tmp_path, monkeypatch):
     assert run("compile", "net.nir", "--dt", "0.01", "-o", "back.loom")[0] == 0
     netlist = read_netlist("back.loom")
     layers = tuple(dataclasses.replace(layer, name=f"l{k}") for k, layer in enumerate(netlist.layers))
-    digests = dict(zip((layer.name for layer in layers), netlist.provenance["digests"].values(), strict=True))
-    netlist = dataclasses.replace(netlist, layers=layers, provenance={**netlist.provenance, "digests": digests})
+    digests = dict(
+        zip((layer.name for layer in layers), netlist.provenance["digests"].values(), strict=True)
+    )
+    netlist = dataclasses.replace(
+        netlist, layers=layers, provenance={**netlist.provenance, "digests": digests}
+    )
     write_netlist(netlist, "named.loom")
     assert run("verify", "named.loom", "--checkpoint", "net.nir")[0] == 0
     assert run("verify", "named.loom", "--checkpoint", "net.nir", "--dt", "0.02")[0] == 1

@@ -106,7 +106,9 @@ SMALL = Architecture(taxels=39, classes=4, hops=2, features=3, hidden=(8, 6, 5),
 
 def test_initial_weights_follow_the_seed_and_leave_the_global_random_state_alone():
     before = torch.get_rng_state()
-    first, again, other = (SpikingNet(SMALL, adjacency_of(), seed=seed).export_weights() for seed in (1, 1, 2))
+    first, again, other = (
+        SpikingNet(SMALL, adjacency_of(), seed=seed).export_weights() for seed in (1, 1, 2)
+    )
     assert torch.equal(torch.get_rng_state(), before)
     for name, array in first.items():
         assert_array_equal(array, again[name])
@@ -154,7 +156,9 @@ def seen_by(system, padding="none"):
     return propagation_of(system, MANUAL.edges, 39, FORMS[padding], filters_of(system, 39, 3))
 
 
-def network_of(system, *, seed=1, gain=3.0, padding="none", features=4, hidden=(8, 6), classes=4) -> SpikingNet:
+def network_of(
+    system, *, seed=1, gain=3.0, padding="none", features=4, hidden=(8, 6), classes=4
+) -> SpikingNet:
     """A small network of random weights, lively enough to spike in every layer."""
     sizes = Architecture(taxels=39, classes=classes, features=features, hidden=hidden, system=system)
     network = SpikingNet(sizes, seen_by(system, padding), seed=seed)
@@ -237,7 +241,8 @@ def plain_run(system, state, events, *, padding="none", beta=0.2, theta=0.5):
     """Spikes and membranes of every layer, step by step, of one recording (taxels, channels, steps)."""
     stages = [plain_first(system, state, padding=padding)]
     stages += [
-        lambda x, k=k: torch.nn.functional.linear(x, state[f"fc{k}.weight"], state[f"fc{k}.bias"]) for k in (1, 2, 3)
+        lambda x, k=k: torch.nn.functional.linear(x, state[f"fc{k}.weight"], state[f"fc{k}.bias"])
+        for k in (1, 2, 3)
     ]
     kind, fire = state["fc1.weight"].dtype, surrogate_spike(RECTANGLE)
     membranes, spikes, trace = [0.0] * 4, [torch.zeros(())] * 4, []
@@ -270,9 +275,14 @@ def test_a_window_over_a_grid_equals_torchs_convolution(kernel, stride, padding,
     expected = torch.nn.functional.conv2d(torch.tensor(picture), weight, torch.tensor(bias), stride, padding)
     assert grid.places(kernel) == tuple(expected.shape[2:])
     found = filter_places(
-        torch.tensor(x)[:, None], torch.tensor(grid.propagation(kernel)), torch.tensor(filters), torch.tensor(bias)
+        torch.tensor(x)[:, None],
+        torch.tensor(grid.propagation(kernel)),
+        torch.tensor(filters),
+        torch.tensor(bias),
     )
-    assert_allclose(in_order(GRID_CNN, found.view(5, -1, 3).permute(1, 2, 0)).T, expected.flatten(1), atol=1e-12)
+    assert_allclose(
+        in_order(GRID_CNN, found.view(5, -1, 3).permute(1, 2, 0)).T, expected.flatten(1), atol=1e-12
+    )
 
 
 def test_the_grid_over_the_built_in_sensor():
@@ -307,7 +317,9 @@ def test_spikes_and_gradients_equal_plain_code(system, padding):
         assert found.any()
 
 
-@pytest.mark.parametrize(("system", "bound"), [(MLP, 78**-0.5), (GCN, (6 / 66) ** 0.5), (GRID_CNN, 18**-0.5)])
+@pytest.mark.parametrize(
+    ("system", "bound"), [(MLP, 78**-0.5), (GCN, (6 / 66) ** 0.5), (GRID_CNN, 18**-0.5)]
+)
 def test_initial_weights_are_those_of_the_usual_layers(system, bound):
     weights = network_of(system, gain=1.0, features=64).export_weights()
     assert 0.9 * bound < np.abs(weights["conv1.hops"]).max() <= bound
@@ -344,7 +356,9 @@ def test_expansion_equals_probing_the_layer(tmp_path, system):
     network = network_of(system)
     checkpoint = saved(tmp_path, network)
     first = plain_first(system, {name: tensor.double() for name, tensor in state_of(network).items()})
-    weight, bias = probed(lambda batch: np.stack([first(torch.tensor(row).view(39, 2)).numpy() for row in batch]), 78)
+    weight, bias = probed(
+        lambda batch: np.stack([first(torch.tensor(row).view(39, 2)).numpy() for row in batch]), 78
+    )
     expanded = expand(checkpoint, seen_by(system))
     assert expanded.populations[0].name == "conv1"
     assert_allclose(expanded.projections[0].weight.toarray(), weight, atol=1e-12)
@@ -353,7 +367,9 @@ def test_expansion_equals_probing_the_layer(tmp_path, system):
     assert expanded.projections[0].weight.nnz == np.count_nonzero(weight)
 
 
-@pytest.mark.parametrize(("system", "bits"), [(TACTILESGNET, 2), (TACTILESGNET, 4), *((system, 4) for system in NEW)])
+@pytest.mark.parametrize(
+    ("system", "bits"), [(TACTILESGNET, 2), (TACTILESGNET, 4), *((system, 4) for system in NEW)]
+)
 def test_fine_tuned_on_the_chips_integers_they_are_the_chip(tmp_path, system, bits):
     network, seen = network_of(system), seen_by(system)
     checkpoint = saved(tmp_path, network)

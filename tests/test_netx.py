@@ -46,7 +46,10 @@ REFUSED = [
         "1 (conv): gives [2, 4, 5], the file says [2, 5, 4]",
         [given_input(2, 5, 6), conv(np.full((2, 2, 2, 2), 2), (2, 5, 4))],
     ),
-    *[(f"1 ({kind}): is of a type that has no place", of_type(kind)) for kind in ("pool", "average", "strange")],
+    *[
+        (f"1 ({kind}): is of a type that has no place", of_type(kind))
+        for kind in ("pool", "average", "strange")
+    ],
 ]
 REFUSED = [(f"layer {words}", layers) for words, layers in REFUSED]
 REFUSED += [("has no layers, so it is no netx file", []), ("has no layer of neurons", [given_input(6)])]

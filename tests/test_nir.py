@@ -46,14 +46,24 @@ def recording(network, events, image=False):
     """Events of a file's input as a recording (1, taxels, polarities, steps)."""
     sensor = network.input
     if image:  # [polarities, height, width] in the file
-        return events.reshape(len(events), sensor.polarities, sensor.taxels).transpose(2, 1, 0)[None].astype(np.uint8)
-    return events.reshape(len(events), sensor.taxels, sensor.polarities).transpose(1, 2, 0)[None].astype(np.uint8)
+        return (
+            events.reshape(len(events), sensor.polarities, sensor.taxels)
+            .transpose(2, 1, 0)[None]
+            .astype(np.uint8)
+        )
+    return (
+        events.reshape(len(events), sensor.taxels, sensor.polarities)
+        .transpose(1, 2, 0)[None]
+        .astype(np.uint8)
+    )
 
 
 def float_spikes(network, events, image=False):
     given = with_clocks(recording(network, events, image), network.input.clocks)
     found = run_float(network, np.ascontiguousarray(given.transpose(0, 2, 1)).astype(bool)).spikes
-    return {population.name: spikes[0] for population, spikes in zip(network.populations, found, strict=True)}
+    return {
+        population.name: spikes[0] for population, spikes in zip(network.populations, found, strict=True)
+    }
 
 
 @pytest.mark.parametrize("name", READ)
@@ -97,7 +107,12 @@ def compare(graph, shape, *, convention="euler", least=10, late=()):
 
 def image(rng, **more):
     """A convolution on (2, 5, 6)."""
-    said = {"stride": (2, 1), "padding": (1, 0), "dilation": (1, 2), "weight": rng.normal(size=(4, 2, 3, 2))} | more
+    said = {
+        "stride": (2, 1),
+        "padding": (1, 0),
+        "dilation": (1, 2),
+        "weight": rng.normal(size=(4, 2, 3, 2)),
+    } | more
     return nir.Conv2d(input_shape=(5, 6), bias=rng.normal(size=4) * 0.1, groups=1, **said)
 
 
@@ -108,7 +123,9 @@ def row(shape, out, **nodes):
 
 def leaky(seed):
     rng = np.random.default_rng(seed)
-    first = lif(9, tau=0.07, r=rng.uniform(1, 3, 9), threshold=rng.uniform(0.3, 0.8, 9), leak=0.2, reset=-0.3)
+    first = lif(
+        9, tau=0.07, r=rng.uniform(1, 3, 9), threshold=rng.uniform(0.3, 0.8, 9), leak=0.2, reset=-0.3
+    )
     last = lif(4, tau=0.04, r=2.0, leak=rng.uniform(-0.1, 0.1, 4), reset=0.1)
     return chain(affine(rng, 9, 6, 1.5), first, affine(rng, 4, 9, 1.5), last)
 
@@ -143,7 +160,9 @@ def padded(**more):
 def one_axis():
     rng = np.random.default_rng(9)
     said = {"stride": 2, "padding": 1, "dilation": 1, "groups": 2}
-    conv = nir.Conv1d(input_shape=7, weight=rng.normal(size=(4, 1, 3)), bias=rng.normal(size=4) * 0.2, **said)
+    conv = nir.Conv1d(
+        input_shape=7, weight=rng.normal(size=(4, 1, 3)), bias=rng.normal(size=4) * 0.2, **said
+    )
     return row((2, 7), (16,), a=conv, b=nir.Flatten(np.array([4, 4]), 0, -1), c=lif(16, r=3.0))
 
 
@@ -178,13 +197,26 @@ def test_currents_and_the_biases_that_go_through_them(convention):
     ]
     network = compare(chain(*nodes), (6,), convention=convention)
     assert network.input.clocks.channels == 1
-    assert [population.name for population in network.populations] == ["n1", "always1", "n3", "always2", "n5"]
+    assert [population.name for population in network.populations] == [
+        "n1",
+        "always1",
+        "n3",
+        "always2",
+        "n5",
+    ]
 
 
 def test_a_leaky_integrator_is_the_filter_of_what_follows():
     rng = np.random.default_rng(5)
     filter_ = nir.LI(tau=np.full(9, 0.06), r=np.full(9, 3.0), v_leak=np.full(9, 0.1))
-    nodes = [affine(rng, 9, 6), filter_, affine(rng, 8, 9), lif(8, r=2.0), affine(rng, 4, 8, 2.0), lif(4, r=2.0)]
+    nodes = [
+        affine(rng, 9, 6),
+        filter_,
+        affine(rng, 8, 9),
+        lif(8, r=2.0),
+        affine(rng, 4, 8, 2.0),
+        lif(4, r=2.0),
+    ]
     network = compare(chain(*nodes), (6,))
     assert network.populations[0].alpha == pytest.approx(1 - 0.02 / 0.06)
 
@@ -279,13 +311,17 @@ def test_the_nir_file_alone_has_the_integers_and_the_decays(tmp_path_factory, ne
     path.write_bytes(nir_export.export(lift(netlist), 0.02))
     integer = lift(netlist)
     found = read_nir(path, dt=0.02, polarities=network.input.polarities).network
-    assert [one.name for one in found.populations] == [one.name.replace(".", "_") for one in integer.populations]
+    assert [one.name for one in found.populations] == [
+        one.name.replace(".", "_") for one in integer.populations
+    ]
     for post, (ours, chip) in enumerate(zip(found.populations, integer.populations, strict=True)):
         units = chip.threshold / ours.theta  # thresholds that differ are one threshold in other units
         assert ours.beta == pytest.approx(chip.realised_beta, abs=1e-6)
         assert_allclose(ours.bias * units * 64, chip.bias, rtol=1e-12)
         for pre in {projection.pre for projection in integer.projections if projection.post == post}:
-            chips = sum(p.effective().toarray() for p in integer.projections if (p.pre, p.post) == (pre, post))
+            chips = sum(
+                p.effective().toarray() for p in integer.projections if (p.pre, p.post) == (pre, post)
+            )
             read = [p.weight.toarray() for p in found.projections if (p.pre, p.post) == (pre, post)]
             if chips.any():
                 assert_allclose(read[0] * units[:, None], chips, rtol=1e-12)

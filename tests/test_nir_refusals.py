@@ -59,7 +59,13 @@ def circle(count):
 
 def conv(**changes):
     """A convolution on (2, 5, 6), some of its parameters changed behind its back."""
-    said = {"input_shape": (5, 6), "weight": np.ones((4, 2, 3, 2)), "bias": np.zeros(4), "stride": 1, "padding": 0}
+    said = {
+        "input_shape": (5, 6),
+        "weight": np.ones((4, 2, 3, 2)),
+        "bias": np.zeros(4),
+        "stride": 1,
+        "padding": 0,
+    }
     late = {key: changes.pop(key) for key in ("stride", "dilation", "padding") if key in changes}
     node = nir.Conv2d(**(said | {"dilation": 1, "groups": 1} | changes))
     for key, value in late.items():
@@ -82,8 +88,14 @@ ALONE = {"a": affine(RNG, 5, 4), "b": lif(5), "x": lif(5), "d": lif(5)}
 SKIP = {"a": affine(RNG, 5, 4), "b": lif(5), "c": affine(RNG, 3, 5), "d": affine(RNG, 3, 4), "e": lif(3)}
 
 GRAPHS = [
-    ("has 2 nodes of type Output (output, more), one is allowed", lambda: with_node("more", nir.Output(np.array([5])))),
-    ("has the shape [2097152], allowed are up to 1048576", lambda: with_node("input", nir.Input(np.array([2**21])))),
+    (
+        "has 2 nodes of type Output (output, more), one is allowed",
+        lambda: with_node("more", nir.Output(np.array([5]))),
+    ),
+    (
+        "has the shape [2097152], allowed are up to 1048576",
+        lambda: with_node("input", nir.Input(np.array([2**21]))),
+    ),
     ("node n3 (LIF): receives nothing", lambda: without_edge("n2", "n3")),
     (
         "(Delay): is of a type that has no place here",
@@ -97,7 +109,10 @@ GRAPHS = [
         "node x (LIF): receives nothing but its own",
         lambda: graph_with(ALONE, [("a", "b"), ("b", "d"), ("x", "x"), ("x", "d")], (4,), (5,), last="d"),
     ),
-    ("weight is for 7 values, it gets [5]; the shapes disagree", lambda: chain(W, lif(5), affine(RNG, 3, 7), lif(3))),
+    (
+        "weight is for 7 values, it gets [5]; the shapes disagree",
+        lambda: chain(W, lif(5), affine(RNG, 3, 7), lif(3)),
+    ),
     ("for inputs of [6, 5], it gets [5, 6]", lambda: conv(input_shape=(6, 5))),
     ("stride or dilation below 1", lambda: conv(stride=0)),
     ("has a kernel of 3 for 5 places", lambda: conv(dilation=9)),
@@ -106,15 +121,26 @@ GRAPHS = [
     ("(its r is tau / 0.0001, so", lambda: two_layers(lif(3, tau=0.01, r=100.0))),
     ("fires 0 above its reset", lambda: two_layers(lif(3, threshold=0.0))),
     ("r has 1 of 3 values NaN or infinite", lambda: two_layers(lif(3, r=np.array([1, np.nan, 1])))),
-    ("tau_syn is different from neuron to neuron", lambda: two_layers(cuba(3, tau_syn=np.array([0.1, 0.2, 0.3])))),
-    ("n3 (LIF): tau is different from neuron to neuron", lambda: two_layers(lif(3, tau=np.array([0.1, 0.2, 0.3])))),
+    (
+        "tau_syn is different from neuron to neuron",
+        lambda: two_layers(cuba(3, tau_syn=np.array([0.1, 0.2, 0.3]))),
+    ),
+    (
+        "n3 (LIF): tau is different from neuron to neuron",
+        lambda: two_layers(lif(3, tau=np.array([0.1, 0.2, 0.3]))),
+    ),
     ("resets by subtraction (reset_mechanism = 'subtract')", subtracting),
     ("gets weighted spikes of n1", lambda: chain(affine(RNG, 5, 4), lif(5), affine(RNG, 3, 5))),
     ("has no spiking neurons", lambda: chain(affine(RNG, 5, 4))),
-    ("filters a current that is filtered", lambda: chain(affine(RNG, 5, 4), leaky(5, 0.1), leaky(5, 0.2), lif(5))),
+    (
+        "filters a current that is filtered",
+        lambda: chain(affine(RNG, 5, 4), leaky(5, 0.1), leaky(5, 0.2), lif(5)),
+    ),
     (
         "the input and b, which are at different depths",
-        lambda: graph_with(SKIP, [("a", "b"), ("b", "c"), ("c", "e"), ("input", "d"), ("d", "e")], (4,), (3,)),
+        lambda: graph_with(
+            SKIP, [("a", "b"), ("b", "c"), ("c", "e"), ("input", "d"), ("d", "e")], (4,), (3,)
+        ),
     ),
 ]
 
@@ -135,7 +161,9 @@ def test_networks_that_the_chip_cannot_have(words, made):
         ("there is no node elsewhere", lambda n: n["edges"].append(["n0", "elsewhere"])),
         (
             "graph b: has 0 nodes of type Input",
-            lambda n: n["nodes"].update(b={"type": "NIRGraph", "nodes": {"x": {"type": "Linear"}}, "edges": []}),
+            lambda n: n["nodes"].update(
+                b={"type": "NIRGraph", "nodes": {"x": {"type": "Linear"}}, "edges": []}
+            ),
         ),
         (
             r"node n0 ('Quantum\n'): is of a type that has no place here, allowed are Affine, AvgPool2d",
@@ -167,14 +195,20 @@ def nested(file):
     [
         ("has no node, so it is no NIR file", lambda f: f.__setitem__("x", 1)),
         ("a is a link to elsewhere", lambda f: f.__setitem__("a", h5py.ExternalLink("other.h5", "/b"))),
-        ("a keeps its numbers in another", lambda f: f.create_dataset("a", (10,), "f8", external=[("raw.bin", 0, 80)])),
+        (
+            "a keeps its numbers in another",
+            lambda f: f.create_dataset("a", (10,), "f8", external=[("raw.bin", 0, 80)]),
+        ),
         ("announces more than 268435456", lambda f: f.create_dataset("a", (2**40,), "f8", chunks=(1024,))),
         (
             "announces more than 268435456",
             lambda f: f.create_dataset("a", (1,), "f8", maxshape=(None,), chunks=(2**28,)),
         ),
         ("(RecursionError: ", nested),
-        ("has 0 nodes of type Input", lambda f: f.create_group("node").__setitem__("type", np.bytes_(b"\xff\xfe"))),
+        (
+            "has 0 nodes of type Input",
+            lambda f: f.create_group("node").__setitem__("type", np.bytes_(b"\xff\xfe")),
+        ),
     ],
 )
 def test_contents_of_hdf5(tmp_path, monkeypatch, words, fill):

@@ -75,13 +75,22 @@ STAGES = [
     (f"node stage (Relu): {AFFINE}", "stage = Relu(current)"),
     (f"node stage (Mul): multiplies x by x, so it {AFFINE}", "stage = Mul(x, x)"),
     ("node stage (Gather): takes indices or sizes from what varies", "stage = Gather(w, current)"),
-    ("node odd (Softmax): is computed from constants by an operator", "odd = Softmax(b); stage = Add(current, odd)"),
-    ("node huge (Expand): makes 3000000000000 values or", "huge = Expand(current, big); stage = ReduceSum(huge, axis)"),
+    (
+        "node odd (Softmax): is computed from constants by an operator",
+        "odd = Softmax(b); stage = Add(current, odd)",
+    ),
+    (
+        "node huge (Expand): makes 3000000000000 values or",
+        "huge = Expand(current, big); stage = ReduceSum(huge, axis)",
+    ),
     ("sorted, however input 'nobody'", "stage = Add(current, nobody)"),
 ]
 NODES = [
     ("node stage (Einsum): cannot be used", node("Einsum", "current b b", "stage", equation="ij,j,k->ij")),
-    (f"node stage (Cast): rounds its input to whole numbers, so it {AFFINE}", node("Cast", "current", "stage", to=7)),
+    (
+        f"node stage (Cast): rounds its input to whole numbers, so it {AFFINE}",
+        node("Cast", "current", "stage", to=7),
+    ),
     (f"node stage (LSTM): {AFFINE}", node("LSTM", "current w w", "stage", hidden_size=3)),
     (
         "node stage (Strange): is of the domain my.own, allowed are the",
@@ -108,15 +117,24 @@ REFUSED = [
     ("node u0_new (Add): takes the membrane of u0 as a state, and no", layer(GOOD, outputs=["s0_new"])),
     (
         "node u0_new (Add): 2 inputs are no state of a neuron: x (4), y",
-        layer(f"both = Add(current, y); {GOOD.replace('k, current', 'k, both')}", inputs=[*INPUTS, ("y", [1, 3])]),
+        layer(
+            f"both = Add(current, y); {GOOD.replace('k, current', 'k, both')}",
+            inputs=[*INPUTS, ("y", [1, 3])],
+        ),
     ),
     (
         "node current (Gemm): keeps no membrane from step to step, so",
         layer("hot = Greater(current, theta); s0_new = Cast(hot)", inputs=INPUTS[:1], outputs=["s0_new"]),
     ),
     ("holds no spiking layer: no membrane is compared with a", model(STAGE, INPUTS[:1], ["current"])),
-    ("layer layer1: keeps 1.5 of its membrane in a step, allowed", layer(GOOD, beta=np.array(1.5, np.float32))),
-    ("node u0_new (Add): has coefficients that are not finite", layer(GOOD, w=np.full((4, 3), np.nan, np.float32))),
+    (
+        "layer layer1: keeps 1.5 of its membrane in a step, allowed",
+        layer(GOOD, beta=np.array(1.5, np.float32)),
+    ),
+    (
+        "node u0_new (Add): has coefficients that are not finite",
+        layer(GOOD, w=np.full((4, 3), np.nan, np.float32)),
+    ),
     ("node end0 (Scan): holds a graph, a loop or a choice", looped()),
     # files
     ("holds no graph, so it is not an ONNX file", b""),
@@ -125,7 +143,10 @@ REFUSED = [
     ("too small for the declared shape", changed(lambda w, _: w.dims.__setitem__(0, 2 * 10**12))),
     ("tensor w: has element type 16", changed(lambda w, _: w.CopyFrom(BRAIN))),
     ("makes 1000000000000 values or", layer(GOOD, inputs=[("x", [10**6, 10**6]), *STATE_IN[:2]])),
-    ("input x: has an open size 'taxels', allowed", layer(GOOD, inputs=[("x", [1, "taxels"]), *STATE_IN[:2]])),
+    (
+        "input x: has an open size 'taxels', allowed",
+        layer(GOOD, inputs=[("x", [1, "taxels"]), *STATE_IN[:2]]),
+    ),
 ]
 
 
@@ -181,7 +202,9 @@ def test_data_beside_the_file_that_is_right(tmp_path):
     (tmp_path / "net.onnx").write_bytes(beside("w.bin", offset=4, length=48))
     (tmp_path / "whole.onnx").write_bytes(two_layers())
     found, whole = (read_onnx(tmp_path / name) for name in ("net.onnx", "whole.onnx"))
-    assert np.array_equal(found.network.projections[0].weight.toarray(), whole.network.projections[0].weight.toarray())
+    assert np.array_equal(
+        found.network.projections[0].weight.toarray(), whole.network.projections[0].weight.toarray()
+    )
     assert found.sha256 != whole.sha256
 
 

@@ -53,7 +53,9 @@ def by_steps(netlist, events):
     membranes = spikes.astype(np.int64)
     for step, now in enumerate(steps):
         found = by_name(session, given | {"events": now})
-        given |= {name.removesuffix("_next"): array for name, array in found.items() if name.endswith("_next")}
+        given |= {
+            name.removesuffix("_next"): array for name, array in found.items() if name.endswith("_next")
+        }
         for layer in plan(netlist):
             spikes[:, step, layer.ids] = given[f"{layer.name}.spikes"]
             membranes[:, step, layer.ids] = given[f"{layer.name}.membrane"]
@@ -77,7 +79,9 @@ def test_random_networks_are_the_specification(data):
     netlist = data.draw(netlists(weight_exponents=(-1, 0, 1, 3)))
     bounds = reach(netlist)
     assume(bounds.sums.max() <= ACCUMULATOR_MAX and bounds.current.max() <= CURRENT_MAX)
-    labels = data.draw(st.lists(st.integers(-1, 2), min_size=netlist.n_compartments, max_size=netlist.n_compartments))
+    labels = data.draw(
+        st.lists(st.integers(-1, 2), min_size=netlist.n_compartments, max_size=netlist.n_compartments)
+    )
     netlist = replace(netlist, classes=3, readout_class=read_only(labels))
     assert_as_specified(netlist, data.draw(recordings(netlist)))
 
@@ -93,7 +97,9 @@ def test_a_large_network_is_the_engine():
 def three_neurons():
     """A netlist by hand: two neurons that receive both inputs, one that receives these and votes for class 1."""
     netlist, _, _ = six_steps()
-    return replace(netlist, bias_mantissa=read_only([0, -7, 0]), classes=2, readout_class=read_only([-1, -1, 1]))
+    return replace(
+        netlist, bias_mantissa=read_only([0, -7, 0]), classes=2, readout_class=read_only([-1, -1, 1])
+    )
 
 
 def test_verify_finds_an_engine_that_strays(monkeypatch):
@@ -141,13 +147,17 @@ def test_all_recordings(fixture, bits, request, tmp_path):
 
 
 @given(
-    arrays.arrays(np.int64, st.tuples(st.integers(1, 4), st.integers(1, 4)), elements=st.integers(-(2**22), 2**22)),
+    arrays.arrays(
+        np.int64, st.tuples(st.integers(1, 4), st.integers(1, 4)), elements=st.integers(-(2**22), 2**22)
+    ),
     st.integers(0, 6),
 )
 def test_digits_add_up_to_the_weights(weight, shift):
     found = digits(weight << shift)
     assert all(digit.dtype == np.int8 for digit, _ in found)
-    np.testing.assert_array_equal(sum(digit.astype(np.int64) * factor for digit, factor in found), weight << shift)
+    np.testing.assert_array_equal(
+        sum(digit.astype(np.int64) * factor for digit, factor in found), weight << shift
+    )
 
 
 @pytest.mark.parametrize(
@@ -187,7 +197,10 @@ def test_registers_that_may_overflow_are_refused():
     assert one_layer(decay_u=100).remembers
     axons = [Axon(source=0, targets=((0, 254),), exponent=7)] * 2
     assert len(plan(build([Neuron()], axons[:1], n_inputs=1, depths=[0]))) == 1
-    for overflowing in (lambda: one_layer(decay_u=1), lambda: plan(build([Neuron()], axons, n_inputs=1, depths=[0]))):
+    for overflowing in (
+        lambda: one_layer(decay_u=1),
+        lambda: plan(build([Neuron()], axons, n_inputs=1, depths=[0])),
+    ):
         refused(ModelError, "onnx: some input may overflow a register of layer0", overflowing)
 
 
@@ -198,7 +211,12 @@ def test_the_reference_of_the_format_computes_the_same(tmp_path):
     content = onnx.load_from_string(onnx_writer.export(netlist, "scan")[0])
     onnx.checker.check_model(content, full_check=True)
     (tmp_path / "x.onnx").write_bytes(content.SerializeToString())
-    refused(ModelError, "x.onnx: was written by spikeloom export; use the netlist", read_onnx, tmp_path / "x.onnx")
+    refused(
+        ModelError,
+        "x.onnx: was written by spikeloom export; use the netlist",
+        read_onnx,
+        tmp_path / "x.onnx",
+    )
     model = ReferenceEvaluator(content)
     found = dict(zip(model.output_names, model.run(None, {"events": given.transpose(2, 0, 1)}), strict=True))
     np.testing.assert_array_equal(found["layer0.spikes"].transpose(1, 0, 2), expected[:, :12, :2])

@@ -81,7 +81,9 @@ def test_at_the_threshold_is_the_next_number_below(read):
     assert any("fires at u >= 0.5" in fact and "the next number below" in fact for fact in found.facts)
     # in float32, the arithmetic of the file, every membrane is decided as the file decides it
     for membrane in (0.5, below, np.nextafter(np.float32(0.5), np.float32(1))):
-        assert (np.float32(membrane) >= np.float32(0.5)) == (np.float32(membrane) > np.float32(population.theta))
+        assert (np.float32(membrane) >= np.float32(0.5)) == (
+            np.float32(membrane) > np.float32(population.theta)
+        )
 
 
 @pytest.mark.parametrize(
@@ -99,7 +101,9 @@ def test_how_spikes_are_counted(read, last, inputs, label):
     assert network.classes == max(label) + 1
 
 
-@pytest.mark.parametrize(("name", "opset"), [("tag", 11), ("grid", 13), ("mlp", 17), ("gcn", 17), ("averaged", 20)])
+@pytest.mark.parametrize(
+    ("name", "opset"), [("tag", 11), ("grid", 13), ("mlp", 17), ("gcn", 17), ("averaged", 20)]
+)
 def test_modules_come_back_with_the_same_integers(read, name, opset):
     """One step, and all steps."""
     net, example = NETS[name](), example_of(name)
@@ -108,7 +112,9 @@ def test_modules_come_back_with_the_same_integers(read, name, opset):
     several = read(exported(AllSteps(net), (torch.zeros(*example.shape, 5),)))
     assert "5 steps unrolled" in several.facts[0]
     options = Options(storage=Fixed((Packing(bits=6),)))
-    integers = [compile_network(network, options).integer for network in (ours, step.network, several.network)]
+    integers = [
+        compile_network(network, options).integer for network in (ours, step.network, several.network)
+    ]
     for found in integers[1:]:
         assert_same_network(found, integers[0])
     # torch's exporter folds a batch norm into the convolution before it, in float32
@@ -150,7 +156,9 @@ def test_open_size_in_front_is_one_recording(read):
     axes = {"input": {0: "batch"}}
     found = read(one_step(net, example, input_names=["input"], dynamic_axes=axes))
     assert "the open size 'batch' is the batch's, read as 1" in found.facts
-    assert_same_network(compile_network(module_network(net, example)).integer, compile_network(found.network).integer)
+    assert_same_network(
+        compile_network(module_network(net, example)).integer, compile_network(found.network).integer
+    )
 
 
 def test_the_largest_of_the_votes_is_what_is_counted(read):
@@ -216,7 +224,15 @@ def test_the_released_network_by_torch_geometric(released_checkpoint, tmp_path):
         pytest.skip("needs torch_geometric, and SPIKELOOM_RELEASED_CODE as the folder of the released code")
     script = Path(__file__).parents[1] / "benchmarks" / "released_onnx.py"
     subprocess.run([sys.executable, str(script), code, str(released_checkpoint), str(tmp_path)], check=True)
-    words = ["compile", str(released_checkpoint), "--graph", "manual", "-o", str(tmp_path / "t7.loom"), "--json"]
+    words = [
+        "compile",
+        str(released_checkpoint),
+        "--graph",
+        "manual",
+        "-o",
+        str(tmp_path / "t7.loom"),
+        "--json",
+    ]
     assert cli.main(words) == 0
     for path in sorted(tmp_path.glob("*.onnx")):
         found = compile_network(read_onnx(path).network).netlist
@@ -250,14 +266,26 @@ CASES = [
     ("MatMul", [numbers(5, 2, 3), numbers(3)], {}),
     ("MatMul", [numbers(5, 1, 2, 3), numbers(4, 3, 2)], {}),
     ("Gemm", [numbers(2, 3), numbers(3, 4), numbers(4)], {}),
-    ("Gemm", [numbers(3, 2), numbers(4, 3), numbers(2, 1)], {"transA": 1, "transB": 1, "alpha": 0.5, "beta": 2.0}),
+    (
+        "Gemm",
+        [numbers(3, 2), numbers(4, 3), numbers(2, 1)],
+        {"transA": 1, "transB": 1, "alpha": 0.5, "beta": 2.0},
+    ),
     ("Einsum", [numbers(2, 3), numbers(3, 4)], {"equation": "ij,jk->ki"}),
     ("Einsum", [numbers(2, 3, 3), numbers(3)], {"equation": "bij,j->bi"}),
     ("Einsum", [numbers(2, 3)], {"equation": "ij->ji"}),
-    ("Conv", [numbers(1, 2, 5, 4), numbers(3, 2, 3, 2), numbers(3)], {"pads": [1, 0, 1, 1], "strides": [2, 1]}),
+    (
+        "Conv",
+        [numbers(1, 2, 5, 4), numbers(3, 2, 3, 2), numbers(3)],
+        {"pads": [1, 0, 1, 1], "strides": [2, 1]},
+    ),
     ("Conv", [numbers(1, 4, 6), numbers(2, 2, 3)], {"group": 2, "dilations": [2]}),
     ("Conv", [numbers(2, 3, 4, 4), numbers(2, 3, 1, 1)], {}),
-    ("AveragePool", [numbers(1, 2, 5, 5)], {"kernel_shape": [2, 3], "pads": [1, 1, 0, 1], "strides": [2, 2]}),
+    (
+        "AveragePool",
+        [numbers(1, 2, 5, 5)],
+        {"kernel_shape": [2, 3], "pads": [1, 1, 0, 1], "strides": [2, 2]},
+    ),
     ("AveragePool", [numbers(1, 2, 5)], {"kernel_shape": [3], "pads": [1, 1], "count_include_pad": 1}),
     ("GlobalAveragePool", [numbers(1, 2, 3, 4)], {}),
     ("BatchNormalization", [numbers(2, 3, 4), *[abs(numbers(3)) for _ in range(4)]], {"epsilon": 0.25}),
@@ -282,7 +310,11 @@ CASES = [
     ("Pad", [numbers(2, 2), whole(0, 1, 2, 0), np.array(0.5)], {}),
     ("Pad", [numbers(2, 2), whole(0, 1, 2, 0)], {}),
     ("Where", [np.array([True, False, True]), numbers(2, 3), numbers(3)], {}),
-    ("ScatterElements", [numbers(3, 2), EDGES.reshape(4, 1).repeat(2, 1), numbers(4, 2)], {"reduction": "add"}),
+    (
+        "ScatterElements",
+        [numbers(3, 2), EDGES.reshape(4, 1).repeat(2, 1), numbers(4, 2)],
+        {"reduction": "add"},
+    ),
     ("ScatterElements", [numbers(3, 2), whole(2, -1).reshape(1, 2), numbers(1, 2)], {"axis": 0}),
     ("ScatterND", [numbers(3, 2), EDGES.reshape(4, 1), numbers(4, 2)], {"reduction": "add"}),
     ("ScatterND", [numbers(3, 2), whole(1, 0).reshape(1, 2), numbers(1)], {}),
@@ -327,7 +359,9 @@ def test_numbers_and_coefficients(case):
         for result, theirs in zip(results, expected, strict=True):
             assert isinstance(result, Affine)
             assert set(result.terms) <= {atom}
-            value = sum((terms @ operands[place].ravel() for terms in result.terms.values()), start=result.bias)
+            value = sum(
+                (terms @ operands[place].ravel() for terms in result.terms.values()), start=result.bias
+            )
             assert result.shape == theirs.shape
             assert np.allclose(value, theirs.ravel(), rtol=1e-9, atol=1e-9)
     assert ran >= 1

@@ -27,7 +27,9 @@ def sizes(parts):
     return [[(chunk.population, chunk.first, chunk.last) for chunk in core] for core in parts]
 
 
-@given(st.integers(0, 1024), st.sampled_from([2, 3, 4, 5, 6, 8]), st.sampled_from([0, 6, 7, 8, 9, 10, 11, 12]))
+@given(
+    st.integers(0, 1024), st.sampled_from([2, 3, 4, 5, 6, 8]), st.sampled_from([0, 6, 7, 8, 9, 10, 11, 12])
+)
 def test_words_of_any_list(entries, weight_bits, index):
     words = int(list_words(np.array(entries), weight_bits, index, nets.LOIHI))
     assert words == nets.words_of_list(entries, weight_bits, index)
@@ -35,7 +37,9 @@ def test_words_of_any_list(entries, weight_bits, index):
     assert words <= int(list_words(np.array(entries + 1), weight_bits, index, nets.LOIHI))
 
 
-@pytest.mark.parametrize(("highest", "bits"), [(0, 6), (63, 6), (64, 7), (127, 7), (128, 8), (511, 9), (1023, 10)])
+@pytest.mark.parametrize(
+    ("highest", "bits"), [(0, 6), (63, 6), (64, 7), (127, 7), (128, 8), (511, 9), (1023, 10)]
+)
 def test_a_sparse_index_is_as_narrow_as_it_can_be(highest, bits):
     assert index_bits(highest, nets.LOIHI) == bits
 
@@ -55,7 +59,11 @@ def with_thresholds(count):
     ("network", "target", "cores"),
     [
         # 128 neurons of fan-in 2496 need 44,928 words; up to 46 cost 6 words a list (46 * 8 + 10 bits), 47 cost 7
-        (nets.integer_chain(nets.varied(128, 2496)), nets.LOIHI, [[(0, 0, 46)], [(0, 46, 92)], [(0, 92, 128)]]),
+        (
+            nets.integer_chain(nets.varied(128, 2496)),
+            nets.LOIHI,
+            [[(0, 0, 46)], [(0, 46, 92)], [(0, 92, 128)]],
+        ),
         # nine thresholds are one too many for a core
         (with_thresholds(8), nets.LOIHI, [[(0, 0, 20)]]),
         (with_thresholds(9), nets.LOIHI, [[(0, 0, 8)], [(0, 8, 20)]]),
@@ -209,7 +217,10 @@ def test_a_dense_list_that_starts_too_high_is_refused():
 @pytest.mark.parametrize(("layers", "cores"), [(10, 5), (12, 6)])
 def test_any_two_of_many_layers_fit_a_core_and_no_three_do(layers, cores):
     """The worst case of the exhaustive search; more chunks are packed by first fit."""
-    network, target = nets.integer_chain(*[np.full((3, 3), 2)] * layers), nets.small_target(core_compartments=6)
+    network, target = (
+        nets.integer_chain(*[np.full((3, 3), 2)] * layers),
+        nets.small_target(core_compartments=6),
+    )
     assert len(partition(network, target)) == core_bound(network, target) == cores
 
 
@@ -255,7 +266,9 @@ def test_the_optimum_of_small_cases(cores, mesh, seed, kind):
     traffic = KINDS[kind](np.random.default_rng(seed), cores)
     target = nets.small_target(mesh_width=width, mesh_height=height, mesh_tile_cores=tile_cores)
     placement = place(traffic, target)
-    assert placement.spike_hops == pytest.approx(brute_force(traffic, width, height, tile_cores), rel=1e-9, abs=1e-12)
+    assert placement.spike_hops == pytest.approx(
+        brute_force(traffic, width, height, tile_cores), rel=1e-9, abs=1e-12
+    )
     assert placement.spike_hops == pytest.approx(cost(traffic, placement.tiles, width), abs=1e-12)
     assert max(placement.tiles.count(tile) for tile in placement.tiles) <= tile_cores
     assert set(placement.tiles) <= set(range(width * height))

@@ -89,14 +89,18 @@ NOWHERE = Placement(tiles=(-1,), spike_hops=0)
         ("place", lambda done: replace(done, layout=replace(done.layout, cores=2 * done.layout.cores))),
         (
             "place",
-            lambda done: replace(done, layout=replace(done.layout, placement=Placement(tiles=(-1,), spike_hops=0))),
+            lambda done: replace(
+                done, layout=replace(done.layout, placement=Placement(tiles=(-1,), spike_hops=0))
+            ),
         ),
         ("emit", lambda done: replace(done, netlist=replace(done.netlist, layer=done.netlist.layer + 9))),
     ],
 )
 def test_a_pass_that_breaks_a_rule_is_named_at_once(name, change):
     passes = [
-        replace(step, apply=lambda done, apply=step.apply: change(apply(done))) if step.name == name else step
+        replace(step, apply=lambda done, apply=step.apply: change(apply(done)))
+        if step.name == name
+        else step
         for step in PASSES
     ]
     work = start(expand(random_checkpoint(), ring(5)), Options(), load_target("loihi1"))
@@ -188,7 +192,12 @@ def test_structure_does_not_depend_on_the_weights():
 def test_a_checkpoint_becomes_a_chain_of_populations():
     network = expand(random_checkpoint(taxels=39, features=64, sizes=(128, 256, 36)), adjacency_of("manual"))
     invariants.verify(network)
-    assert [(p.name, p.size) for p in network.populations] == [("conv1", 2496), ("fc1", 128), ("fc2", 256), ("fc3", 36)]
+    assert [(p.name, p.size) for p in network.populations] == [
+        ("conv1", 2496),
+        ("fc1", 128),
+        ("fc2", 256),
+        ("fc3", 36),
+    ]
     assert [(p.pre, p.post) for p in network.projections] == [(INPUT, 0), (0, 1), (1, 2), (2, 3)]
     assert depths(network) == (0, 1, 2, 3)
     assert [int(fan_in(network, post).sum()) for post in range(4)] == [97_920, 319_488, 32_768, 9_216]
@@ -205,7 +214,9 @@ def test_what_never_fires_never_fires(network, data):
         for mask, spikes in zip(silent, run_float(network, recordings, dtype=dtype).spikes, strict=True):
             assert not spikes[..., mask].any()
     assert not silent[network.readout.population].any()
-    assert_same_layers(*(run_float(each, recordings).spikes for each in (disconnect(network, silent), network)))
+    assert_same_layers(
+        *(run_float(each, recordings).spikes for each in (disconnect(network, silent), network))
+    )
 
 
 @given(integer_networks(), st.data())
@@ -227,7 +238,9 @@ def test_a_bound_that_is_met_just_so():
     for theta, silent in ((0.81, True), (0.79, False)):
         network = chain([[0.2, 0.2]], [[1.0]], beta=0.5, theta=theta)
         assert never_fires(network)[0].tolist() == [silent]
-    spikes = run_float(chain([[0.2, 0.2]], [[1.0]], beta=0.5, theta=0.79), np.ones((1, 40, 2), bool)).spikes[0]
+    spikes = run_float(chain([[0.2, 0.2]], [[1.0]], beta=0.5, theta=0.79), np.ones((1, 40, 2), bool)).spikes[
+        0
+    ]
     assert spikes.any()
 
 

@@ -75,7 +75,11 @@ def test_the_option(monkeypatch, tmp_path):
     assert (found["samples"], found["plan"]["bits"], found["seconds"]) == (12, 8, 1.0)
     assert all(price["source"] for price in found["prices"].values())
     text = run(*words, "--against-processor")[1]
-    for telling in ("a microcontroller is cheaper at the sensor's pace", "at no event rate", "static power dominates"):
+    for telling in (
+        "a microcontroller is cheaper at the sensor's pace",
+        "at no event rate",
+        "static power dominates",
+    ):
         assert telling in text
     metrics = as_json(*words, "--neurobench")
     assert (
@@ -84,6 +88,8 @@ def test_the_option(monkeypatch, tmp_path):
         <= metrics["per_inference"]["synaptic_operations"]
     )
     assert metrics.keys() - as_json(*words).keys() == {"neurobench"}
-    request = EstimateRequest(netlist="net.loom", data=synthetic_split("test", limit=12), against_processor=True)
+    request = EstimateRequest(
+        netlist="net.loom", data=synthetic_split("test", limit=12), against_processor=True
+    )
     with pytest.raises(OptionError, match="needs the training split"):
         estimate.run(request)

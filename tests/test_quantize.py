@@ -18,7 +18,12 @@ from spikeloom.compiler.targets.loihi1 import registers
 from spikeloom.compiler.targets.loihi1.bounds import one_sided, prove_ranges
 from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.storage import choose_storage as choice_module
-from spikeloom.compiler.targets.loihi1.storage.choose_storage import adjust_biases, assemble, best_scale, choose_storage
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import (
+    adjust_biases,
+    assemble,
+    best_scale,
+    choose_storage,
+)
 from spikeloom.compiler.targets.loihi1.storage.scales import candidate, layer_of
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import round_population
 from spikeloom.runtime.machines.loihi1.spec import decayed
@@ -58,7 +63,9 @@ def test_no_input_brings_more_than_the_stated_worst_case(data):
         sums = np.abs(events.reshape(-1, weights.shape[1]).astype(np.int64) @ weights.T)
         assert 64 * sums.max() <= proof.accumulator <= 2**21 - 1
         # The worst case is reached by the input that hits just the positive or just the negative synapses.
-        worst = max(np.abs((sign * weights[i] > 0) @ weights[i]) for i in range(len(weights)) for sign in (1, -1))
+        worst = max(
+            np.abs((sign * weights[i] > 0) @ weights[i]) for i in range(len(weights)) for sign in (1, -1)
+        )
         assert proof.accumulator == 64 * worst
         assert choice.headroom == pytest.approx(1 - worst / registers.ONE_STEP_SUM_MAX, abs=1e-12)
 
@@ -111,13 +118,17 @@ def test_a_layer_of_zeros_with_biases_spikes_by_them():
     network = nets.chain(np.zeros((3, 2)), biases=[[0.6, 0.45, 0.3]])
     events = np.ones((1, 20, 2), bool)
     integer, _ = choose_storage(network, nets.LOIHI)
-    np.testing.assert_array_equal(run_integer(integer, events).spikes[0], run_float(network, events).spikes[0])
+    np.testing.assert_array_equal(
+        run_integer(integer, events).spikes[0], run_float(network, events).spikes[0]
+    )
 
 
 @pytest.mark.parametrize("weight", [100.0, 300.0, 4000.0])
 @pytest.mark.parametrize("bits", [2, 8])
 def test_weights_far_above_the_threshold_take_a_larger_exponent(weight, bits):
-    integer, (choice,) = choose_storage(nets.chain([[weight, -weight / 2]]), nets.LOIHI, packings=(Packing(bits=bits),))
+    integer, (choice,) = choose_storage(
+        nets.chain([[weight, -weight / 2]]), nets.LOIHI, packings=(Packing(bits=bits),)
+    )
     assert choice.exponent > 0
     assert integer.populations[0].threshold[0] >= 1
     largest = integer.projections[0].weight.data[0] * 2**choice.exponent / choice.scale
@@ -139,7 +150,9 @@ def test_a_large_bias_takes_the_finest_scale_that_its_register_holds():
 
 
 @pytest.mark.parametrize(("bits", "seed"), [(2, 0), (4, 1), (8, 2)])
-def test_the_scale_that_keeps_most_spikes_is_chosen_of_those_that_did_best_on_a_sample(bits, seed, monkeypatch):
+def test_the_scale_that_keeps_most_spikes_is_chosen_of_those_that_did_best_on_a_sample(
+    bits, seed, monkeypatch
+):
     monkeypatch.setattr(choice_module, "compensated", lambda *_: None)
     network = noisy_layer(seed, outlier=1.0)
     calibration, packing = calibrate(network, recordings(network, seed, samples=24)), Packing(bits=bits)
@@ -159,7 +172,10 @@ def test_the_scale_that_keeps_most_spikes_is_chosen_of_those_that_did_best_on_a_
 
 def spike_cost(integer, calibration, post, rows=slice(None)):
     """Of each neuron the spikes that differ, and how many more there are."""
-    spikes, wanted = run_integer(integer, calibration.events).spikes[post][rows], calibration.spikes[post][rows]
+    spikes, wanted = (
+        run_integer(integer, calibration.events).spikes[post][rows],
+        calibration.spikes[post][rows],
+    )
     more = spikes.sum(axis=(0, 1)) - wanted.sum(axis=(0, 1)).astype(int)
     return np.count_nonzero(spikes != wanted, axis=(0, 1)), more
 
@@ -186,7 +202,9 @@ def test_a_relay_keeps_no_bias():
     weight = np.random.default_rng(5).normal(0, 0.2, (20, 12))
     weight[-1] = np.eye(12)[-1]
     network = nets.chain(weight)
-    network = dataclasses.replace(network, populations=(dataclasses.replace(network.populations[0], relays=1),))
+    network = dataclasses.replace(
+        network, populations=(dataclasses.replace(network.populations[0], relays=1),)
+    )
     calibration = calibrate(network, recordings(network, 6, samples=12))
     integer, _ = choose_storage(network, nets.LOIHI, packings=(Packing(bits=3),), calibration=calibration)
     assert integer.populations[0].bias[:-1].any()
@@ -198,9 +216,13 @@ def test_a_relay_keeps_no_bias():
 def test_layers_of_several_planes_and_no_others_are_rounded_on_more_recordings(planes, monkeypatch):
     rng, more = np.random.default_rng(3), []
     network = nets.chain(rng.normal(0, 0.2, (8, 12)), rng.normal(0, 0.3, (4, 8)))
-    monkeypatch.setattr(choice_module, "round_with_more", lambda layer, chosen, _: more.append(layer.post) or chosen)
+    monkeypatch.setattr(
+        choice_module, "round_with_more", lambda layer, chosen, _: more.append(layer.post) or chosen
+    )
     packings = [Packing(planes=each) for each in planes]
-    choose_storage(network, nets.LOIHI, packings=packings, calibration=calibrate(network, recordings(network, 4)))
+    choose_storage(
+        network, nets.LOIHI, packings=packings, calibration=calibrate(network, recordings(network, 4))
+    )
     assert more == [planes.index(2)]
 
 
@@ -251,7 +273,8 @@ def test_without_a_leak_only_the_positive_side_is_bounded():
 
 
 @pytest.mark.parametrize(
-    ("weights", "holds"), [([254] * 129, True), ([254] * 129 + [2], False), ([-254] * 129 + [254] * 129, True)]
+    ("weights", "holds"),
+    [([254] * 129, True), ([254] * 129 + [2], False), ([-254] * 129 + [254] * 129, True)],
 )
 def test_the_accumulator_holds_129_full_weights(weights, holds):
     (proof,) = prove_ranges(nets.integer_chain([weights]))
@@ -301,14 +324,20 @@ def mantissas(weight, scale, bits):
 
 
 def test_registers_have_their_published_widths():
-    assert (registers.ACCUMULATOR_MAX, registers.CURRENT_MAX, registers.MEMBRANE_MAX) == (2097151, 8388607, 8388607)
+    assert (registers.ACCUMULATOR_MAX, registers.CURRENT_MAX, registers.MEMBRANE_MAX) == (
+        2097151,
+        8388607,
+        8388607,
+    )
     assert (registers.BIAS_MANTISSA_MAX, registers.BIAS_EXPONENT_MAX, registers.THRESHOLD_MANTISSA_MAX) == (
         4095,
         7,
         131071,
     )
     assert registers.MEMBRANE_SHIFT == 6
-    assert 64 * registers.ONE_STEP_SUM_MAX <= registers.ACCUMULATOR_MAX < 64 * (registers.ONE_STEP_SUM_MAX + 1)
+    assert (
+        64 * registers.ONE_STEP_SUM_MAX <= registers.ACCUMULATOR_MAX < 64 * (registers.ONE_STEP_SUM_MAX + 1)
+    )
 
 
 @given(st.integers(-(2**24), 2**24), st.integers(0, 4096))

@@ -55,7 +55,9 @@ def test_a_pipe_is_no_file(name):
     pipe = Path(f"pipe{READERS[name].suffix}")
     pipe.unlink(missing_ok=True)
     os.mkfifo(pipe)
-    with pytest.raises(SpikeloomError, match=rf"pipe{READERS[name].suffix}: (is not a|no such folder or) file; "):
+    with pytest.raises(
+        SpikeloomError, match=rf"pipe{READERS[name].suffix}: (is not a|no such folder or) file; "
+    ):
         READERS[name].read(pipe)
     code, _, err = commands.run("inspect", pipe)
     assert (code, err.count("\n")) == (2, 1)

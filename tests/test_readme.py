@@ -36,7 +36,9 @@ FILE = re.compile(r"\b(?:compiler|runtime|models|tests|benchmarks|examples)/[\w/
 
 def subcommands(parser):
     """Name and parser of each command below one."""
-    return next((action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction)), {})
+    return next(
+        (action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction)), {}
+    )
 
 
 def options(parser):
@@ -61,7 +63,9 @@ def anchors(text):
     """Anchors of the headings of a page, as GitHub makes them."""
     headings = re.findall(r"^#+ (.+)$", FENCED.sub("", text), flags=re.MULTILINE)
     plain = [re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings]
-    return [name if name not in plain[:i] else f"{name}-{plain[:i].count(name)}" for i, name in enumerate(plain)]
+    return [
+        name if name not in plain[:i] else f"{name}-{plain[:i].count(name)}" for i, name in enumerate(plain)
+    ]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
@@ -105,7 +109,9 @@ def test_what_a_page_speaks_of_exists(page):
 
 
 def test_the_readme_lists_every_command():
-    listed = re.findall(r"^\| `(\w+)` \|.*\|$", TEXTS[README].split("## Commands")[1].split("\n## ")[0], re.MULTILINE)
+    listed = re.findall(
+        r"^\| `(\w+)` \|.*\|$", TEXTS[README].split("## Commands")[1].split("\n## ")[0], re.MULTILINE
+    )
     assert sorted(listed) == sorted(subcommands(build_parser()))
 
 
@@ -138,7 +144,9 @@ def environment(tmp_path):
 
 
 def run_example(environment, *command, **options):
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=540, check=False, **options)
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=environment, timeout=540, check=False, **options
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -16,7 +16,17 @@ import commands
 import numpy as np
 import pytest
 import torch
-from made_files import CLASSES, TAXELS, csv_folder, events, own_file, recordings_folder, released, state_dict, zipped
+from made_files import (
+    CLASSES,
+    TAXELS,
+    csv_folder,
+    events,
+    own_file,
+    recordings_folder,
+    released,
+    state_dict,
+    zipped,
+)
 from made_files import weights as made_weights
 
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist, write_netlist
@@ -105,7 +115,10 @@ TABLE = [
     (VERIFY.format("--min-agreement 1.1"), "--min-agreement 1.1|from 0 to 1"),
     (VERIFY.format("--spec-samples 0"), "--spec-samples 0|at least 1"),
     # checkpoints
-    *((f"{command} missing.pt", "missing.pt: no such file") for command in ("inspect", "compile -o out.loom")),
+    *(
+        (f"{command} missing.pt", "missing.pt: no such file")
+        for command in ("inspect", "compile -o out.loom")
+    ),
     ("inspect empty.pt", "empty.pt: is not a checkpoint"),
     ("inspect data", "data: is a folder|spikeloom data describe"),
     ("inspect notes.zip", "notes.zip: holds a/b/notes.txt"),
@@ -130,10 +143,19 @@ TABLE = [
         (f"{command} grasp_label_1.npz", "grasp_label_1.npz: holds recordings; give the netlist")
         for command in NETLISTS
     ),
-    ("run pretrained:grasps --data data", "compile it first: spikeloom compile pretrained:grasps -o NET.loom"),
-    (COMPILE.format("grasp_label_1.npz"), "grasp_label_1.npz: holds recordings; give the network here|--calibrate"),
+    (
+        "run pretrained:grasps --data data",
+        "compile it first: spikeloom compile pretrained:grasps -o NET.loom",
+    ),
+    (
+        COMPILE.format("grasp_label_1.npz"),
+        "grasp_label_1.npz: holds recordings; give the network here|--calibrate",
+    ),
     ("join net.loom net.pt -o out.pt", "net.loom: is a netlist, its weights are rounded"),
-    ("data describe semicolons.csv", "columns time_s;taxel;polarity, expected are|name them so, separated by commas"),
+    (
+        "data describe semicolons.csv",
+        "columns time_s;taxel;polarity, expected are|name them so, separated by commas",
+    ),
     # graphs, targets, storage
     (COMPILE.format("bare.pt"), "bare.pt: the graph is not in this file|--graph: manual"),
     (COMPILE.format("bare.pt --graph manual"), f"the graph has 39 taxels, fc1 was trained on {TAXELS}"),
@@ -147,7 +169,10 @@ TABLE = [
     ("compile net.pt --chips 0 -o out.loom", "--chips 0: not a number of chips; give 1 or more"),
     # layouts
     *(
-        (COMPILE.format(f"net.pt --cores-for {text!r}"), f"{word!r} is not LAYER=N, N from 1; write for example fc1=6")
+        (
+            COMPILE.format(f"net.pt --cores-for {text!r}"),
+            f"{word!r} is not LAYER=N, N from 1; write for example fc1=6",
+        )
         for text, word in (("fc1=2,=3", "=3"), ("fc1=0", "fc1=0"))
     ),
     *(
@@ -162,7 +187,10 @@ TABLE = [
     (COMPILE.format("net.pt --calibrate data --keep 2"), "--keep 2: not a share"),
     (COMPILE.format("net.pt --keep 0.9"), "--keep 0.9: no recordings to hold out; give --calibrate"),
     *(
-        (COMPILE.format(f"net.pt --calibrate data --keep 0.9 {more}"), "--keep 0.9: chooses storage; omit it, or")
+        (
+            COMPILE.format(f"net.pt --calibrate data --keep 0.9 {more}"),
+            "--keep 0.9: chooses storage; omit it, or",
+        )
         for more in ("--planes 2", "--spike-exact")
     ),
     # formats
@@ -202,7 +230,10 @@ TABLE = [
     *((WATCH.format(words), f"{words}: ") for words in ("--bin nan", "--bins 0")),
     # training
     (TRAIN.format("--system counters --epochs 3"), "--epochs 3: counters are trained without; omit it"),
-    (TRAIN.format("--system counters --window 50"), "--window 50%: counters see what comes later; give --parts 2"),
+    (
+        TRAIN.format("--system counters --window 50"),
+        "--window 50%: counters see what comes later; give --parts 2",
+    ),
     (TRAIN.format("--system counters --seed 3"), "omit --recipe, --seed and --seeds"),
     (TRAIN.format("--system mlp --parts 3"), "--parts 3: is for --system counters; omit it"),
     (TRAIN.format("--system mlp --hops 2"), "--hops 2: an MLP has no hops to choose; omit it"),
@@ -211,7 +242,10 @@ TABLE = [
     (SEEDS.format("-o x.pt --robust 1"), "--robust 1: allowed are numbers from 0 to below 1"),
     (SEEDS.format(f"-o x.pt --seed {10**22}"), f"--seed {10**22}: allowed are 0 to {2**63 - 1}"),
     (SEEDS.format("-o x.pt --picture none/x.png"), "--picture none/x.png: the folder does not exist"),
-    (SEEDS.format("-o x.pt --epochs 1 --resume"), "nothing was interrupted, neither x.pt nor x.pt.state.validation"),
+    (
+        SEEDS.format("-o x.pt --epochs 1 --resume"),
+        "nothing was interrupted, neither x.pt nor x.pt.state.validation",
+    ),
     (TRAIN.format("--system counters --levels 0"), "--levels 0: allowed are 1 or more"),
     *(
         (f"train --data nowhere --graph manual -o x.pt {words}", f"{words}: allowed are ")
@@ -234,7 +268,11 @@ TABLE = [
     # places to write
     *(
         (f"{command} {where!r}", f"{command.split()[-1]} {where}: {why}")
-        for command in ("compile net.pt -o", "run net.loom --data data --spikes", "train --data data --graph manual -o")
+        for command in (
+            "compile net.pt -o",
+            "run net.loom --data data --spikes",
+            "train --data data --graph manual -o",
+        )
         for where, why in (
             ("nowhere/out", "the folder does not exist"),
             ("data", "is not a regular file"),
@@ -277,7 +315,10 @@ TABLE = [
     ("verify net.loom --data data --checkpoint other.pt", "the netlist has taxels 6|fc2 8|fc2 7"),
     (VERIFY.format("--graph manual"), "trained on ring, --graph says manual"),
     ("verify finger.loom --checkpoint finger.pt --graph manual", "compiled for graph knn:1, this is manual"),
-    ("verify net.loom --checkpoint net.pt --require E0", "--require E0: is about recordings, give --data too"),
+    (
+        "verify net.loom --checkpoint net.pt --require E0",
+        "--require E0: is about recordings, give --data too",
+    ),
     ("explain net.loom --checkpoint other.pt --data data", "netlist and checkpoint disagree|fc2 8|fc2 7"),
     (REPORT.replace("x.html", "x.pdf").format(""), "-o x.pdf: has to end in .html; give another name"),
     *(
@@ -286,14 +327,20 @@ TABLE = [
         for other, why in (
             ("same.pt net.loom", "net.loom: compiled from a checkpoint of sha256"),
             ("finger.pt finger.loom --graph knn:2", "compiled for graph knn:1, this is knn:2"),
-            ("finger.pt finger.loom --theta 0.9", "conv1 was compiled with theta 0.5, this has 0.9; give --theta 0.5"),
+            (
+                "finger.pt finger.loom --theta 0.9",
+                "conv1 was compiled with theta 0.5, this has 0.9; give --theta 0.5",
+            ),
         )
     ),
     ("lean net.pt --data data --differ 1.5", "--differ 1.5: not a share; give a number from 0 to below 1"),
     # one recording
     (EXPLAIN.format("--top 0"), "--top 0|at least 1"),
     (EXPLAIN.format("--sample sample_9_label_1.npy"), "among 6 of split test|near are sample_5_label_1.npy"),
-    (EXPLAIN.format("--sample sample_5_label_1.npy --limit 1"), "among 1 of split test|near are sample_0_label_0"),
+    (
+        EXPLAIN.format("--sample sample_5_label_1.npy --limit 1"),
+        "among 1 of split test|near are sample_0_label_0",
+    ),
     (REPORT.format("--recording 6"), "--recording 6|0 to 5"),
     # recordings
     *(
@@ -305,10 +352,22 @@ TABLE = [
         "train --data square --graph manual -o x.pt",
         "square: has events of taxels 0..3 only, the network has 39; |--taxels",
     ),
-    (COMPILE.format("net.pt --calibrate square"), "square: has events of taxels 0..3 only, the network has 6; "),
-    ("run binned.loom --data flat --bin 0.1", "--bin 0.1: the network was trained on bins of 0.05 s; omit --bin"),
-    (RUN.format("pressures"), "pressures: test/sample_0_label_0.npy: |value 0.5 at taxel 0|allowed are 0 and 1"),
-    (COMPILE.format("net.pt --calibrate five"), "five: train/sample_0_label_0.npy: has 5 taxels, the network has 6"),
+    (
+        COMPILE.format("net.pt --calibrate square"),
+        "square: has events of taxels 0..3 only, the network has 6; ",
+    ),
+    (
+        "run binned.loom --data flat --bin 0.1",
+        "--bin 0.1: the network was trained on bins of 0.05 s; omit --bin",
+    ),
+    (
+        RUN.format("pressures"),
+        "pressures: test/sample_0_label_0.npy: |value 0.5 at taxel 0|allowed are 0 and 1",
+    ),
+    (
+        COMPILE.format("net.pt --calibrate five"),
+        "five: train/sample_0_label_0.npy: has 5 taxels, the network has 6",
+    ),
     ("estimate net.loom --data lengths", "test/sample_1_label_1.npy: shape (6, 2, 20)|(6, 2, 24)"),
     (RUN.format("nowhere"), "nowhere: no such folder or file"),
     (RUN.format("net.loom"), "net.loom: no recordings"),
@@ -350,12 +409,16 @@ def test_refusals(refusal, words, telling):
 
 
 def test_recordings_of_another_number_of_channels(refusal, tmp_path):
-    arrays = made_weights()  # an own checkpoint may have any number of channels; recordings have two polarities
+    arrays = (
+        made_weights()
+    )  # an own checkpoint may have any number of channels; recordings have two polarities
     arrays["conv1.hops"] = arrays["conv1.hops"][:, :, :1]
     own_file(tmp_path / "one.pt", last=arrays)
     assert cli.main(["compile", f"{tmp_path}/one.pt", "-o", f"{tmp_path}/one.loom"]) == 0
     for words in (["run"], ["estimate"], ["verify", "--checkpoint", tmp_path / "one.pt"]):
-        assert "12 input channels found, the netlist has 6" in refusal(*words, tmp_path / "one.loom", "--data", "data")
+        assert "12 input channels found, the netlist has 6" in refusal(
+            *words, tmp_path / "one.loom", "--data", "data"
+        )
     line = refusal("compile", tmp_path / "one.pt", "--calibrate", "data", "-o", "out.loom")
     assert "the recordings have 12 channels, the network has 6" in line
 
@@ -364,7 +427,8 @@ def test_overflow_on_the_chip_names_neuron_step_and_recording(refusal, tmp_path)
     recordings_folder(tmp_path / "quiet", train=events(rate=0.01), test=events(3, rate=1.0))
     netlist = read_netlist("net.loom")
     write_netlist(
-        dataclasses.replace(netlist, format_exponent=np.full_like(netlist.format_exponent, 7)), tmp_path / "net.loom"
+        dataclasses.replace(netlist, format_exponent=np.full_like(netlist.format_exponent, 7)),
+        tmp_path / "net.loom",
     )
     line = refusal("run", tmp_path / "net.loom", "--data", tmp_path / "quiet")
     for part in ("conv1 neuron ", "on core 0, chip step 0", "2097151 allowed", "recording 0 of 6"):
@@ -375,7 +439,15 @@ def test_a_violated_limit_is_named(place, tmp_path):
     arrays = made_weights(taxels=39, features=128, sizes=(2, 2, 2))
     signs = {name: np.where(array >= 0, 0.5, -0.5).astype(np.float32) for name, array in arrays.items()}
     torch.save(state_dict(signs), tmp_path / "wide.pt")
-    words = ["compile", f"{tmp_path}/wide.pt", "--graph", "mst:0", "--keep-all", "-o", f"{tmp_path}/out.loom"]
+    words = [
+        "compile",
+        f"{tmp_path}/wide.pt",
+        "--graph",
+        "mst:0",
+        "--keep-all",
+        "-o",
+        f"{tmp_path}/out.loom",
+    ]
     (line,) = commands.run(*words)[2].splitlines()
     assert f"fc1 neuron 0: {39 * 128} used" in line
     assert "(loihi1.core.axons_in)" in line
@@ -425,10 +497,15 @@ def almost_full(path, mode="r", *options, whole=Path.open, **more):
 )
 @pytest.mark.parametrize(
     ("patched", "replacement", "line"),
-    [("pathlib.Path.open", almost_full, "No space left on device"), ("os.fsync", interrupt, "nothing was written")],
+    [
+        ("pathlib.Path.open", almost_full, "No space left on device"),
+        ("os.fsync", interrupt, "nothing was written"),
+    ],
     ids=["full disk", "interrupt"],
 )
-def test_an_older_file_stays_intact(refusal, tmp_path, monkeypatch, old, name, words, patched, replacement, line):
+def test_an_older_file_stays_intact(
+    refusal, tmp_path, monkeypatch, old, name, words, patched, replacement, line
+):
     path = tmp_path / name
     if old is not None:
         path.write_bytes(old)
@@ -459,7 +536,8 @@ def test_of_two_files_the_first_is_named(refusal, tmp_path, monkeypatch, trouble
 
 
 @pytest.mark.parametrize(
-    ("trouble", "line"), [(interrupt, "nothing was written"), (exhausted, "out of memory (Unable to allocate 9.9 TiB)")]
+    ("trouble", "line"),
+    [(interrupt, "nothing was written"), (exhausted, "out of memory (Unable to allocate 9.9 TiB)")],
 )
 def test_trouble_while_the_engine_runs(refusal, monkeypatch, trouble, line):
     monkeypatch.setattr("spikeloom.runtime.machines.loihi1.engine.simulate", trouble)

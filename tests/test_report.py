@@ -41,11 +41,28 @@ from spikeloom.runtime.report.sections import Code, Details, Facts, Figure, Sect
 from spikeloom.runtime.studies.chart.sections import page, picture, printed, series_of
 
 REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data", "-o", "out.html")
-HEADINGS = ["Verdict", "Decisions", "Cores", "Taxels", "One recording", "Energy and time", "Provenance", "Words"]
+HEADINGS = [
+    "Verdict",
+    "Decisions",
+    "Cores",
+    "Taxels",
+    "One recording",
+    "Energy and time",
+    "Provenance",
+    "Words",
+]
 LAYERS = ("conv1", "fc1", "fc2", "fc3")
 RASTERS = [f"raster-{place}" for place in range(1 + len(LAYERS))]  # of the input and of the layers
 FIGURES = {*RASTERS}
-FIGURES |= {"confusion", "cores-map", "taxels-map", "membranes", "energy-layers", "energy-parts", "time-cores"}
+FIGURES |= {
+    "confusion",
+    "cores-map",
+    "taxels-map",
+    "membranes",
+    "energy-layers",
+    "energy-parts",
+    "time-cores",
+}
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +71,16 @@ def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     recordings_folder(folder / "data")
     own_file(folder / "net.pt", training={"seed": 17})
-    words = ["compile", folder / "net.pt", "--weight-bits", "4", "--keep-all", "-o", folder / "net.loom", "--json"]
+    words = [
+        "compile",
+        folder / "net.pt",
+        "--weight-bits",
+        "4",
+        "--keep-all",
+        "-o",
+        folder / "net.loom",
+        "--json",
+    ]
     assert cli.main([str(word) for word in words]) == 0
     return folder
 
@@ -76,7 +102,9 @@ def drawings(page):
 
 def values(page, name):
     """What the script reads of a drawing."""
-    content = page.partition(f'<div class="drawing" id="{name}"')[2].partition('<script type="application/json">')[2]
+    content = page.partition(f'<div class="drawing" id="{name}"')[2].partition(
+        '<script type="application/json">'
+    )[2]
     return json.loads(content.partition("</script>")[0])
 
 
@@ -95,13 +123,18 @@ def test_it_begins_with_a_sentence_and_explains_each_level(made):
     assert re.search(
         r"<p>The netlist is its checkpoint, rounded; the chip decides as .* on \d of 6 recordings", made[0]
     )
-    assert "<p>A TactileSGNet, graph ring, on 1 core, compared with its float model on 6 recordings.</p>" in made[0]
+    assert (
+        "<p>A TactileSGNet, graph ring, on 1 core, compared with its float model on 6 recordings.</p>"
+        in made[0]
+    )
     words = made[0].partition("<h2>Words</h2>")[2]
     assert all(f'<th scope="row">{level}</th>' in words for level in LEVELS)
 
 
 def test_a_recording_that_is_decided_differently_is_drawn(made):
-    apart = [row[0] for row in re.findall(r"<caption><span>Decided differently.*?</table>", made[0], re.DOTALL)]
+    apart = [
+        row[0] for row in re.findall(r"<caption><span>Decided differently.*?</table>", made[0], re.DOTALL)
+    ]
     decided = made[1]["recording"]["decision"]
     assert (decided["float"] != decided["chip"]) == bool(apart)
 
@@ -156,9 +189,15 @@ def test_spikes_and_membranes_are_those_of_both_sides(made, place):
         assert_allclose(shown["chip"], register / (64 * netlist.scale[own]))
         fires = shown["step"] in shown["float_spikes"], shown["step"] in shown["chip_spikes"]
         assert sum(fires) == 1
-    assert [shown["step"] for shown in recording["membranes"]] == sorted(s["step"] for s in recording["membranes"])
+    assert [shown["step"] for shown in recording["membranes"]] == sorted(
+        s["step"] for s in recording["membranes"]
+    )
     first, shown = made[1]["verify"]["first_divergence"], recording["membranes"][0]
-    assert (first["file"], first["layer"], first["neuron"]) == (recording["file"], shown["layer"], shown["neuron"])
+    assert (first["file"], first["layer"], first["neuron"]) == (
+        recording["file"],
+        shown["layer"],
+        shown["neuron"],
+    )
 
 
 def test_decisions_cores_and_taxels_agree_with_the_rest(made, place):
@@ -175,9 +214,13 @@ def test_decisions_cores_and_taxels_agree_with_the_rest(made, place):
         assert 0 < core["fill"][core["fullest"]]["share"] <= 1
     taxels = report["taxels"]
     assert_allclose(taxels["events"], data.events.mean(axis=0).sum(axis=(1, 2)))
-    fired = engine.simulate(netlist, data.events.reshape(len(data), -1, STEPS)).counts.spikes[:, netlist.layer == 0]
+    fired = engine.simulate(netlist, data.events.reshape(len(data), -1, STEPS)).counts.spikes[
+        :, netlist.layer == 0
+    ]
     assert_allclose(taxels["spikes"], fired.mean(axis=0).reshape(TAXELS, FEATURES).sum(axis=1))
-    assert sorted(map(tuple, taxels["edges"])) == sorted(map(tuple, read_checkpoint(place / "net.pt").edges.tolist()))
+    assert sorted(map(tuple, taxels["edges"])) == sorted(
+        map(tuple, read_checkpoint(place / "net.pt").edges.tolist())
+    )
     assert (taxels["graph"], taxels["positions_mm"]) == ("ring", None)
 
 
@@ -222,7 +265,9 @@ def test_networks_without_a_graph_show_their_taxels(tmp_path):
     text, found = report_of(made, tmp_path)
     taxels, sensor = found["taxels"], made.machine.netlist.taxels
     assert (taxels["graph"], taxels["spikes"], taxels["edges"]) == (None, None, [])
-    assert (taxels["sensor"], len(taxels["positions_mm"] or ())) == (("NeuTouch", 39) if sensor == 39 else (None, 0))
+    assert (taxels["sensor"], len(taxels["positions_mm"] or ())) == (
+        ("NeuTouch", 39) if sensor == 39 else (None, 0)
+    )
     assert len(values(text, "taxels-map")["tips"]) == sensor
     assert drawings(text) >= FIGURES - {*RASTERS[1:]} - {"time-cores"}
 
@@ -289,7 +334,9 @@ def browsed(page, script, *, width=1100, scheme="light"):
     words = [command, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
     words += [f"--user-data-dir={page.parent / 'profile'}", f"--window-size={width},900"]
     words += ["--blink-settings=preferredColorScheme=0"] if scheme == "dark" else []
-    done = subprocess.run([*words, "--dump-dom", copy.as_uri()], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [*words, "--dump-dom", copy.as_uri()], capture_output=True, text=True, timeout=60, check=True
+    )
     title = re.search("<title>(.*?)</title>", done.stdout, re.DOTALL)
     assert title is not None
     complaints, requests, value = json.loads(unescape(title[1]))
@@ -317,7 +364,11 @@ def test_arrow_keys_walk_through_the_differences_and_the_pointer_reads_cells(mad
         (row, step)
         for row, neuron in enumerate(layer["active"])
         for step in range(STEPS)
-        if not any((other, near) in different for near in layer["active"][row - 1 : row + 2] for other in range(STEPS))
+        if not any(
+            (other, near) in different
+            for near in layer["active"][row - 1 : row + 2]
+            for other in range(STEPS)
+        )
         or not any((step + gap, neuron) in different for gap in (-1, 0, 1))
     )
     x = cells["from"][0] + (step + 0.5) * (cells["to"][0] - cells["from"][0]) / STEPS
@@ -338,7 +389,12 @@ CHAPTER = Section(
         Facts({"accuracy": ("90 %", "9 of 10")}),
         Text("first\nsecond"),
         Section(
-            "Spikes", [Figure("spikes", lambda: drawing.bars("Spikes", {"conv1": [12]}, ["n"]), "By layer.", [NUMBERS])]
+            "Spikes",
+            [
+                Figure(
+                    "spikes", lambda: drawing.bars("Spikes", {"conv1": [12]}, ["n"]), "By layer.", [NUMBERS]
+                )
+            ],
         ),
         Details("More", [Text("folded")], group="more"),
         Code(["spikeloom run 'a b'"]),
@@ -371,7 +427,18 @@ def test_names_from_a_file_run_no_script_and_tear_no_drawing(tmp_path, monkeypat
     nir.write("net.nir", graph)
     recordings_folder(tmp_path / "data")
     assert run("compile", "net.nir", "--dt", "0.02", "-o", "net.loom")[0] == 0
-    words = ["report", "net.loom", "--checkpoint", "net.nir", "--dt", "0.02", "--data", "data", "-o", "out.html"]
+    words = [
+        "report",
+        "net.loom",
+        "--checkpoint",
+        "net.nir",
+        "--dt",
+        "0.02",
+        "--data",
+        "data",
+        "-o",
+        "out.html",
+    ]
     code, out, err = run(*words)
     assert (code, err) == (0, "")
     assert names[1] in out
@@ -432,7 +499,11 @@ class Outer:
 def test_a_result_is_written_as_json_and_read_back():
     result = Outer(inner=(Inner(0.5), Inner(1.0, "x")), by_window={50: 1.0})
     value = json.loads(json.dumps(encode(result)))
-    wanted = {"inner": [{"share": 0.5}, {"share": 1.0, "name": "x"}], "windows": {"50": 1.0}, "pair": ["a", 1]}
+    wanted = {
+        "inner": [{"share": 0.5}, {"share": 1.0, "name": "x"}],
+        "windows": {"50": 1.0},
+        "pair": ["a", 1],
+    }
     assert value == wanted | {"twice": 2}
     assert decode(Outer, value) == result
     for wrong in ({}, [], value | {"inner": [{"share": "much"}]}, value | {"pair": ["a"]}):
@@ -440,7 +511,11 @@ def test_a_result_is_written_as_json_and_read_back():
 
 
 def test_numbers_of_numpy_are_plain_and_what_has_no_form_is_refused():
-    assert encode({"a": np.float32(0.5), "b": np.arange(2), "c": math.nan}) == {"a": 0.5, "b": [0, 1], "c": None}
+    assert encode({"a": np.float32(0.5), "b": np.arange(2), "c": math.nan}) == {
+        "a": 0.5,
+        "b": [0, 1],
+        "c": None,
+    }
     refused(TypeError, "", encode, object())
 
 
@@ -479,7 +554,9 @@ def test_every_point_is_a_mark_that_tells_its_figures_and_commands(chart):
     for panel in (tips[:12], tips[12:]):  # over energy and over time
         assert sorted(int(tip[1:].split()[0]) for tip in panel) == [point.number for point in chart.points]
     first = next(tip for tip in tips if tip.startswith("#1 "))
-    assert first.startswith("#1 grasps 2b, 50 %: expected % 83.40, test % 68.00, interval 58.3 … 76.3, float % 70.00, ")
+    assert first.startswith(
+        "#1 grasps 2b, 50 %: expected % 83.40, test % 68.00, interval 58.3 … 76.3, float % 70.00, "
+    )
     assert first.splitlines()[1:] == list(chart.points[0].commands)
 
 

@@ -143,7 +143,10 @@ def test_the_whole_file(tmp_path, golden):
     path = tmp_path / "net.yaml"
     report = as_json("export", tmp_path / "net.loom", "--to", "sanafe", "-o", path)
     golden("six_steps.yaml", path.read_text("utf-8"))
-    assert (report["bytes"], report["sha256"]) == (path.stat().st_size, hashlib.sha256(path.read_bytes()).hexdigest())
+    assert (report["bytes"], report["sha256"]) == (
+        path.stat().st_size,
+        hashlib.sha256(path.read_bytes()).hexdigest(),
+    )
     assert (report["neurons"], report["synapses"], report["groups"]) == (3, 6, ["input", "layer0", "layer1"])
 
 
@@ -165,7 +168,10 @@ def test_neurons_are_mapped_in_the_order_of_their_compartments():
 
 def test_parameters_and_weights_are_exact():
     neuron = Neuron(threshold=131071, decay_v=0, bias=-4095, bias_exponent=7)
-    axons = [Axon(source=0, targets=((0, -254),), exponent=-1), Axon(source=1, targets=((0, 6),), exponent=7)]
+    axons = [
+        Axon(source=0, targets=((0, -254),), exponent=-1),
+        Axon(source=1, targets=((0, 6),), exponent=7),
+    ]
     text = "\n".join(lines(build([neuron, Neuron(bias=1)], axons, n_inputs=2, depths=[0])))
     assert "- 0: {threshold: 131071.0, leak_decay: 1.0, bias: -8190.0, " in text
     assert f"bias: {1 / 64}, " in text
@@ -185,7 +191,9 @@ def test_a_neuron_names_the_unit_of_most_of_its_synapses():
 
 def test_names_are_such_that_the_format_can_hold_them():
     netlist, _, _ = six_steps()
-    layers = tuple(replace(layer, name=name) for layer, name in zip(netlist.layers, ("a.b c", "input"), strict=True))
+    layers = tuple(
+        replace(layer, name=name) for layer, name in zip(netlist.layers, ("a.b c", "input"), strict=True)
+    )
     assert sanafe.group_names(replace(netlist, layers=layers)) == ("a_b_c", "input_1")
     layers = tuple(replace(layer, name="fc") for layer in netlist.layers)
     assert sanafe.group_names(replace(netlist, layers=layers)) == ("fc_0", "fc_1")

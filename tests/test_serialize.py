@@ -41,7 +41,9 @@ def netlist() -> Netlist:
         thresholds=[[1, 2, 131071], 7],
         polarities=2,
     )
-    return compiled(network, provenance={"graph": "manual", "options": {"weight_bits": 8}, "checkpoint": "0" * 64})
+    return compiled(
+        network, provenance={"graph": "manual", "options": {"weight_bits": 8}, "checkpoint": "0" * 64}
+    )
 
 
 @pytest.fixture
@@ -137,15 +139,31 @@ def manifest(text):
 
 
 def without(name):
-    return lambda path: write_members(path, {k: v for k, v in archive.read_members(path).items() if k != name})
+    return lambda path: write_members(
+        path, {k: v for k, v in archive.read_members(path).items() if k != name}
+    )
 
 
-LAYER = {"name": "fc1", "neurons": 3, "unread": [], "depth": 0, "weight_bits": 8, "synapses": 9, "max_fan_in": 6}
+LAYER = {
+    "name": "fc1",
+    "neurons": 3,
+    "unread": [],
+    "depth": 0,
+    "weight_bits": 8,
+    "synapses": 9,
+    "max_fan_in": 6,
+}
 LAYER |= {"beta": 0.2, "theta": 0.5, "alpha": 0.0}
 DAMAGES = [
-    *((lambda path, content=content: path.write_bytes(content), "something else") for content in (b"", bytes(9999))),
+    *(
+        (lambda path, content=content: path.write_bytes(content), "something else")
+        for content in (b"", bytes(9999))
+    ),
     (unsigned("synapse_weight", lambda weights: weights + 2), "does not match its hash"),
-    (unsigned("manifest", lambda text: np.array(str(text).replace("manual", "knn:3 "))), "does not match its hash"),
+    (
+        unsigned("manifest", lambda text: np.array(str(text).replace("manual", "knn:3 "))),
+        "does not match its hash",
+    ),
     (
         lambda path: write_members(path, {"weights": np.zeros(3)}, sign=False),
         "not a netlist (no manifest and no sha256)",
@@ -159,7 +177,14 @@ DAMAGES = [
     *((manifest(text), "not a netlist") for text in ("[]", "3", "{}", '{"format": "spikeloom-checkpoint"}')),
     *(
         (stating(layers=[LAYER | {name: value}]), "no usable layers")
-        for name, value in {"neurons": -1, "scale": 0, "depth": 0.5, "name": 7, "beta": -1, "colour": "red"}.items()
+        for name, value in {
+            "neurons": -1,
+            "scale": 0,
+            "depth": 0.5,
+            "name": 7,
+            "beta": -1,
+            "colour": "red",
+        }.items()
     ),
     (stating(layers=[]), "no usable layers"),
     (stating(target="loihi9"), "is for 'loihi9', this program knows loihi1"),
@@ -239,7 +264,10 @@ def with_value(name, value, place=0):
         (lengthened("synapse_target"), "synapse_target has 23 entries, 22 are needed"),
         (lengthened("format_weight_bits"), "format_weight_bits has 2 entries, 1 are needed"),
         (with_value("layer", 2), "layer has values outside 0 … 1"),
-        (with_value("neuron", 1), "layer fc1 holds none of its 3 neurons, one twice or one that is not there"),
+        (
+            with_value("neuron", 1),
+            "layer fc1 holds none of its 3 neurons, one twice or one that is not there",
+        ),
         (with_value("axon_source", 11), "axon_source has values outside 0 … 10"),
         (with_value("axon_format", 7), "axon_format has values outside 0 … 0"),
         (with_value("readout_class", 2), "readout_class has values outside -1 … 1"),
@@ -308,7 +336,10 @@ def test_leftovers_are_those_of_one_file(tmp_path):
     for name in (written.name, written.name.replace("x[1]", "x1")):
         (tmp_path / name).write_bytes(b"half")
     remove_leftovers(path)
-    assert sorted(file.name for file in tmp_path.iterdir()) == [written.name.replace("x[1]", "x1"), "x[1].json"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == [
+        written.name.replace("x[1]", "x1"),
+        "x[1].json",
+    ]
 
 
 def test_a_file_that_is_replaced_hands_its_permissions_on(tmp_path):

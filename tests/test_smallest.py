@@ -66,12 +66,19 @@ def budgets(*words):
 
 def test_the_cheapest_that_is_not_shown_to_be_worse():
     found = study.pick(POOL, ())
-    assert (found.best, found.cheapest, found.allowed, found.fits) == (1, {"one": 2, "two": 3}, (1, 2, 3), True)
+    assert (found.best, found.cheapest, found.allowed, found.fits) == (
+        1,
+        {"one": 2, "two": 3},
+        (1, 2, 3),
+        True,
+    )
     assert found.ahead == 1
     ahead, error = lead(POOL[0].shares, POOL[3].shares)
     wrong = np.repeat([1.0, 0.0], [4, 36])
     assert (ahead, error) == (pytest.approx(0.1), pytest.approx(wrong.std(ddof=1) / np.sqrt(40)))
-    shifted = tried(6, 32, UJ, order=8)  # as good as number 4, wrong elsewhere: less is known of the difference
+    shifted = tried(
+        6, 32, UJ, order=8
+    )  # as good as number 4, wrong elsewhere: less is known of the difference
     assert not study.worse(tried(1, 33, UJ), shifted)
     assert study.pick([POOL[0], POOL[3]], ()).cheapest["one"] == 1
 
@@ -102,11 +109,15 @@ def test_budgets(words, chosen, fits):
 
 
 def test_decisions_that_no_event_alters_are_a_budget():
-    pool = [replace(each, certified=share) for each, share in zip(POOL, (0.96, 0.8, 0.9, 0.5, None), strict=True)]
+    pool = [
+        replace(each, certified=share) for each, share in zip(POOL, (0.96, 0.8, 0.9, 0.5, None), strict=True)
+    ]
     for share, chosen, fits in ((85, 3, True), (95, 1, True), (97, 1, False)):
         found = study.pick(pool, budgets(f"certified={share}"))
         assert (found.cheapest["one"], found.fits) == (chosen, fits)
-    assert study.promote(pool, 1, budgets("certified=99")) == study.promote(pool, 1)  # it is known on the last rung
+    assert study.promote(pool, 1, budgets("certified=99")) == study.promote(
+        pool, 1
+    )  # it is known on the last rung
 
 
 def test_budgets_that_are_none():
@@ -131,14 +142,18 @@ def test_who_goes_on():
 
 
 @pytest.mark.parametrize(
-    "plan", [Plan(parts=2, ramp=5), Plan(bins=5, ramp=8), Plan(thresholds=(1, 2), parts=5, window=50)], ids=str
+    "plan",
+    [Plan(parts=2, ramp=5), Plan(bins=5, ramp=8), Plan(thresholds=(1, 2), parts=5, window=50)],
+    ids=str,
 )
 def test_decisions_are_those_of_the_spiking_network(plan):
     training, test = (synthetic_split(split, limit=72) for split in ("train", "test"))
     data = run_counters(training, plan)
     made = counters_of(data, fit(data, 6), training, 6)
     for each in (training, test):
-        assert_array_equal(work.decisions(made, run_counters(each, plan, data.steps)), decisions_of(made, each))
+        assert_array_equal(
+            work.decisions(made, run_counters(each, plan, data.steps)), decisions_of(made, each)
+        )
 
 
 def test_candidates_can_all_be_trained():
@@ -160,7 +175,9 @@ def few(monkeypatch, tmp_path):
     small = {"JOINS": (10,), "PARTS": (1,), "THRESHOLDS": ((1,), (1, 4)), "WINDOWS": (100,), "RAMPS": (16,)}
     for name, values in small.items():
         monkeypatch.setattr(space, name, values)
-    monkeypatch.setattr(recordings_input, "synthetic_split", lambda split, **_: synthetic_split(split, limit=90))
+    monkeypatch.setattr(
+        recordings_input, "synthetic_split", lambda split, **_: synthetic_split(split, limit=90)
+    )
     monkeypatch.setattr(work, "PRICED", 12)
     monkeypatch.setattr(space, "NETWORKS", ())
     monkeypatch.setattr(baselines, "PARTS", (1,))
@@ -184,7 +201,11 @@ def test_the_command(few, monkeypatch, target, table):
     assert chosen["rung"] == 3
     assert chosen["costs"]["energy_j"][table] <= best["costs"]["energy_j"][table]
     assert ("whole" in chosen) == (target == "loihi1")  # the other runs whole recordings
-    assert all(each["whole"]["operations"] > each["costs"]["operations"] for each in found["tried"] if "whole" in each)
+    assert all(
+        each["whole"]["operations"] > each["costs"]["operations"]
+        for each in found["tried"]
+        if "whole" in each
+    )
     assert chosen["behind"] <= chosen["behind_error"]
     assert found["checked"]["different"] == {"train": 0, "test": 0}
     assert "static power dominates" in found["checked"]["pace"]
@@ -221,7 +242,12 @@ def test_a_network_that_is_trained_by_gradients(few, monkeypatch):
     network, stored = found["tried"]
     assert all(0.01 < each["certified"] <= 1 for each in found["tried"])
     assert "no single event alters" in (few / "a.html").read_text()
-    assert (network["system"], network["rung"], "storage" in network, stored["storage"]) == ("mlp", 3, False, 4)
+    assert (network["system"], network["rung"], "storage" in network, stored["storage"]) == (
+        "mlp",
+        3,
+        False,
+        4,
+    )
     assert network["costs"]["operations"] <= network["whole"]["operations"]
     assert len(found["baselines"]) in (0, 4)
     netlist = (few / "a.loom").read_bytes()

@@ -43,8 +43,18 @@ PLAIN = -4095 * 128
 COURSES = {
     # a current loses one 4096th more than its register says; below 4096 such a membrane forgets at once
     "current loses 1": ({"decay_u": 0, "decay_v": 4095}, [(32, 0)], ["1000"], [2048, 2047, 2046, 2045]),
-    "negative current": ({"decay_u": 0, "decay_v": 4095}, [(-32, 0)], ["1000"], [-2048, -2047, -2046, -2045]),
-    "current loses half": ({"decay_u": 2047, "decay_v": 4095}, [(-32, 0)], ["1000"], [-2048, -1024, -512, -256]),
+    "negative current": (
+        {"decay_u": 0, "decay_v": 4095},
+        [(-32, 0)],
+        ["1000"],
+        [-2048, -2047, -2046, -2045],
+    ),
+    "current loses half": (
+        {"decay_u": 2047, "decay_v": 4095},
+        [(-32, 0)],
+        ["1000"],
+        [-2048, -1024, -512, -256],
+    ),
     "current keeps 1": ({"decay_u": 4094, "decay_v": 4095}, [(128, 0)], ["1000"], [8192, 2 + 2, 0, 0]),
     "current keeps nothing": ({"decay_u": 4095, "decay_v": 4095}, [(128, 0)], ["1000"], [8192, 0 + 2, 0, 0]),
     # a membrane loses what its register says
@@ -109,8 +119,16 @@ def two_layers() -> Netlist:
 @pytest.mark.parametrize(
     ("netlist", "channels", "found"),
     [
-        (two_layers(), ("0101", "0001"), "core 1, chip step 3: synaptic sum 2097152 found, magnitudes up to 2097151"),
-        (single(Neuron(), (-254, 7), (-256, 0), (254, 7)), "111", "core 0, chip step 0: synaptic sum -2097152 found"),
+        (
+            two_layers(),
+            ("0101", "0001"),
+            "core 1, chip step 3: synaptic sum 2097152 found, magnitudes up to 2097151",
+        ),
+        (
+            single(Neuron(), (-254, 7), (-256, 0), (254, 7)),
+            "111",
+            "core 0, chip step 0: synaptic sum -2097152 found",
+        ),
         # the current is -8320024 after four steps
         (
             single(Neuron(decay_u=0), (-254, 7)),

@@ -100,7 +100,9 @@ def test_where_a_register_may_overflow_every_change_is_run():
     machine, channels = machine_of(netlist), np.zeros((20, 3), np.uint8)
     assert machine.forgetting(channels) is None
     changes = single(every_cell(channels)[:5])
-    assert_array_equal(machine.effects(channels, changes).votes, by_running(machine.votes, channels, changes).votes)
+    assert_array_equal(
+        machine.effects(channels, changes).votes, by_running(machine.votes, channels, changes).votes
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -117,12 +119,17 @@ def test_what_is_known_again_is_so_after_any_past(seed):
         pasts = np.repeat(channels[None], 12, axis=0)
         pasts[:, :, :start] = rng.random((12, inputs, start)) < rng.random((12, 1, 1))
         other_spikes, other_membranes = kept(netlist, pasts)
-        assert_array_equal(other_spikes[:, known.quiet[start] :], np.tile(spikes[known.quiet[start] :], (12, 1, 1)))
+        assert_array_equal(
+            other_spikes[:, known.quiet[start] :], np.tile(spikes[known.quiet[start] :], (12, 1, 1))
+        )
         after = max(known.back[start], start)
         assert_array_equal(other_membranes[:, after:], np.tile(membranes[after:], (12, 1, 1)))
         for each in range(netlist.classes):
             own = np.flatnonzero(classes == each)
-            ours, theirs = spikes[start:, own].sum(axis=1), other_spikes[:, start:, own].sum(axis=2, dtype=np.int64)
+            ours, theirs = (
+                spikes[start:, own].sum(axis=1),
+                other_spikes[:, start:, own].sum(axis=2, dtype=np.int64),
+            )
             assert np.all(theirs <= ours + known.come[start, start:, each])
             assert np.all(theirs >= ours - known.gone[start, start:, each])
     assert known.quiet[:20].max() < steps or seed == 0  # it does forget
@@ -141,7 +148,13 @@ def bounded(machine, one, most=8):
     channels, cells = channels_of(one[None], machine.netlist)[0], cells_of(one, machine.netlist)
     votes = machine.votes(channels[None])[0]
     alone = machine.effects(channels, single(cells.cells))
-    return channels, cells, alone, votes, lower_bound(votes, cells, alone, machine.forgetting(channels), most)
+    return (
+        channels,
+        cells,
+        alone,
+        votes,
+        lower_bound(votes, cells, alone, machine.forgetting(channels), most),
+    )
 
 
 def test_none_of_all_pairs_and_triples_breaks_what_is_proven_of_them():
@@ -192,7 +205,9 @@ def test_counters_bear_exactly_so_many_events(plan):
     made = counters_of(seen, fit(seen, 3), data, 3)
     machine = machine_of(compile_network(counting_network(made)).netlist)
     tally, exact = tally_of(machine), set()
-    for one, found in zip(given[:5], certify(machine, data.part(slice(5)), jobs=1, most=2).certificates, strict=True):
+    for one, found in zip(
+        given[:5], certify(machine, data.part(slice(5)), jobs=1, most=2).certificates, strict=True
+    ):
         channels, cells = channels_of(one[None], machine.netlist)[0], cells_of(one, machine.netlist)
         votes, broken = machine.votes(channels[None])[0], 3
         known = least(tally, channels != 0, votes, cells, 2)
@@ -237,7 +252,9 @@ def test_verdicts_are_those_of_plain_runs(bins, clocks):
             changed = one.copy()
             changed[taxel, polarity, step] ^= 1
             kind = "removed" if one[taxel, polarity, step] else "added"
-            if (place := (kind, taxel, polarity, step // bins)) not in seen:  # events of one step do the same
+            if (
+                place := (kind, taxel, polarity, step // bins)
+            ) not in seen:  # events of one step do the same
                 seen.add(place)
                 tally(kind, changed, taxel)
         for taxel in range(TAXELS):
@@ -262,7 +279,9 @@ def test_verdicts_are_those_of_plain_runs(bins, clocks):
         assert {kind: set(each) for kind, each in found.taxels.items()} == hanging
         assert (found.at_least >= 1) == (wanted["removed"] + wanted["added"] == 0)
         assert found.at_most is None or found.at_most > found.at_least
-        assert all((each.alter > 0) == (each.to is not None and each.to != known) for each in found.kinds.values())
+        assert all(
+            (each.alter > 0) == (each.to is not None and each.to != known) for each in found.kinds.values()
+        )
 
 
 def test_a_chip_that_knows_no_short_cut_runs_every_change():
@@ -286,7 +305,9 @@ def test_an_attack_alters_the_decision_with_the_events_that_it_names():
     for one, found in zip(given, result.certificates, strict=True):
         changed = one.copy()
         for words in found.attack:
-            taxel, polarity, step = (int(word.strip(",:")) for word in words.split() if word.strip(",:").isdigit())
+            taxel, polarity, step = (
+                int(word.strip(",:")) for word in words.split() if word.strip(",:").isdigit()
+            )
             assert words.endswith("removed" if one[taxel, polarity, step] else "added")
             changed[taxel, polarity, step] ^= 1
         assert np.count_nonzero(changed != one) == (found.at_most or 0)
@@ -308,8 +329,13 @@ def test_the_command(tmp_path, monkeypatch):
     code, out, err = run(*words)
     assert code == 0
     singles = events(3, samples=4).size
-    assert err == f"spikeloom: trying {singles:,} single events of 4 recordings, then taxels, pairs, shifts and cuts\n"
+    assert (
+        err
+        == f"spikeloom: trying {singles:,} single events of 4 recordings, then taxels, pairs, shifts and cuts\n"
+    )
     assert f"no single event alters the decision: {25 * result.certified(1):.2f} %" in out
-    assert f"a taxel sends nothing  {'':35}{result.unaltered('dead')} of 4".replace(" ", "") in out.replace(" ", "")
+    assert f"a taxel sends nothing  {'':35}{result.unaltered('dead')} of 4".replace(" ", "") in out.replace(
+        " ", ""
+    )
     for wrong in ("--shift -1", "--most 0", "--jobs 0"):
         assert run(*words[:-2], *wrong.split())[0] == 2

@@ -48,7 +48,9 @@ def storages(draw):
 def one_layer(weight, *, seed=0, samples=8, steps=40, rate=0.2, **options):
     """A layer and recordings."""
     network = chain(weight, **options)
-    return network, calibrate(network, np.random.default_rng(seed).random((samples, steps, len(weight[0]))) < rate)
+    return network, calibrate(
+        network, np.random.default_rng(seed).random((samples, steps, len(weight[0]))) < rate
+    )
 
 
 def uneven_layer(seed=0):
@@ -62,7 +64,11 @@ def uneven_layer(seed=0):
 def test_planes_hold_every_step_and_the_coarser_only_what_the_finer_do_not_reach(storage):
     bits, exponents = storage
     limit = reach(bits, exponents)
-    steps = np.arange(-limit, limit + 1) if limit < 5000 else np.unique(np.linspace(-limit, limit, 9999).astype(int))
+    steps = (
+        np.arange(-limit, limit + 1)
+        if limit < 5000
+        else np.unique(np.linspace(-limit, limit, 9999).astype(int))
+    )
     planes = split_planes(steps, bits, exponents)
     total = sum(plane * 2 ** (e - exponents[0]) for plane, e in zip(planes, exponents, strict=True))
     np.testing.assert_array_equal(total, steps * weight_step(bits))
@@ -85,7 +91,9 @@ def test_a_rounded_population_is_the_nearest_of_its_grid(network, storage, data)
     bits, exponents = storage
     for post, population in enumerate(network.populations):
         incoming = tuple(p for p in network.projections if p.post == post)
-        threshold = np.array(data.draw(st.lists(st.integers(1, 9), min_size=population.size, max_size=population.size)))
+        threshold = np.array(
+            data.draw(st.lists(st.integers(1, 9), min_size=population.size, max_size=population.size))
+        )
         form = Form(bits=bits, exponents=exponents, threshold=threshold)
         integer, planes = round_population(population, incoming, form)
         np.testing.assert_allclose(integer.realised_theta, population.theta, rtol=1e-15)
@@ -147,7 +155,9 @@ def test_the_finest_scales_are_legal_and_hardly_more_is(bits, exponents):
 
 
 @settings(max_examples=10)
-@given(float_networks(), st.sampled_from(BITS), st.integers(1, 3), st.integers(1, 8), st.booleans(), st.data())
+@given(
+    float_networks(), st.sampled_from(BITS), st.integers(1, 3), st.integers(1, 8), st.booleans(), st.data()
+)
 def test_every_recipe_gives_a_proven_legal_network(network, bits, planes, groups, calibrated, data):
     calibration = calibrate(network, data.draw(recordings_for(network.input.size))) if calibrated else None
     packing = Packing(bits=bits, planes=planes, groups=groups)
@@ -214,7 +224,9 @@ def test_errors_cancel_on_the_recordings():
     layer, form = layer_of(network, 0), Form(bits=4, exponents=(0,), threshold=np.full(16, 200))
 
     def error(stored):
-        weight = sum(p.effective().toarray() for p in stored.projections) - network.projections[0].weight * 400
+        weight = (
+            sum(p.effective().toarray() for p in stored.projections) - network.projections[0].weight * 400
+        )
         bias = stored.population.bias / 64 - network.populations[0].bias * 400
         return float(np.square(calibration.events.reshape(-1, 48) @ weight.T + bias).mean())
 
@@ -233,7 +245,9 @@ def test_compensation_is_kept_only_where_it_keeps_spikes():
 
 def test_a_neuron_that_would_overflow_is_rounded_to_nearest():
     """At the very end of the accumulator errors must not add up: the sums stay inside."""
-    network, calibration = one_layer(np.abs(np.random.default_rng(0).normal(0, 0.1, (4, 300))), samples=4, rate=0.3)
+    network, calibration = one_layer(
+        np.abs(np.random.default_rng(0).normal(0, 0.1, (4, 300))), samples=4, rate=0.3
+    )
     layer = layer_of(network, 0)
     finest = finest_thresholds(layer, 8, (-1, 6))
     plain = rounded(layer, Form(bits=8, exponents=(-1, 6), threshold=finest))
@@ -279,7 +293,9 @@ def test_an_outlier_takes_another_plane():
     network, calibration = two_layers(2, outlier=200.0)
     integer, choices, found = make_exact(network, LOIHI, calibration)
     assert choices[0].planes >= 2
-    assert moved(integer, calibration) < moved(choose_storage(network, LOIHI, calibration=calibration)[0], calibration)
+    assert moved(integer, calibration) < moved(
+        choose_storage(network, LOIHI, calibration=calibration)[0], calibration
+    )
     assert found[0].tried[0][2] > found[0].flips
 
 

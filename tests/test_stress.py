@@ -6,7 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import as_json as answer
-from made_files import CLASSES, STEPS, TAXELS, events, recorded, recordings_folder, ring, small_checkpoint, weights
+from made_files import (
+    CLASSES,
+    STEPS,
+    TAXELS,
+    events,
+    recorded,
+    recordings_folder,
+    ring,
+    small_checkpoint,
+    weights,
+)
 from numpy.testing import assert_array_equal
 from scipy import stats
 from timed_networks import events_of, written
@@ -34,7 +44,9 @@ from spikeloom.runtime.studies.robustness.perturbations import SAMPLED, longer, 
 from spikeloom.runtime.studies.robustness.results import Run, Spread
 from spikeloom.runtime.studies.robustness.sampled import clean, generator, measure
 
-STRESS, REPORT = (f"{command} net.loom --checkpoint net.pt --data data".split() for command in ("stress", "report"))
+STRESS, REPORT = (
+    f"{command} net.loom --checkpoint net.pt --data data".split() for command in ("stress", "report")
+)
 FEW = "taxels_dead,events_lost,warm_state,longer,weight_bit_flips,fewer_bits"
 
 
@@ -93,8 +105,12 @@ def test_recordings_after_others_without_a_reset_are_one_long_run_of_the_specifi
         slow = spec.simulate(bench.pair.netlist, events[i, :, : inputs.lengths[i]])
         layer = bench.pair.netlist.layers[-1]
         window = slow.spikes[inputs.begin[i] + layer.depth : inputs.lengths[i] + layer.depth]
-        assert_array_equal(found.votes["chip"][i], class_counts(bench.pair.netlist, window.sum(axis=0)[None])[0])
-        assert_array_equal(events[i, :, 2 * STEPS :], with_clocks(bench.events, bench.pair.netlist.clocks)[i])
+        assert_array_equal(
+            found.votes["chip"][i], class_counts(bench.pair.netlist, window.sum(axis=0)[None])[0]
+        )
+        assert_array_equal(
+            events[i, :, 2 * STEPS :], with_clocks(bench.events, bench.pair.netlist.clocks)[i]
+        )
 
 
 def test_ten_times_as_long_is_ten_recordings_of_which_the_last_counts(bench):
@@ -281,7 +297,9 @@ def test_it_is_the_mean_over_seeds_that_counts():
 def test_reasons(run, seen):
     assert list(reasons("chip", [run], run.layers, CLEAN, 100)) == seen
     silent = replace(run, layers={"fc": (0, 1000, 1000, 10000)})
-    assert reasons("float", [silent], silent.layers, CLEAN, 100)[0] == "fc is silent", "each side has its own"
+    assert reasons("float", [silent], silent.layers, CLEAN, 100)[0] == "fc is silent", (
+        "each side has its own"
+    )
 
 
 def test_spikes_in_common_and_requirements():

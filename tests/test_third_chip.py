@@ -27,7 +27,11 @@ ABACUS = Target(
     title="Abacus",
     limits={"core.neurons": Quantity(value=4096, unit="neurons", source="here")},
     choices={},
-    energy=(EnergyTable(name="guess", title="A guess", prices={"spike": Quantity(value=2, unit="pJ", source="here")}),),
+    energy=(
+        EnergyTable(
+            name="guess", title="A guess", prices={"spike": Quantity(value=2, unit="pJ", source="here")}
+        ),
+    ),
     time=(),
     static={},
 )
@@ -70,13 +74,23 @@ FILE = NetlistFile(
 def lowered(network, provenance=None) -> Beads:
     """Eight bits a weight; as many neurons as a core holds."""
     offsets = np.cumsum([0, *(population.size for population in network.populations)])
-    columns = {name: [] for name in ("layer", "shift", "threshold", "bias", "readout_class", "pre", "post", "weight")}
+    columns = {
+        name: []
+        for name in ("layer", "shift", "threshold", "bias", "readout_class", "pre", "post", "weight")
+    }
     for post, population in enumerate(network.populations):
         into = [(p.pre, p.weight.tocoo()) for p in network.projections if p.post == post]
         scale = 127 / max(np.abs(weight.data).max() for _, weight in into)
         votes = network.readout.label if post == network.readout.population else np.full(population.size, -1)
-        own = np.full(population.size, post), np.full(population.size, round(-np.log2(population.beta or 0.5**31)))
-        numbers = np.floor(np.full(population.size, population.theta * scale)), np.rint(population.bias * scale), votes
+        own = (
+            np.full(population.size, post),
+            np.full(population.size, round(-np.log2(population.beta or 0.5**31))),
+        )
+        numbers = (
+            np.floor(np.full(population.size, population.theta * scale)),
+            np.rint(population.bias * scale),
+            votes,
+        )
         for name, values in zip(list(columns)[:5], (*own, *numbers), strict=True):
             columns[name].append(values)
         for pre, weight in into:
@@ -85,7 +99,9 @@ def lowered(network, provenance=None) -> Beads:
             columns["weight"].append(np.rint(weight.data * scale))
     made = {name: np.concatenate(parts).astype(np.int64) for name, parts in columns.items()}
     if offsets[-1] > ABACUS.limit("core.neurons"):
-        raise CapacityError([ABACUS.exceeded("network", "core.neurons", int(offsets[-1]), "train a smaller one")])
+        raise CapacityError(
+            [ABACUS.exceeded("network", "core.neurons", int(offsets[-1]), "train a smaller one")]
+        )
     sizes = {name: getattr(network.input, name) for name in ("taxels", "polarities", "clocks")}
     names = tuple(population.name for population in network.populations)
     return Beads(classes=network.classes, layers=names, provenance=provenance or {}, **sizes, **made)
@@ -97,13 +113,18 @@ def simulate(netlist: Beads, channels: np.ndarray, lengths=None):
     neurons = len(netlist.threshold)
     weight = np.zeros((inputs + neurons, neurons), np.int64)
     np.add.at(weight, (netlist.pre, netlist.post), netlist.weight)
-    spikes, membranes = np.zeros((samples, steps, neurons), bool), np.zeros((samples, steps, neurons), np.int32)
+    spikes, membranes = (
+        np.zeros((samples, steps, neurons), bool),
+        np.zeros((samples, steps, neurons), np.int32),
+    )
     held = np.zeros((samples, neurons), np.int64)
     for step in range(steps):
         for layer in range(len(netlist.layers)):
             here = netlist.layer == layer
             sent = np.concatenate([channels[:, :, step] != 0, spikes[:, step]], axis=1)
-            held[:, here] = (held[:, here] >> netlist.shift[here]) + sent @ weight[:, here] + netlist.bias[here]
+            held[:, here] = (
+                (held[:, here] >> netlist.shift[here]) + sent @ weight[:, here] + netlist.bias[here]
+            )
             spikes[:, step, here] = held[:, here] > netlist.threshold[here]
             held[spikes[:, step] & here] = 0
         membranes[:, step] = held
@@ -132,13 +153,18 @@ class Traced:
 def specification(netlist: Beads, channels: np.ndarray):
     """The same for one recording, a synapse at a time."""
     neurons = len(netlist.threshold)
-    spikes, membranes = np.zeros((channels.shape[1], neurons), bool), np.zeros((channels.shape[1], neurons), np.int32)
+    spikes, membranes = (
+        np.zeros((channels.shape[1], neurons), bool),
+        np.zeros((channels.shape[1], neurons), np.int32),
+    )
     held = [0] * neurons
     for step, events in enumerate(channels.T):
         sent = [*events.tolist(), *[0] * neurons]
         for neuron in range(neurons):
             into = netlist.post == neuron
-            inputs = sum(w for s, w in zip(netlist.pre[into], netlist.weight[into].tolist(), strict=True) if sent[s])
+            inputs = sum(
+                w for s, w in zip(netlist.pre[into], netlist.weight[into].tolist(), strict=True) if sent[s]
+            )
             held[neuron] = (held[neuron] >> int(netlist.shift[neuron])) + inputs + int(netlist.bias[neuron])
             if held[neuron] > netlist.threshold[neuron]:
                 sent[len(events) + neuron] = spikes[step, neuron] = 1
@@ -164,8 +190,12 @@ class Machinery(Machine):
     def check_lowering(self, network):
         due = lowered(network)
         names = [each.name for each in fields(Beads) if isinstance(getattr(due, each.name), np.ndarray)]
-        wrong = [name for name in names if not np.array_equal(getattr(due, name), getattr(self.netlist, name))]
-        return NetlistCheck(whole=tuple(f"another {name}" for name in wrong), claim="every bead is in its place")
+        wrong = [
+            name for name in names if not np.array_equal(getattr(due, name), getattr(self.netlist, name))
+        ]
+        return NetlistCheck(
+            whole=tuple(f"another {name}" for name in wrong), claim="every bead is in its place"
+        )
 
     def of_layer(self, array, index):
         return array[..., self.netlist.layer == index]
@@ -211,7 +241,9 @@ class Abacus(Backend):
     def lower(self, arguments, after):
         refuse(arguments, ("calibrate", *ROUNDING, *PLACING), "is not for the abacus")
         loaded = load_network(arguments.checkpoint, arguments)
-        netlist = lowered(loaded.network, {"checkpoint_sha256": loaded.sha256, **loaded.origin(arguments.run)})
+        netlist = lowered(
+            loaded.network, {"checkpoint_sha256": loaded.sha256, **loaded.origin(arguments.run)}
+        )
         return Lowered(
             netlist=netlist,
             model=Machinery(netlist).model(loaded.network),
@@ -258,7 +290,10 @@ def test_every_command_takes_it(made):
     shares = {level["name"]: level["share"] for level in verdict["levels"]}
     assert (shares["EN"], shares["E0"], shares["E1"], shares["E2"]) == (1, 1, 1, None)
     assert shares["E3"] == verdict["decision_agreement"] > 0.2
-    assert as_json("report", *words, "--spec-samples", 1, "-o", "page.html")["verify"]["levels"] == verdict["levels"]
+    assert (
+        as_json("report", *words, "--spec-samples", 1, "-o", "page.html")["verify"]["levels"]
+        == verdict["levels"]
+    )
     assert "beads moved an inference" in Path("page.html").read_text()
 
 
@@ -275,7 +310,16 @@ def wrongly(machine, channels):
 
 def test_what_is_wrong_is_found(made, monkeypatch):
     as_json("compile", made.network, *made.reading, "--target", "abacus", "-o", "net.loom")
-    words = ("net.loom", "--checkpoint", made.network, *made.reading, "--data", made.data, "--spec-samples", 1)
+    words = (
+        "net.loom",
+        "--checkpoint",
+        made.network,
+        *made.reading,
+        "--data",
+        made.data,
+        "--spec-samples",
+        1,
+    )
     netlist = FILE.read("net.loom")
     FILE.write(replace(netlist, threshold=netlist.threshold - 20), "net.loom")
     code, out, _ = run("verify", *words)

@@ -60,7 +60,13 @@ def compilation(timed):
 
 @pytest.mark.parametrize(
     ("alpha", "register", "realised"),
-    [(0.0, 4095, 0.0), (0.5, 2047, 0.5), (0.95, 204, 3891 / 4096), (0.9999, 0, 4095 / 4096), (0.0001, 4095, 0.0)],
+    [
+        (0.0, 4095, 0.0),
+        (0.5, 2047, 0.5),
+        (0.95, 204, 3891 / 4096),
+        (0.9999, 0, 4095 / 4096),
+        (0.0001, 4095, 0.0),
+    ],
 )
 def test_the_current_register_is_the_nearest(alpha, register, realised):
     assert registers.decay_registers(0.2, alpha) == (register, 3277)
@@ -79,10 +85,14 @@ def test_a_current_counts_by_the_register_that_it_fills_first():
 def test_a_neuron_that_only_fires_from_its_gathered_current_is_kept():
     """0.04 a step is 0.05 with the membrane alone, but 0.4 with a current that keeps nine tenths: 0.5 at the limit."""
     network = chain([[0.04]], [[1.0]])
-    lasting = replace(network, populations=(replace(network.populations[0], alpha=0.9), network.populations[1]))
+    lasting = replace(
+        network, populations=(replace(network.populations[0], alpha=0.9), network.populations[1])
+    )
     assert [mask.tolist() for mask in never_fires(network)] == [[True], [False]]
     stronger = chain([[0.0401]], [[1.0]])
-    stronger = replace(stronger, populations=(replace(stronger.populations[0], alpha=0.9), stronger.populations[1]))
+    stronger = replace(
+        stronger, populations=(replace(stronger.populations[0], alpha=0.9), stronger.populations[1])
+    )
     assert [mask.tolist() for mask in never_fires(stronger)] == [[False], [False]]
     events = np.ones((1, 400, 1), np.bool_)
     assert not run_float(network, events).spikes[0].any()
@@ -97,7 +107,8 @@ def test_ranges_are_proven_for_any_input(compilation):
     assert 0.8 * registers.MEMBRANE_MAX < widest <= registers.MEMBRANE_MAX, "the scale is as fine as can be"
     assert lasting.accumulator < 0.3 * registers.ACCUMULATOR_MAX
     assert_allclose(
-        [p.accumulator for p in prove_ranges(lift(compilation.netlist))], [p.accumulator for p in compilation.proofs]
+        [p.accumulator for p in prove_ranges(lift(compilation.netlist))],
+        [p.accumulator for p in compilation.proofs],
     )
     positive, negative = one_step_bounds(compilation.netlist)
     ids = compilation.netlist.compartments_of(1)
@@ -114,7 +125,9 @@ def test_ranges_are_proven_for_any_input(compilation):
 )
 def test_relays_tick_with_their_clocks_however_weights_are_stored(timed, options):
     _, _, network = timed
-    netlist = compile_network(network, Options(**{"training_events": events_of(5, samples=12), **options})).netlist
+    netlist = compile_network(
+        network, Options(**{"training_events": events_of(5, samples=12), **options})
+    ).netlist
     events = events_of(13, steps=14)
     trace = engine.simulate(netlist, with_clocks(events, TIMING.clocks), spikes=True)
     conv = aligned(netlist, trace.spikes, 0)
@@ -151,7 +164,9 @@ def drawn(seed, *, hidden=12, gain=1.0, alpha=0.0):
     """Ten channels, a recurrent layer, four classes; weights of no special values."""
     rng = np.random.default_rng(seed)
     first, last = rng.normal(size=(hidden, 10)) * 0.4, rng.normal(size=(4, hidden)) * 0.5
-    network = chain(first, last, beta=0.6, biases=[rng.normal(size=hidden) * 0.05, np.zeros(4)], polarities=2)
+    network = chain(
+        first, last, beta=0.6, biases=[rng.normal(size=hidden) * 0.05, np.zeros(4)], polarities=2
+    )
     recurring = replace(network.populations[0], alpha=alpha)
     network = replace(network, populations=(recurring, network.populations[1]))
     return with_loop(network, 0, rng.normal(size=(hidden, hidden)) * gain / hidden**0.5)
@@ -226,7 +241,11 @@ def test_a_layer_is_cut_so_that_its_axons_to_itself_are_enough():
     pairs = np.kron(np.eye(2, dtype=int), np.ones((2, 2), int))
     target = small_target(core_axons_out=3)
     parts = partition(in_pairs(pairs), target)
-    assert [[(chunk.first, chunk.last) for chunk in core] for core in parts] == [[(0, 2)], [(2, 3)], [(3, 4)]]
+    assert [[(chunk.first, chunk.last) for chunk in core] for core in parts] == [
+        [(0, 2)],
+        [(2, 3)],
+        [(3, 4)],
+    ]
     require_legal(emit(in_pairs(pairs), parts, (0, 1, 2), target, {}), target)
     words = "fc1 neuron 0: 4 used, 3 allowed (loihi1.core.axons_out)"
     refused(CapacityError, words, partition, in_pairs(np.ones((4, 4), int)), target)

@@ -56,7 +56,12 @@ def assert_as_defined(netlist, trace, events, *, times=SANAFE):
     critical = [load.index(max(load)) for load in loads]
     np.testing.assert_array_equal(simple.critical_core, [[core % cores for core in critical]])
     np.testing.assert_array_equal(simple.receiving, [[core >= cores for core in critical]])
-    for name, field in (("detailed", "duration"), ("sent", "sent"), ("processed", "processed"), ("blocked", "blocked")):
+    for name, field in (
+        ("detailed", "duration"),
+        ("sent", "sent"),
+        ("processed", "processed"),
+        ("blocked", "blocked"),
+    ):
         np.testing.assert_array_equal(getattr(detailed, f"{field}_ns"), column(name), err_msg=name)
     np.testing.assert_array_equal(detailed.critical_core, column("critical_core", 1))
     np.testing.assert_array_equal(detailed.receiving, column("receiving", 1))
@@ -110,7 +115,9 @@ def test_the_published_energies_to_the_decimal():
     # o fired in step 2 on what arrived; its current still holds that in step 3, and nothing else happens to it
     assert np.argwhere(trace.updated & ~updated).tolist() == [[3, 2]]
     parts = timing_oracle.parts_of_energy(netlist, LOIHI, counts, updated.sum(axis=1), 1, (0,))
-    assert {part: (1e12 * joules.sum(axis=1)).round(1).tolist() for part, joules in parts.items()} == ENERGY_PJ
+    assert {
+        part: (1e12 * joules.sum(axis=1)).round(1).tolist() for part, joules in parts.items()
+    } == ENERGY_PJ
 
 
 @st.composite
@@ -121,7 +128,9 @@ def cases(draw):
     tiles = draw(st.lists(tile, min_size=netlist.n_cores, max_size=netlist.n_cores))
     index_bits = draw(st.sampled_from([0, 10]))
     netlist = replace(
-        netlist, core_tile=read_only(tiles), format_index_bits=read_only([index_bits] * len(netlist.format_index_bits))
+        netlist,
+        core_tile=read_only(tiles),
+        format_index_bits=read_only([index_bits] * len(netlist.format_index_bits)),
     )
     latency = st.sampled_from([0.0, 0.001, 1.0, 3.7, 500.0])
     chosen = {event: draw(latency) for event in LATENCIES}
@@ -155,7 +164,9 @@ def test_kernels_and_definition_agree_on_a_crowded_mesh(link_buffer):
 def pipe(tiles, targets=1, senders=1):
     """Neurons of a first core that each feed `targets` of a second one."""
     neurons = [Neuron() for _ in range(senders)] + [Neuron(core=1, layer=1) for _ in range(targets)]
-    axons = [Axon(source=1 + i, core=1, targets=tuple((j, 2) for j in range(targets))) for i in range(senders)]
+    axons = [
+        Axon(source=1 + i, core=1, targets=tuple((j, 2) for j in range(targets))) for i in range(senders)
+    ]
     netlist = build(neurons, axons, n_inputs=1, depths=[0, 1])
     return replace(netlist, core_tile=read_only(tiles))
 
@@ -193,7 +204,9 @@ def test_one_message(tiles, flight, barrier):
 def test_input_cores_go_where_there_is_room():
     netlist, _, _ = six_steps()
     assert sanafe.input_tiles(netlist, LOIHI) == (8,)
-    full = replace(netlist, core_tile=read_only([8] * 4 + [9] * 4), core_compartments=read_only([0, 2] + [3] * 7))
+    full = replace(
+        netlist, core_tile=read_only([8] * 4 + [9] * 4), core_compartments=read_only([0, 2] + [3] * 7)
+    )
     assert sanafe.input_tiles(full, LOIHI) == (0,)
     wide = replace(full, taxels=3000)
     assert sanafe.input_tiles(wide, LOIHI) == (0, 0, 0)
@@ -224,7 +237,9 @@ def test_parts_and_cores_add_up_to_the_estimate():
 def test_amounts_of_a_core_are_its_own():
     netlist, _, trace = six_steps()
     updates = cost.updates_by_core(netlist, trace.updated[None])
-    counts = replace(trace.counts, inputs=trace.counts.inputs[None], spikes=trace.counts.spikes[None], updates=updates)
+    counts = replace(
+        trace.counts, inputs=trace.counts.inputs[None], spikes=trace.counts.spikes[None], updates=updates
+    )
     amounts = cost.count(cost.prepare(netlist, LOIHI, "core"), counts, 6)
     # h0 fires twice and h1 once, all to o; o fires twice, to nobody; six events reach two neurons each
     assert amounts["spike"].tolist() == [[3, 2]]

@@ -102,7 +102,9 @@ def test_steps_equal_adam_on_the_released_loss():
         losses = []
         for index in order.permutation(len(training)):
             optimizer.zero_grad()
-            output = network(torch.tensor(training.events[index], dtype=torch.float32).permute(2, 0, 1)[:, None])[0]
+            output = network(
+                torch.tensor(training.events[index], dtype=torch.float32).permute(2, 0, 1)[:, None]
+            )[0]
             label = torch.zeros(SMALL.classes)
             label[training.labels[index]] = 1
             loss = torch.nn.MSELoss()(output, label)
@@ -117,12 +119,16 @@ def test_steps_equal_adam_on_the_released_loss():
 def test_another_decay_is_an_option_that_a_state_remembers(tmp_path):
     one = synthetic_grasps(per_class=1, steps=10, seed=0, classes=("sphere",))
     tiny = Architecture(taxels=39, classes=1, hops=0, features=1, hidden=(1,))
-    trained = train(one, one, ADJACENCY, tiny, epochs=7, recipe=replace(RELEASED, decay_epochs=2), state=tmp_path / "s")
+    trained = train(
+        one, one, ADJACENCY, tiny, epochs=7, recipe=replace(RELEASED, decay_epochs=2), state=tmp_path / "s"
+    )
     assert RELEASED.decay_epochs == DECAY_EPOCHS == 40
     rates = [epoch.learning_rate for epoch in trained.history]
     assert_allclose(rates, [1e-3] * 3 + [1e-4] * 2 + [1e-5] * 2, rtol=1e-12)
     options = {"epochs": 7, "state": tmp_path / "s", "resume": True}
-    refused(OptionError, "belongs to a training with other recipe; ", train, one, one, ADJACENCY, tiny, **options)
+    refused(
+        OptionError, "belongs to a training with other recipe; ", train, one, one, ADJACENCY, tiny, **options
+    )
 
 
 def test_best_weights_are_those_of_the_first_epoch_with_the_most_right(monkeypatch):
@@ -160,7 +166,13 @@ FIVE = synthetic_grasps(coordinates=np.random.default_rng(0).random((5, 2)), per
     ("test", "architecture", "options", "error", "words"),
     [
         (grasps(1), SMALL, {"epochs": 0}, OptionError, "--epochs 0: allowed are 1 or more"),
-        (FIVE, SMALL, {}, DataError, "split 'synthetic': 5 taxels and 2 polarities, the network has 39 and 2"),
+        (
+            FIVE,
+            SMALL,
+            {},
+            DataError,
+            "split 'synthetic': 5 taxels and 2 polarities, the network has 39 and 2",
+        ),
         (grasps(1), replace(SMALL, classes=5), {}, DataError, "label 5, the network has 5 classes (0..4)"),
     ],
 )
@@ -216,7 +228,9 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_state(tmp_path, monkeypatc
     train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
     kept = state.read_bytes()
     steps = iter((1.0, float("nan")))
-    monkeypatch.setattr("spikeloom.models.training.evaluate.rate_loss", lambda rates, _: rates.sum() * next(steps))
+    monkeypatch.setattr(
+        "spikeloom.models.training.evaluate.rate_loss", lambda rates, _: rates.sum() * next(steps)
+    )
     words = "epoch 1, step 2: the loss is nan|state of the epoch before is kept"
     refused(DataError, words, train, grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, seed=1, state=state)
     assert state.read_bytes() == kept
@@ -238,7 +252,12 @@ def test_the_validation_part_is_a_fifth_of_every_class_and_disjoint():
     assert np.bincount(held.labels).tolist() == [2] * 6
     assert np.bincount(fitted.labels).tolist() == [8] * 6
     assert not set(fitted.files) & set(held.files)
-    refused(DataError, "class 0 has one training recording|needs 2 of each", validation_split, grasps(0, per_class=1))
+    refused(
+        DataError,
+        "class 0 has one training recording|needs 2 of each",
+        validation_split,
+        grasps(0, per_class=1),
+    )
 
 
 LOIHI = load_target("loihi1")
@@ -354,7 +373,17 @@ def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
     moved = replace(checkpoint, conv_bias=checkpoint.conv_bias + 1)  # as other epochs of the same file are
     for other, what in ((moved, "network"), (replace(checkpoint, beta=0.6), "beta")):
         words = f"belongs to a training with other {what}"
-        refused(OptionError, words, finetune, expand(other, adjacency), train, test, LOIHI, resume=True, **options)
+        refused(
+            OptionError,
+            words,
+            finetune,
+            expand(other, adjacency),
+            train,
+            test,
+            LOIHI,
+            resume=True,
+            **options,
+        )
 
 
 @pytest.mark.parametrize(
@@ -405,10 +434,21 @@ def test_the_model_is_the_chip_on_every_recording(tmp_path, objects_zip, contain
     adjacency = normalised_adjacency(build_graph("manual").edges, 39)
     for name, place in (("objects", objects_zip), ("containers", containers_zip)):
         output = tmp_path / f"{name}.pt"
-        words = ["finetune", f"pretrained:{name}", "--data", str(place), "--weight-bits", "4", "--epochs", "2"]
+        words = [
+            "finetune",
+            f"pretrained:{name}",
+            "--data",
+            str(place),
+            "--weight-bits",
+            "4",
+            "--epochs",
+            "2",
+        ]
         assert main([*words, "-o", str(output)]) == 0
         checkpoint = read_checkpoint(output)
-        netlist = compile_network(expand(checkpoint, adjacency), Options(storage=Given(checkpoint.forms))).netlist
+        netlist = compile_network(
+            expand(checkpoint, adjacency), Options(storage=Given(checkpoint.forms))
+        ).netlist
         for split in ("train", "test"):
             data = load_data(place, split)
             model = quantised_spikes(expand(checkpoint, adjacency), data.events)

@@ -37,7 +37,9 @@ def data(tmp_path, monkeypatch) -> Path:
     """A small data set in the released layout; the working folder is where it is."""
     monkeypatch.chdir(tmp_path)
     splits = (("train", 1), ("test", 2))
-    grasps = [replace(synthetic_grasps(per_class=3, steps=12, seed=seed), split=split) for split, seed in splits]
+    grasps = [
+        replace(synthetic_grasps(per_class=3, steps=12, seed=seed), split=split) for split, seed in splits
+    ]
     write_released(tmp_path / "data", grasps)
     return tmp_path
 
@@ -177,7 +179,13 @@ def test_resume_does_not_take_another_training_for_this_one(data):
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes under /proc")
 def test_no_worker_outlives_the_command(data):
     process = started(
-        "--epochs", "5000", "--seeds", "2", "-o", "x.pt", until=lambda: len(list(data.glob("x-seed?.pt.state.*"))) == 2
+        "--epochs",
+        "5000",
+        "--seeds",
+        "2",
+        "-o",
+        "x.pt",
+        until=lambda: len(list(data.glob("x-seed?.pt.state.*"))) == 2,
     )
     workers = children(process.pid)
     assert len(workers) >= 2
@@ -203,7 +211,8 @@ def fails(_job):
 
 @pytest.mark.filterwarnings("ignore")  # of tasks that joblib cancels
 @pytest.mark.parametrize(
-    ("run", "error", "told"), [(dies, OptionError, "go on with --resume"), (fails, DataError, "the loss is nan")]
+    ("run", "error", "told"),
+    [(dies, OptionError, "go on with --resume"), (fails, DataError, "the loss is nan")],
 )
 def test_a_worker_that_fails_ends_all(run, error, told, monkeypatch, tmp_path):
     monkeypatch.setattr(trainings, "run_job", run)
@@ -246,7 +255,10 @@ def test_results_are_the_same_however_many_work(tmp_path, jobs):
 def test_equal_keys_are_measured_once_and_no_points_are_none(tmp_path):
     made = points(tmp_path / "log", 2)
     twin = Square(key=made[0].key, label="twin", payload=made[1].payload)
-    assert [each["square"] for each in swept_here(tmp_path, [made[0], twin, made[1]], jobs=1).values()] == [0, 1]
+    assert [each["square"] for each in swept_here(tmp_path, [made[0], twin, made[1]], jobs=1).values()] == [
+        0,
+        1,
+    ]
     assert begun(tmp_path / "log") == [0, 1]
     assert swept_here(tmp_path, []) == {}
 
@@ -268,17 +280,23 @@ def test_a_killed_sweep_goes_on_with_what_it_had(tmp_path, end):
     kept = set(keys(store))
     assert 6 <= len(kept) < 60
     assert list(swept_here(tmp_path, made, jobs=1).values()) == expected(60)
-    assert Counter(begun(tmp_path / "again")) == Counter(n for n, point in enumerate(made) if point.key not in kept)
+    assert Counter(begun(tmp_path / "again")) == Counter(
+        n for n, point in enumerate(made) if point.key not in kept
+    )
 
 
 def test_a_process_that_dies_leaves_what_the_others_had(tmp_path):
     made = points(tmp_path / "log", 6, trouble={5: "die"}, seconds={5: 1.0})
-    with pytest.raises(UnfinishedError, match=r"ended early.*\n5 of 6 measurements of this stage are kept in"):
+    with pytest.raises(
+        UnfinishedError, match=r"ended early.*\n5 of 6 measurements of this stage are kept in"
+    ):
         swept_here(tmp_path, made, jobs=2)
     assert list(swept_here(tmp_path, points(tmp_path / "log", 6), jobs=2).values()) == expected(6)
 
 
-def test_a_process_that_is_stopped_without_dying_is_given_up_and_its_point_begun_again(tmp_path, monkeypatch, capsys):
+def test_a_process_that_is_stopped_without_dying_is_given_up_and_its_point_begun_again(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(jobs_module, "STILL_S", 2.0)
     made = points(tmp_path / "log", 6, trouble={2: "stop"})
     assert list(swept_here(tmp_path, made, jobs=2).values()) == expected(6)
@@ -292,14 +310,17 @@ def test_what_a_measurement_raises_arrives_and_results_are_kept(tmp_path, jobs):
     with pytest.raises(DataError, match="is empty") as raised:
         swept_here(tmp_path, made, jobs=jobs)
     assert raised.value.__notes__[0] == "number 2"
-    assert raised.value.__notes__[1].endswith(f"of 4 measurements of this stage are kept in {tmp_path / 'x.store'}")
+    assert raised.value.__notes__[1].endswith(
+        f"of 4 measurements of this stage are kept in {tmp_path / 'x.store'}"
+    )
     with pytest.raises(ZeroDivisionError, match="a defect"):
         swept_here(tmp_path, points(tmp_path / "log", 5, trouble={4: "defect"}), jobs=jobs)
 
 
 def test_an_interrupt_keeps_all(tmp_path):
     with pytest.raises(
-        KeyboardInterrupt, match=r"2 of 3 measurements of this stage are kept in .*; go on with the same command"
+        KeyboardInterrupt,
+        match=r"2 of 3 measurements of this stage are kept in .*; go on with the same command",
     ):
         swept_here(tmp_path, points(tmp_path / "log", 3, trouble={2: "interrupt"}), jobs=1)
 
@@ -308,7 +329,10 @@ def test_what_is_refused(tmp_path):
     made = points(tmp_path / "log", 2)
     refused(OptionError, "--jobs 0", swept_here, tmp_path, made, jobs=0)
     swept_here(tmp_path, made, jobs=1)
-    with only_one(tmp_path / "x.store"), pytest.raises(OptionError, match="another process is working on it"):
+    with (
+        only_one(tmp_path / "x.store"),
+        pytest.raises(OptionError, match="another process is working on it"),
+    ):
         swept_here(tmp_path, made)
     (tmp_path / "x.store").write_text("precious" * 100)
     refused(DataError, "x.store: is truncated or damaged, or something else", swept_here, tmp_path, made)

@@ -25,18 +25,30 @@ from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.votes import class_counts
 
 
-def random_counters(seed, *, taxels=3, parts=1, classes=3, thresholds=(1, 3), most=LARGEST, steps=20, ramp=12):
+def random_counters(
+    seed, *, taxels=3, parts=1, classes=3, thresholds=(1, 3), most=LARGEST, steps=20, ramp=12
+):
     """Some counters of a sensor, whose sums of the data never reach the threshold."""
     rng = np.random.default_rng(seed)
-    kinds = [(channel, part, k) for k in thresholds for part in range(parts) for channel in range(2 * taxels)]
+    kinds = [
+        (channel, part, k) for k in thresholds for part in range(parts) for channel in range(2 * taxels)
+    ]
     counter = np.array(kinds)[rng.random(len(kinds)) < 0.8][::-1]
-    weight = rng.integers(-most, most + 1, (classes, len(counter))) * (rng.random((classes, len(counter))) < 0.7)
+    weight = rng.integers(-most, most + 1, (classes, len(counter))) * (
+        rng.random((classes, len(counter))) < 0.7
+    )
     slope = int(rng.integers(1, 9))
     highest = int(weight.clip(min=0).sum(axis=1).max())
     sizes = {"taxels": taxels, "polarities": 2, "classes": classes, "bins": 1, "steps": steps}
     threshold = highest + slope * steps + 0.5
     return Counters(
-        **sizes, parts=parts, ramp=ramp, counter=counter, weight=weight, slope=float(slope), threshold=threshold
+        **sizes,
+        parts=parts,
+        ramp=ramp,
+        counter=counter,
+        weight=weight,
+        slope=float(slope),
+        threshold=threshold,
     )
 
 
@@ -113,7 +125,16 @@ def test_it_leaves_for_ranc_with_joined_bins_and_its_ramp(tmp_path):
     write_crossbars(netlist, tmp_path / "net.loom")
     touches = np.ones((1, 2, 2, 40), np.uint8)
     recordings_folder(tmp_path / "data", train=touches, test=touches)
-    words = ["export", tmp_path / "net.loom", "--to", "ranc", "-o", tmp_path / "net.json", "--data", tmp_path / "data"]
+    words = [
+        "export",
+        tmp_path / "net.loom",
+        "--to",
+        "ranc",
+        "-o",
+        tmp_path / "net.json",
+        "--data",
+        tmp_path / "data",
+    ]
     assert as_json(*words)["ticks"] == netlist.ticks(20 + 12) + 1
     written = json.loads((tmp_path / "net.json").read_text("utf-8"))
     assert [bool(tick) for tick in written["packets"]] == [True] * 20 + [False] * (12 + netlist.drain)
@@ -122,7 +143,9 @@ def test_it_leaves_for_ranc_with_joined_bins_and_its_ramp(tmp_path):
 
 def test_what_the_chip_cannot_hold_is_refused(tmp_path):
     counters = random_counters(0, most=127)
-    with pytest.raises(ModelError, match=r"weights of up to \d+, 15 allowed; train it with --weight-bits 5 or fewer"):
+    with pytest.raises(
+        ModelError, match=r"weights of up to \d+, 15 allowed; train it with --weight-bits 5 or fewer"
+    ):
         compile_crossbars(counters)
     counters = random_counters(0)
     with pytest.raises(ModelError, match=r"a ramp of 0\.5 a step"):
@@ -132,7 +155,9 @@ def test_what_the_chip_cannot_hold_is_refused(tmp_path):
     write_counters(tmp_path / "c.pt", random_counters(0, most=127))
     code, _, err = run("compile", tmp_path / "c.pt", "--target", "truenorth", "-o", tmp_path / "c.loom")
     assert (code, "c.pt: weights of up to" in err) == (2, True)
-    code, _, err = run("train", "--data", "synthetic", "--system", "counters", "--weight-bits", "9", "-o", "x.pt")
+    code, _, err = run(
+        "train", "--data", "synthetic", "--system", "counters", "--weight-bits", "9", "-o", "x.pt"
+    )
     assert (code, "--weight-bits 9: allowed are 2 to 8" in err) == (2, True)
 
 

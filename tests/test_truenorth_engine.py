@@ -21,7 +21,9 @@ from spikeloom.runtime.machines.truenorth import engine, spec
 
 def lives(neuron: Neuron, arrivals: list[int]) -> tuple[list[int], list[int]]:
     """Membranes at the ends of ticks and ticks with spikes of a neuron to which weights of type 0 arrive."""
-    state = spec.Neuron(**{each.name: getattr(neuron, each.name, neuron.initial) for each in fields(spec.Neuron)})
+    state = spec.Neuron(
+        **{each.name: getattr(neuron, each.name, neuron.initial) for each in fields(spec.Neuron)}
+    )
     held, spikes = [], []
     for tick, arrived in enumerate(arrivals):
         spiked, _ = spec.neuron_tick(state, max(arrived, 0), max(-arrived, 0), 20)
@@ -48,13 +50,28 @@ def lives(neuron: Neuron, arrivals: list[int]) -> tuple[list[int], list[int]]:
         # leak: one direction, or by the sign of the membrane, which it does not change
         (Neuron(threshold=9, leak=-2, negative_threshold=99), [3, 0, 0], [1, -1, -3], []),
         (Neuron(threshold=9, leak=-2, leak_reversal=True, negative_threshold=99), [3, 0, 0], [1, 0, 0], []),
-        (Neuron(threshold=9, leak=-2, leak_reversal=True, negative_threshold=99), [-5, 0, 0], [-3, -1, 0], []),
-        (Neuron(threshold=9, leak=2, leak_reversal=True, negative_threshold=99), [-1, 0, 0], [-3, -5, -7], []),
+        (
+            Neuron(threshold=9, leak=-2, leak_reversal=True, negative_threshold=99),
+            [-5, 0, 0],
+            [-3, -1, 0],
+            [],
+        ),
+        (
+            Neuron(threshold=9, leak=2, leak_reversal=True, negative_threshold=99),
+            [-1, 0, 0],
+            [-3, -5, -7],
+            [],
+        ),
         (Neuron(threshold=9, leak=2, leak_reversal=True, negative_threshold=99), [0, 0], [0, 0], []),
         # history-free: the threshold is the leak
         (history_free((1, 0, 0, 0), 3), [2, 2, 3, 0, -9, 4], [0] * 6, [2, 5]),
         # the register saturates at both ends
-        (Neuron(threshold=2**18 - 1, reset_mode=RESET_NONE, initial=2**19 - 1), [5, -3], [524287, 524284], [0, 1]),
+        (
+            Neuron(threshold=2**18 - 1, reset_mode=RESET_NONE, initial=2**19 - 1),
+            [5, -3],
+            [524287, 524284],
+            [0, 1],
+        ),
         (Neuron(negative_threshold=2**18 - 1, reset_mode=RESET_NONE, initial=-(2**19)), [-5], [-524288], []),
     ],
 )
@@ -99,9 +116,13 @@ def large():
     for core in range(10):
         draft.core(core, 0)
         for number in range(250):
-            neuron = Neuron(leak=-1, leak_reversal=True, threshold=9, reset_mode=RESET_LINEAR, negative_threshold=50)
+            neuron = Neuron(
+                leak=-1, leak_reversal=True, threshold=9, reset_mode=RESET_LINEAR, negative_threshold=50
+            )
             weights = tuple(int(weight) for weight in rng.integers(-3, 5, 4))
-            draft.neuron(core, history_free(weights, 6) if core % 2 else neuron, layer="layer0", number=number)
+            draft.neuron(
+                core, history_free(weights, 6) if core % 2 else neuron, layer="layer0", number=number
+            )
         for _ in range(256):
             draft.axon(core, int(rng.integers(4)), rng.choice(250, 60, replace=False).tolist())
         for line in range(78):
@@ -123,12 +144,18 @@ def test_full_cores_and_many_ticks():
 
 def test_a_membrane_that_climbs_to_the_end_of_its_register():
     """A neuron that is given more in every tick than a spike takes from it."""
-    draft = alone(Neuron(weights=(255, 0, 0, 0), reset_mode=RESET_LINEAR, negative_saturates=True), channels=0)
+    draft = alone(
+        Neuron(weights=(255, 0, 0, 0), reset_mode=RESET_LINEAR, negative_saturates=True), channels=0
+    )
     draft.vote((0, 0), 0)
     draft.clock(0, 0, period=1)
     netlist = draft.netlist(taxels=1, polarities=1, classes=1)
-    assert both(netlist, np.zeros((1, 2100), np.uint8)).counts.overflows.sum() > 0  # 254 a tick, 2**19 after 2,064
-    assert [engine.prepare(netlist, careful=careful).wiring.steady.shape[1] for careful in (False, True)] == [1, 0]
+    assert (
+        both(netlist, np.zeros((1, 2100), np.uint8)).counts.overflows.sum() > 0
+    )  # 254 a tick, 2**19 after 2,064
+    assert [
+        engine.prepare(netlist, careful=careful).wiring.steady.shape[1] for careful in (False, True)
+    ] == [1, 0]
 
 
 SOURCE = "core 0, neuron 0"
@@ -141,7 +168,9 @@ def made(draft: Draft, **changes):
 
 def broken(netlist, chip=CHIP) -> list[tuple[str, str, str]]:
     """Owner, what was found, and the rule."""
-    return [(fault.owner, fault.used, fault.rule.removeprefix("truenorth.")) for fault in faults(netlist, chip)]
+    return [
+        (fault.owner, fault.used, fault.rule.removeprefix("truenorth.")) for fault in faults(netlist, chip)
+    ]
 
 
 def with_neuron(**changes) -> Draft:
@@ -179,7 +208,10 @@ def more(change, times: int = 1):
     [
         (made(relays()), []),
         *((made(relays(), wire_delay=n), [(SOURCE, f"delay {n}", "neuron.delay")]) for n in (0, 16, -1)),
-        (more(lambda d: d.wire((0, 0), 1, d.axon(1))), [(SOURCE, "2 targets on one core", "neuron.targets")]),
+        (
+            more(lambda d: d.wire((0, 0), 1, d.axon(1))),
+            [(SOURCE, "2 targets on one core", "neuron.targets")],
+        ),
         (
             more(lambda d: d.wire((0, 0), d.core(2, 0), d.axon(2))),
             [(SOURCE, "targets on 2 cores without a splitter", "neuron.targets")],
@@ -188,7 +220,10 @@ def more(change, times: int = 1):
             more(lambda d: d.wire((1, 0), 0, 0)),
             [("core 1, neuron 0", "votes and has a target on the chip", "neuron.targets")],
         ),
-        *((more(lambda d, n=n: d.axon(0, n)), [("core 0, axon 1", f"type {n}", "core.axon_types")]) for n in (4, -1)),
+        *(
+            (more(lambda d, n=n: d.axon(0, n)), [("core 0, axon 1", f"type {n}", "core.axon_types")])
+            for n in (4, -1)
+        ),
         (
             more(lambda d: d.axon(0), 256),
             [("core 0", "257 axons", "core.axons"), ("core 0, axon 256", "line 256", "core.axons")],
@@ -212,9 +247,18 @@ def test_rules(netlist, found):
     [
         *((made(with_neuron(reset_mode=n)), "reset_mode has values outside 0 … 2") for n in (-1, 3)),
         *((made(with_neuron(leak_reversal=n)), "leak_reversal has values outside 0 … 1") for n in (-1, 2)),
-        *((made(with_neuron(negative_saturates=n)), "negative_saturates has values outside 0 … 1") for n in (-1, 2)),
-        *((made(relays(), **change), "wire 0 leads to no axon") for change in ({"wire_y": 6}, {"wire_line": 7})),
-        *((more(lambda d, n=n: d.axon(0, n, line=0)), "two axons are on one line of a core") for n in (0, 2)),
+        *(
+            (made(with_neuron(negative_saturates=n)), "negative_saturates has values outside 0 … 1")
+            for n in (-1, 2)
+        ),
+        *(
+            (made(relays(), **change), "wire 0 leads to no axon")
+            for change in ({"wire_y": 6}, {"wire_line": 7})
+        ),
+        *(
+            (more(lambda d, n=n: d.axon(0, n, line=0)), "two axons are on one line of a core")
+            for n in (0, 2)
+        ),
         (more(lambda d: d.core(0, 0)), "two cores are at one place"),
         (more(lambda d: d.clock(0, 0, period=0)), "clock_period has values outside 1"),
         (more(lambda d: d.clock(0, 0, period=1, phase=-1)), "clock_phase has values outside 0"),
@@ -272,11 +316,21 @@ def test_limits_of_inputs_and_targets(network, found):
 
 @pytest.mark.parametrize(
     ("inputs", "distinct", "over"),
-    [(64, 15, False), (64, 16, True), (85, 7, False), (86, 7, True), (128, 3, False), (129, 1, False), (129, 2, True)],
+    [
+        (64, 15, False),
+        (64, 16, True),
+        (85, 7, False),
+        (86, 7, True),
+        (128, 3, False),
+        (129, 1, False),
+        (129, 2, True),
+    ],
 )
 def test_the_limit_of_levels_follows_the_axons_that_are_left(inputs, distinct, over):
     weight = np.resize(np.arange(1, distinct + 1), inputs)[None].astype(float)
-    assert needed(chain(weight, beta=0.0)) == [(f"{distinct} different weights", "neuron.weight_bits")] * over
+    assert (
+        needed(chain(weight, beta=0.0)) == [(f"{distinct} different weights", "neuron.weight_bits")] * over
+    )
 
 
 def test_zeros_are_no_level_and_the_worst_neuron_is_named():

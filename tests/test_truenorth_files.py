@@ -35,7 +35,9 @@ def network() -> crossbar.CrossbarNetlist:
     draft = Draft()
     core = draft.core(3, 4)
     for taxel in range(2):
-        draft.axon(core, taxel, [draft.neuron(core, history_free((1, 1, 0, 0), 1), layer="out", number=taxel)])
+        draft.axon(
+            core, taxel, [draft.neuron(core, history_free((1, 1, 0, 0), 1), layer="out", number=taxel)]
+        )
         for polarity in range(2):
             draft.feed(2 * taxel + polarity, core, taxel)
         draft.vote((core, taxel), taxel)
@@ -94,7 +96,9 @@ def test_files_that_mean_nothing(path, changes, line):
     """The same file with other arrays and a fitting hash."""
     members = archive.read_members(path)
     manifest = json.loads(str(members["manifest"])) | changes.get("manifest", {})
-    path.write_bytes(archive.archive_bytes(manifest, {name: changes.get(name, members[name]) for name in ARRAYS}))
+    path.write_bytes(
+        archive.archive_bytes(manifest, {name: changes.get(name, members[name]) for name in ARRAYS})
+    )
     with pytest.raises(FormatError, match=re.escape(line)):
         crossbar.read_crossbars(path)
 
@@ -123,7 +127,10 @@ def test_four_touches_counted_by_hand(place):
     report = as_json("estimate", *words)
     assert report["per_inference"]["spikes"] == 1.5
     # every arrival meets one crossing point: 2, 3, 1 and 0 of them, and one of two polarities is merged in each
-    found = {name: report["per_inference"][name] for name in ("synaptic_events", "spikes", "merged_spikes", "ticks")}
+    found = {
+        name: report["per_inference"][name]
+        for name in ("synaptic_events", "spikes", "merged_spikes", "ticks")
+    }
     assert found == {"synaptic_events": 1.5, "spikes": 1.5, "merged_spikes": 0.75, "ticks": 6}
     assert report["per_inference"]["time_s"] == pytest.approx(6e-3)
     all_in, marginal = report["energy"]
@@ -154,9 +161,13 @@ def small(**changes):
     draft = Draft()
     draft.core(5, 2)
     draft.core(6, 3)
-    draft.neuron(0, Neuron(weights=(0, 4, 0, 0), threshold=3, negative_threshold=2, **changes), layer="layer0")
+    draft.neuron(
+        0, Neuron(weights=(0, 4, 0, 0), threshold=3, negative_threshold=2, **changes), layer="layer0"
+    )
     for number in range(2):
-        draft.neuron(1, Neuron(weights=(0, 0, 0, 1), reset_mode=crossbar.RESET_LINEAR), layer="layer1", number=number)
+        draft.neuron(
+            1, Neuron(weights=(0, 0, 0, 1), reset_mode=crossbar.RESET_LINEAR), layer="layer1", number=number
+        )
     draft.axon(0, 1, [0])
     draft.axon(1, 3, [0, 1], line=2)
     draft.feed(0, 0, 0, tick=1)
@@ -170,7 +181,9 @@ def test_the_schema_of_ranc():
     written = json.loads("\n".join(ranc.export(small(), np.array([[1, 0]], np.uint8))))
     sizes = {"num_neurons": 256, "num_axons": 256, "num_weights": 4, "num_cores_x": 2, "num_cores_y": 2}
     sizes |= {"max_tick_offset": 16, "neuron_reset_type": 0}
-    assert {key: value for key, value in written.items() if key.startswith(("num", "max", "neuron_r"))} == sizes
+    assert {
+        key: value for key, value in written.items() if key.startswith(("num", "max", "neuron_r"))
+    } == sizes
     assert written["output_bus"] == {"coordinates": [1, 0], "num_outputs": 2}
     packet = {"destination_core": [1, 1], "destination_axon": 2, "destination_tick": 0}
     fed = {"destination_core": [0, 0], "destination_axon": 0, "destination_tick": 0}
@@ -183,7 +196,11 @@ def test_the_schema_of_ranc():
     assert second["axons"] == [0, 0, 3]
     assert second["connections"] == [[0, 0, 1], [0, 0, 1]]
     voter, lost = second["neurons"]
-    assert (voter["destination_core_offset"], voter["destination_axon"], voter["destination_tick"]) == ([0, -1], 0, 0)
+    assert (voter["destination_core_offset"], voter["destination_axon"], voter["destination_tick"]) == (
+        [0, -1],
+        0,
+        0,
+    )
     assert (lost["destination_core_offset"], lost["destination_axon"]) == ([0, -1], 1)
 
 
@@ -241,8 +258,12 @@ def test_the_command_for_ranc(tmp_path, monkeypatch):
     for command in ("anytime", "explain --checkpoint x", "stress --checkpoint x"):
         name, *more = command.split()
         said = refusal(name, "net.loom", *more, "--data", "data")
-        assert said == f"net.loom: is for IBM TrueNorth, which {name} does not take; give one for another chip"
-    assert "this is for cores of compartments (--target loihi1)" in refusal(*words[:3], "nir", "-o", "net.nir")
+        assert (
+            said == f"net.loom: is for IBM TrueNorth, which {name} does not take; give one for another chip"
+        )
+    assert "this is for cores of compartments (--target loihi1)" in refusal(
+        *words[:3], "nir", "-o", "net.nir"
+    )
     costs = run("estimate", "net.loom", "--data", "data")[1]
     assert "static power of a chip: 42 mW (idle_0v70), 65 mW (typical_0v75)" in costs
     words += ["--data", "data", "--recording"]
@@ -279,6 +300,10 @@ def test_ranc_spikes_the_same(simulator, tmp_path, netlist, seed):
     except ModelError:
         assume(False)
     ticks = str(int(expected.counts.ticks) + 1)
-    done = subprocess.run([simulator, source, result, source, ticks], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [simulator, source, result, source, ticks], capture_output=True, text=True, check=True
+    )
     assert "ERROR" not in done.stdout
-    np.testing.assert_array_equal(outputs_of(result.read_text("utf-8"), len(voters)), expected.spikes[:, voters])
+    np.testing.assert_array_equal(
+        outputs_of(result.read_text("utf-8"), len(voters)), expected.spikes[:, voters]
+    )

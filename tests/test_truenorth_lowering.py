@@ -80,7 +80,9 @@ def test_leaks_rest_in_the_ticks_before_the_first_data():
 
 def test_a_neuron_is_there_once_for_each_axon_that_it_reaches():
     # 300 voters take two cores, both of which receive all 120 neurons on 2 axons: 480, again two cores
-    network = cores.random_network(0, copies=2, blocks=1, taxels=4, features=25, hidden=(120,), classes=150, clocks=0)
+    network = cores.random_network(
+        0, copies=2, blocks=1, taxels=4, features=25, hidden=(120,), classes=150, clocks=0
+    )
     netlist = lower(network, cores.CHIP)
     count = {name: np.bincount(netlist.neuron[netlist.layer == i]) for i, name in enumerate(netlist.layers)}
     assert set(count["fc2"]) == {1}

@@ -28,7 +28,9 @@ from spikeloom.models.truenorth.kind import CROSSBARS
 from spikeloom.models.truenorth.neurons import block_sums, integrate
 
 SMOOTH = Surrogate(shape=FAST_SIGMOID, width=0.5, reset=False)
-SIZES = truenorth.NativeArchitecture(taxels=6, classes=3, features=4, groups=2, hidden=(6, 4), clocks=clocks_over(2, 9))
+SIZES = truenorth.NativeArchitecture(
+    taxels=6, classes=3, features=4, groups=2, hidden=(6, 4), clocks=clocks_over(2, 9)
+)
 EDGES = np.array([[0, 1], [1, 0], [1, 2], [2, 1], [3, 4], [4, 3]])
 
 
@@ -77,7 +79,9 @@ def test_sums_of_blocks_and_their_gradient():
 
 
 def network(seed=0, sizes=SIZES):
-    return sizes.network(propagation_of("tactilesgnet", EDGES, sizes.taxels, None, 4), seed=seed, surrogate=SMOOTH)
+    return sizes.network(
+        propagation_of("tactilesgnet", EDGES, sizes.taxels, None, 4), seed=seed, surrogate=SMOOTH
+    )
 
 
 def test_what_is_trained_is_what_is_exported():
@@ -94,7 +98,9 @@ def test_what_is_trained_is_what_is_exported():
         for whole in (layer.weight / 32, layer.leak, layer.threshold, layer.floor):
             np.testing.assert_array_equal(whole.detach().numpy(), np.round(whole.detach().numpy()))
     rates.sum().backward()
-    assert all(parameter.grad is not None and parameter.grad.abs().sum() > 0 for parameter in net.parameters())
+    assert all(
+        parameter.grad is not None and parameter.grad.abs().sum() > 0 for parameter in net.parameters()
+    )
 
 
 def test_shorter_recordings_count_their_own_steps():
@@ -123,14 +129,24 @@ def test_equal_votes_stay_equal():
 
 
 def test_groups_fill_the_axons_of_a_core():
-    found = truenorth.size_network(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(5, 325))
+    found = truenorth.size_network(
+        taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(5, 325)
+    )
     assert (found.groups, found.hidden) == (8, (80, 80))
-    found = truenorth.size_network(taxels=39, classes=20, hops=3, features=15, copies=2, clocks=clocks_over(8, 325))
+    found = truenorth.size_network(
+        taxels=39, classes=20, hops=3, features=15, copies=2, clocks=clocks_over(8, 325)
+    )
     assert (found.groups, found.hidden) == (5, (120, 120))
     with pytest.raises(OptionError, match=r"--copies 4: 78 input channels with 4 axons each, .* has 256"):
-        truenorth.size_network(taxels=39, classes=20, hops=3, features=16, copies=4, clocks=clocks_over(5, 325))
-    with pytest.raises(OptionError, match=r"--features 16: .* 39 taxels and 60 clocks to cores of 85 inputs"):
-        truenorth.size_network(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(60, 325))
+        truenorth.size_network(
+            taxels=39, classes=20, hops=3, features=16, copies=4, clocks=clocks_over(5, 325)
+        )
+    with pytest.raises(
+        OptionError, match=r"--features 16: .* 39 taxels and 60 clocks to cores of 85 inputs"
+    ):
+        truenorth.size_network(
+            taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(60, 325)
+        )
 
 
 def written(path, networks=None):
@@ -147,7 +163,12 @@ def test_round_trip(tmp_path):
     assert (written(path), path.read_bytes()) == (sha256, first)
     for which, seed in (("last", 0), ("best", 1)):
         found, made = read_trained(path, weights=which), random_network(seed)
-        assert (found.weights, found.sets, found.graph, found.sha256) == (which, ("last", "best"), "ring", sha256)
+        assert (found.weights, found.sets, found.graph, found.sha256) == (
+            which,
+            ("last", "best"),
+            "ring",
+            sha256,
+        )
         for one, other in zip(found.network.stages, made.stages, strict=True):
             for part in PARTS:
                 np.testing.assert_array_equal(getattr(one, part), getattr(other, part))
@@ -174,7 +195,10 @@ def with_first(name, change):
     [
         (lambda path: path.unlink(), "no such file"),
         (lambda path: restated(path, towers=2, graph=1), "no usable graph, towers"),
-        (lambda path: restated(path, graph={"name": "ring", "edges": [[0, 9]]}), "joins taxels outside 0..3"),
+        (
+            lambda path: restated(path, graph={"name": "ring", "edges": [[0, 9]]}),
+            "joins taxels outside 0..3",
+        ),
         (lambda path: written(path, with_first("level", lambda k: k * 4)), "conv1: levels beyond 3"),
         (lambda path: written(path, with_first("leak", lambda v: v[None])), "leak is no list of integers"),
     ],
@@ -192,10 +216,14 @@ TRAIN = "train --system tactilesgnet-truenorth --data data --graph manual --feat
 def test_from_recordings_to_the_chip(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     seeds = (("train", 1), ("test", 2))
-    grasps = [replace(synthetic_grasps(per_class=2, steps=12, seed=seed), split=split) for split, seed in seeds]
+    grasps = [
+        replace(synthetic_grasps(per_class=2, steps=12, seed=seed), split=split) for split, seed in seeds
+    ]
     write_released(tmp_path / "data", grasps)
     (run,) = as_json(*f"{TRAIN} -o x.pt".split())["runs"]
-    assert run["command"].endswith("--system tactilesgnet-truenorth --graph manual --features 2 --epochs 1 --seed 0")
+    assert run["command"].endswith(
+        "--system tactilesgnet-truenorth --graph manual --features 2 --epochs 1 --seed 0"
+    )
     assert run["recipe"] == CROSSBARS.to_json() | {"features": 2}
     shown = as_json("inspect", "x.pt")
     assert (shown["copies"], shown["levels"], shown["sets"]) == (3, 7, ["last", "best", "clean"])
@@ -210,7 +238,9 @@ def test_from_recordings_to_the_chip(tmp_path, monkeypatch):
     # what was finished is not trained again
     (again,) = as_json(*f"{TRAIN} -o x.pt --resume".split())["runs"]
     assert again == run
-    assert "x.pt: holds another training (other seed)" in refusal(*f"{TRAIN} --seed 1 --resume -o x.pt".split())
+    assert "x.pt: holds another training (other seed)" in refusal(
+        *f"{TRAIN} --seed 1 --resume -o x.pt".split()
+    )
 
 
 @pytest.fixture
@@ -220,7 +250,10 @@ def native(tmp_path, monkeypatch):
     for name in ("net.pt", "net.loom", "data"):
         (tmp_path / name).symlink_to(made.folder / name)
     monkeypatch.chdir(tmp_path)
-    written("two.pt", {which: random_network(seed, taxels=TAXELS, classes=CLASSES) for which, seed in WHICH.items()})
+    written(
+        "two.pt",
+        {which: random_network(seed, taxels=TAXELS, classes=CLASSES) for which, seed in WHICH.items()},
+    )
     own_file(Path("own.pt"))
 
 
@@ -239,9 +272,15 @@ VERIFY = "verify net.loom --data data --checkpoint"
         ("inspect net.pt --beta 0.3", "--beta 0.3: net.pt is a network for TrueNorth and says that itself"),
         (f"{VERIFY} net.pt --min-agreement 1", "--min-agreement 1.0: the network is whole numbers"),
         (f"{VERIFY} two.pt", "--checkpoint two.pt: net.loom was compiled from another file"),
-        ("verify two.loom --data data --checkpoint two.pt", "--weights last: two.loom was compiled from best"),
+        (
+            "verify two.loom --data data --checkpoint two.pt",
+            "--weights last: two.loom was compiled from best",
+        ),
         ("join net.pt own.pt -o z.pt", "net.pt: is a network trained for TrueNorth, not yet compiled; only"),
-        ("compile own.pt --target truenorth -o z.loom", "fc3, all 4 neurons: keep 0.2 of their membranes a step"),
+        (
+            "compile own.pt --target truenorth -o z.loom",
+            "fc3, all 4 neurons: keep 0.2 of their membranes a step",
+        ),
     ],
 )
 @pytest.mark.usefixtures("native")
@@ -261,7 +300,9 @@ def test_a_spike_that_differs_fails():
     assert any(missed.startswith("E1") for missed in report["missed"])
 
 
-@pytest.mark.parametrize("command", ["run net.loom", "estimate net.loom", "verify net.loom --checkpoint net.pt"])
+@pytest.mark.parametrize(
+    "command", ["run net.loom", "estimate net.loom", "verify net.loom --checkpoint net.pt"]
+)
 @pytest.mark.usefixtures("native")
 def test_a_part_of_every_recording(command):
     words = [*command.split(), "--data", "data", "--window"]

@@ -60,7 +60,9 @@ def lowered(different: int):
 
 
 def test_levels_without_a_float_model():
-    alone = verdict(**lowered(0), float_predictions=None, float_counts=None, spikes={}, required={"E0": 1, "E1": 1})
+    alone = verdict(
+        **lowered(0), float_predictions=None, float_counts=None, spikes={}, required={"E0": 1, "E1": 1}
+    )
     assert [level.share for level in alone.levels] == [1, 1, 1, None, None]
     assert (alone.accuracy, alone.decision_agreement, alone.missed) == ({"chip": 0.75}, None, ())
     assert "every spike of its model and is right on 3 of 4 recordings" in in_a_sentence(alone)
@@ -95,7 +97,10 @@ def test_the_paired_test_is_the_binomial_one_of_scipy(pairs):
 def test_requirements_are_read_and_held_against_levels():
     assert parse_requirements("E0,E1,E2=0.99,E3=1") == {"E0": 1.0, "E1": 1.0, "E2": 0.99, "E3": 1.0}
     levels = (Level(name="E1", share=None, text="not applicable"), Level(name="E2", share=0.98, text=""))
-    assert unmet(levels, {"E1": 1.0, "E2": 0.99}) == ["E1: not applicable", "E2: 0.9800 reached, 0.99 required"]
+    assert unmet(levels, {"E1": 1.0, "E2": 0.99}) == [
+        "E1: not applicable",
+        "E2: 0.9800 reached, 0.99 required",
+    ]
     assert unmet(levels, {"E2": 0.98}) == []
     assert unmet(levels, {}) == []
 
@@ -166,7 +171,9 @@ def test_votes_that_decide_little(before, after, expected):
 
 def verified(folder, arrays, recordings, packing, **options):
     checkpoint, adjacency = small_checkpoint(folder, last=arrays)
-    netlist = compile_network(expand(checkpoint, adjacency), Options(storage=Fixed((packing,)), **options)).netlist
+    netlist = compile_network(
+        expand(checkpoint, adjacency), Options(storage=Fixed((packing,)), **options)
+    ).netlist
     made = verify(netlist, expand(checkpoint, adjacency), recorded(recordings))
     return {breakdown.kind: breakdown for breakdown in made.breakdowns}
 
@@ -177,7 +184,9 @@ def test_a_neuron_that_fires_by_a_hair_from_its_bias_alone(tmp_path, bits):
     arrays = weights()
     arrays["fc2.weight"][3], arrays["fc2.bias"][3] = 0, 0.400005
     recordings = events(2, steps=60)
-    kinds = verified(tmp_path, arrays, recordings, Packing(bits=bits), keep_all=True, training_events=events(1))
+    kinds = verified(
+        tmp_path, arrays, recordings, Packing(bits=bits), keep_all=True, training_events=events(1)
+    )
     assert ("silenced neurons" in kinds) == (bits == 4)
     assert bits == 8 or "fc2 neurons that fire in the float model" in kinds["silenced neurons"].text
 

@@ -121,9 +121,7 @@ def test_several_grasps_are_runs_of_their_own(lively_file, lines):
     grasps = [random_events(seed, length) for seed, length in ((1, 40), (2, 25), (3, 33))]
     first, second, third = (as_lines(events) for events in grasps)
     header = f"{HEADER.upper()}\n"
-    content = (
-        f"\ufeff# first\n\n# {header}# {header}{first}\n{header}{second}# pause\nreset\n\n   \nreset\n{third.rstrip()}"
-    )
+    content = f"\ufeff# first\n\n# {header}# {header}{first}\n{header}{second}# pause\nreset\n\n   \nreset\n{third.rstrip()}"
     for text in (content, content.replace("\n", "\r\n"), content.replace(",", " ,  ")):
         found = objects(lively_file, lines(text))
         shown = [(grasp["grasp"], grasp["bins"], grasp["counts"]) for grasp in found["grasp"]]
@@ -135,7 +133,9 @@ def test_exact_edges_of_bins(pair_file, lines):
     # 0.58 / 0.02 is below 29 in binary floating point
     found = objects(pair_file, lines("0.579999,0,0\n0.58,0,0\n5.8e-1,0,1\n0.60,0,1\n"))
     assert [each["counts"] for each in found["bin"][28:]] == [[1, 0], [2, 1], [2, 2]]
-    content = "0.000000000000000000e+00,0.000e+00,1.000e+00\n+0.02,+0,+1\n4E-2,0,-1\n"  # as programs write numbers
+    content = (
+        "0.000000000000000000e+00,0.000e+00,1.000e+00\n+0.02,+0,+1\n4E-2,0,-1\n"  # as programs write numbers
+    )
     assert objects(pair_file, lines(content))["grasp"][0]["counts"] == [1, 2]
     found = objects(pair_file, "--bin", "0.003", lines("0.0089,0,0\n0.009,0,1\n"))
     assert [each["counts"] for each in found["bin"]] == [[0, 0], [0, 0], [1, 0], [1, 1]]
@@ -144,7 +144,9 @@ def test_exact_edges_of_bins(pair_file, lines):
 def test_a_file_is_read_as_recordings_are(lively_file, lines):
     # a sensor that counts in binary floating point misses half of the edges by a little
     rng = np.random.default_rng(0)
-    rows = sorted((k * 0.01 * (1 - e), *rng.integers([10, 2])) for k in range(200) for e in (0, 1e-15, 1e-10, 1e-7))
+    rows = sorted(
+        (k * 0.01 * (1 - e), *rng.integers([10, 2])) for k in range(200) for e in (0, 1e-15, 1e-10, 1e-7)
+    )
     path = lines("taxel,time_s,label,polarity\n" + "".join(f"{x},{t!r},4,{p}  # {p}\n" for t, x, p in rows))
     read = load_data(path.removeprefix("--input="), taxels=10)
     found = objects(lively_file, path)
@@ -207,7 +209,12 @@ def test_silence(pair_file, speed):
     read_end, write_end = os.pipe()
     thread = feed(write_end, ("0.0,0,1\n", 0.1), ("# nothing\n0.0", 0.3), ("1,0,1\n", 0))
     found = objects(
-        pair_file, "--input", f"/dev/fd/{read_end}", "--speed", speed, said=LATE.format("0.01") * (speed == "real")
+        pair_file,
+        "--input",
+        f"/dev/fd/{read_end}",
+        "--speed",
+        speed,
+        said=LATE.format("0.01") * (speed == "real"),
     )
     thread.join()
     os.close(read_end)
@@ -234,7 +241,11 @@ def test_silence(pair_file, speed):
         ("0,1,2\n", 1, "polarity 2 found"),
         ("0,1,0\n0,1,1\n0,2,-1\n", 3, "polarity -1 found after polarity 0"),
         ("0,1,0\n" + "7" * 1500, 2, "longer than 1000 bytes"),
-        ("0,1,0\n2000.02,1,0\n", 2, "time 2000.02 s leaves 100001 bins without an event, allowed are 100000"),
+        (
+            "0,1,0\n2000.02,1,0\n",
+            2,
+            "time 2000.02 s leaves 100001 bins without an event, allowed are 100000",
+        ),
     ],
 )
 def test_bad_lines(lively_file, lines, content, line, said):
@@ -287,7 +298,11 @@ def test_a_grasp_ends_as_soon_as_it_is_sure(lively_file, lines, factor):
         events = random_events(seed)
         given = () if factor is None else (factor,)
         found = objects(lively_file, lines(as_lines(events, seed)), "--bins", 40, "--until-sure", *given)
-        votes = require_stoppable(machine_of(LIVELY)).cumulative(events.reshape(1, 20, 1, 40), np.array([40])).votes
+        votes = (
+            require_stoppable(machine_of(LIVELY))
+            .cumulative(events.reshape(1, 20, 1, 40), np.array([40]))
+            .votes
+        )
         at = exits.standing(votes, np.array([40]))
         sure = exits.proven(votes, at, exits.most_votes(require_stoppable(machine_of(LIVELY)), 40))
         end = int(exits.exits(sure, at, np.inf if factor is None else factor)[0])

@@ -13,7 +13,9 @@ from spikeloom.models.systems import filters_of, propagation_of, sensor_grid
 
 GRAPH = build_graph("manual")
 
-TIMING = Dynamics(betas=(0.2, 0.3, 0.0, 0.4), alphas=(0.0, 0.95, 0.5, 0.0), clocks=Clocks(channels=3, steps=4))
+TIMING = Dynamics(
+    betas=(0.2, 0.3, 0.0, 0.4), alphas=(0.0, 0.95, 0.5, 0.0), clocks=Clocks(channels=3, steps=4)
+)
 
 SMALL = Architecture(taxels=39, classes=4, hops=2, features=3, hidden=(8, 6), dynamics=TIMING)
 
@@ -32,7 +34,13 @@ def written(path, system="tactilesgnet", dynamics=TIMING, seed=1, **sizes):
     grid = sensor_grid(NEUTOUCH, "none") if system == "grid-cnn" else None
     seen = propagation_of(system, GRAPH.edges, 39, grid, filters_of(system, 39, architecture.hops))
     network = louder(SpikingNet(architecture, seen, seed=seed))
-    constants = {"beta": architecture.beta, "theta": architecture.theta, "training": {}, "system": system, "grid": grid}
+    constants = {
+        "beta": architecture.beta,
+        "theta": architecture.theta,
+        "training": {},
+        "system": system,
+        "grid": grid,
+    }
     save_checkpoint(path, {"last": network.export_weights()}, GRAPH, dynamics=dynamics, **constants)
     return network, seen
 

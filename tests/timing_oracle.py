@@ -59,7 +59,12 @@ class Chip:
     """Where everything is and what it takes."""
 
     def __init__(
-        self, netlist: Netlist, target: Target, table: TimeTable, input_tiles: tuple[int, ...] = (), dense=None
+        self,
+        netlist: Netlist,
+        target: Target,
+        table: TimeTable,
+        input_tiles: tuple[int, ...] = (),
+        dense=None,
     ) -> None:
         """SANA-FE has the channels on cores of certain tiles, and says itself which synapses are `dense`."""
         self.netlist = netlist
@@ -102,14 +107,17 @@ class Chip:
     def flight(self, source: int, destination: int) -> int:
         """Least time from core to core."""
         (x, y), (to_x, to_y) = self.place(source), self.place(destination)
-        east_west, north_south = (self.table.picoseconds(f"hop_{way}") for way in ("east_west", "north_south"))
+        east_west, north_south = (
+            self.table.picoseconds(f"hop_{way}") for way in ("east_west", "north_south")
+        )
         return abs(x - to_x) * east_west + abs(y - to_y) * north_south
 
     def messages(self, core: int, fired: set[int], worked: set[int]) -> list[Message]:
         """What one core sends in a step, in order."""
         is_input = core >= self.netlist.n_cores
         access, update, spike = (
-            0 if is_input else self.table.picoseconds(event) for event in ("neuron_access", "neuron_update", "spike")
+            0 if is_input else self.table.picoseconds(event)
+            for event in ("neuron_access", "neuron_update", "spike")
         )
         messages = []
         since = 0
@@ -119,7 +127,9 @@ class Chip:
                 since += spike
                 for destination, work in self.deliveries.get(source, []):
                     since += self.table.picoseconds("axon_out")
-                    messages.append(Message(source=core, destination=destination, generation=since, processing=work))
+                    messages.append(
+                        Message(source=core, destination=destination, generation=since, processing=work)
+                    )
                     since = 0
         if since:
             messages.append(Message(source=core, destination=-1, generation=since, processing=0))
@@ -147,7 +157,9 @@ class Chip:
         blocked, peak = 0.0, Fraction(0)
         while any(waiting):
             # the earliest message of all cores; of several at one time that of the lowest core
-            core = min((c for c in cores if waiting[c]), key=lambda c: (done[c] + waiting[c][0].generation, c))
+            core = min(
+                (c for c in cores if waiting[c]), key=lambda c: (done[c] + waiting[c][0].generation, c)
+            )
             message = waiting[core].pop(0)
             message.sent = done[core] + message.generation
             if message.destination >= 0:
@@ -215,17 +227,23 @@ def parts_of_energy(netlist, target, counts, updates, steps, tiles, dense=None):
 
     `updates` are (samples,), `dense` says which synapses are priced as such.
     """
-    amounts = cost.count(cost.prepare(netlist, target, "whole"), replace(counts, updates=updates[:, None]), steps)
+    amounts = cost.count(
+        cost.prepare(netlist, target, "whole"), replace(counts, updates=updates[:, None]), steps
+    )
     sent = netlist.axon_source < netlist.n_inputs
     source, end = netlist.axon_source[sent], netlist.core_tile[netlist.core_of_axon()[sent]]
     way = hops(np.array(tiles)[source // target.limit("core.compartments")], end, target.limit("mesh.width"))
-    for name, each in zip(("packet", "hop_east_west", "hop_north_south"), (np.ones_like(end), *way), strict=True):
+    for name, each in zip(
+        ("packet", "hop_east_west", "hop_north_south"), (np.ones_like(end), *way), strict=True
+    ):
         amounts[name] = amounts[name] + (counts.inputs[:, source] @ each)[:, None]
     if dense is not None:
         sources = np.concatenate([counts.inputs, counts.spikes], axis=1)
         visited = sources[:, netlist.axon_source[netlist.axon_of_synapse()]]
         for form, which in (("dense", dense), ("sparse", ~dense)):
-            amounts[f"synaptic_operation_{form}"] = visited[:, which].sum(axis=1, keepdims=True).astype(np.float64)
+            amounts[f"synaptic_operation_{form}"] = (
+                visited[:, which].sum(axis=1, keepdims=True).astype(np.float64)
+            )
     return cost.by_part(target, amounts)["sanafe"]
 
 

@@ -89,7 +89,9 @@ def stored(path: Path, checkpoint: Checkpoint, **changes: int) -> Checkpoint:
     """Write a checkpoint as the commands do, and read it back."""
     names = ("beta", "theta", "forms", "system", "grid", "dynamics", "towers", "bins")
     facts = {name: getattr(checkpoint, name) for name in names} | {"training": {}} | changes
-    save_checkpoint(path, {"last": arrays_of(checkpoint)}, GRAPH, **facts | {"forms": checkpoint.forms or None})
+    save_checkpoint(
+        path, {"last": arrays_of(checkpoint)}, GRAPH, **facts | {"forms": checkpoint.forms or None}
+    )
     return read_checkpoint(path)
 
 
@@ -167,9 +169,19 @@ def netx(folder: Path) -> Made:
 def counting(folder: Path) -> Made:
     """Counters of two parts of a recording that is shorter than most, and a read-out."""
     rng = np.random.default_rng(0)
-    counter = np.array([(channel, part, k) for k in (1, 2) for part in (0, 1) for channel in range(2 * TAXELS)])
+    counter = np.array(
+        [(channel, part, k) for k in (1, 2) for part in (0, 1) for channel in range(2 * TAXELS)]
+    )
     weight = rng.integers(-9, 10, (CLASSES, len(counter)))
-    sizes = {"taxels": TAXELS, "polarities": 2, "classes": CLASSES, "bins": 1, "steps": 10, "parts": 2, "ramp": 8}
+    sizes = {
+        "taxels": TAXELS,
+        "polarities": 2,
+        "classes": CLASSES,
+        "bins": 1,
+        "steps": 10,
+        "parts": 2,
+        "ramp": 8,
+    }
     made = Counters(**sizes, counter=counter, weight=weight, slope=9.0, threshold=150.5)
     write_counters(folder / "net.pt", made)
     return "net.pt", TAXELS, "", ""
@@ -182,7 +194,9 @@ def counting_crossbars(folder: Path) -> Made:
 
 def native(folder: Path) -> Made:
     network = native_network(0, taxels=TAXELS, classes=CLASSES, steps=STEPS)
-    write_trained(folder / "net.pt", {"last": network}, graph="ring", edges=np.array([[0, 1], [1, 0]]), training={})
+    write_trained(
+        folder / "net.pt", {"last": network}, graph="ring", edges=np.array([[0, 1], [1, 0]]), training={}
+    )
     return "net.pt", TAXELS, "", "--target truenorth"
 
 

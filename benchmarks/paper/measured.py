@@ -67,7 +67,9 @@ def measure(path: Path, training: Recordings, test: Recordings) -> Json:
 def _compiled(network: Network, training: Recordings) -> Compilation:
     """The network on the chip, scales chosen on training recordings."""
     try:
-        compile_network(network)  # scales from the weights: a second, where choosing them takes minutes in vain
+        compile_network(
+            network
+        )  # scales from the weights: a second, where choosing them takes minutes in vain
     except CapacityError as error:
         if any(int(each.used) > HOPELESS * int(each.allowed) for each in error.violations):
             raise
@@ -99,7 +101,9 @@ def _figures(
     spikes, costs = _costs(netlist, target, test)
     chip = predictions(netlist, spikes)
     held = netlist.compartments_of(0)
-    in_training = engine.simulate(netlist, _flat(training), lengths=training.lengths).counts.spikes.sum(axis=0)
+    in_training = engine.simulate(netlist, _flat(training), lengths=training.lengths).counts.spikes.sum(
+        axis=0
+    )
     quiet = in_training[held] == 0
     first = netlist.layers[0]
     found: Json = {
@@ -119,7 +123,9 @@ def _figures(
     unused[0][netlist.neuron[held[quiet]]] = True
     if quiet.all():
         unused[0][netlist.neuron[held[0]]] = False  # a layer keeps one neuron
-    steps = float(training.steps * len(training)) if training.lengths is None else float(training.lengths.sum())
+    steps = (
+        float(training.steps * len(training)) if training.lengths is None else float(training.lengths.sum())
+    )
     lean = without(compilation, unused, rates=_rates(compilation, in_training / steps))
     lean_spikes, lean_costs = _costs(lean, target, test)
     lean_chip = predictions(lean, lean_spikes)

@@ -29,7 +29,10 @@ WIDTH = 6.4
 def pictures(table: str, lines: Sequence[Line]) -> dict[str, bytes]:
     """PNG files of a table by name."""
     mpl.use("Agg")
-    by_data = {data: [line for line in lines if line.row.data == data] for data in {line.row.data: 0 for line in lines}}
+    by_data = {
+        data: [line for line in lines if line.row.data == data]
+        for data in {line.row.data: 0 for line in lines}
+    }
     found = {f"{table}.png": _png(_accuracies(by_data))}
     if table == "graphs":
         found |= {"graphs-costs.png": _png(_costs(by_data)), "graphs-quiet.png": _png(_quiet(by_data))}
@@ -104,7 +107,9 @@ def _accuracy_row(axes: Axes, place: int, line: Line) -> list[float]:
         seen.append(mean)
     for at, (reading, (label, colour, marker)) in zip((-0.3, -0.1, 0.1, 0.3), SERIES.items(), strict=True):
         spread = line.accuracy(reading)
-        axes.plot(spread.values, [place + at] * len(spread.values), ".", color=colour, alpha=0.45, markersize=5)
+        axes.plot(
+            spread.values, [place + at] * len(spread.values), ".", color=colour, alpha=0.45, markersize=5
+        )
         if spread.interval is not None:
             axes.plot(spread.interval, [place + at] * 2, color=colour, linewidth=1.4)
         axes.plot([spread.mean], [place + at], marker, color=colour, markersize=5.5, label=label)
@@ -118,7 +123,9 @@ def _costs(by_data: dict[str, list[Line]]) -> Figure:
     for column, lines in enumerate(by_data.values()):
         _against(panels[0, column], lines, lambda line: line.mean("first_layer_operations") / 1e6)
         _against(panels[1, column], lines, lambda line: 1e6 * line.mean("energy_j", ENERGY))
-        panels[0, column].set(xlabel="first-layer synaptic operations an inference (million)", title=_titled(lines))
+        panels[0, column].set(
+            xlabel="first-layer synaptic operations an inference (million)", title=_titled(lines)
+        )
         panels[1, column].set(xlabel=f"energy of an inference (µJ, {ENERGY})")
     _legend(figure, list(panels.flat))
     return figure
@@ -132,7 +139,9 @@ def _against(axes: Axes, lines: Sequence[Line], cost_of: Callable[[Line], float]
         for reading in ("last", "chip"):
             label, colour, marker = SERIES[reading]
             spread = line.accuracy(reading)
-            axes.plot([cost] * len(spread.values), spread.values, ".", color=colour, alpha=0.45, markersize=4)
+            axes.plot(
+                [cost] * len(spread.values), spread.values, ".", color=colour, alpha=0.45, markersize=4
+            )
             size = 4.5 if reading == "chip" else 7
             axes.plot([cost], [spread.mean], marker, color=colour, markersize=size, label=label)
             seen += spread.values
@@ -157,7 +166,15 @@ def _name(axes: Axes, points: dict[tuple[float, float], list[str]]) -> None:
         places[index] = min(places[index], places[index + 1] - gap)
     for place, (cost, top) in zip(places, order, strict=True):
         axes.plot([cost, place], [top, high], color="0.85", linewidth=0.8, zorder=0)
-        axes.text(place, high, " " + ", ".join(points[cost, top]), ha="center", va="bottom", fontsize=7, rotation=90)
+        axes.text(
+            place,
+            high,
+            " " + ", ".join(points[cost, top]),
+            ha="center",
+            va="bottom",
+            fontsize=7,
+            rotation=90,
+        )
     axes.set_xlim(left, right)
     axes.set_ylim(low, high + 0.3 * (high - low))
 
@@ -200,9 +217,13 @@ def _savings(axes: Axes, lines: Sequence[Line]) -> None:
         f"energy ({ENERGY})": ("energy_j", ENERGY),
     }
     most = 1.0
-    for offset, (label, keys), colour in zip((-0.27, 0.0, 0.27), figures.items(), ("C9", "C5", "C2"), strict=True):
+    for offset, (label, keys), colour in zip(
+        (-0.27, 0.0, 0.27), figures.items(), ("C9", "C5", "C2"), strict=True
+    ):
         saved = [100 * (1 - line.mean("without_quiet", *keys) / line.mean(*keys)) for line in lines]
-        axes.barh([place + offset for place in range(len(lines))], saved, height=0.25, label=label, color=colour)
+        axes.barh(
+            [place + offset for place in range(len(lines))], saved, height=0.25, label=label, color=colour
+        )
         most = max(most, *saved)
     axes.set_xlim(0, 1.5 * most)  # room for the legend
     axes.grid(axis="x", alpha=0.3)

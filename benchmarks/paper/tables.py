@@ -44,7 +44,8 @@ def files(cells: Mapping[str, Cell], *, drawn: bool = True) -> dict[str, bytes]:
         "command": "python benchmarks/paper/tables.py",
         "spikeloom": " ".join(sorted({cell["spikeloom"] for cell in cells.values()})),
         "data_sha256": {
-            data: sorted({cell["data_sha256"] for cell in cells.values() if cell["data"] == data}) for data in DATA
+            data: sorted({cell["data_sha256"] for cell in cells.values() if cell["data"] == data})
+            for data in DATA
         },
     }
     for table in EPOCHS:
@@ -53,7 +54,9 @@ def files(cells: Mapping[str, Cell], *, drawn: bool = True) -> dict[str, bytes]:
         found[f"{table}.md"] = _markdown(table, lines, cells).encode()
         found |= pictures(table, lines) if drawn else {}
         of = {data: [line for line in lines if line.row.data == data] for data in DATA}
-        summed[table] = {data: _statistics(each) | {"spans": _spans(each)} for data, each in of.items() if each}
+        summed[table] = {
+            data: _statistics(each) | {"spans": _spans(each)} for data, each in of.items() if each
+        }
     found["statistics.json"] = (json.dumps(_rounded(summed), indent=1, allow_nan=False) + "\n").encode()
     return found
 
@@ -89,7 +92,11 @@ def _flat(line: Line, planned_seeds: int) -> dict[str, Any]:
         flat |= _columns(protocol, line.accuracy(protocol))
     for reading in ("best", "last"):
         found = line.comparison(reading)
-        values = (round(found.difference, 3), round(found.error, 3), found.within, found.equal) if found else [""] * 4
+        values = (
+            (round(found.difference, 3), round(found.error, 3), found.within, found.equal)
+            if found
+            else [""] * 4
+        )
         flat |= dict(zip((f"{reading}_{key}" for key in COMPARED), values, strict=True))
     flat["chip_refused"] = ""
     for which, reading in (("last", "chip"), ("clean", "chip_clean")):
@@ -157,7 +164,13 @@ def _accuracies(lines: Sequence[Line]) -> Table:
         paper = "—" if line.paper is None else f"{line.paper[0]:.2f} ({line.paper[1]:.2f})"
         spreads = (line.accuracy(protocol).words() for protocol in PROTOCOLS)
         rows.append(
-            [line.name, str(len(line.cells)), paper, *spreads, *(_against(line, which) for which in COMPARABLE)]
+            [
+                line.name,
+                str(len(line.cells)),
+                paper,
+                *spreads,
+                *(_against(line, which) for which in COMPARABLE),
+            ]
         )
     less = (f"less the paper's, {PROTOCOLS[which]}" for which in COMPARABLE)
     return Table(["", "seeds", "paper", *PROTOCOLS.values(), *less], rows)
@@ -188,8 +201,12 @@ def _statistics(lines: Sequence[Line]) -> dict[str, Any]:
             ranks["kendall"] = rank_correlation(ours, papers, kendall=True)
             found[reading] |= {"rows": len(against)}
             found[reading]["difference"] = fmean(each.difference for each in against) if against else None
-            found[reading] |= {key: sum(getattr(each, key) for each in against) for key in ("within", "equal")}
-        found[reading] |= {key: rank and dict(zip(("rank", "p"), rank, strict=True)) for key, rank in ranks.items()}
+            found[reading] |= {
+                key: sum(getattr(each, key) for each in against) for key in ("within", "equal")
+            }
+        found[reading] |= {
+            key: rank and dict(zip(("rank", "p"), rank, strict=True)) for key, rank in ranks.items()
+        }
     return found
 
 
@@ -202,7 +219,10 @@ def _spans(lines: Sequence[Line]) -> dict[str, Any]:
     first = {key: [line.mean("first_layer", key) for line in lines] for key in FIRST_LAYER}
     silent = [sum(each) for each in zip(first["cannot_fire"], first["quiet_in_training"], strict=True)]
     left = {"first_layer_operations": ("first_layer_operations",), "energy": ("energy_j", ENERGIES[0])}
-    saved = {key: [1 - line.mean("without_quiet", *at) / line.mean(*at) for line in lines] for key, at in left.items()}
+    saved = {
+        key: [1 - line.mean("without_quiet", *at) / line.mean(*at) for line in lines]
+        for key, at in left.items()
+    }
     return {
         "paper_points": max(papers) - min(papers) if papers else None,
         "points": {reading: max(each) - min(each) for reading, each in means.items()},
@@ -234,7 +254,14 @@ def _agreement(statistics: Mapping[str, Any]) -> Table:
 
 def _noise(table: str, statistics: Mapping[str, Any]) -> Table:
     """Whether rows differ by more than their seeds do, and with what they cost."""
-    head = ["differences", f"{table} with two seeds or more", "deviation of their means", "by seeds alone", "F", "p"]
+    head = [
+        "differences",
+        f"{table} with two seeds or more",
+        "deviation of their means",
+        "by seeds alone",
+        "F",
+        "p",
+    ]
     head += ["rank correlation with first-layer operations", "p"] if table == "graphs" else []
     rows = []
     for reading, title in READINGS.items():
@@ -253,7 +280,14 @@ def _chance(p: float) -> str:
 
 
 def _chip(lines: Sequence[Line]) -> Table:
-    head = ["on the chip", "last epoch", "clean epoch", "decided as float", "operations", "of the first layer"]
+    head = [
+        "on the chip",
+        "last epoch",
+        "clean epoch",
+        "decided as float",
+        "operations",
+        "of the first layer",
+    ]
     rows = [
         [
             line.name,
@@ -270,8 +304,20 @@ def _chip(lines: Sequence[Line]) -> Table:
 
 def _quiet(lines: Sequence[Line]) -> Table:
     """First-layer neurons that never fire, and what leaving them out saves."""
-    head = ["first layer", "neurons", "cannot fire", "never fired in training", "nor in test", "operations saved"]
-    head += ["of the first layer", *(f"energy saved, {name}" for name in ENERGIES), "cores", "decisions changed"]
+    head = [
+        "first layer",
+        "neurons",
+        "cannot fire",
+        "never fired in training",
+        "nor in test",
+        "operations saved",
+    ]
+    head += [
+        "of the first layer",
+        *(f"energy saved, {name}" for name in ENERGIES),
+        "cores",
+        "decisions changed",
+    ]
     rows = []
     for line in lines:
         saved = [(key,) for key in OPERATIONS] + [("energy_j", name) for name in ENERGIES]
@@ -279,7 +325,10 @@ def _quiet(lines: Sequence[Line]) -> Table:
             [
                 line.name,
                 *(f"{line.mean('first_layer', key):,.0f}" for key in FIRST_LAYER if key != "unheard"),
-                *(f"{100 * (1 - line.mean('without_quiet', *keys) / line.mean(*keys)):.1f} %" for keys in saved),
+                *(
+                    f"{100 * (1 - line.mean('without_quiet', *keys) / line.mean(*keys)):.1f} %"
+                    for keys in saved
+                ),
                 f"{_range(line.cores())} → {_range(line.cores('without_quiet'))}",
                 str(line.changed),
             ]
@@ -302,12 +351,16 @@ def _schedule(cells: Mapping[str, Cell]) -> Table:
         seeds = {cell["seed"] for cell in short[data].cells} & {cell["seed"] for cell in long[data].cells}
         for protocol, title in PROTOCOLS.items():
             ours, whole = (
-                Spread(tuple(100 * cell[protocol]["accuracy"] for cell in each.cells if cell["seed"] in seeds))
+                Spread(
+                    tuple(100 * cell[protocol]["accuracy"] for cell in each.cells if cell["seed"] in seeds)
+                )
                 for each in (short[data], long[data])
             )
             error, difference = (whole.std or 0.0) / len(seeds) ** 0.5, ours.mean - whole.mean
             within = "yes" if abs(difference) <= error else "no"
-            rows.append([data, title, ours.words(), whole.words(), f"{difference:+.2f}", f"{error:.2f}", within])
+            rows.append(
+                [data, title, ours.words(), whole.words(), f"{difference:+.2f}", f"{error:.2f}", within]
+            )
     head = ["manual graph", "epoch", *(f"{EPOCHS[table]} epochs" for table in ("graphs", "methods"))]
     return Table([*head, "difference", "standard error", "within"], rows)
 

@@ -18,7 +18,18 @@ from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.recordings.events import load_data
 
-KEPT = ("command", "data_sha256", "test_samples", "best", "last", "clean", "validation", "spikeloom", "torch", "numpy")
+KEPT = (
+    "command",
+    "data_sha256",
+    "test_samples",
+    "best",
+    "last",
+    "clean",
+    "validation",
+    "spikeloom",
+    "torch",
+    "numpy",
+)
 
 
 def make(row: Row, seed: int, data: str, network: Path) -> tuple[str, Cell]:
@@ -48,7 +59,12 @@ def main() -> None:
     networks.mkdir(parents=True, exist_ok=True)
     paths = {Path(path).stem.lower().removeprefix("ev-"): path for path in arguments.data}
     cells = read_cells(arguments.output)
-    rows = [row for table in EPOCHS if arguments.table in (None, table) for row in planned(table, tuple(paths)).items()]
+    rows = [
+        row
+        for table in EPOCHS
+        if arguments.table in (None, table)
+        for row in planned(table, tuple(paths)).items()
+    ]
     wanted = sorted(((seed, row) for row, seeds in rows for seed in range(seeds)), key=lambda cell: cell[0])
     work = [
         delayed(make)(row, seed, paths[row.data], networks / f"{row.cell(seed)}.pt")

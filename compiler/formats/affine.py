@@ -1,7 +1,8 @@
 """What lies between two spiking layers: values that are affine in *atoms*, things that vary, such as spikes.
 
-Convolutions and poolings are the sparse matrices that they are, for any number of space axes. A convolution here is a
-cross-correlation, as in torch: kernels are not turned round. Images are (channels, space), flat in that order.
+Convolutions and poolings are the sparse matrices that they are, for any number of space axes. A convolution
+here is a cross-correlation, as in torch: kernels are not turned round. Images are (channels, space), flat in
+that order.
 """
 
 import math
@@ -43,7 +44,9 @@ def picked(value: A, rows: IntArray, shape: tuple[int, ...]) -> A:
     """
     same = np.array_equal(rows, np.arange(len(value.bias)))
     terms = {atom: own if same else own[rows] for atom, own in value.terms.items()}
-    return replace(value, shape=shape, terms={a: own for a, own in terms.items() if own.nnz}, bias=value.bias[rows])
+    return replace(
+        value, shape=shape, terms={a: own for a, own in terms.items() if own.nnz}, bias=value.bias[rows]
+    )
 
 
 def picked_of_all(parts: Sequence[Affine], rows: IntArray) -> Affine:
@@ -142,7 +145,9 @@ def convolution(
             f"channels; export it again"
         )
     if min((*kernel, *stride, *dilation), default=1) < 1 or any(min(pair) < 0 for pair in padding):
-        raise ModelError("has a kernel size, stride or dilation below 1 or a padding below 0; export it again")
+        raise ModelError(
+            "has a kernel size, stride or dilation below 1 or a padding below 0; export it again"
+        )
     spans = [apart * (taps - 1) + 1 for taps, apart in zip(kernel, dilation, strict=True)]
     padded_space = [size + sum(zeros) for size, zeros in zip(space, padding, strict=True)]
     for size, taps, span, covered in zip(space, kernel, spans, padded_space, strict=True):
@@ -171,7 +176,11 @@ def convolution(
 def block_diagonal(matrix: Sparse, copies: int) -> Sparse:
     """The same matrix for each of so many parts of a value; ModelError if it would be too large."""
     _require_few(copies * matrix.nnz)
-    return matrix if copies == 1 else sparse.csr_array(sparse.kron(sparse.identity(copies), matrix, format="csr"))
+    return (
+        matrix
+        if copies == 1
+        else sparse.csr_array(sparse.kron(sparse.identity(copies), matrix, format="csr"))
+    )
 
 
 def _require_few(weights: int) -> None:

@@ -1,7 +1,7 @@
 """Put spiking layers and what lies between them together as a network, or say why the chip cannot have it.
 
-What reads a network from elsewhere, an ONNX graph or a torch module, ends here: with layers, each with its decay, its
-threshold and affine stages from other layers, and with how the output is counted.
+What reads a network from elsewhere, an ONNX graph or a torch module, ends here: with layers, each with its
+decay, its threshold and affine stages from other layers, and with how the output is counted.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,9 @@ class ReadNetwork(Generic[N]):
     network: N
     facts: tuple[str, ...]  # what was read and what was assumed, for people
     sha256: str  # of the file, and of data beside it
-    read_as: Mapping[str, Any] = field(default_factory=dict)  # beyond what the file says: the time step of a NIR file
+    read_as: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # beyond what the file says: the time step of a NIR file
     training: Mapping[str, Any] | None = None  # how it was fine-tuned, where the file says so
 
 
@@ -34,7 +36,8 @@ class ReadNetwork(Generic[N]):
 class Layer(Population):
     """A spiking layer: its neurons, and the weights from its sources.
 
-    Those are known by their place in the sequence, or INPUT; from the own place come the spikes of the step before.
+    Those are known by their place in the sequence, or INPUT; from the own place come the spikes of the step
+    before.
     """
 
     sources: Mapping[int, Sparse]
@@ -53,7 +56,12 @@ def class_of_each(counts: Sparse) -> IntArray | None:
     """
     columns = counts.tocsc()
     one_each = np.all(np.diff(columns.indptr) == 1)
-    if not one_each or not columns.nnz or columns.data[0] <= 0 or np.ptp(columns.data) > 1e-12 * columns.data[0]:
+    if (
+        not one_each
+        or not columns.nnz
+        or columns.data[0] <= 0
+        or np.ptp(columns.data) > 1e-12 * columns.data[0]
+    ):
         return None
     return np.asarray(columns.indices.astype(np.int64))
 
@@ -69,7 +77,9 @@ def by_depth(layers: Sequence[Layer]) -> list[list[int]]:
         ready.append([index for index, sources in left.items() if not sources & left.keys()])
         if not ready[-1]:
             stuck = ", ".join(printable(layers[index].name) for index in left)
-            raise ModelError(f"layers {stuck} feed each other in a circle; a layer may feed itself, no layer before it")
+            raise ModelError(
+                f"layers {stuck} feed each other in a circle; a layer may feed itself, no layer before it"
+            )
         left = {index: sources for index, sources in left.items() if index not in ready[-1]}
     return ready
 
@@ -77,8 +87,8 @@ def by_depth(layers: Sequence[Layer]) -> list[list[int]]:
 def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArray) -> Network:
     """Network of layers in any order; the spikes of `voters` are counted, `label` is the class of each of its neurons.
 
-    Raises ModelError if the layers are in a circle, some are not reached from the input, skip a layer, or have
-    constants or weights that no chip's neuron has.
+    Raises ModelError if the layers are in a circle, some are not reached from the input, skip a layer, or
+    have constants or weights that no chip's neuron has.
     """
     order = [index for ready in by_depth(layers) for index in ready]
     place = {INPUT: INPUT} | {old: new for new, old in enumerate(order)}
@@ -87,7 +97,9 @@ def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArra
     for layer in (layers[index] for index in order):
         _require_neuron(layer)
         post = len(populations)
-        populations.append(Population(**{each.name: getattr(layer, each.name) for each in fields(Population)}))
+        populations.append(
+            Population(**{each.name: getattr(layer, each.name) for each in fields(Population)})
+        )
         for source, weight in sorted(layer.sources.items(), key=lambda entry: place[entry[0]]):
             weight.sort_indices()
             projections.append(Projection(pre=place[source], post=post, weight=weight))

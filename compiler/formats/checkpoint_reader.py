@@ -22,14 +22,14 @@ def read_checkpoint(
 ) -> Checkpoint:
     """Read a checkpoint of any known layout; `run` is one of those of a released file.
 
-    weights: which epoch, ``last``, ``best`` (on the test split) or ``clean`` (on a part of the training split), where
-    the file holds several; the first of these that it holds by default.
-    beta, theta: decay and threshold, where the file does not say; those of the released code by default.
-    Files in the released layout hold a TactileSGNet.
+    weights: which epoch, ``last``, ``best`` (on the test split) or ``clean`` (on a part of the training
+    split), where the file holds several; the first of these that it holds by default. beta, theta: decay and
+    threshold, where the file does not say; those of the released code by default. Files in the released
+    layout hold a TactileSGNet.
 
-    Raises ModelError if the file is no checkpoint, holds code, is damaged or altered, lacks the set or run, or its
-    tensors do not make the system, with every fault of them; OptionError if an option contradicts the file, or has a
-    value that does not exist.
+    Raises ModelError if the file is no checkpoint, holds code, is damaged or altered, lacks the set or run,
+    or its tensors do not make the system, with every fault of them; OptionError if an option contradicts the
+    file, or has a value that does not exist.
     """
     if weights is not None and weights not in WEIGHTS:
         raise OptionError(f"--weights {weights}: unknown; choose from {', '.join(WEIGHTS)}")

@@ -1,15 +1,17 @@
 """Counting networks: what one is, its file, and the spiking network that it stands for. Whole numbers from end to end.
 
-A *counter* is a neuron without leak that receives one channel with weight 1 and itself with ``-BLOCK``: it spikes when
-the channel has had `count` events, and then not before the ``2 * count + BLOCK``-th. *Sums*, one neuron a class, add up
-the weights of the counters that spiked. A bias, the same for all, is a ramp: after the data the largest sum crosses the
-threshold first. The *vote* of a class spikes from then on in every step, so that spikes order the classes as sums do.
+A *counter* is a neuron without leak that receives one channel with weight 1 and itself with ``-BLOCK``: it
+spikes when the channel has had `count` events, and then not before the ``2 * count + BLOCK``-th. *Sums*, one
+neuron a class, add up the weights of the counters that spiked. A bias, the same for all, is a ramp: after
+the data the largest sum crosses the threshold first. The *vote* of a class spikes from then on in every
+step, so that spikes order the classes as sums do.
 
-Where the recording has several parts, a *gate* for each channel and part spikes when the channel and the clock of the
-part do, and the counters of the part receive the gate.
+Where the recording has several parts, a *gate* for each channel and part spikes when the channel and the
+clock of the part do, and the counters of the part receive the gate.
 
-The file is an archive of :mod:`compiler.archive`: the ``manifest`` has the sizes and constants of :class:`Counters` and
-``training`` (how it was made and what it reached), ``counter`` and ``weight`` are arrays.
+The file is an archive of :mod:`compiler.archive`: the ``manifest`` has the sizes and constants of
+:class:`Counters` and ``training`` (how it was made and what it reached), ``counter`` and ``weight`` are
+arrays.
 """
 
 import os
@@ -98,7 +100,10 @@ def read_counters(path: str | os.PathLike[str]) -> tuple[Counters, str]:
             path, archive.COUNTERS, VERSION, KINDS, lambda _: ("counter", "weight")
         )
         archive.require_none(_array_faults(manifest, members["counter"], members["weight"]))
-        manifest = {**manifest, **{name: float(manifest[name]) for name in CONSTANTS}}  # too large: OverflowError
+        manifest = {
+            **manifest,
+            **{name: float(manifest[name]) for name in CONSTANTS},
+        }  # too large: OverflowError
     counters = Counters(
         **{name: manifest[name] for name in (*SIZES, *CONSTANTS, "training")},
         counter=read_only(members["counter"]),
@@ -111,7 +116,11 @@ def _array_faults(sizes: Mapping[str, Any], counter: archive.Array, weight: arch
     """What in the arrays does not suit the sizes, or each other."""
     if sizes["taxels"] * sizes["polarities"] * sizes["parts"] > MOST:
         return [f"more than {MOST:,} channels of parts"]
-    if (counter.dtype.kind, weight.dtype.kind) != ("i", "i") or counter.shape[1:] != (3,) or not len(counter):
+    if (
+        (counter.dtype.kind, weight.dtype.kind) != ("i", "i")
+        or counter.shape[1:] != (3,)
+        or not len(counter)
+    ):
         return ["counter is no table of whole numbers"]
     if weight.shape != (sizes["classes"], len(counter)) or np.abs(weight.astype(np.int64)).max() > BLOCK:
         return ["weight is no table of whole numbers for these counters"]
@@ -129,4 +138,6 @@ def read_network(path: str | os.PathLike[str]) -> ReadNetwork[Network]:
         f"{len(counters.counter)} counters of {thresholds} events{parts}; {counters.steps} steps count, then "
         f"{counters.ramp} to read out"
     )
-    return ReadNetwork(network=counting_network(counters), facts=(fact,), sha256=sha256, training=counters.training)
+    return ReadNetwork(
+        network=counting_network(counters), facts=(fact,), sha256=sha256, training=counters.training
+    )

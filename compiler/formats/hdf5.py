@@ -58,7 +58,9 @@ class Part:
         array = self.numbers(key)
         wrong = array[(array != np.rint(array)) | (np.abs(array) >= 2**31)]
         if wrong.size:
-            raise self.fail(f"{key} holds {wrong[0]:g}, allowed are whole numbers of 32 bits; export it quantised")
+            raise self.fail(
+                f"{key} holds {wrong[0]:g}, allowed are whole numbers of 32 bits; export it quantised"
+            )
         return array.astype(np.int64)
 
     def few(self, key: str, count: int = 1) -> tuple[int, ...]:
@@ -78,7 +80,8 @@ def entry_of(group: Tree, key: str, kind: type[E]) -> E:
 def read_hdf5(path: Path, what: str) -> tuple[Tree, str]:
     """Content of a whole file, and its sha256; messages say `what` it should be.
 
-    FileFault, ModelError, or what h5py raises, if it is missing, too large, damaged, or holds what may not be read.
+    FileFault, ModelError, or what h5py raises, if it is missing, too large, damaged, or holds what may not
+    be read.
     """
     content = read_whole(path, what)
     return tree_of(content), hashlib.sha256(content).hexdigest()
@@ -109,7 +112,9 @@ def _require_end(content: bytes) -> None:
         finally:
             os._exit(0)
     if os.WIFSIGNALED(os.waitpid(child, 0)[1]):
-        raise FileFault(f"the HDF5 library dies on it, or takes more than {MOST_SECONDS} s, so it is damaged")
+        raise FileFault(
+            f"the HDF5 library dies on it, or takes more than {MOST_SECONDS} s, so it is damaged"
+        )
 
 
 def _group(group: Any, room: list[int]) -> Tree:

@@ -48,5 +48,7 @@ def unique_names(names: Sequence[str]) -> tuple[str, ...]:
     >>> unique_names(["conv", "", "fc", "fc"])
     ('conv', 'layer2', 'layer3', 'layer4')
     """
-    usable = [name if names.count(name) == 1 and len(name) < 40 and name.isprintable() else "" for name in names]
+    usable = [
+        name if names.count(name) == 1 and len(name) < 40 and name.isprintable() else "" for name in names
+    ]
     return tuple(name or f"layer{place}" for place, name in enumerate(usable, 1))

@@ -1,29 +1,32 @@
 """Our own checkpoints of all systems: a plain zip (members stored, not compressed) that needs neither pickle nor torch.
 
 ``manifest.json``
-    ``format`` ("spikeloom-checkpoint"), ``version``, ``architecture`` ("tactilesgnet"), ``taxels``, ``classes``,
-    ``beta``, ``theta``, ``graph`` (``name`` and ``edges``, pairs of source and target, repeats adding up),
-    ``weights`` (the sets in the file, one at least: ``last``, ``best`` on the test split, ``clean`` on a part of the
-    training split), ``training`` (how it was made and what it reached) and ``sha256`` over all of these and all arrays.
+    ``format`` ("spikeloom-checkpoint"), ``version``, ``architecture`` ("tactilesgnet"), ``taxels``,
+    ``classes``, ``beta``, ``theta``, ``graph`` (``name`` and ``edges``, pairs of source and target, repeats
+    adding up), ``weights`` (the sets in the file, one at least: ``last``, ``best`` on the test split,
+    ``clean`` on a part of the training split), ``training`` (how it was made and what it reached) and
+    ``sha256`` over all of these and all arrays.
 ``last/NAME.npy``, ``best/NAME.npy``, ``clean/NAME.npy``
-    float32: ``conv1.hops`` (K + 1, features, channels), ``conv1.bias``, ``weight`` and ``bias`` of ``fc1``, ``fc2`` …
+    float32: ``conv1.hops`` (K + 1, features, channels), ``conv1.bias``, ``weight`` and ``bias`` of ``fc1``,
+    ``fc2`` …
 
 The manifest may have, beside these,
 
 ``architecture``
-    Of the other systems: "mlp", "gcn" or "grid-cnn". ``conv1.hops`` holds a filter for each taxel, one filter, or one
-    for each cell of the window, row by row; ``grid`` says of the last where the taxels lie (``rows``, ``columns``,
-    ``stride``, ``padding``, ``cells``).
+    Of the other systems: "mlp", "gcn" or "grid-cnn". ``conv1.hops`` holds a filter for each taxel, one
+    filter, or one for each cell of the window, row by row; ``grid`` says of the last where the taxels lie
+    (``rows``, ``columns``, ``stride``, ``padding``, ``cells``).
 ``forms``
-    How the chip stores each layer that the network was fine-tuned for: ``layer``, ``bits``, ``exponents`` and
-    ``threshold`` (one integer a neuron).
+    How the chip stores each layer that the network was fine-tuned for: ``layer``, ``bits``, ``exponents``
+    and ``threshold`` (one integer a neuron).
 ``dynamics``
     ``betas`` and ``alphas`` (one a layer, or none) and ``clocks`` (``channels`` and ``steps``), see
     :mod:`compiler.dynamics`; ``fc1`` has one more input for each clock, at the end.
 ``towers``
-    How many networks of the same sizes lie side by side, see :mod:`formats.tensors`. Arrays hold one tower after the
-    other: ``conv1.hops`` along its features, the others along their first axis, so that ``fc1.weight`` has the inputs
-    of one tower. Neuron ``tower * classes + class`` of the last layer votes for that class.
+    How many networks of the same sizes lie side by side, see :mod:`formats.tensors`. Arrays hold one tower
+    after the other: ``conv1.hops`` along its features, the others along their first axis, so that
+    ``fc1.weight`` has the inputs of one tower. Neuron ``tower * classes + class`` of the last layer votes
+    for that class.
 ``bins``
     How many bins of the recordings a step joins, with an event where one of them has any.
 
@@ -101,7 +104,14 @@ MORE: dict[str, Kind] = {
         "cells": [[(0, SMALL_GRID), 2], ...],
     },
     "dynamics": {"betas": [float], "alphas": [float], "clocks": CLOCKS},
-    "forms": [{"layer": str, "bits": (2, 8), "exponents": [(-1, 7), ...], "threshold": [(1, THRESHOLD_MANTISSA_MAX)]}],
+    "forms": [
+        {
+            "layer": str,
+            "bits": (2, 8),
+            "exponents": [(-1, 7), ...],
+            "threshold": [(1, THRESHOLD_MANTISSA_MAX)],
+        }
+    ],
 }
 """What a manifest may leave out."""
 
@@ -151,10 +161,11 @@ def save_checkpoint(
 ) -> None:
     """Write a checkpoint, whole or not at all; equal input gives equal bytes.
 
-    `weights` has the tensors of at least one of ``last``, ``best`` and ``clean``: ``conv1.hops`` (filters, features,
-    channels), ``conv1.bias``, ``fc1.weight``, ``fc1.bias`` … float32. `training` are JSON values: how it was made and
-    what it reached. `forms` say how the chip stores each layer, conv1 first, where the network was fine-tuned for it.
-    `towers` lie side by side in the tensors, see :mod:`formats.tensors`; a step joins so many `bins` of the recordings.
+    `weights` has the tensors of at least one of ``last``, ``best`` and ``clean``: ``conv1.hops`` (filters,
+    features, channels), ``conv1.bias``, ``fc1.weight``, ``fc1.bias`` … float32. `training` are JSON values:
+    how it was made and what it reached. `forms` say how the chip stores each layer, conv1 first, where the
+    network was fine-tuned for it. `towers` lie side by side in the tensors, see :mod:`formats.tensors`; a
+    step joins so many `bins` of the recordings.
     """
     tensors_of_one = next(iter(weights.values()))
     stages = sum(name.startswith("fc") and name.endswith(".weight") for name in tensors_of_one)
@@ -186,7 +197,12 @@ def save_checkpoint(
     if forms is not None:
         layers = ["conv1", *(f"fc{stage}" for stage in range(1, stages + 1))]
         manifest["forms"] = [
-            {"layer": layer, "bits": form.bits, "exponents": list(form.exponents), "threshold": form.threshold.tolist()}
+            {
+                "layer": layer,
+                "bits": form.bits,
+                "exponents": list(form.exponents),
+                "threshold": form.threshold.tolist(),
+            }
             for layer, form in zip(layers, forms, strict=True)
         ]
     manifest["sha256"] = content_digest(manifest, arrays)
@@ -218,7 +234,9 @@ def save_again(path: str | os.PathLike[str], checkpoint: Checkpoint, *, training
 def content_digest(manifest: Mapping[str, Any], arrays: Mapping[str, AnyArray]) -> str:
     """Hash that a manifest states: over its other entries and all arrays."""
     stated = {key: value for key, value in manifest.items() if key != "sha256"}
-    return hashlib.sha256(f"{json.dumps(stated, sort_keys=True)}\n{arrays_digest(arrays)}".encode()).hexdigest()
+    return hashlib.sha256(
+        f"{json.dumps(stated, sort_keys=True)}\n{arrays_digest(arrays)}".encode()
+    ).hexdigest()
 
 
 def read_own(content: bytes, members: dict[str, bytes], weights: str | None) -> Checkpoint:
@@ -231,7 +249,9 @@ def read_own(content: bytes, members: dict[str, bytes], weights: str | None) -> 
     weights = sets[0] if weights is None else weights
     if weights not in sets:
         raise ModelError(f"--weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
-    chosen = {name.removeprefix(f"{weights}/"): a for name, a in arrays.items() if name.startswith(f"{weights}/")}
+    chosen = {
+        name.removeprefix(f"{weights}/"): a for name, a in arrays.items() if name.startswith(f"{weights}/")
+    }
     system = manifest["architecture"]
     towers = manifest.get("towers", 1)
     edges = read_only(np.array(manifest["graph"]["edges"], np.int64).reshape(-1, 2))
@@ -249,7 +269,9 @@ def read_own(content: bytes, members: dict[str, bytes], weights: str | None) -> 
             faults.append(f"the manifest has an unusable grid or dynamics ({'; '.join(wrong)})")
     faults += tower_faults(chosen, towers)
     for tower in () if faults else apart(chosen, towers):
-        faults = faults or _tower_faults(tower, manifest["taxels"], manifest["classes"], (system, grid, dynamics))
+        faults = faults or _tower_faults(
+            tower, manifest["taxels"], manifest["classes"], (system, grid, dynamics)
+        )
     if edges.size and edges.max() >= manifest["taxels"]:
         faults.append(f"the graph joins taxels outside 0..{manifest['taxels'] - 1}")
     if faults:
@@ -271,20 +293,28 @@ def read_own(content: bytes, members: dict[str, bytes], weights: str | None) -> 
         towers=towers,
         bins=manifest.get("bins", 1),
     )
-    return replace(checkpoint, forms=_forms(manifest["forms"], checkpoint)) if "forms" in manifest else checkpoint
+    return (
+        replace(checkpoint, forms=_forms(manifest["forms"], checkpoint))
+        if "forms" in manifest
+        else checkpoint
+    )
 
 
 def _signed_content(members: Mapping[str, bytes]) -> tuple[dict[str, Any], Arrays]:
     """Manifest and arrays that match the hash which the manifest states."""
     manifest = json.loads(members["manifest.json"])
-    arrays = {name.removesuffix(".npy"): read_npy(data) for name, data in members.items() if name.endswith(".npy")}
+    arrays = {
+        name.removesuffix(".npy"): read_npy(data) for name, data in members.items() if name.endswith(".npy")
+    }
     if len(arrays) + 1 != len(members) or any(array.dtype != "<f4" for array in arrays.values()):
         raise FileFault("has members that are no arrays of float32")
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ModelError(NOT_A_CHECKPOINT)
     version = manifest.get("version")
     if type(version) is not int or not 1 <= version <= VERSION:
-        raise ModelError(f"has format version {version!r:.40}, this program reads up to {VERSION}; update spikeloom")
+        raise ModelError(
+            f"has format version {version!r:.40}, this program reads up to {VERSION}; update spikeloom"
+        )
     if content_digest(manifest, arrays) != manifest.get("sha256"):
         raise FileFault("its content does not match its hash, so it was altered")
     return manifest, arrays
@@ -297,15 +327,23 @@ def _forms(entries: list[dict[str, Any]], checkpoint: Checkpoint) -> tuple[Form,
     if not fits or not all(0 < gap <= plane_distance(bits) for bits, gap in gaps):
         raise FileFault("the manifest has no usable forms")
     return tuple(
-        Form(bits=entry["bits"], exponents=tuple(entry["exponents"]), threshold=read_only(entry["threshold"]))
+        Form(
+            bits=entry["bits"], exponents=tuple(entry["exponents"]), threshold=read_only(entry["threshold"])
+        )
         for entry in entries
     )
 
 
-def _tower_faults(arrays: Arrays, taxels: int, classes: int, kind: tuple[str, Grid | None, Dynamics]) -> list[str]:
+def _tower_faults(
+    arrays: Arrays, taxels: int, classes: int, kind: tuple[str, Grid | None, Dynamics]
+) -> list[str]:
     system, grid, dynamics = kind
-    stages = max((int(m[1]) for key in arrays if (m := re.fullmatch(r"fc([1-9]\d?)\.weight", key))), default=1)
-    wanted = {"conv1.hops": ("K + 1", "features", "channels"), "conv1.bias": ("features",)} | wanted_dense(stages)
+    stages = max(
+        (int(m[1]) for key in arrays if (m := re.fullmatch(r"fc([1-9]\d?)\.weight", key))), default=1
+    )
+    wanted = {"conv1.hops": ("K + 1", "features", "channels"), "conv1.bias": ("features",)} | wanted_dense(
+        stages
+    )
     faults = faults_of(arrays, wanted, TITLES[system])
     if not faults:
         features = len(arrays["conv1.bias"])

@@ -1,12 +1,13 @@
 """A network of crossbar cores, and a recording, for the simulator of RANC (github.com/UA-RCL/RANC, 08ae4bd).
 
-The file serves as input and as configuration: ``ranc_sim NET.json OUT.txt NET.json TICKS``. Where RANC differs:
+The file serves as input and as configuration: ``ranc_sim NET.json OUT.txt NET.json TICKS``. Where RANC
+differs:
 
 - Its ``destination_tick`` is one less than ours: a packet of ``d`` is due ``d + 1`` ticks after it was sent. Packets
   listed for tick ``i`` with ``d = 0`` are those that we inject in tick ``i``.
 - Row ``k`` of its output holds what the neurons on the output bus did in our tick ``k - 1``; row 0 is empty. So a
-  recording takes one tick more. Voters go out on the bus in the order of their ids; neurons without a target share
-  the output after the last, for RANC has no neuron without one.
+  recording takes one tick more. Voters go out on the bus in the order of their ids; neurons without a target
+  share the output after the last, for RANC has no neuron without one.
 - Its schema asks for ``destination_core_offset``; the examples in its repository are older and have another name.
 - The negative threshold is compared by ``<`` only in reset type 0, and is written with its sign.
 - Its membranes have no width, and below the negative threshold they are reset: to the negative of the reset value, or
@@ -31,8 +32,8 @@ Place = tuple[int, int]
 class Terms:
     """A network as RANC has it: every spike is the same, and a membrane is ``scale`` times ours, plus ``shift``.
 
-    scale, shift: (neurons,) int64.
-    ticks: from the initial membranes on until which that is proven, as far as no register of ours saturates; None for
+    scale, shift: (neurons,) int64. ticks: from the initial membranes on until which that is proven, as far
+    as no register of ours saturates; None for
         ever.
     """
 
@@ -46,11 +47,12 @@ def expressed(netlist: CrossbarNetlist, ticks: int | None = None) -> Terms:
     """A network that breaks no rule of its chip in RANC's terms; ModelError if RANC has not what it uses.
 
     - A membrane that a spike sets to ``r`` and that is held at ``-f`` is, counted from ``(r - f) / 2`` on, one that is
-      set to ``(r + f) / 2`` above and to the negative of that below, which is RANC's rule; all numbers of the neuron
-      are doubled where ``r + f`` is odd.
+      set to ``(r + f) / 2`` above and to the negative of that below, which is RANC's rule; all numbers of
+      the neuron are doubled where ``r + f`` is odd.
     - A spike that leaves the membrane takes a threshold of zero from it, if the membrane is counted from the threshold.
     - Of these, and of those that a spike reduces by their threshold, none may reach a floor that holds them, for RANC
-      has none: not within `ticks`, from the least that leak and weights above crossing points can come to in a tick.
+      has none: not within `ticks`, from the least that leak and weights above crossing points can come to in
+      a tick.
     """
     reset_to = netlist.reset_mode == RESET_TO
     saturating = netlist.negative_saturates > 0
@@ -67,7 +69,9 @@ def expressed(netlist: CrossbarNetlist, ticks: int | None = None) -> Terms:
     endless = (netlist.reset_mode == RESET_NONE) | ((netlist.reset_mode == RESET_LINEAR) & saturating)
     neuron = netlist.neuron_of_synapse()
     least = np.zeros(netlist.n_neurons, np.int64)
-    np.add.at(least, neuron, np.minimum(netlist.weight[neuron, netlist.axon_type[netlist.axon_of_synapse()]], 0))
+    np.add.at(
+        least, neuron, np.minimum(netlist.weight[neuron, netlist.axon_type[netlist.axon_of_synapse()]], 0)
+    )
     fall = np.minimum(least + netlist.leak, 0)
     room = floor + np.minimum(netlist.initial, 0)
     falling = endless & ((fall < 0) | (room < 0))
@@ -138,7 +142,9 @@ def packets_of(netlist: CrossbarNetlist, events: EventArray, mesh: Mesh) -> list
 def aims_of(netlist: CrossbarNetlist, mesh: Mesh, outputs: IntArray) -> list[tuple[int, int, int, int]]:
     """Offset, axon and destination tick of each neuron; without a wire, it is their output (neurons,) of the bus."""
     core = netlist.core_of_neuron()
-    aim = np.stack([mesh.bus[0] - mesh.x[core], mesh.bus[1] - mesh.y[core], outputs, np.zeros(len(core))], axis=1)
+    aim = np.stack(
+        [mesh.bus[0] - mesh.x[core], mesh.bus[1] - mesh.y[core], outputs, np.zeros(len(core))], axis=1
+    )
     source = netlist.wire_neuron
     aim[source, 0] = netlist.wire_x - netlist.core_x[core[source]]
     aim[source, 1] = netlist.wire_y - netlist.core_y[core[source]]
@@ -162,8 +168,9 @@ def crossbar(netlist: CrossbarNetlist, core: int) -> tuple[IntArray, IntArray]:
 def export(given: CrossbarNetlist, events: EventArray | None = None) -> Iterator[str]:
     """Lines of the JSON file of a network that breaks no rule of its chip; ModelError if it uses what RANC has not.
 
-    Events (n_inputs, T) of a recording become packets, with the clocks; without it there are none. ``exact_ticks`` is
-    for how many ticks the spikes are proven to be ours, null for ever; RANC does not read it.
+    Events (n_inputs, T) of a recording become packets, with the clocks; without it there are none.
+    ``exact_ticks`` is for how many ticks the spikes are proven to be ours, null for ever; RANC does not read
+    it.
     """
     terms = expressed(given, None if events is None else given.ticks(events.shape[1]))
     netlist = terms.netlist
@@ -191,7 +198,10 @@ def export(given: CrossbarNetlist, events: EventArray | None = None) -> Iterator
     ticks = [[]] if events is None else packets_of(netlist, events, mesh)
     yield ",\n".join(
         json.dumps(
-            [{"destination_core": [x, y], "destination_axon": line, "destination_tick": 0} for x, y, line in tick],
+            [
+                {"destination_core": [x, y], "destination_axon": line, "destination_tick": 0}
+                for x, y, line in tick
+            ],
             separators=(",", ":"),
         )
         for tick in ticks
@@ -207,7 +217,9 @@ def export(given: CrossbarNetlist, events: EventArray | None = None) -> Iterator
     yield "]}"
 
 
-def _core(netlist: CrossbarNetlist, core: int, mesh: Mesh, aims: list[tuple[int, int, int, int]]) -> dict[str, object]:
+def _core(
+    netlist: CrossbarNetlist, core: int, mesh: Mesh, aims: list[tuple[int, int, int, int]]
+) -> dict[str, object]:
     kinds, points = crossbar(netlist, core)
     return {
         "axons": kinds.tolist(),

@@ -1,8 +1,8 @@
 """A network of crossbar cores as memory files of RANC's hardware description, and a recording as packets.
 
-Row n of ``csram_PLACE.mem`` is neuron n of the core at ``x + width * y``: crossing points, membrane, reset, weights,
-leak, both thresholds, reset mode, and where its spikes go. ``tc_PLACE.mem`` holds the types of the axons. All sizes are
-parameters of the description.
+Row n of ``csram_PLACE.mem`` is neuron n of the core at ``x + width * y``: crossing points, membrane, reset,
+weights, leak, both thresholds, reset mode, and where its spikes go. ``tc_PLACE.mem`` holds the types of the
+axons. All sizes are parameters of the description.
 """
 
 from collections.abc import Iterator
@@ -27,7 +27,9 @@ def sizes(terms: Terms, chip: Target) -> dict[str, int]:
     mesh = mesh_of(terms.netlist)
     axons = chip.limit("core.axons")
     if netlist.classes >= axons:
-        raise ModelError(f"{netlist.classes} classes, {axons - 1} allowed on RANC's output bus; give a smaller network")
+        raise ModelError(
+            f"{netlist.classes} classes, {axons - 1} allowed on RANC's output bus; give a smaller network"
+        )
     return WIDTHS | {
         "WIDTH": mesh.width,
         "HEIGHT": mesh.height,
@@ -49,9 +51,18 @@ def memories(terms: Terms, found: dict[str, int]) -> Iterator[tuple[str, str]]:
     places = (mesh.x + mesh.width * mesh.y).tolist()
     outputs = np.where(netlist.readout_class < 0, netlist.classes, netlist.readout_class)
     limits = (netlist.threshold, -netlist.negative_threshold, netlist.reset_mode)
-    columns = (netlist.initial, netlist.reset, netlist.weight, netlist.leak, *limits, aims_of(netlist, mesh, outputs))
+    columns = (
+        netlist.initial,
+        netlist.reset,
+        netlist.weight,
+        netlist.leak,
+        *limits,
+        aims_of(netlist, mesh, outputs),
+    )
     registers = np.column_stack(columns).tolist()
-    membrane, weight, leak, threshold = (found[f"{name}_BITS"] for name in ("MEMBRANE", "WEIGHT", "LEAK", "THRESHOLD"))
+    membrane, weight, leak, threshold = (
+        found[f"{name}_BITS"] for name in ("MEMBRANE", "WEIGHT", "LEAK", "THRESHOLD")
+    )
     kind_bits, *way = _bits_of(found, "WEIGHTS", "AXONS", "DELAYS")
     widths = [membrane] * 2 + [weight] * found["WEIGHTS"] + [leak, threshold, threshold, 1]
     widths += [found["OFFSET_BITS"]] * 2 + way
@@ -62,7 +73,9 @@ def memories(terms: Terms, found: dict[str, int]) -> Iterator[tuple[str, str]]:
         if place in places:
             core = places.index(place)
             kinds, points = crossbar(netlist, core)
-            for point, row in zip(points[:, ::-1].tolist(), registers[netlist.core_neurons[core] :], strict=False):
+            for point, row in zip(
+                points[:, ::-1].tolist(), registers[netlist.core_neurons[core] :], strict=False
+            ):
                 rows.append("".join(map(str, point)).zfill(axons) + _joined(row, widths))
         rows += [silent] * (found["NEURONS"] - len(rows))
         yield f"csram_{place:03d}.mem", "\n".join(rows) + "\n"
@@ -77,7 +90,9 @@ def _bits_of(found: dict[str, int], *names: str) -> list[int]:
 
 def _joined(values: list[int], widths: list[int]) -> str:
     """Numbers of so many bits each, side by side; those below zero as two's complement."""
-    return "".join(f"{value & ((1 << width) - 1):0{width}b}" for value, width in zip(values, widths, strict=True))
+    return "".join(
+        f"{value & ((1 << width) - 1):0{width}b}" for value, width in zip(values, widths, strict=True)
+    )
 
 
 def packet_lines(terms: Terms, found: dict[str, int], events: EventArray) -> Iterator[str]:

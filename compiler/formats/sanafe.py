@@ -68,7 +68,9 @@ def input_tiles(netlist: Netlist, target: Target) -> tuple[int, ...]:
     free = np.repeat(order, np.maximum(room - used[order], 0))
     wanted = -(-netlist.n_inputs // target.limit("core.compartments"))
     if wanted > len(free):
-        raise ModelError(f"input channels: {wanted} cores needed, the chip has {len(free)} left; use fewer cores")
+        raise ModelError(
+            f"input channels: {wanted} cores needed, the chip has {len(free)} left; use fewer cores"
+        )
     return tuple(int(tile) for tile in free[:wanted])
 
 
@@ -78,7 +80,9 @@ def cores(netlist: Netlist, target: Target) -> tuple[str, ...]:
     width = target.limit("mesh.width")
     height = target.limit("mesh.height")
     tiles = [*netlist.core_tile.tolist(), *input_tiles(netlist, target)]
-    return tuple(f"{tile % width * height + tile // width}.{tiles[:n].count(tile)}" for n, tile in enumerate(tiles))
+    return tuple(
+        f"{tile % width * height + tile // width}.{tiles[:n].count(tile)}" for n, tile in enumerate(tiles)
+    )
 
 
 def export(netlist: Netlist, target: Target) -> Iterator[str]:

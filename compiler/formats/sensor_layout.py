@@ -37,7 +37,11 @@ def sensor_layout(
     while len(sizes) > 3 and sizes[0] == 1:
         sizes.pop(0)
     # The 1 of [1, 39, 2] is a batch's axis, of [1, 8, 8] one polarity of an image.
-    while len(sizes) > 1 and sizes[0] == 1 and (len(sizes) < 3 or (len(shape) == 3 and (polarities or 2) in sizes[1:])):
+    while (
+        len(sizes) > 1
+        and sizes[0] == 1
+        and (len(sizes) < 3 or (len(shape) == 3 and (polarities or 2) in sizes[1:]))
+    ):
         sizes.pop(0)
     shown = f"[{', '.join(map(str, shape))}]"
     if not sizes or min(sizes) < 1:
@@ -75,10 +79,16 @@ def _polarity_axis(sizes: list[int], shown: str, polarities: int | None, first: 
     if len(fits) == 1 or (fits and inner == 2):
         return fits[0]
     which = "both axes could be" if fits else "no axis is"
-    raise ModelError(f"the input {shown}: {which} the polarities; give --polarities N and --polarities-first or -last")
+    raise ModelError(
+        f"the input {shown}: {which} the polarities; give --polarities N and --polarities-first or -last"
+    )
 
 
 def _layout(grid: IntArray, words: str) -> tuple[Input, IntArray, str]:
     taxels, polarities = grid.shape
     sensor = Input(taxels=taxels, polarities=polarities)
-    return sensor, np.ascontiguousarray(grid).ravel(), f"{taxels} taxels, {polarities} polarities, as {words}"
+    return (
+        sensor,
+        np.ascontiguousarray(grid).ravel(),
+        f"{taxels} taxels, {polarities} polarities, as {words}",
+    )

@@ -1,11 +1,12 @@
 """Tensors of a checkpoint: what they must be, and how those of several networks lie side by side as towers.
 
-A joined network has the filters of all its towers in its first layer, and fully connected layers that are blocks: a
-neuron receives its own tower, and the relays of clocks, of which there is one set for all. Each tower therefore spikes
-as it does alone. Its last layer has a neuron for every class and tower, ``tower * classes + class``; the class whose
-neurons spike most wins.
+A joined network has the filters of all its towers in its first layer, and fully connected layers that are
+blocks: a neuron receives its own tower, and the relays of clocks, of which there is one set for all. Each
+tower therefore spikes as it does alone. Its last layer has a neuron for every class and tower, ``tower *
+classes + class``; the class whose neurons spike most wins.
 
-Neurons of the first layer count as in any network of the system, with the features of all towers at each place.
+Neurons of the first layer count as in any network of the system, with the features of all towers at each
+place.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +26,9 @@ Shape = tuple[str, ...]
 """A wanted shape; a word stands for any size from 1, the same wherever it occurs."""
 
 
-def faults_of(arrays: Mapping[str, AnyArray], wanted: Mapping[str, Shape], title: str = "a TactileSGNet") -> list[str]:
+def faults_of(
+    arrays: Mapping[str, AnyArray], wanted: Mapping[str, Shape], title: str = "a TactileSGNet"
+) -> list[str]:
     """Missing, mis-shaped and unknown tensors, and values that are not finite, in that order per tensor.
 
     >>> faults_of({"a": np.ones(2), "b": np.ones((2, 3)), "d": np.ones(1)}, {"a": ("n",), "b": ("m", "n"), "c": ("n",)})
@@ -67,7 +70,9 @@ def taxel_faults(arrays: Mapping[str, AnyArray], features: int, clocks: int = 0)
     inputs = arrays["fc1.weight"].shape[1]
     if inputs <= clocks or (inputs - clocks) % features:
         beside = f" beside {clocks} clocks" if clocks else ""
-        return [f"fc1.weight has {inputs} inputs, not a whole number of taxels with {features} features each{beside}"]
+        return [
+            f"fc1.weight has {inputs} inputs, not a whole number of taxels with {features} features each{beside}"
+        ]
     return []
 
 
@@ -84,7 +89,9 @@ def apart(arrays: Mapping[str, AnyArray], towers: int) -> tuple[Arrays, ...]:
 
 def together(towers: Sequence[Mapping[str, AnyArray]]) -> Arrays:
     """Inverse of :func:`apart`."""
-    return {name: np.concatenate([one[name] for one in towers], axis=_tower_axis(name)) for name in towers[0]}
+    return {
+        name: np.concatenate([one[name] for one in towers], axis=_tower_axis(name)) for name in towers[0]
+    }
 
 
 def tower_faults(arrays: Mapping[str, AnyArray], towers: int) -> list[str]:
@@ -129,8 +136,8 @@ def arrays_of(checkpoint: Checkpoint) -> Arrays:
 def join(checkpoints: Sequence[Checkpoint], names: Sequence[str]) -> Checkpoint:
     """One network of all towers; where it is from, its training record and hash, are those of the first.
 
-    They are of one system, sensor, graph, sizes, neurons and clocks, and of one storage where they were fine-tuned;
-    joined ones give all their towers. `names` are for messages.
+    They are of one system, sensor, graph, sizes, neurons and clocks, and of one storage where they were
+    fine-tuned; joined ones give all their towers. `names` are for messages.
 
     Raises ModelError if they disagree in any of these; all of them are listed.
     """
@@ -155,7 +162,9 @@ def _joined_forms(joined: Checkpoint, every: Sequence[Checkpoint]) -> tuple[Form
     if not forms:
         return None
     thresholds = merge(towers_of(joined), [[form.threshold for form in one] for one in forms])
-    return tuple(replace(form, threshold=threshold) for form, threshold in zip(forms[0], thresholds, strict=True))
+    return tuple(
+        replace(form, threshold=threshold) for form, threshold in zip(forms[0], thresholds, strict=True)
+    )
 
 
 def _facts(checkpoint: Checkpoint) -> dict[str, object]:

@@ -1,9 +1,9 @@
 """Read the released layout: files of ``torch.save`` with a first layer and dense weights, one state dict per run.
 
-A ``.t7`` file is a dict whose ``net_list`` holds the state dicts, with the weights of the *last* epoch, while
-``best_acc`` belongs to the best one. It holds no graph, no decay and no threshold. Bare state dicts are read too, both
-kinds in torch's zip and in its older format, with the keys of current torch_geometric (``conv1.lins.0.weight`` …) or
-of old releases (``conv1.lin.weight``, the filters of all hops side by side).
+A ``.t7`` file is a dict whose ``net_list`` holds the state dicts, with the weights of the *last* epoch,
+while ``best_acc`` belongs to the best one. It holds no graph, no decay and no threshold. Bare state dicts
+are read too, both kinds in torch's zip and in its older format, with the keys of current torch_geometric
+(``conv1.lins.0.weight`` …) or of old releases (``conv1.lin.weight``, the filters of all hops side by side).
 
 torch is imported here only, late, and always with ``weights_only=True``: files that hold code are refused.
 """
@@ -73,8 +73,8 @@ def read_torch(content: bytes, run: int) -> Checkpoint:
 def load_torch(content: bytes) -> Any:
     """Let torch read the content if it looks like a zip or a pickle.
 
-    The CRCs of a zip are checked here, for torch does not. The format before it has no checksum: a bit of a weight that
-    is flipped goes unnoticed.
+    The CRCs of a zip are checked here, for torch does not. The format before it has no checksum: a bit of a
+    weight that is flipped goes unnoticed.
     """
     if content[:2] != b"PK" and content[:1] != b"\x80":
         raise ModelError(NOT_A_CHECKPOINT)
@@ -88,7 +88,9 @@ def load_torch(content: bytes) -> Any:
             warnings.simplefilter("ignore")  # torch warns of its own old storage classes
             return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises nearly anything on damaged files
-        if isinstance(error, pickle.UnpicklingError) and (named := re.search(r"GLOBAL ([\w.]+)", str(error))):
+        if isinstance(error, pickle.UnpicklingError) and (
+            named := re.search(r"GLOBAL ([\w.]+)", str(error))
+        ):
             raise ModelError(
                 f"is a pickle that calls {named[1]}, allowed are tensors alone, since code in a file could "
                 f"do anything; save the state_dict of a TactileSGNet and nothing else; {OTHERS}"
@@ -106,7 +108,9 @@ def _arrays(state: Any, file_size: int) -> Arrays:
     import torch
 
     if not isinstance(state, Mapping) or not any(re.match(r"(conv|fc)\d", str(key)) for key in state):
-        keys = [printable(str(key)) for key in state] if isinstance(state, Mapping) else [type(state).__name__]
+        keys = (
+            [printable(str(key)) for key in state] if isinstance(state, Mapping) else [type(state).__name__]
+        )
         raise ModelError(
             f"holds neither net_list nor weights of a TactileSGNet, but {', '.join(keys[:5]) or 'nothing'}; {OTHERS}"
         )
@@ -123,7 +127,9 @@ def _tensor_fault(value: Any, file_size: int) -> str | None:
     if not isinstance(value, torch.Tensor):
         return f"is a {type(value).__name__}, wanted a tensor"
     if value.layout != torch.strided or value.device.type != "cpu" or not value.is_floating_point():
-        return f"is a tensor of {str(value.dtype).removeprefix('torch.')}, wanted plain floating-point numbers"
+        return (
+            f"is a tensor of {str(value.dtype).removeprefix('torch.')}, wanted plain floating-point numbers"
+        )
     # A tensor may repeat its storage through strides of zero, and so be far larger than the file.
     if value.numel() * value.element_size() > file_size:
         return f"claims {value.numel()} values, more than the file holds"
@@ -132,19 +138,27 @@ def _tensor_fault(value: Any, file_size: int) -> str | None:
 
 def _unified(arrays: Arrays) -> Arrays:
     """Check everything and bring both key styles to the names of our own format."""
-    hops = [int(match[1]) for key in arrays if (match := re.fullmatch(r"conv1\.lins\.(0|[1-9]\d?)\.weight", key))]
+    hops = [
+        int(match[1]) for key in arrays if (match := re.fullmatch(r"conv1\.lins\.(0|[1-9]\d?)\.weight", key))
+    ]
     wanted: dict[str, Shape]
     if not hops and "conv1.lin.weight" in arrays:
         bias = "conv1.lin.bias"
         wanted = {"conv1.lin.weight": ("features", f"hops * {CHANNELS}"), bias: ("features",)}
     else:
         bias = "conv1.bias"
-        wanted = {f"conv1.lins.{k}.weight": ("features", "channels") for k in range(max(hops, default=0) + 1)}
+        wanted = {
+            f"conv1.lins.{k}.weight": ("features", "channels") for k in range(max(hops, default=0) + 1)
+        }
         wanted[bias] = ("features",)
-    faults = faults_of(arrays, wanted | wanted_dense(DENSE_STAGES)) or taxel_faults(arrays, len(arrays[bias]))
+    faults = faults_of(arrays, wanted | wanted_dense(DENSE_STAGES)) or taxel_faults(
+        arrays, len(arrays[bias])
+    )
     if not faults and not hops and arrays["conv1.lin.weight"].shape[1] % CHANNELS:
         columns = arrays["conv1.lin.weight"].shape[1]
-        faults = [f"conv1.lin.weight has {columns} columns, not a whole number of hops with {CHANNELS} channels each"]
+        faults = [
+            f"conv1.lin.weight has {columns} columns, not a whole number of hops with {CHANNELS} channels each"
+        ]
     if faults:
         raise ModelError(f"{'; '.join(faults)}; {GIVE_WEIGHTS}")
     if hops:

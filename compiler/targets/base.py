@@ -33,7 +33,13 @@ PICOSECONDS = 1000
 """In a TIME_UNIT; finer latencies are rounded."""
 
 EVENTS = (
-    *("synaptic_operation", "synaptic_operation_dense", "synaptic_operation_sparse", "neuron_idle", "neuron_active"),
+    *(
+        "synaptic_operation",
+        "synaptic_operation_dense",
+        "synaptic_operation_sparse",
+        "neuron_idle",
+        "neuron_active",
+    ),
     *("spike", "packet", "hop_east_west", "hop_north_south"),
 )
 """What an energy table may price."""
@@ -97,7 +103,9 @@ class TimeTable:
 
     def barrier(self, tiles: int) -> int:
         """Picoseconds of the barrier among so many used tiles, at least one."""
-        return round(self.barriers[max(least for least in self.barriers if least <= tiles)].value * PICOSECONDS)
+        return round(
+            self.barriers[max(least for least in self.barriers if least <= tiles)].value * PICOSECONDS
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,7 +127,9 @@ class Target:
 
     def exceeded(self, owner: str, rule: str, used: int, remedy: str) -> Violation:
         """What is said of a limit that a network breaks."""
-        return Violation(owner=owner, rule=f"{self.name}.{rule}", used=used, allowed=self.limit(rule), remedy=remedy)
+        return Violation(
+            owner=owner, rule=f"{self.name}.{rule}", used=used, allowed=self.limit(rule), remedy=remedy
+        )
 
 
 def read_target(path: str | os.PathLike[str]) -> Target:
@@ -153,11 +163,15 @@ def with_tables(target: Target, name: str) -> Target:
     if not energy and not time:
         if not name.endswith(".toml"):
             names = sorted({table.name for table in target.energy} | {table.name for table in target.time})
-            raise OptionError(f"--table {name}: unknown; allowed: {', '.join(names)}, or a file that ends in .toml")
+            raise OptionError(
+                f"--table {name}: unknown; allowed: {', '.join(names)}, or a file that ends in .toml"
+            )
         with reading(name, OptionError, REMEDY):
             raw = tomllib.loads(read_whole(Path(name), "file of tables").decode())
             if not raw or raw.keys() - {"energy", "time"}:
-                raise FileFault(f"holds {', '.join(raw) or 'nothing'}, wanted is [energy.NAME] or [time.NAME] alone")
+                raise FileFault(
+                    f"holds {', '.join(raw) or 'nothing'}, wanted is [energy.NAME] or [time.NAME] alone"
+                )
             energy, time = _cost_tables(raw, target.cores)
     return replace(target, energy=energy or target.energy, time=time or target.time)
 
@@ -209,7 +223,9 @@ def _quantity(where: str, entry: Any, unit: str = "") -> Quantity:
     return quantity
 
 
-def _quantities(where: str, table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> dict[str, Quantity]:
+def _quantities(
+    where: str, table: Mapping[str, Any], units: Mapping[str, str] | None = None
+) -> dict[str, Quantity]:
     """Numbers of a section by their dotted names; `units` are those that it may have, all by default."""
     quantities = {}
     for name, entry in _entries(table):
@@ -219,7 +235,9 @@ def _quantities(where: str, table: Mapping[str, Any], units: Mapping[str, str] |
     return quantities
 
 
-def _cost_tables(raw: Mapping[str, Any], cores: str) -> tuple[tuple[EnergyTable, ...], tuple[TimeTable, ...]]:
+def _cost_tables(
+    raw: Mapping[str, Any], cores: str
+) -> tuple[tuple[EnergyTable, ...], tuple[TimeTable, ...]]:
     """Energy tables and time tables of a file."""
     events = CROSSBAR_EVENTS if cores == CROSSBARS else EVENTS
     units = {event: POWER_UNIT if event == FLOOR else PRICE_UNIT for event in events}
@@ -232,12 +250,22 @@ def _cost_tables(raw: Mapping[str, Any], cores: str) -> tuple[tuple[EnergyTable,
         barriers = table.pop("barrier", {})
         latencies = _quantities(where, table, dict.fromkeys(LATENCIES, TIME_UNIT) | {LINK_BUFFER: ""})
         missing = [event for event in (*LATENCIES, LINK_BUFFER) if event not in latencies]
-        if missing or not isinstance(barriers, dict) or "1" not in barriers or not all(map(str.isdecimal, barriers)):
+        if (
+            missing
+            or not isinstance(barriers, dict)
+            or "1" not in barriers
+            or not all(map(str.isdecimal, barriers))
+        ):
             wanted = ", ".join(missing) or "barrier.1, and others with a number of tiles"
             raise FileFault(f"{where}: lacks {wanted}, which a time table has")
-        least = {int(tiles): _quantity(f"{where}.barrier.{tiles}", barriers[tiles], TIME_UNIT) for tiles in barriers}
+        least = {
+            int(tiles): _quantity(f"{where}.barrier.{tiles}", barriers[tiles], TIME_UNIT)
+            for tiles in barriers
+        }
         buffer = latencies.pop(LINK_BUFFER)
-        time.append(TimeTable(name=name, title=title, latencies=latencies, barriers=least, link_buffer=buffer))
+        time.append(
+            TimeTable(name=name, title=title, latencies=latencies, barriers=least, link_buffer=buffer)
+        )
     return tuple(energy), tuple(time)
 
 

@@ -5,7 +5,13 @@ from spikeloom.compiler.targets.loihi1.bounds import one_sided_sums, prove_range
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerPopulation, integer_simulation
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, write_netlist
 from spikeloom.compiler.targets.loihi1.options import Options, check_packings
-from spikeloom.compiler.targets.loihi1.passes import Compilation, compile_network, lay_out_again, to_integers, without
+from spikeloom.compiler.targets.loihi1.passes import (
+    Compilation,
+    compile_network,
+    lay_out_again,
+    to_integers,
+    without,
+)
 from spikeloom.compiler.targets.loihi1.registers import (
     DECAY_BITS,
     MEMBRANE_MAX,

@@ -53,7 +53,9 @@ class Netlist:
     axon_synapses: IntArray  # (axons + 1,) int64; range bounds into the synapses
     readout_class: IntArray  # (neurons,) int64; class that a spike votes for, -1 for none
     provenance: Mapping[str, Any]  # JSON values only: what it was compiled from
-    clocks: Clocks  # Input channels that tell the time, after those of the sensor, see :mod:`compiler.dynamics`
+    clocks: (
+        Clocks  # Input channels that tell the time, after those of the sensor, see :mod:`compiler.dynamics`
+    )
     bins: int = 1  # Bins of the recordings that make a data step
 
     @property
@@ -90,7 +92,9 @@ class NetlistFile(Generic[N]):
     entries: dict[str, archive.Kind]  # Of the manifest, beside the common ones; ``layers`` among them
     layer: Callable[[Any], Any]  # Makes a layer of its entry
     inconsistencies: Callable[[N], list[str]]  # What in a netlist points nowhere
-    optional: dict[str, archive.Kind] = field(default_factory=dict)  # Entries that are left out where they are zero
+    optional: dict[str, archive.Kind] = field(
+        default_factory=dict
+    )  # Entries that are left out where they are zero
     floats: frozenset[str] = frozenset()  # Arrays of real numbers
     tables: frozenset[str] = frozenset()  # Arrays of two axes
     as_stored: frozenset[str] = frozenset()  # Large arrays that stay in the type that they are stored in
@@ -99,7 +103,9 @@ class NetlistFile(Generic[N]):
     def arrays(self) -> tuple[str, ...]:
         """Array members in file order."""
         kind: Any = self.netlist
-        return tuple(each.name for each in fields(kind) if each.name not in COMMON | self.entries | self.optional)
+        return tuple(
+            each.name for each in fields(kind) if each.name not in COMMON | self.entries | self.optional
+        )
 
     def verify(self, netlist: N) -> None:
         """Check every rule of a netlist that a pass made; VerifyError names all that are broken."""
@@ -133,17 +139,26 @@ class NetlistFile(Generic[N]):
         path = Path(path)
         with reading(path, FormatError, "write it with spikeloom compile"):
             kinds = COMMON | self.entries
-            manifest, members = archive.read_archive(path, self.format, self.version, kinds, lambda _: self.arrays)
+            manifest, members = archive.read_archive(
+                path, self.format, self.version, kinds, lambda _: self.arrays
+            )
             further = {name: kind for name, kind in self.optional.items() if name in manifest}
             archive.require_none(archive.entry_faults(manifest, further))
             if manifest["taxels"] * manifest["polarities"] > MOST:
                 raise FileFault(f"has more than {MOST} input channels")
             archive.require_none(archive.array_faults(members, dict.fromkeys(self.tables, 2), self.floats))
             if manifest["target"] not in self.targets:
-                raise FileFault(f"is for {manifest['target'][:40]!r}, this program knows {', '.join(self.targets)}")
+                raise FileFault(
+                    f"is for {manifest['target'][:40]!r}, this program knows {', '.join(self.targets)}"
+                )
             values = {name: manifest[name] for name in kinds | further}
-            values |= {"clocks": Clocks(**values["clocks"]), "layers": tuple(map(self.layer, values["layers"]))}
-            netlist = self.netlist(**values, **{name: self._held(name, members[name]) for name in self.arrays})
+            values |= {
+                "clocks": Clocks(**values["clocks"]),
+                "layers": tuple(map(self.layer, values["layers"])),
+            }
+            netlist = self.netlist(
+                **values, **{name: self._held(name, members[name]) for name in self.arrays}
+            )
             archive.require_none(self.inconsistencies(netlist))
         return netlist
 

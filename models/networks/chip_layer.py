@@ -52,7 +52,8 @@ class ChipLayer(torch.autograd.Function):
         threshold = population.threshold << registers.MEMBRANE_SHIFT
         bias, threshold, unit = (np.tile(each, samples) for each in (population.bias, threshold, unit))
         alpha, beta = (
-            round(kept * registers.DECAY_ONE) for kept in (population.realised_alpha, population.realised_beta)
+            round(kept * registers.DECAY_ONE)
+            for kept in (population.realised_alpha, population.realised_beta)
         )
         recurrent = integers.units[inputs:]
         _integrate_chip(sums.reshape(shape), recurrent, bias, threshold, unit, alpha, beta, fired, membrane)
@@ -104,7 +105,16 @@ def _backwards(
 
 @numba.njit(cache=True)
 def _chip_step(
-    sums: Any, i: Any, v: Any, bias: Any, threshold: Any, unit: Any, keep_u: Any, keep_v: Any, fired: Any, membrane: Any
+    sums: Any,
+    i: Any,
+    v: Any,
+    bias: Any,
+    threshold: Any,
+    unit: Any,
+    keep_u: Any,
+    keep_v: Any,
+    fired: Any,
+    membrane: Any,
 ) -> None:
     for n in range(len(v)):
         i[n] = charged(i[n], keep_u, np.int64(sums[n]) << registers.MEMBRANE_SHIFT)
@@ -117,7 +127,15 @@ def _chip_step(
 
 @numba.njit(cache=True)
 def _integrate_chip(
-    sums: Any, recurrent: Any, bias: Any, threshold: Any, unit: Any, keep_u: Any, keep_v: Any, fired: Any, membrane: Any
+    sums: Any,
+    recurrent: Any,
+    bias: Any,
+    threshold: Any,
+    unit: Any,
+    keep_u: Any,
+    keep_v: Any,
+    fired: Any,
+    membrane: Any,
 ) -> None:
     """The chip's compartment along the first axis; its ``spec`` module defines it.
 

@@ -81,7 +81,9 @@ def filter_places(x: Tensor, propagation: Tensor, filters: Tensor, bias: Tensor)
     return torch.addmm(bias, rows, weight).view(steps, samples, -1)
 
 
-def lif(current: Tensor, beta: float, theta: float, surrogate: Surrogate = RECTANGLE) -> tuple[Tensor, Tensor]:
+def lif(
+    current: Tensor, beta: float, theta: float, surrogate: Surrogate = RECTANGLE
+) -> tuple[Tensor, Tensor]:
     """Leaky integrate-and-fire neurons along the first axis, from rest.
 
     ``u_t = beta * u_{t-1} * (1 - s_{t-1}) + current_t`` and ``s_t = u_t > theta``, a strict comparison. The
@@ -95,7 +97,9 @@ def lif(current: Tensor, beta: float, theta: float, surrogate: Surrogate = RECTA
 
 class _Lif(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, current: Tensor, beta: float, theta: float, surrogate: Surrogate) -> tuple[Tensor, Tensor]:
+    def forward(
+        ctx: Any, current: Tensor, beta: float, theta: float, surrogate: Surrogate
+    ) -> tuple[Tensor, Tensor]:
         ctx.beta = beta
         ctx.theta = theta
         ctx.surrogate = surrogate
@@ -249,7 +253,15 @@ def _integrate(current: Any, beta: Any, theta: Any, spikes: Any, membrane: Any) 
 
 @numba.njit(cache=True)
 def differentiate_step(
-    from_above: Any, membrane: Any, later: Any, beta: Any, theta: Any, width: Any, reset: Any, smooth: Any, out: Any
+    from_above: Any,
+    membrane: Any,
+    later: Any,
+    beta: Any,
+    theta: Any,
+    width: Any,
+    reset: Any,
+    smooth: Any,
+    out: Any,
 ) -> None:
     """Gradient of the current of a step from that of its spikes, and `later`, that of the step after."""
     zero = membrane.dtype.type(0)
@@ -277,7 +289,14 @@ def differentiate(
 
 @numba.njit(cache=True)
 def _differentiate(
-    spikes_gradient: Any, membrane: Any, beta: Any, theta: Any, width: Any, reset: Any, smooth: bool, out: Any
+    spikes_gradient: Any,
+    membrane: Any,
+    beta: Any,
+    theta: Any,
+    width: Any,
+    reset: Any,
+    smooth: bool,
+    out: Any,
 ) -> None:
     steps, size = membrane.shape
     later = np.zeros(size, membrane.dtype)

@@ -41,7 +41,9 @@ class Stage:
         self.shape = weight.shape
         if np.prod(weight.shape) > MATRIX_LIMIT:
             size = f"{weight.shape[0]:,} x {weight.shape[1]:,} weights, zeros among them"
-            raise ModelError(f"{self.population.name}: has {size}, fine-tuning holds {MATRIX_LIMIT:,}; use it as it is")
+            raise ModelError(
+                f"{self.population.name}: has {size}, fine-tuning holds {MATRIX_LIMIT:,}; use it as it is"
+            )
         self.row = np.repeat(np.arange(weight.shape[0]), np.diff(weight.indptr))
         self.column = weight.indices
         self.ends = weight.indptr
@@ -62,7 +64,10 @@ class Stage:
         """Largest positive and negative sum of each neuron, each plane by itself, as :func:`bounds.one_sided`."""
         exponents = self.form.exponents
         planes = zip(registers.split_planes(steps, self.form.bits, exponents), exponents, strict=True)
-        sides = [one_sided_sums(registers.in_units(mantissa, exponent), self.ends) for mantissa, exponent in planes]
+        sides = [
+            one_sided_sums(registers.in_units(mantissa, exponent), self.ends)
+            for mantissa, exponent in planes
+        ]
         positive, negative = np.sum(sides, axis=0)
         return positive, negative
 

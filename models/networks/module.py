@@ -59,8 +59,13 @@ class _Stages:
                     "use one for each"
                 )
         if not self.order:
-            raise ModelError("module: has no LIF layer, so nothing spikes; put spikeloom.LIF between its stages")
-        self.shapes = [tuple((first[:1] if self.batched else first).shape), *(tuple(r.shape) for r in responses[:-1])]
+            raise ModelError(
+                "module: has no LIF layer, so nothing spikes; put spikeloom.LIF between its stages"
+            )
+        self.shapes = [
+            tuple((first[:1] if self.batched else first).shape),
+            *(tuple(r.shape) for r in responses[:-1]),
+        ]
 
     def _record(self, layer: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> Tensor:
         assert isinstance(layer, LIF)
@@ -84,7 +89,9 @@ class _Stages:
         reset(self.net)
         output = self.net(sources[0])
         if not isinstance(output, Tensor):
-            raise ModelError(f"module: returns a {type(output).__name__}, wanted one tensor, the spikes of its classes")
+            raise ModelError(
+                f"module: returns a {type(output).__name__}, wanted one tensor, the spikes of its classes"
+            )
         return [*self.currents, output]
 
 
@@ -117,7 +124,9 @@ def _require_affine(stages: _Stages, weights: list[list[Sparse]], biases: list[F
         given = [rng.normal(size=shape) * size for shape in stages.shapes]
         responses = stages.respond([torch.from_numpy(values) for values in given])
         for what, response, parts, bias in zip(named, responses, weights, biases, strict=True):
-            expected = sum((part @ values.ravel() for part, values in zip(parts, given, strict=True)), start=bias)
+            expected = sum(
+                (part @ values.ravel() for part, values in zip(parts, given, strict=True)), start=bias
+            )
             off = np.abs(response.numpy().ravel() - expected).max(initial=0) / max(
                 np.abs(expected).max(initial=0), 1e-300
             )
@@ -156,7 +165,13 @@ def module_network(
         if INPUT in sources:
             sources[INPUT] = sources[INPUT][:, positions]
         layers.append(
-            Layer(name=name, beta=float(layer.beta), theta=float(layer.theta), bias=bias[index], sources=sources)
+            Layer(
+                name=name,
+                beta=float(layer.beta),
+                theta=float(layer.theta),
+                bias=bias[index],
+                sources=sources,
+            )
         )
     given = [source for source, part in enumerate(weights[-1]) if part.nnz]
     label = class_of_each(weights[-1][given[0]]) if len(given) == 1 and given[0] > 0 else None

@@ -170,11 +170,15 @@ class SpikingNet(TrainedModule):
         bias = layer.get_parameter("bias")
         (weight,) = (values for name, values in layer.named_parameters() if name != "bias")
         if alpha:
-            current = lasting_current(layer(*inputs, self._scaled(index, weight), torch.zeros_like(bias)), alpha)
+            current = lasting_current(
+                layer(*inputs, self._scaled(index, weight), torch.zeros_like(bias)), alpha
+            )
             current = current + bias.repeat(current.shape[-1] // len(bias))
         else:
             current = layer(*inputs, weight, bias)
-        return lif(current, dynamics.beta(index, self.architecture.beta), self.architecture.theta, self.surrogate)
+        return lif(
+            current, dynamics.beta(index, self.architecture.beta), self.architecture.theta, self.surrogate
+        )
 
     def _scaled(self, index: int, weight: Tensor) -> Tensor:
         """Weight of a layer from its parameter."""
@@ -208,7 +212,9 @@ class SpikingNet(TrainedModule):
         state = {name: p.detach() for name, p in self.named_parameters()}
         for index, layer in enumerate(("conv1", *self.dense)):
             state |= {
-                n: self._scaled(index, p) for n, p in state.items() if n.startswith(f"{layer}.") and "bias" not in n
+                n: self._scaled(index, p)
+                for n, p in state.items()
+                if n.startswith(f"{layer}.") and "bias" not in n
             }
         arrays = {name: p.numpy() for name, p in state.items()}
         weights = {name: (array.T if name.endswith(".weight") else array) for name, array in arrays.items()}
@@ -225,7 +231,9 @@ class SpikingNet(TrainedModule):
         features = self.architecture.features
         clocks = self.architecture.dynamics.clocks.channels
         order = np.arange(self.places * features).reshape(self.places, features)
-        return np.append(in_order(self.architecture.system, order), np.arange(order.size, order.size + clocks))
+        return np.append(
+            in_order(self.architecture.system, order), np.arange(order.size, order.size + clocks)
+        )
 
 
 def relay_spikes(clocks: Clocks, like: Tensor) -> Tensor:

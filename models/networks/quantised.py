@@ -37,14 +37,18 @@ class QuantisedNet(nn.Module):
     ModelError if a layer is too large for one matrix.
     """
 
-    def __init__(self, network: ir.Network, forms: Sequence[ir.Form], surrogate: Surrogate = RECTANGLE) -> None:
+    def __init__(
+        self, network: ir.Network, forms: Sequence[ir.Form], surrogate: Surrogate = RECTANGLE
+    ) -> None:
         super().__init__()
         self.surrogate = surrogate
         self.network = in_thresholds(network) if network.convolution is None else network
         populations = self.network.populations
         self.names = tuple(population.name for population in populations)
         self.forms = tuple(
-            replace(form, exponents=(0,), threshold=np.full(each.size, RELAY)) if each.relays == each.size else form
+            replace(form, exponents=(0,), threshold=np.full(each.size, RELAY))
+            if each.relays == each.size
+            else form
             for each, form in zip(populations, forms, strict=True)
         )
         stages = [Stage(self.network, post, form) for post, form in enumerate(self.forms)]
@@ -75,7 +79,9 @@ class QuantisedNet(nn.Module):
             first = 0
             for pre in stage.sources:
                 size = self.network.input.size if pre == ir.INPUT else self.network.populations[pre].size
-                projections.append(ir.Projection(pre=pre, post=stage.post, weight=whole[:, first : first + size]))
+                projections.append(
+                    ir.Projection(pre=pre, post=stage.post, weight=whole[:, first : first + size])
+                )
                 first += size
         changed = replace(self.network, populations=tuple(populations), projections=tuple(projections))
         return replace(changed, convolution=None)
@@ -121,7 +127,9 @@ class QuantisedNet(nn.Module):
         spikes: list[Tensor] = []
         for layer, integers in zip(self.learned, self.integers, strict=True):
             stage = layer.stage
-            sources = [inputs if pre == ir.INPUT else spikes[pre] for pre in stage.sources if pre != stage.post]
+            sources = [
+                inputs if pre == ir.INPUT else spikes[pre] for pre in stage.sources if pre != stage.post
+            ]
             received = sources[0] if len(sources) == 1 else torch.cat(sources, dim=2)
             fired: Tensor = ChipLayer.apply(  # type: ignore[no-untyped-call]
                 received, *with_relays(layer), integers, self.surrogate

@@ -85,7 +85,9 @@ def _convolution(network: Network, dtype: np.dtype[Any]) -> Callable[[AnyArray],
     return lambda spikes: _first(convolution.system, spikes, propagation, filters, inside)
 
 
-def _linear(population: Population, projection: Projection, dtype: np.dtype[Any]) -> Callable[[AnyArray], AnyArray]:
+def _linear(
+    population: Population, projection: Projection, dtype: np.dtype[Any]
+) -> Callable[[AnyArray], AnyArray]:
     """What spikes bring to a fully connected layer, all of whose synapses are stored."""
     weight = projection.weight.data.reshape(population.size, -1).T.astype(dtype)
     bias = np.zeros(population.size, dtype) if population.alpha else population.bias.astype(dtype)
@@ -95,11 +97,15 @@ def _linear(population: Population, projection: Projection, dtype: np.dtype[Any]
 class _Neurons:
     """Neurons of a layer and their state; what arrives is what `drive` makes of spikes (steps, samples, neurons)."""
 
-    def __init__(self, drive: Callable[[AnyArray], AnyArray], population: Population, dtype: np.dtype[Any]) -> None:
+    def __init__(
+        self, drive: Callable[[AnyArray], AnyArray], population: Population, dtype: np.dtype[Any]
+    ) -> None:
         self._drive = drive
         bias = population.bias[: population.size - population.relays].astype(dtype)
         self._bias = bias if population.alpha else np.zeros_like(bias)
-        self._constants = [dtype.type(value) for value in (population.alpha, population.beta, population.theta)]
+        self._constants = [
+            dtype.type(value) for value in (population.alpha, population.beta, population.theta)
+        ]
         self._state: AnyArray = np.zeros(0, dtype)
 
     def __call__(self, spikes: AnyArray) -> tuple[AnyArray, AnyArray]:
@@ -109,7 +115,13 @@ class _Neurons:
             self._state = np.zeros((2, drive[0].size), drive.dtype)
         fired = np.empty(drive.shape, np.uint8)
         rows = drive.reshape(len(drive), -1)
-        _integrate(rows, np.tile(self._bias, drive.shape[1]), *self._constants, *self._state, fired.reshape(rows.shape))
+        _integrate(
+            rows,
+            np.tile(self._bias, drive.shape[1]),
+            *self._constants,
+            *self._state,
+            fired.reshape(rows.shape),
+        )
         return fired.astype(drive.dtype), drive
 
 
@@ -131,7 +143,9 @@ def _integrate(
         copy(membrane, drive[t])
 
 
-def _with_relays(network: Network, spikes: AnyArray, membranes: AnyArray, first: int) -> tuple[AnyArray, AnyArray]:
+def _with_relays(
+    network: Network, spikes: AnyArray, membranes: AnyArray, first: int
+) -> tuple[AnyArray, AnyArray]:
     """Add those of the relays, which spike as their clocks tick."""
     clocks = network.input.clocks
     ticks = clocks.events(len(spikes), first=first).T.astype(spikes.dtype)

@@ -39,15 +39,21 @@ def _tower(network: Network, tower: int, convolution: Convolution, owners: Seque
 
     def own(projection: Projection) -> Projection:
         weight = projection.weight[chosen[projection.post]]
-        return replace(projection, weight=weight if projection.pre == INPUT else weight[:, chosen[projection.pre]])
+        return replace(
+            projection, weight=weight if projection.pre == INPUT else weight[:, chosen[projection.pre]]
+        )
 
     forms = network.forms
     if forms is not None:
-        forms = tuple(replace(form, threshold=form.threshold[keep]) for form, keep in zip(forms, chosen, strict=True))
+        forms = tuple(
+            replace(form, threshold=form.threshold[keep]) for form, keep in zip(forms, chosen, strict=True)
+        )
     populations = zip(network.populations, chosen, strict=True)
     return replace(
         network,
-        populations=tuple(replace(population, bias=population.bias[keep]) for population, keep in populations),
+        populations=tuple(
+            replace(population, bias=population.bias[keep]) for population, keep in populations
+        ),
         projections=tuple(map(own, network.projections)),
         readout=replace(network.readout, label=network.readout.label[chosen[network.readout.population]]),
         forms=forms,

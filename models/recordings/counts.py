@@ -16,7 +16,9 @@ class EventCounts:
 
     events: int  # Events read, duplicates included
     out_of_order: int  # Events with a time before that of an event that came earlier
-    duplicates: int  # Events whose taxel already had one of the same polarity in the same bin; they count once
+    duplicates: (
+        int  # Events whose taxel already had one of the same polarity in the same bin; they count once
+    )
     gaps: int  # Silences longer than `gap_s` between two events of a recording
     gap_s: float = GAP_S
     shorter: int = 0  # Recordings shorter than the longest

@@ -42,7 +42,11 @@ class Table:
 
 
 def read_table(
-    path: str | os.PathLike[str], required: tuple[str, ...], optional: tuple[str, ...] = (), *, where: str | None = None
+    path: str | os.PathLike[str],
+    required: tuple[str, ...],
+    optional: tuple[str, ...] = (),
+    *,
+    where: str | None = None,
 ) -> Table:
     """Read a CSV file with these columns, whose order counts where the file does not name them; `where` names the file.
 
@@ -69,7 +73,9 @@ def read_table(
     else:
         names = known[: len(names)]
     if not rows:
-        raise DataError(f"{where}: no rows, expected are lines of {expected}; check how the file was written")
+        raise DataError(
+            f"{where}: no rows, expected are lines of {expected}; check how the file was written"
+        )
     try:
         values = np.loadtxt(rows, delimiter=",", ndmin=2)
     except ValueError:
@@ -115,7 +121,9 @@ def _fault(where: str, lines: Sequence[int], rows: Sequence[str], names: tuple[s
             )
         for name, cell in zip(names, cells, strict=True):
             if not _is_number(cell):
-                return DataError(f"{where}: line {line}: {name} is {cell[:40]!r}, not a number; write plain numbers")
+                return DataError(
+                    f"{where}: line {line}: {name} is {cell[:40]!r}, not a number; write plain numbers"
+                )
     raise AssertionError("rows of numbers are a table")
 
 
@@ -147,7 +155,9 @@ def _read_labels(path: Path, where: str) -> Mapping[str, int] | None:
             continue
         name, label = (row[index].strip() if index < len(row) else "" for index in (files[0], classes[0]))
         if not (name and label.isascii() and label.isdigit() and len(label) <= 6):
-            raise DataError(f"{where}: row {line}: {name!r}, label {label!r}; give a file and a number from 0")
+            raise DataError(
+                f"{where}: row {line}: {name!r}, label {label!r}; give a file and a number from 0"
+            )
         if labels.setdefault(name, int(label)) != int(label):
             raise DataError(f"{where}: row {line}: {name} has labels {labels[name]} and {label}; keep one")
     return labels
@@ -168,5 +178,7 @@ def labels_beside(path: Path, files: list[Path], source: str) -> tuple[dict[Path
             inside = [file for file in files if file.is_relative_to(folder)]
             names = {file: {file.name, file.relative_to(folder).as_posix()} & rows.keys() for file in inside}
             labels |= {file: rows[name] for file, known in names.items() for name in known}
-            notes.append(f"{where}: gives the labels of {sum(map(bool, names.values()))} of {len(files)} recordings")
+            notes.append(
+                f"{where}: gives the labels of {sum(map(bool, names.values()))} of {len(files)} recordings"
+            )
     return labels, notes

@@ -35,7 +35,9 @@ class EventStream:
     at: Callable[[int], str]  # Place of an event by its index, for messages
 
 
-def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, where: str | None = None) -> EventStream:
+def read_stream(
+    path: str | os.PathLike[str], *, taxels: int | None = None, where: str | None = None
+) -> EventStream:
     """Read a ``.csv`` or a ``.npz`` of one-dimensional arrays, whose ``label`` may be one number.
 
     DataError if the file cannot be read, holds no events, or one that a sensor of so many `taxels` does not
@@ -97,7 +99,9 @@ def _label(where: str, name: str, column: FloatArray | None) -> int:
         return named
     first = float(column[0])
     if not (0 <= first <= MAX_LABEL and first.is_integer()):
-        raise DataError(f"{where}: label {first:g}, allowed are whole numbers 0..{MAX_LABEL}; number the classes")
+        raise DataError(
+            f"{where}: label {first:g}, allowed are whole numbers 0..{MAX_LABEL}; number the classes"
+        )
     other = column != first
     if other.any():
         raise DataError(
@@ -124,7 +128,9 @@ def _read_npz(path: Path, where: str) -> tuple[Mapping[str, FloatArray], Callabl
     shapes = {name: columns[name].shape for name in _REQUIRED}
     if len(set(shapes.values())) > 1 or columns["time_s"].ndim != 1:
         shown = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
-        raise DataError(f"{where}: shapes {shown}, allowed is one number per event in each; save flat arrays")
+        raise DataError(
+            f"{where}: shapes {shown}, allowed is one number per event in each; save flat arrays"
+        )
     if not columns["time_s"].size:
         raise DataError(f"{where}: no events, a recording needs one or more; remove the file")
     if "label" in columns:

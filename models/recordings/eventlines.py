@@ -127,7 +127,8 @@ class EventLines:
         if polarity != 1:
             if self._low is not None and self._low != polarity:
                 raise self.complain(
-                    f"polarity {fields[2]} found after polarity {self._low}", "write 0 and 1, or -1 and 1, not both"
+                    f"polarity {fields[2]} found after polarity {self._low}",
+                    "write 0 and 1, or -1 and 1, not both",
                 )
             self._low = int(polarity)
         return Event(time_s=time_s, channel=2 * int(taxel) + (polarity == 1))

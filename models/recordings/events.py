@@ -76,7 +76,9 @@ def load_data(
     with _data_set(place, split) as (members, splits):
         if split not in splits and "" not in splits:
             present = ", ".join(sorted(splits))
-            raise DataError(f"{source}: split {split!r} is missing or empty; splits with recordings: {present}")
+            raise DataError(
+                f"{source}: split {split!r} is missing or empty; splits with recordings: {present}"
+            )
         folder = split if split in splits else ""
         chosen = sorted(splits[folder].items())[:limit]
         binned = all(name.lower().endswith(".npy") for name, _ in chosen)
@@ -149,7 +151,9 @@ def _sum_counts(read: Sequence[_Recording], steps: IntArray, notes: Sequence[str
 def _require_alike(read: _Recording, first: _Recording, released: bool) -> None:
     """Refuse other polarities than the first recording has; in the released layout another shape, and no label."""
     if released and read.label == evtouch.UNLABELLED:
-        raise DataError(f"{read.where}: no label in the name, allowed is sample_N_label_L.npy; rename or remove it")
+        raise DataError(
+            f"{read.where}: no label in the name, allowed is sample_N_label_L.npy; rename or remove it"
+        )
     if read.grid.shape[1] != first.grid.shape[1] or (released and read.grid.shape != first.grid.shape):
         raise DataError(
             f"{read.where}: shape {read.grid.shape}, the recordings before it have {first.grid.shape}; "
@@ -274,7 +278,9 @@ def fitted(events: AnyArray, steps: int) -> AnyArray:
 
 
 @contextmanager
-def _data_set(path: Path, split: str = "test") -> Iterator[tuple[evtouch.Members, dict[str, dict[str, str]]]]:
+def _data_set(
+    path: Path, split: str = "test"
+) -> Iterator[tuple[evtouch.Members, dict[str, dict[str, str]]]]:
     """What opens each file, and their names and members by split, ``""`` for any; DataError if there are none."""
     source = path.name or str(path)
     if path.is_file():
@@ -283,7 +289,9 @@ def _data_set(path: Path, split: str = "test") -> Iterator[tuple[evtouch.Members
             return
         with path.open("rb") as file:
             if file.read(2) != b"PK":
-                raise DataError(f"{path}: not a recording; give a folder, a released zip, or a .csv, .npz or .npy file")
+                raise DataError(
+                    f"{path}: not a recording; give a folder, a released zip, or a .csv, .npz or .npy file"
+                )
     with evtouch.opened(path) as members:
         plain = {name: member for name, member in members.items() if not is_table(Path(name))}
         splits = evtouch.splits_of(source, plain, {"train", "test", split})
@@ -308,7 +316,11 @@ def _unit_notes(read: Sequence[_Recording]) -> list[str]:
 def other_sensor(recordings: evtouch.Recordings) -> str | None:
     """What says that events are of a smaller sensor: in many recordings none of the last quarter of the taxels."""
     last = int(np.flatnonzero(recordings.events.any(axis=(0, 2, 3))).max(initial=-1))
-    if recordings.bin_s is None or len(recordings) < SEVERAL or 4 * (recordings.taxels - 1 - last) <= recordings.taxels:
+    if (
+        recordings.bin_s is None
+        or len(recordings) < SEVERAL
+        or 4 * (recordings.taxels - 1 - last) <= recordings.taxels
+    ):
         return None
     return f"{recordings.source}: has events of taxels 0..{last} only, the network has {recordings.taxels}"
 
@@ -318,11 +330,18 @@ def _taxel_notes(source: str, events: EventArray) -> list[str]:
     alive = np.asarray(events.any(axis=(0, 2, 3)), np.bool_)
     if len(alive) < 4 or alive[0] or not alive[1:].all():
         return []
-    return [f"{source}: no event at taxel 0, some at each of 1..{len(alive) - 1}: if these count from 1, count from 0"]
+    return [
+        f"{source}: no event at taxel 0, some at each of 1..{len(alive) - 1}: if these count from 1, count from 0"
+    ]
 
 
 def _read(
-    file: Path, opener: Callable[[], IO[Any]], where: str, bin_s: float, taxels: int | None, listed: int | None
+    file: Path,
+    opener: Callable[[], IO[Any]],
+    where: str,
+    bin_s: float,
+    taxels: int | None,
+    listed: int | None,
 ) -> _Recording:
     """One recording; `listed` is its class in a table of labels."""
     if file.suffix.lower() == ".npy":

@@ -133,7 +133,9 @@ def opened(path: Path) -> Iterator[Members]:
     """
     if path.is_dir():
         files = [file for depth in ("*", "*/*", "*/*/*") for file in path.glob(depth) if file.is_file()]
-        names = {file.relative_to(path).as_posix(): file for file in files if file.suffix.lower() in SUFFIXES}
+        names = {
+            file.relative_to(path).as_posix(): file for file in files if file.suffix.lower() in SUFFIXES
+        }
         yield {name: partial(file.open, "rb") for name, file in names.items()}
         return
     if not path.is_file():
@@ -142,7 +144,9 @@ def opened(path: Path) -> Iterator[Members]:
         with reading(path.name, DataError, f"{_GIVE}, or copy it again"):
             archive = opened_zip(file)
             infos = [info for info in archive.infolist() if info.filename.endswith(".npy")]
-        require_memory(path.name, sum(info.file_size for info in infos))  # no more than that is ever decompressed
+        require_memory(
+            path.name, sum(info.file_size for info in infos)
+        )  # no more than that is ever decompressed
         yield {info.filename: partial(archive.open, info) for info in infos}
 
 
@@ -193,15 +197,15 @@ def parse_width(source: str, members: Members, recording: str) -> float | None:
         return None
     seconds = parse_npy(f"{source}: {where}", members[where]).ravel()
     if len(seconds) != 1 or not (math.isfinite(seconds[0]) and seconds[0] > 0):
-        raise DataError(f"{source}: {where}: allowed is one number, seconds of a bin; convert the events again")
+        raise DataError(
+            f"{source}: {where}: allowed is one number, seconds of a bin; convert the events again"
+        )
     return float(seconds[0])
 
 
 def other_taxels(found: int, wanted: int) -> str:
     """What is said of recordings of another sensor."""
-    return (
-        f"has {found} taxels, the network has {wanted}; use recordings of its sensor, or train on these with --taxels"
-    )
+    return f"has {found} taxels, the network has {wanted}; use recordings of its sensor, or train on these with --taxels"
 
 
 def parse_bins(where: str, opener: Callable[[], IO[Any]], taxels: int | None) -> EventArray:
@@ -209,7 +213,9 @@ def parse_bins(where: str, opener: Callable[[], IO[Any]], taxels: int | None) ->
     values = parse_npy(where, opener)
     shape = values.shape
     if len(shape) != 3 or 0 in shape or shape[1] > MAX_POLARITIES:
-        raise DataError(f"{where}: shape {shape}, allowed is (taxels, polarities, steps); one recording per file")
+        raise DataError(
+            f"{where}: shape {shape}, allowed is (taxels, polarities, steps); one recording per file"
+        )
     if taxels is not None and shape[0] != taxels:
         raise DataError(f"{where}: {other_taxels(shape[0], taxels)}")
     values = values.view(np.uint8) if values.dtype == np.bool_ else values  # a byte of 2 is no truth value
@@ -253,7 +259,11 @@ def data_digest(training: Recordings, test: Recordings) -> str:
     splits = {"train": training, "test": test}
     names = {"events": "", "labels": "_labels", "lengths": "_lengths"}
     return arrays_digest(
-        {f"{split}{names[key]}": array for split, data in splits.items() for key, array in data.identity().items()}
+        {
+            f"{split}{names[key]}": array
+            for split, data in splits.items()
+            for key, array in data.identity().items()
+        }
     )
 
 
@@ -271,7 +281,9 @@ def parse_window(words: str) -> int:
     """
     match = re.fullmatch(r"([0-9]{1,3})%?", words.strip(), re.ASCII)
     if match is None or not 1 <= int(match[1]) <= WHOLE:
-        raise OptionError(f"--window {words}: not a part of a recording; give whole per cent from 1% to 100%")
+        raise OptionError(
+            f"--window {words}: not a part of a recording; give whole per cent from 1% to 100%"
+        )
     return int(match[1])
 
 
@@ -294,5 +306,7 @@ def first_part(recordings: Recordings, percent: int) -> Recordings:
     kept = steps_of(lengths, percent)
     longest = int(kept.max(initial=0))
     return replace(
-        recordings, events=recordings.events[..., :longest], lengths=None if recordings.lengths is None else kept
+        recordings,
+        events=recordings.events[..., :longest],
+        lengths=None if recordings.lengths is None else kept,
     )

@@ -91,7 +91,13 @@ def fetch_data(name: str, *, url: str | None = None) -> Fetched:
     if not re.match(r"https?://[^/]", url):
         raise OptionError(f"--url {url}: not a web address; give one that starts with http:// or https://")
     path = data_folder() / data.file
-    facts: dict[str, Any] = {"name": name, "path": path, "sha256": data.sha256, "bytes": data.size, "data": name}
+    facts: dict[str, Any] = {
+        "name": name,
+        "path": path,
+        "sha256": data.sha256,
+        "bytes": data.size,
+        "data": name,
+    }
     if path.exists():
         if not _is_released(path, data):
             raise DataError(f"{path}: exists and is not the released file; move it away")
@@ -107,7 +113,9 @@ def fetch_data(name: str, *, url: str | None = None) -> Fetched:
     try:
         store.fetch(data.file, downloader=download)
     except requests.RequestException as error:
-        raise DataError(f"{url}: cannot be fetched ({error}); try later, or give another address with --url") from error
+        raise DataError(
+            f"{url}: cannot be fetched ({error}); try later, or give another address with --url"
+        ) from error
     except ValueError as error:
         raise DataError(
             f"{url}: serves another file, the released one has sha256 {data.sha256}; give its address with --url"

@@ -48,14 +48,18 @@ SPLITS = {"train": (60, 1), "test": (24, 2)}
 SPLIT_STEPS = 100
 
 
-def synthetic_split(split: str, *, limit: int | None = None, coordinates: ArrayLike = NEUTOUCH) -> Recordings:
+def synthetic_split(
+    split: str, *, limit: int | None = None, coordinates: ArrayLike = NEUTOUCH
+) -> Recordings:
     """Draw the split of the fixed synthetic data set that the shipped checkpoint was trained and tested on.
 
     360 training or 144 test recordings of 100 steps, 6 classes, or the first `limit` of them. With
     `coordinates` the same grasps touch another sensor.
     """
     if split not in SPLITS:
-        raise OptionError(f"--split {split}: the synthetic grasps have no such split; allowed: {', '.join(SPLITS)}")
+        raise OptionError(
+            f"--split {split}: the synthetic grasps have no such split; allowed: {', '.join(SPLITS)}"
+        )
     if limit is not None and limit < 1:
         raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
     per_class, seed = SPLITS[split]
@@ -64,7 +68,12 @@ def synthetic_split(split: str, *, limit: int | None = None, coordinates: ArrayL
 
 
 def synthetic_grasps(
-    *, coordinates: ArrayLike = NEUTOUCH, per_class: int, steps: int, seed: int, classes: tuple[str, ...] = SHAPES
+    *,
+    coordinates: ArrayLike = NEUTOUCH,
+    per_class: int,
+    steps: int,
+    seed: int,
+    classes: tuple[str, ...] = SHAPES,
 ) -> Recordings:
     """Draw grasps with random place, orientation, size, depth and speed.
 
@@ -83,13 +92,17 @@ def synthetic_grasps(
         if value < least:
             raise OptionError(f"grasps: {name} is {value}, allowed are {least} or more; choose another")
     if not classes or len(set(classes) & set(SHAPES)) < len(classes):
-        raise OptionError(f"grasps: classes {', '.join(classes)}; choose from {', '.join(SHAPES)}, each once")
+        raise OptionError(
+            f"grasps: classes {', '.join(classes)}; choose from {', '.join(SHAPES)}, each once"
+        )
 
     place = _unit_layout(check_coordinates(coordinates))
     labels = np.tile(np.arange(len(classes), dtype=np.int64), per_class)
     events = np.empty((len(labels), len(place), 2, steps), dtype=np.uint8)
     for index, label in enumerate(labels.tolist()):
-        stream = np.random.SeedSequence(seed, spawn_key=(SHAPES.index(classes[label]), index // len(classes)))
+        stream = np.random.SeedSequence(
+            seed, spawn_key=(SHAPES.index(classes[label]), index // len(classes))
+        )
         events[index] = _grasp(np.random.Generator(np.random.PCG64(stream)), classes[label], place, steps)
     return Recordings(
         events=events,

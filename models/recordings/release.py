@@ -23,7 +23,9 @@ SOURCES = "sources.csv"
 """Table of split, new name and old name of every recording."""
 
 
-def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings], bin_s: float | None = None) -> None:
+def write_released(
+    path: str | os.PathLike[str], splits: Sequence[Recordings], bin_s: float | None = None
+) -> None:
     """Write splits, of bins of so many seconds, into a new folder, or a zip if the name ends so; all or nothing.
 
     A zip that exists is replaced, a folder must not exist. Numbers have leading zeros, so that the plain
@@ -87,10 +89,15 @@ def write_event_lines(path: str | os.PathLike[str], splits: Sequence[Recordings]
     """
     count = sum(len(recordings) for recordings in splits)
     if count != 1:
-        raise DataError(f"-o {path}: {count} recordings, a .csv holds one; give one, or a folder or zip to -o")
+        raise DataError(
+            f"-o {path}: {count} recordings, a .csv holds one; give one, or a folder or zip to -o"
+        )
     require_polarities(splits[0])
     step, taxel, polarity = np.nonzero(splits[0].events[0].transpose(2, 0, 1))
     times = (step + 0.5) * bin_s
-    lines = [f"{t:.9g},{n},{p}\n" for t, n, p in zip(times.tolist(), taxel.tolist(), polarity.tolist(), strict=True)]
+    lines = [
+        f"{t:.9g},{n},{p}\n"
+        for t, n, p in zip(times.tolist(), taxel.tolist(), polarity.tolist(), strict=True)
+    ]
     with write_atomically(path) as file:
         file.write(("time_s,taxel,polarity\n" + "".join(lines)).encode())

@@ -78,9 +78,13 @@ class Plan:
             raise OptionError(f"--window {self.window}: allowed are 1 to {WHOLE} per cent; choose another")
         if not 1 <= len(set(self.thresholds)) == len(self.thresholds) <= MOST or min(self.thresholds) < 1:
             words = ",".join(map(str, self.thresholds))
-            raise OptionError(f"--thresholds {words}: give up to {MOST} different numbers from 1, as in 1,4,16,64")
+            raise OptionError(
+                f"--thresholds {words}: give up to {MOST} different numbers from 1, as in 1,4,16,64"
+            )
         if self.bits not in BITS:
-            raise OptionError(f"--weight-bits {self.bits}: allowed are {BITS[0]} to {BITS[-1]}; choose another")
+            raise OptionError(
+                f"--weight-bits {self.bits}: allowed are {BITS[0]} to {BITS[-1]}; choose another"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -108,7 +112,9 @@ def run_counters(data: Recordings, plan: Plan, steps: int | None = None) -> Coun
     flat = events.reshape(len(events), -1, events.shape[-1])[..., :steps]
     length = -(-steps // plan.parts)
     if (plan.parts - 1) * length >= steps:
-        raise OptionError(f"--parts {plan.parts}: a recording has {steps} steps, the last part none; give fewer")
+        raise OptionError(
+            f"--parts {plan.parts}: a recording has {steps} steps, the last part none; give fewer"
+        )
     rows = []
     kinds = []
     for part in range(plan.parts):
@@ -199,7 +205,9 @@ def fit_rules(data: Counted, classes: int, strengths: Iterable[float]) -> dict[f
 def _least_squares(alike: FloatArray, sign: FloatArray, strength: float) -> FloatArray:
     """Shares of recordings if all of them pull, as those short of the margin do."""
     ridge = alike + np.eye(len(alike)) / (2 * strength)
-    return np.asarray(cho_solve(cho_factor(ridge, overwrite_a=True, check_finite=False), sign, check_finite=False))
+    return np.asarray(
+        cho_solve(cho_factor(ridge, overwrite_a=True, check_finite=False), sign, check_finite=False)
+    )
 
 
 def _short(sign: FloatArray, sums: FloatArray) -> BoolArray:
@@ -266,7 +274,9 @@ class Fitted:
 def fit(data: Counted, classes: int) -> Fitted:
     """Fit the rule on all recordings, at the strength that cross-validation chooses."""
     sums = cross_validate(data, classes)
-    accuracy = {strength: float(np.mean(each.argmax(axis=1) == data.labels)) for strength, each in sums.items()}
+    accuracy = {
+        strength: float(np.mean(each.argmax(axis=1) == data.labels)) for strength, each in sums.items()
+    }
     best = max(accuracy, key=accuracy.__getitem__)
     rule = fit_rules(data, classes, [best])[best]
     return Fitted(rule=rule, strength=best, accuracy=accuracy, lowest=float(sums[best].max(axis=1).min()))
@@ -308,7 +318,9 @@ def counters_of(data: Counted, fitted: Fitted, recordings: Recordings, classes: 
     unit = float(np.abs(fitted.rule.weight).max()) / most
     weight = np.rint(fitted.rule.weight / unit)
     if plan.bits < BITS[-1]:  # as few levels as these need to make up for each other
-        weight = round_weights(fitted.rule.weight / unit, data.spikes[:, fitted.rule.used].astype(np.float64), most)
+        weight = round_weights(
+            fitted.rule.weight / unit, data.spikes[:, fitted.rule.used].astype(np.float64), most
+        )
     kept = weight.any(axis=0)
     rule = Rule(used=fitted.rule.used[kept], weight=weight[:, kept])
     highest = rule.highest(data)

@@ -17,7 +17,9 @@ from spikeloom.models.training.recipes import CROSS_ENTROPY, RELEASED, Recipe
 TEST_BATCH = 2  # larger batches outgrow the cache
 
 
-def evaluate(network: torch.nn.Module, recordings: Recordings, recipe: Recipe = RELEASED) -> tuple[float, int]:
+def evaluate(
+    network: torch.nn.Module, recordings: Recordings, recipe: Recipe = RELEASED
+) -> tuple[float, int]:
     """Mean loss, and how many recordings are classified correctly; equal top rates count for the lowest class."""
     loss = 0.0
     correct = 0
@@ -46,7 +48,9 @@ def loss_of(recipe: Recipe, rates: Tensor, labels: IntArray) -> Tensor:
     """Loss of spike rates (samples, classes) by a recipe, without its penalty on spikes."""
     if recipe.loss == CROSS_ENTROPY:
         wanted = torch.tensor(labels)
-        return torch.nn.functional.cross_entropy(recipe.gain * rates, wanted, label_smoothing=recipe.smoothing)
+        return torch.nn.functional.cross_entropy(
+            recipe.gain * rates, wanted, label_smoothing=recipe.smoothing
+        )
     return rate_loss(rates, labels)
 
 

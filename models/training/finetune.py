@@ -88,8 +88,8 @@ def finetune(
     """Train a network on chip integers: `bits` wide, one or one a layer, with at most so many `groups` of scales.
 
     Without `bits` the storage is what the compiler chooses on held-out training recordings. Training starts
-    from the compiler's integers; shared filters of a first layer start from its scales alone. Nothing is chosen
-    on `test`. The `seed` orders the recordings, and draws what is lost of them (`robust`, see
+    from the compiler's integers; shared filters of a first layer start from its scales alone. Nothing is
+    chosen on `test`. The `seed` orders the recordings, and draws what is lost of them (`robust`, see
     :func:`robust.disturb`). `state` and `resume` as of :func:`train.train`.
 
     A SpikeloomError if options, network or recordings cannot be used, or the loss is no longer a number.
@@ -108,7 +108,13 @@ def finetune(
         net.start_at(chosen)
         net.make_legal()
         identity = _identity(net, training, test)
-        identity |= {"chip": target.name, "scale groups": groups, "epochs": epochs, "seed": seed, "robust": robust}
+        identity |= {
+            "chip": target.name,
+            "scale groups": groups,
+            "epochs": epochs,
+            "seed": seed,
+            "robust": robust,
+        }
         course = Course(
             options=identity,
             network=net,
@@ -125,7 +131,10 @@ def finetune(
             lambda index: _run_epoch(course, net, training, teacher, robust, rate, index, epochs),
             state=state,
             after_epoch=after_epoch,
-            shown=lambda epoch: {"loss": f"{epoch.loss:.4f}", "training": f"{epoch.correct}/{len(training)}"},
+            shown=lambda epoch: {
+                "loss": f"{epoch.loss:.4f}",
+                "training": f"{epoch.correct}/{len(training)}",
+            },
             label="finetune",
         )
         _, after = evaluate(net, test)
@@ -176,7 +185,10 @@ def _run_epoch(
     total = 0.0
     correct = 0
     for step in range(steps):
-        set_rate(course.optimizer, rate * 0.5 * (1 + math.cos(math.pi * (index * steps + step) / (epochs * steps))))
+        set_rate(
+            course.optimizer,
+            rate * 0.5 * (1 + math.cos(math.pi * (index * steps + step) / (epochs * steps))),
+        )
         chosen = order[step * BATCH : (step + 1) * BATCH]
         course.optimizer.zero_grad()
         lengths = None if training.lengths is None else torch.tensor(training.lengths[chosen])

@@ -37,7 +37,9 @@ def architecture(plan: Plan) -> Architecture:
         hops=plan.recipe.hops,
         hidden=plan.recipe.hidden,
     )
-    return replace(plain, dynamics=plan.recipe.dynamics(plan.recipe.layers, plain.beta, -(-plan.steps // plan.bins)))
+    return replace(
+        plain, dynamics=plan.recipe.dynamics(plan.recipe.layers, plain.beta, -(-plan.steps // plan.bins))
+    )
 
 
 def save(path: Path, kept: Mapping[str, Any], plan: Plan, record: Mapping[str, Any]) -> None:

@@ -75,7 +75,9 @@ def seen_by(plan: Plan) -> FloatArray:
     """What the first layer sees; systems of a single chip convolve as TactileSGNet does."""
     taxels = plan.graph.n_taxels
     system = plan.system if plan.system in SYSTEMS else TACTILESGNET
-    return propagation_of(system, plan.graph.edges, taxels, plan.grid, filters_of(system, taxels, plan.recipe.hops))
+    return propagation_of(
+        system, plan.graph.edges, taxels, plan.grid, filters_of(system, taxels, plan.recipe.hops)
+    )
 
 
 def same_graph(found: Any, plan: Plan) -> bool:

@@ -70,7 +70,9 @@ class Recipe:
         """JSON values that are not the defaults; a training states its number of epochs by itself."""
         values = asdict(self) | {"betas": dict(self.betas), "alphas": dict(self.alphas)}
         defaults = {"epochs": self.epochs, "hidden": HIDDEN, "penalty": 0, "robust": 0}
-        return {name: value for name, value in values.items() if name not in defaults or value != defaults[name]}
+        return {
+            name: value for name, value in values.items() if name not in defaults or value != defaults[name]
+        }
 
     @property
     def layers(self) -> tuple[str, ...]:
@@ -86,7 +88,9 @@ class Recipe:
         alphas = dict(self.alphas)
         return Dynamics(
             betas=tuple(realised_decays(betas.get(name, beta), 0.0)[0] for name in layers) if betas else (),
-            alphas=tuple(realised_decays(beta, alphas.get(name, 0.0))[1] for name in layers) if alphas else (),
+            alphas=tuple(realised_decays(beta, alphas.get(name, 0.0))[1] for name in layers)
+            if alphas
+            else (),
             clocks=clocks_over(self.clocks, steps),
         )
 
@@ -155,7 +159,11 @@ MOST_HOPS = 16
 
 def check_recipe(recipe: Recipe) -> None:
     """Refuse sizes that no network has."""
-    sizes = (("features", recipe.features), ("batch", recipe.batch), *(("hidden", size) for size in recipe.hidden))
+    sizes = (
+        ("features", recipe.features),
+        ("batch", recipe.batch),
+        *(("hidden", size) for size in recipe.hidden),
+    )
     for option, value in sizes:
         if not 1 <= value <= MOST_SIZE:
             raise OptionError(f"--{option} {value}: allowed are 1 to {MOST_SIZE}; choose another")
@@ -163,7 +171,9 @@ def check_recipe(recipe: Recipe) -> None:
         raise OptionError(f"--hops {recipe.hops}: allowed are 0 to {MOST_HOPS}; choose another")
     require_chance(recipe.robust)
     if not 0 <= recipe.penalty < math.inf:
-        raise OptionError(f"--spike-penalty {recipe.penalty:g}: allowed are numbers from 0 up; choose another")
+        raise OptionError(
+            f"--spike-penalty {recipe.penalty:g}: allowed are numbers from 0 up; choose another"
+        )
     if not 0 <= recipe.clocks <= MOST_CLOCKS:
         raise OptionError(f"--clocks {recipe.clocks}: allowed are 0 to {MOST_CLOCKS}; choose another")
     if recipe.clocks and dict(recipe.alphas).get("conv1"):

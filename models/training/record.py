@@ -71,7 +71,9 @@ class TrainingRecord:
 def read_record(found: Mapping[str, Any]) -> TrainingRecord:
     """The record of a checkpoint; KeyError if it is of another kind of training."""
     values = dict(found)
-    values |= {which: Reached(**values[which]) for which in CHOSEN_ON} | {"validation": Held(**values["validation"])}
+    values |= {which: Reached(**values[which]) for which in CHOSEN_ON} | {
+        "validation": Held(**values["validation"])
+    }
     return TrainingRecord(**values)
 
 

@@ -45,7 +45,9 @@ class Course(Generic[E]):
     ) -> None:
         """Train the epochs that are left, by their index, with a progress bar; write the `state` after each."""
         done = len(self.history)
-        with tqdm(total=epochs, initial=done, desc=label, unit="epoch", position=position, disable=None) as bar:
+        with tqdm(
+            total=epochs, initial=done, desc=label, unit="epoch", position=position, disable=None
+        ) as bar:
             for index in range(done, epochs):
                 self.history.append(train_epoch(index))
                 if state is not None:
@@ -88,7 +90,8 @@ class Course(Generic[E]):
             self.draw.bit_generator.state = state["order"]
         self.history = [self.epoch(**each) for each in state["history"]]
         self.weights = {
-            which: {name: array.numpy() for name, array in arrays.items()} for which, arrays in state["kept"].items()
+            which: {name: array.numpy() for name, array in arrays.items()}
+            for which, arrays in state["kept"].items()
         }
 
     def _require_same(self, path: Path, state: Any) -> None:
@@ -115,7 +118,10 @@ def _trained(
     return {
         "network": {name: parameter.detach() for name, parameter in network.named_parameters()},
         "optimizer": optimizer.state_dict(),
-        "kept": {which: {name: torch.tensor(array) for name, array in kept.items()} for which, kept in weights.items()},
+        "kept": {
+            which: {name: torch.tensor(array) for name, array in kept.items()}
+            for which, kept in weights.items()
+        },
     }
 
 
@@ -136,7 +142,9 @@ def _alike(found: Any, wanted: Any) -> bool:
         return False
     match wanted:
         case dict():
-            return found.keys() == wanted.keys() and all(_alike(found[key], each) for key, each in wanted.items())
+            return found.keys() == wanted.keys() and all(
+                _alike(found[key], each) for key, each in wanted.items()
+            )
         case list() | tuple():
             return len(found) == len(wanted) and all(map(_alike, found, wanted))
         case torch.Tensor():

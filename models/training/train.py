@@ -52,7 +52,9 @@ class Epoch:
 
     epoch: int  # Counted from 1
     learning_rate: float  # When it began
-    training_loss: float  # The recipe's, mean over the recordings; a penalty on spikes counts in training only
+    training_loss: (
+        float  # The recipe's, mean over the recordings; a penalty on spikes counts in training only
+    )
     test_loss: float
     correct: int  # Test recordings classified correctly after it
     tested: int  # All test recordings
@@ -123,7 +125,10 @@ def train(
             lambda index: _run_epoch(course, network, training, test, recipe, epochs, keep_epoch, index),
             state=state,
             after_epoch=after_epoch,
-            shown=lambda epoch: {"loss": f"{epoch.training_loss:.4f}", "test": f"{epoch.correct}/{epoch.tested}"},
+            shown=lambda epoch: {
+                "loss": f"{epoch.training_loss:.4f}",
+                "test": f"{epoch.correct}/{epoch.tested}",
+            },
             label=label,
             position=position,
         )
@@ -179,7 +184,9 @@ def _run_epoch(
     if schedule is not None:
         set_rate(optimizer, schedule(0.0))
     rate = float(optimizer.param_groups[0]["lr"])
-    training_loss = _train_epoch(network, optimizer, training, course.draw, recipe, schedule, epoch=index + 1)
+    training_loss = _train_epoch(
+        network, optimizer, training, course.draw, recipe, schedule, epoch=index + 1
+    )
     if schedule is None and index % recipe.decay_epochs == 0 and index > 1:
         set_rate(optimizer, rate * 0.1)
     test_loss, correct = evaluate(network, test, recipe)
@@ -202,7 +209,9 @@ def _optimizer_of(recipe: Recipe, network: torch.nn.Module) -> torch.optim.Optim
     rate = recipe.learning_rate
     parameters = network.parameters()
     if recipe.optimizer == ADAMW:
-        return torch.optim.AdamW(parameters, lr=rate, weight_decay=recipe.weight_decay, amsgrad=True, fused=True)
+        return torch.optim.AdamW(
+            parameters, lr=rate, weight_decay=recipe.weight_decay, amsgrad=True, fused=True
+        )
     return torch.optim.Adam(parameters, lr=rate, amsgrad=True, fused=True)
 
 
@@ -240,7 +249,11 @@ def _train_epoch(
 
 
 def _loss(
-    network: TrainedModule, recordings: Recordings, chosen: IntArray, recipe: Recipe, draw: np.random.Generator
+    network: TrainedModule,
+    recordings: Recordings,
+    chosen: IntArray,
+    recipe: Recipe,
+    draw: np.random.Generator,
 ) -> torch.Tensor:
     """Loss of some recordings, with the penalty on spikes."""
     lengths = np.array([recordings.steps_of(int(index)) for index in chosen])
@@ -250,12 +263,16 @@ def _loss(
     if not isinstance(network, SpikingNet) or not recipe.penalty:
         return loss_of(recipe, network(events, filled), labels)
     layers = network.layers(events)
-    return loss_of(recipe, network.rates(layers, filled), labels) + recipe.penalty * network.activity(layers, filled)
+    return loss_of(recipe, network.rates(layers, filled), labels) + recipe.penalty * network.activity(
+        layers, filled
+    )
 
 
 def _require_options(epochs: int, decay_epochs: int, seed: int) -> None:
     """Refuse numbers that are too small or large."""
-    require_least({"epochs": epochs, "decay_epochs": decay_epochs, "seed": seed}, epochs=1, decay_epochs=1, seed=0)
+    require_least(
+        {"epochs": epochs, "decay_epochs": decay_epochs, "seed": seed}, epochs=1, decay_epochs=1, seed=0
+    )
     if seed > MOST_SEED:
         raise OptionError(f"--seed {seed}: allowed are 0 to {MOST_SEED}; choose another")
 
@@ -283,7 +300,9 @@ class Reported:
     """A training and what it reached at its last, best and clean epoch."""
 
     trained: Trained  # On the whole training split; ``kept`` holds the weights of the clean epoch
-    validation: Trained  # The training that chose the clean epoch; its "test" figures are those of the left-out part
+    validation: (
+        Trained  # The training that chose the clean epoch; its "test" figures are those of the left-out part
+    )
     clean_epoch: int  # Counted from 1
 
 

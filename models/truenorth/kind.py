@@ -74,5 +74,8 @@ def save(path: Path, kept: Mapping[str, Any], plan: Plan, record: Mapping[str, A
 
 def differing(found: Trained, plan: Plan) -> list[str]:
     """Names of what differs between a file and a plan."""
-    same = {"graph": same_graph(found, plan), "copies": found.network.copies == (plan.copies or DEFAULT_COPIES)}
+    same = {
+        "graph": same_graph(found, plan),
+        "copies": found.network.copies == (plan.copies or DEFAULT_COPIES),
+    }
     return [name for name, equal in same.items() if not equal]

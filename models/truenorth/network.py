@@ -184,7 +184,10 @@ class NativeNet(TrainedModule):
             reach = torch.clamp(torch.floor((flat - 1) / max(1, depth - 1)), max=LEAK_MOST)
             leak = torch.maximum(torch.minimum(torch.round(bias * flat), reach), -reach)
         return Rounded(
-            weight=_past(weight * threshold, level * UNIT), leak=_past(bias * flat, leak), threshold=flat, floor=flat
+            weight=_past(weight * threshold, level * UNIT),
+            leak=_past(bias * flat, leak),
+            threshold=flat,
+            floor=flat,
         )
 
     def forward(self, events: Tensor, lengths: Tensor | None = None) -> Tensor:
@@ -240,7 +243,9 @@ def run_layers(
     layers_spikes = [spikes]
     for layer, received in zip(layers[1:], inputs, strict=True):
         width = received.shape[1]
-        sums = block_sums(spikes.index_select(2, torch.tensor(received.reshape(-1))), layer.weight[:, :width])
+        sums = block_sums(
+            spikes.index_select(2, torch.tensor(received.reshape(-1))), layer.weight[:, :width]
+        )
         if layer.weight.shape[1] > width:
             timed = torch.matmul(ticks, layer.weight[:, width:])
             sums = sums + timed.transpose(0, 1).reshape(steps, 1, -1)
@@ -253,7 +258,9 @@ def _spikes(layer: Rounded, sums: Tensor, surrogate: Surrogate) -> Tensor:
     return integrate(sums + layer.leak, layer.threshold, layer.floor, surrogate)
 
 
-def native_network(architecture: NativeArchitecture, arrays: Mapping[str, NDArray[np.float32]]) -> NativeNetwork:
+def native_network(
+    architecture: NativeArchitecture, arrays: Mapping[str, NDArray[np.float32]]
+) -> NativeNetwork:
     """Network from what `NativeNet.export_weights` returned."""
     channels = np.arange(architecture.taxels * architecture.channels)[None]
     return NativeNetwork(
@@ -263,7 +270,11 @@ def native_network(architecture: NativeArchitecture, arrays: Mapping[str, NDArra
         copies=architecture.copies,
         clocks=architecture.clocks,
         stages=tuple(
-            Stage(name=name, inputs=inputs, **{n: arrays[f"{name}.{n}"].astype(np.int64) for n in ("level", *VECTORS)})
+            Stage(
+                name=name,
+                inputs=inputs,
+                **{n: arrays[f"{name}.{n}"].astype(np.int64) for n in ("level", *VECTORS)},
+            )
             for name, inputs in zip(architecture.layers, [channels, *architecture.inputs()], strict=True)
         ),
     )

@@ -89,13 +89,17 @@ def _differentiate_step(
 
 
 @numba.njit(cache=True)
-def _differentiate(above: Any, membrane: Any, threshold: Any, floor: Any, width: Any, smooth: bool, out: Any) -> None:
+def _differentiate(
+    above: Any, membrane: Any, threshold: Any, floor: Any, width: Any, smooth: bool, out: Any
+) -> None:
     steps, samples, neurons = membrane.shape
     nothing = np.zeros(neurons, np.float32)
     for t in range(steps - 1, -1, -1):
         for s in range(samples):
             later = out[t + 1, s] if t + 1 < steps else nothing
-            _differentiate_step(above[t, s], membrane[t, s], later, threshold, floor, width, smooth, out[t, s])
+            _differentiate_step(
+                above[t, s], membrane[t, s], later, threshold, floor, width, smooth, out[t, s]
+            )
 
 
 def block_sums(spikes: Tensor, weight: Tensor) -> Tensor:

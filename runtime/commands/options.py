@@ -12,7 +12,17 @@ R = TypeVar("R", bound=Request)
 KINDS = {"int": int, "float": float}
 
 
-GROUPS = ("options", "network", "storage", "layout", "recordings", "depth and prices", "counters", "hardware", "output")
+GROUPS = (
+    "options",
+    "network",
+    "storage",
+    "layout",
+    "recordings",
+    "depth and prices",
+    "counters",
+    "hardware",
+    "output",
+)
 """Headings in the order of the help."""
 
 SUBJECTS = ("checkpoint", "data")
@@ -20,7 +30,9 @@ SUBJECTS = ("checkpoint", "data")
 
 
 def add_options(
-    parser: argparse.ArgumentParser, kind: type[Request], choices: Mapping[str, Mapping[str, str]] | None = None
+    parser: argparse.ArgumentParser,
+    kind: type[Request],
+    choices: Mapping[str, Mapping[str, str]] | None = None,
 ) -> None:
     """Add the options of a request; `choices`, with what each means, are of fields that know them only now."""
     options = sorted(kind.options(), key=lambda each: each.name not in SUBJECTS)
@@ -28,7 +40,9 @@ def add_options(
         _add_option(parser, each, (choices or {}).get(each.name))
 
 
-def _add_option(parser: argparse.ArgumentParser, each: Field[Any], meanings: Mapping[str, str] | None) -> None:
+def _add_option(
+    parser: argparse.ArgumentParser, each: Field[Any], meanings: Mapping[str, str] | None
+) -> None:
     about = each.metadata
     options = group(parser, about["group"])
     if about["constants"]:

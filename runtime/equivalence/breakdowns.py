@@ -1,7 +1,7 @@
 """Ways in which a quantised network is known to fail at once, looked for by name.
 
-Shares of equal spikes hide them: a silent layer agrees with a quiet one, and one class for every recording is right now
-and then.
+Shares of equal spikes hide them: a silent layer agrees with a quiet one, and one class for every recording
+is right now and then.
 """
 
 from collections.abc import Sequence
@@ -24,8 +24,8 @@ class Breakdown:
     """A known failure.
 
     Its kind (``silent layer``, ``silenced neurons``, ``woken neurons``, ``one class``, ``no vote`` or ``tied
-    votes``), the layer if it is in one, how many spikes of the float model, neurons or recordings it concerns,
-    and a line for people.
+    votes``), the layer if it is in one, how many spikes of the float model, neurons or recordings it
+    concerns, and a line for people.
     """
 
     kind: str
@@ -44,8 +44,8 @@ def breakdowns(
 ) -> tuple[Breakdown, ...]:
     """Look for all of them.
 
-    `reference` and `chip` are the spikes of each layer, (compared,), of those neurons that `neurons` numbers; `votes`
-    are those of float model and chip, (samples, classes), of recordings that `files` names.
+    `reference` and `chip` are the spikes of each layer, (compared,), of those neurons that `neurons`
+    numbers; `votes` are those of float model and chip, (samples, classes), of recordings that `files` names.
     """
     failures: list[Breakdown] = []
     for name, ours, theirs, ids in zip(names, reference, chip, neurons, strict=True):

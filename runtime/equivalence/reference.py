@@ -40,7 +40,9 @@ def require_match(netlist: Netlist, network: Network) -> None:
     ours = {"taxels": netlist.taxels, "channels": netlist.polarities}
     ours |= _timing(netlist.clocks, netlist.bins) | {layer.name: layer.neurons for layer in netlist.layers}
     theirs = {"taxels": network.input.taxels, "channels": network.input.polarities}
-    theirs |= _timing(network.input.clocks, network.input.bins) | {p.name: p.size for p in network.populations}
+    theirs |= _timing(network.input.clocks, network.input.bins) | {
+        p.name: p.size for p in network.populations
+    }
     if ours != theirs:
         what = "network" if network.convolution is None else "checkpoint"
         sizes = [", ".join(f"{name} {neurons}" for name, neurons in side.items()) for side in (ours, theirs)]
@@ -128,8 +130,12 @@ def realised(network: Network, integer: IntegerNetwork) -> tuple[Network, Networ
         ),
         convolution=None,
     )
-    # A neuron with another threshold fires as one with the model's threshold whose weights and bias are scaled to it.
-    stretch = [population.theta / np.maximum(population.realised_theta, 1e-300) for population in integer.populations]
+    # A neuron with another threshold fires as one with the model's threshold whose weights and bias are
+    # scaled to it.
+    stretch = [
+        population.theta / np.maximum(population.realised_theta, 1e-300)
+        for population in integer.populations
+    ]
     bias_threshold = replace(
         weights,
         populations=tuple(

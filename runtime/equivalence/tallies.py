@@ -63,7 +63,8 @@ class ModelTally:
     def layers(self) -> dict[str, ModelSpikes]:
         """What was counted."""
         return {
-            name: ModelSpikes(spikes=spikes, different=self._different[name]) for name, spikes in self._spikes.items()
+            name: ModelSpikes(spikes=spikes, different=self._different[name])
+            for name, spikes in self._spikes.items()
         }
 
 
@@ -98,8 +99,12 @@ class SpikeTally:
         self._kept = machine.compared()
         self._ladder = rungs(network, machine.integer, windows=not machine.free_running)
         populations = machine.integer.populations
-        self._neurons = [np.arange(each.size)[keep] for each, keep in zip(populations, self._kept, strict=True)]
-        self._fired = [np.zeros((2, len(each)), np.int64) for each in self._neurons]  # Of float model and chip
+        self._neurons = [
+            np.arange(each.size)[keep] for each, keep in zip(populations, self._kept, strict=True)
+        ]
+        self._fired = [
+            np.zeros((2, len(each)), np.int64) for each in self._neurons
+        ]  # Of float model and chip
         self._different = {stage: np.zeros(len(self._names), np.int64) for stage in LADDER}
         self.first_divergence: Divergence | None = None
 
@@ -116,7 +121,9 @@ class SpikeTally:
             self._begin(f"ladder: {'proven' if simulation is None else stage}", first)
             lower = chip
             if simulation is not None:
-                lower = self._compared([cut(spikes, part.lengths) for spikes in simulation.run(channels).spikes])
+                lower = self._compared(
+                    [cut(spikes, part.lengths) for spikes in simulation.run(channels).spikes]
+                )
             self._different[stage] += _differences(wanted, lower)
             if stage == LADDER[0] and self.first_divergence is None:
                 self._begin("first divergence", first)

@@ -41,8 +41,8 @@ SHARES = ("E2", "E3")
 class LayerSpikes:
     """Spikes of one layer over all recordings.
 
-    `different` counts entries (recording, step, neuron) in which float32 reference and chip differ, `ill_posed` those
-    in which float64 and float32 do.
+    `different` counts entries (recording, step, neuron) in which float32 reference and chip differ,
+    `ill_posed` those in which float64 and float32 do.
     """
 
     float: int
@@ -55,9 +55,9 @@ class LayerSpikes:
 class Divergence:
     """The first entry in which chip and float model differ: first recording, then step, layer, neuron.
 
-    Membranes before the comparison and thresholds are in the float model's units, the register is as it stands. Taxel
-    and feature are the neuron in a graph convolution's own terms. It is ill-posed if the float64 model sides with the
-    chip.
+    Membranes before the comparison and thresholds are in the float model's units, the register is as it
+    stands. Taxel and feature are the neuron in a graph convolution's own terms. It is ill-posed if the
+    float64 model sides with the chip.
     """
 
     file: str
@@ -103,18 +103,18 @@ class ModelSpikes:
 class Verdict(Shown):
     """Everything that verify finds, on any chip.
 
-    Predictions are (samples,) int64 and votes (samples, classes) int64; those of the float model are None where the
-    network is whole numbers and there is none.
+    Predictions are (samples,) int64 and votes (samples, classes) int64; those of the float model are None
+    where the network is whole numbers and there is none.
 
-    netlist: level EN.
-    spec_samples, spec_different: recordings on which the specification ran beside the engine, of a free-running netlist
+    netlist: level EN. spec_samples, spec_different: recordings on which the specification ran beside the
+    engine, of a free-running netlist
         also in a row; spikes, membranes and counts that differed.
-    engine, engine_different: the further engine, and its spikes and votes that are not our engine's.
-    model: level E1 by layer; None where the network brings no whole-number model of its own.
-    membranes_saturated: membranes that left their register, which the model's do not; None where the chip saturates
+    engine, engine_different: the further engine, and its spikes and votes that are not our engine's. model:
+    level E1 by layer; None where the network brings no whole-number model of its own. membranes_saturated:
+    membranes that left their register, which the model's do not; None where the chip saturates
         by definition.
-    spikes, ladder, first_divergence: level E2; empty where layers of the chip are not those of a float model.
-    not_compared: neurons of each layer that the chip omits because their spikes reach no neuron.
+    spikes, ladder, first_divergence: level E2; empty where layers of the chip are not those of a float
+    model. not_compared: neurons of each layer that the chip omits because their spikes reach no neuron.
     row_different: decisions that differ where all recordings follow each other on a free-running chip.
     required: shares that levels have to reach; EN always.
     """
@@ -170,13 +170,21 @@ class Verdict(Shown):
     @property
     def different(self) -> int:
         """Spikes that are not the float model's, or where the network is whole numbers not the lowered model's."""
-        return sum(layer.different for layer in self.spikes.values()) if self.spikes else self.model_different or 0
+        return (
+            sum(layer.different for layer in self.spikes.values())
+            if self.spikes
+            else self.model_different or 0
+        )
 
     @property
     def accuracy(self) -> Mapping[str, float]:
         """Shares of recordings that each side, ``float`` and ``chip``, gets right."""
         sides = {"float": self.float_predictions, "chip": self.chip_predictions}
-        return {side: float(np.mean(decided == self.labels)) for side, decided in sides.items() if decided is not None}
+        return {
+            side: float(np.mean(decided == self.labels))
+            for side, decided in sides.items()
+            if decided is not None
+        }
 
     @property
     def decision_agreement(self) -> float | None:
@@ -281,7 +289,9 @@ def _model_level(verdict: Verdict) -> Level:
         text = "not applicable: the checkpoint was not fine-tuned on the chip's integers"
         return Level(name="E1", share=None, text=text)
     spikes = sum(layer.spikes for layer in verdict.model.values())
-    text = f"lowered model = chip: {different:,} differing spikes of {spikes:,} on {verdict.samples} recordings"
+    text = (
+        f"lowered model = chip: {different:,} differing spikes of {spikes:,} on {verdict.samples} recordings"
+    )
     if verdict.membranes_saturated is not None:
         text += f"; membranes that left their register: {verdict.membranes_saturated:,}"
     return Level(name="E1", share=float(not different and not verdict.membranes_saturated), text=text)
@@ -290,10 +300,14 @@ def _model_level(verdict: Verdict) -> Level:
 def _spike_level(verdict: Verdict) -> Level:
     """E2: spikes of the float model."""
     if not verdict.spikes:
-        return Level(name="E2", share=None, text="not applicable: layers of the chip are not those of a float model")
+        return Level(
+            name="E2", share=None, text="not applicable: layers of the chip are not those of a float model"
+        )
     agreement = {name: spike_agreement(spikes) for name, spikes in verdict.spikes.items()}
     shares = ", ".join(f"{name} {100 * share:.2f} %" for name, share in agreement.items())
-    return Level(name="E2", share=min(agreement.values()), text=f"spikes in common with the float model: {shares}")
+    return Level(
+        name="E2", share=min(agreement.values()), text=f"spikes in common with the float model: {shares}"
+    )
 
 
 def _decision_level(verdict: Verdict) -> Level:
@@ -322,9 +336,13 @@ def parse_requirements(words: str) -> dict[str, float]:
         name, given, number = part.strip().partition("=")
         where = f"--require {words}: {part.strip()!r}"
         if name not in LEVELS or name in required:
-            raise OptionError(f"{where}: give each of EN, E0, E1, E2=SHARE, E3=SHARE once at most, with commas between")
+            raise OptionError(
+                f"{where}: give each of EN, E0, E1, E2=SHARE, E3=SHARE once at most, with commas between"
+            )
         if bool(given) != (name in SHARES):
-            raise OptionError(f"{where}: {'needs a share, as in ' + name + '=0.98' if not given else 'takes no share'}")
+            raise OptionError(
+                f"{where}: {'needs a share, as in ' + name + '=0.98' if not given else 'takes no share'}"
+            )
         try:
             share = float(number) if given else 1.0
         except ValueError:
@@ -354,7 +372,9 @@ def sections(verdict: Verdict) -> list[Section]:
     chapters = [Section("Levels", [Text("\n".join(_lines(verdict)))])]
     if verdict.model is not None:
         rows = [[name, f"{layer.spikes:,}", f"{layer.different:,}"] for name, layer in verdict.model.items()]
-        chapters.append(Section("Lowered model", [Table(["layer", "spikes of the model", "different"], rows)]))
+        chapters.append(
+            Section("Lowered model", [Table(["layer", "spikes of the model", "different"], rows)])
+        )
     if verdict.spikes:
         first = verdict.first_divergence
         divergence = "no spike differs" if first is None else _divergence(first)
@@ -375,12 +395,17 @@ def _spike_table(verdict: Verdict) -> Table:
 
 
 def _ladder_table(verdict: Verdict) -> Table:
-    rows = [[rung.stage, *(f"{rung.different[name]:,}" for name in verdict.spikes)] for rung in verdict.ladder]
+    rows = [
+        [rung.stage, *(f"{rung.different[name]:,}" for name in verdict.spikes)] for rung in verdict.ladder
+    ]
     return Table(["different, adding", *verdict.spikes], rows)
 
 
 def _lines(verdict: Verdict) -> list[str]:
-    right = {side: percent(round(share * verdict.samples), verdict.samples) for side, share in verdict.accuracy.items()}
+    right = {
+        side: percent(round(share * verdict.samples), verdict.samples)
+        for side, share in verdict.accuracy.items()
+    }
     lines = [
         *(f"{side + ' accuracy:':<17}{share}" for side, share in right.items()),
         *(f"{level.name}  {level.text}" for level in verdict.levels),

@@ -1,8 +1,8 @@
 """How closely a chip follows the network that it was compiled from: one ladder for every chip.
 
-EN, E0 and E1 hold the netlist against what its network is lowered to, E2 and E3 against a float model where there is
-one. The float model runs in the released operator order, in float32. A float64 run stands beside it: spikes in which
-the two differ are ill-posed, decided by the rounding of a sum and not by the chip.
+EN, E0 and E1 hold the netlist against what its network is lowered to, E2 and E3 against a float model where
+there is one. The float model runs in the released operator order, in float32. A float64 run stands beside
+it: spikes in which the two differ are ill-posed, decided by the rounding of a sum and not by the chip.
 """
 
 from collections.abc import Mapping
@@ -63,8 +63,8 @@ def verify(
     Raises
     ------
     ModelError, DataError, NumericRangeError or OptionError
-        If the parts do not belong together, a register of the chip overflows, or the further engine is not installed
-        or cannot hold the netlist.
+        If the parts do not belong together, a register of the chip overflows, or the further engine is not
+        installed or cannot hold the netlist.
     """
     machine = machine_of(netlist)
     floats = source if original is None and isinstance(source, Network) else original
@@ -72,7 +72,9 @@ def verify(
     _require_fit(machine, source, floats, data, spec_samples)
     lowered, reference = _tallies(machine, source, floats, len(data), begin)
     engines = _compare_engines(machine, data, min(spec_samples, len(data)), engine_name, begin)
-    votes, saturated = _run(machine, data, [tally for tally in (lowered, reference) if tally is not None], begin)
+    votes, saturated = _run(
+        machine, data, [tally for tally in (lowered, reference) if tally is not None], begin
+    )
     return Verdict(
         target=netlist.target,
         files=data.files,
@@ -100,17 +102,23 @@ def _tallies(
     )
 
 
-def _require_fit(machine: Machine, source: Any, floats: Network | None, data: Recordings, spec_samples: int) -> None:
+def _require_fit(
+    machine: Machine, source: Any, floats: Network | None, data: Recordings, spec_samples: int
+) -> None:
     """Refuse networks or recordings of another size, and a specification that would run on nothing."""
     if spec_samples < 1:
-        raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")
+        raise DataError(
+            f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number"
+        )
     if isinstance(machine, Comparable):
         require_match(machine.netlist, source)
         require_match(machine.netlist, source if floats is None else floats)
     machine.require_sensor(data.events)
 
 
-def _compare_engines(machine: Machine, data: Recordings, samples: int, name: str, begin: Begin) -> dict[str, Any]:
+def _compare_engines(
+    machine: Machine, data: Recordings, samples: int, name: str, begin: Begin
+) -> dict[str, Any]:
     """Fields of E0: the specification on the first recordings, a further engine on all."""
     beside = machine.beside(name)
     begin("specification", 0)
@@ -136,7 +144,11 @@ def _run(
         if run.saturated is not None:
             saturated = (saturated or 0) + int(run.saturated.sum())
         part = Part(
-            rows=rows, events=data.events[rows], lengths=data.step_counts[rows], files=data.files[rows], run=run
+            rows=rows,
+            events=data.events[rows],
+            lengths=data.step_counts[rows],
+            files=data.files[rows],
+            run=run,
         )
         for tally in tallies:
             tally.add(part)

@@ -36,7 +36,8 @@ def graph_of(checkpoint: Checkpoint, request: CheckpointChoice, made: Mapping[st
 def load_graph(request: SensorChoice, system: str = TACTILESGNET) -> Graph | None:
     """Graph that the options name, or None if they name none; a warning goes to stderr.
 
-    Raises OptionError or ModelError if there is no such graph, its files are wrong, or the system has no graph at all.
+    Raises OptionError or ModelError if there is no such graph, its files are wrong, or the system has no
+    graph at all.
     """
     if system not in GRAPH_SYSTEMS:
         refuse(request, ("graph", "edges", "directed"), f"is for taxel graphs, {TITLES[system]} has none")
@@ -92,9 +93,13 @@ def load_checkpoint(path: str, request: CheckpointChoice) -> Checkpoint:
     if (kind := stated(Path(shipped(path)), "format")) in (TRAINED, COUNTERS):
         raise ModelError(f"{path}: is {FORMATS[kind]}; only compile, verify and inspect take one")
     if Path(shipped(path)).is_file() and is_netlist(shipped(path)):
-        raise ModelError(f"{path}: is a netlist, its weights are rounded; give the checkpoint that it was made from")
+        raise ModelError(
+            f"{path}: is a netlist, its weights are rounded; give the checkpoint that it was made from"
+        )
     if is_recordings(path):
-        raise ModelError(f"{path}: holds recordings; give the network here, and these as --calibrate or --data")
+        raise ModelError(
+            f"{path}: holds recordings; give the network here, and these as --calibrate or --data"
+        )
     return read_checkpoint(
         shipped(path), run=request.run, weights=request.weights, beta=request.beta, theta=request.theta
     )

@@ -16,7 +16,9 @@ STORED = ("weight_bits", "planes", "scale_groups", "spike_exact", "keep")
 """Options that say how weights are stored."""
 
 
-def provenance(request: CompileRequest, asked: LoadedNetwork, *, calibrated: Recordings | None) -> Mapping[str, Any]:
+def provenance(
+    request: CompileRequest, asked: LoadedNetwork, *, calibrated: Recordings | None
+) -> Mapping[str, Any]:
     """What a netlist remembers of its compilation, whose scales the recordings `calibrated` chose, if any did."""
     seen = {} if calibrated is None else {"data": calibrated.source, "bin_s": calibrated.bin_s}
     checkpoint = asked.checkpoint
@@ -120,7 +122,9 @@ def _packings(request: CompileRequest) -> tuple[Packing, ...] | None:
     layers = max(len(values) for values in numbers.values())
     for option, values in numbers.items():
         if len(values) not in (1, layers):
-            raise OptionError(f"{option}: {len(values)} numbers, another option gives {layers}; give as many, or one")
+            raise OptionError(
+                f"{option}: {len(values)} numbers, another option gives {layers}; give as many, or one"
+            )
     columns = [values if len(values) == layers else values * layers for values in numbers.values()]
     return tuple(Packing(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
 
@@ -159,7 +163,9 @@ def parse_cores(words: str | None) -> dict[str, int]:
     for word in words.split(","):
         layer, _, count = word.strip().partition("=")
         if not layer or not (count.isascii() and count.isdecimal()) or int(count) == 0:
-            raise OptionError(f"--cores-for {words}: {word!r} is not LAYER=N, N from 1; write for example fc1=6")
+            raise OptionError(
+                f"--cores-for {words}: {word!r} is not LAYER=N, N from 1; write for example fc1=6"
+            )
         if layer in cores:
             raise OptionError(f"--cores-for {words}: names {layer} twice; give it once")
         cores[layer] = int(count)

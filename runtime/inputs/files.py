@@ -39,7 +39,9 @@ def shipped(path: str) -> str:
     known = {file.stem: file for file in sorted(folder.glob("*.pt"), key=lambda file: file.stem)}
     name = path.removeprefix(PRETRAINED)
     if name not in known:
-        raise OptionError(f"{path}: no such shipped checkpoint; allowed: {', '.join(PRETRAINED + n for n in known)}")
+        raise OptionError(
+            f"{path}: no such shipped checkpoint; allowed: {', '.join(PRETRAINED + n for n in known)}"
+        )
     return str(known[name])
 
 
@@ -58,17 +60,24 @@ INPUTS = (
 """Arguments that may name a file to read."""
 
 
-def require_place(path: str | None, option: str, request: Request | None = None, kinds: Iterable[str] = ()) -> None:
+def require_place(
+    path: str | None, option: str, request: Request | None = None, kinds: Iterable[str] = ()
+) -> None:
     """Refuse, before any work is done, a place where a result could not be written; nothing to do without one.
 
-    Raises OptionError if there is no such folder, or none that takes a file, the path is a folder or a device, has
-    another suffix than one of the `kinds`, or is one of the `INPUTS` of `request`, which must not be overwritten.
+    Raises OptionError if there is no such folder, or none that takes a file, the path is a folder or a
+    device, has another suffix than one of the `kinds`, or is one of the `INPUTS` of `request`, which must
+    not be overwritten.
     """
     if path is None:
         return
     place = Path(path)
     if not (folder := place.absolute().parent).is_dir():
-        why = f"{folder.name} is a file; name" if folder.exists() else "the folder does not exist; make it, or name"
+        why = (
+            f"{folder.name} is a file; name"
+            if folder.exists()
+            else "the folder does not exist; make it, or name"
+        )
         raise OptionError(f"{option} {path}: {why} another")
     if place.exists() and not place.is_file():
         raise OptionError(f"{option} {path}: is not a regular file; give the name of a file to write")
@@ -82,7 +91,9 @@ def require_place(path: str | None, option: str, request: Request | None = None,
         given = getattr(request, name, None)
         for each in given if isinstance(given, tuple) else [given]:
             if isinstance(each, str) and Path(shipped(each)).exists() and place.samefile(shipped(each)):
-                raise OptionError(f"{option} {path}: is an input of this command ({each}); give another name")
+                raise OptionError(
+                    f"{option} {path}: is an input of this command ({each}); give another name"
+                )
     if kinds and place.suffix not in (allowed := [f".{kind}" for kind in kinds]):
         raise OptionError(f"{option} {path}: has to end in {' or '.join(allowed)}; give another name")
 
@@ -124,13 +135,19 @@ def is_recordings(path: str) -> bool:
     names = _members(path)
     if names is None:
         names = [path] if path.endswith(".csv") and Path(path).is_file() else []
-    return any(name.endswith(".csv") or name == "time_s.npy" or label_in_name(name) != UNLABELLED for name in names)
+    return any(
+        name.endswith(".csv") or name == "time_s.npy" or label_in_name(name) != UNLABELLED for name in names
+    )
 
 
 def require_netlist(path: str) -> None:
     """Refuse what is to be a netlist and is a trained network, or recordings; OptionError."""
-    if path.startswith(PRETRAINED) or (path.endswith(NETWORK_ENDINGS) and stated(Path(path), "target") is None):
-        raise OptionError(f"{path}: is a trained network; compile it first: spikeloom compile {path} -o NET.loom")
+    if path.startswith(PRETRAINED) or (
+        path.endswith(NETWORK_ENDINGS) and stated(Path(path), "target") is None
+    ):
+        raise OptionError(
+            f"{path}: is a trained network; compile it first: spikeloom compile {path} -o NET.loom"
+        )
     if is_recordings(path):
         raise OptionError(f"{path}: holds recordings; give the netlist here, and these as --data")
 

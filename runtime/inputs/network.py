@@ -33,7 +33,9 @@ class LoadedNetwork:
     graph: str | None = None  # Its name, likewise
     facts: tuple[str, ...] = ()  # What was read from an ONNX or NIR file and what was assumed
     format: str = "checkpoint"  # or ``onnx``, ``nir``, ``module``
-    read_as: Mapping[str, Any] = field(default_factory=dict)  # Beyond what the file says: the time step of a NIR file
+    read_as: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # Beyond what the file says: the time step of a NIR file
     training: Mapping[str, Any] | None = None  # How it was made, where the file says so
 
     def origin(self, run: int) -> JsonObject:
@@ -64,9 +66,7 @@ class LoadedNetwork:
                 value_here = getattr(ours, name)
                 due = getattr(layer, name, value_here)
                 if due != value_here:
-                    return (
-                        f"{layer.name} was compiled with {name} {due:g}, this has {value_here:g}; give --{name} {due:g}"
-                    )
+                    return f"{layer.name} was compiled with {name} {due:g}, this has {value_here:g}; give --{name} {due:g}"
         return None
 
     def require_same(self, path: str, netlist: Netlist, run: int) -> None:
@@ -79,10 +79,10 @@ class LoadedNetwork:
 class Reader:
     """A format that float networks are read from.
 
-    name, title: what :attr:`LoadedNetwork.format` says, and what one of its files is, in a sentence.
-    ending: how their names end; empty where the file itself says what it is, by the format `states` of its manifest.
-    options: those of a request that it takes; others are refused.
-    read: reads a file as a request says, beside the provenance of a netlist where there is one.
+    name, title: what :attr:`LoadedNetwork.format` says, and what one of its files is, in a sentence. ending:
+    how their names end; empty where the file itself says what it is, by the format `states` of its manifest.
+    options: those of a request that it takes; others are refused. read: reads a file as a request says,
+    beside the provenance of a netlist where there is one.
     """
 
     name: str
@@ -171,13 +171,16 @@ def reader_of(path: str) -> Reader:
     return next(reader for reader in READERS if reader.takes(path))
 
 
-def load_network(path: str | Network, request: NetworkChoice, netlist: Netlist | None = None) -> LoadedNetwork:
+def load_network(
+    path: str | Network, request: NetworkChoice, netlist: Netlist | None = None
+) -> LoadedNetwork:
     """Read what a command is given; beside a `netlist` as that was, where the options say nothing.
 
-    These are the epoch and the graph of a checkpoint that does not say which, the time step of a NIR file, and the
-    names of the layers of a network.
+    These are the epoch and the graph of a checkpoint that does not say which, the time step of a NIR file,
+    and the names of the layers of a network.
 
-    Raises OptionError or ModelError if it is not there, not as the options say, or an option is for another format.
+    Raises OptionError or ModelError if it is not there, not as the options say, or an option is for another
+    format.
     """
     if isinstance(path, Network):
         # a network that Python made, as if it came from a file
@@ -196,7 +199,9 @@ def load_network(path: str | Network, request: NetworkChoice, netlist: Netlist |
 def _require_fit(path: str, reader: Reader, request: NetworkChoice) -> None:
     """Refuse options that are for another format, and files that hold no float network."""
     if path.endswith(NETX):
-        raise OptionError(f"{path}: holds integers, no float network to compare with; compile, inspect and run it")
+        raise OptionError(
+            f"{path}: holds integers, no float network to compare with; compile, inspect and run it"
+        )
     for name in (*NETWORK, *LAYOUT):
         if name not in reader.options:
             titles = " or ".join(other.title for other in READERS if name in other.options)
@@ -209,4 +214,6 @@ def _named_alike(network: Network, netlist: Any) -> Network:
     if [population.size for population in network.populations] != [neurons for _, neurons in layers]:
         return network
     pairs = zip(network.populations, layers, strict=True)
-    return replace(network, populations=tuple(replace(population, name=name) for population, (name, _) in pairs))
+    return replace(
+        network, populations=tuple(replace(population, name=name) for population, (name, _) in pairs)
+    )

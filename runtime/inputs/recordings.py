@@ -40,10 +40,10 @@ def recordings(
 ) -> Recordings:
     """Read recordings of any form, or make the package's own synthetic ones; hold both against the network.
 
-    Counts of disorder in event files go to stderr. `bins` of them make a step of the network. `labels_for` names what
-    needs the label of every recording. `trained` is what is known of the recordings that the network was trained on,
-    see :func:`origin_of`: events come in its bins, others are refused, and what looks like other recordings is warned
-    of.
+    Counts of disorder in event files go to stderr. `bins` of them make a step of the network. `labels_for`
+    names what needs the label of every recording. `trained` is what is known of the recordings that the
+    network was trained on, see :func:`origin_of`: events come in its bins, others are refused, and what
+    looks like other recordings is warned of.
 
     Raises DataError or OptionError if they cannot be used, or do not suit the network.
     """
@@ -57,7 +57,9 @@ def recordings(
         return events.joined_bins(data if labels_for is None else events.need_labels(data, labels_for), bins)
     if path != SYNTHETIC:
         if trained_bin is not None and bin_s not in (None, trained_bin):
-            raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {trained_bin:g} s; omit --bin")
+            raise OptionError(
+                f"--bin {bin_s:g}: the network was trained on bins of {trained_bin:g} s; omit --bin"
+            )
         data = events.load_data(
             path,
             split,
@@ -84,7 +86,11 @@ def recordings(
 def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
     """What a netlist remembers of the recordings behind a network: their name, and their bins if they were events."""
     kinds = {"data": str, "bin_s": float}
-    return {name: training[name] for name, kind in kinds.items() if training and isinstance(training.get(name), kind)}
+    return {
+        name: training[name]
+        for name, kind in kinds.items()
+        if training and isinstance(training.get(name), kind)
+    }
 
 
 def _require_width(data: Recordings, own: float | None) -> None:
@@ -100,7 +106,9 @@ def _require_sensor(data: Recordings, split: str, taxels: int | None) -> None:
     """Refuse training recordings that look like another sensor's, warn of others."""
     if taxels is not None and (why := events.other_sensor(data)) is not None:
         if split == "train":
-            raise DataError(f"{why}; give the graph of their sensor (--taxels), or recordings of the network's")
+            raise DataError(
+                f"{why}; give the graph of their sensor (--taxels), or recordings of the network's"
+            )
         tell(f"warning: {why}; are they of its sensor?")
 
 
@@ -109,7 +117,9 @@ def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int, 
     name = trained.get("data", data.source)
     known = int(data.labels.max(initial=UNLABELLED))
     fewer = whole and len(data) >= classes and UNLABELLED < known < classes - 1
-    same = name.partition(", seed")[0] == data.source.partition(", seed")[0]  # splits of synthetic ones differ in these
+    same = (
+        name.partition(", seed")[0] == data.source.partition(", seed")[0]
+    )  # splits of synthetic ones differ in these
     origin = "" if same else f"the network was trained on {name}; "
     if fewer:
         tell(f"warning: {data.source}: {origin}their classes are 0..{known}, the network's 0..{classes - 1}")
@@ -154,8 +164,8 @@ def load_recordings(
 ) -> Recordings:
     """Recordings of a source that a request names, held against a netlist; as `recordings` otherwise.
 
-    In steps of the network if `joined`, as long a part of each as a ``--window`` says, as long as the network needs;
-    else whole, in their own bins.
+    In steps of the network if `joined`, as long a part of each as a ``--window`` says, as long as the
+    network needs; else whole, in their own bins.
     """
     window = parse_window(getattr(request, "window", "100%"))
     progress("reading the recordings")
@@ -192,7 +202,9 @@ def find_recording(data: Recordings, wanted: str, option: str) -> int:
         return data.files.index(wanted)
     if wanted.isascii() and wanted.isdecimal():
         if int(wanted) >= len(data):
-            raise OptionError(f"{option} {wanted}: there are {len(data)}; give a number from 0 to {len(data) - 1}")
+            raise OptionError(
+                f"{option} {wanted}: there are {len(data)}; give a number from 0 to {len(data) - 1}"
+            )
         return int(wanted)
     near = get_close_matches(wanted, data.files, n=3, cutoff=0.5) or data.files[:3]
     raise DataError(

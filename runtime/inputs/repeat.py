@@ -31,7 +31,9 @@ USUAL: Mapping[str, object] = {
     "bin": BIN_S,
     "chips": 1,
     "engine": "spikeloom",
-    **dict.fromkeys(("directed", "spike_exact", "prune_unused", "share_lists", "keep_all", "free_running"), False),
+    **dict.fromkeys(
+        ("directed", "spike_exact", "prune_unused", "share_lists", "keep_all", "free_running"), False
+    ),
 }
 """What options are where they are not given; others are None."""
 

@@ -208,7 +208,9 @@ class Machine(ABC):
     def require_windows(self) -> None:
         """Refuse a free-running netlist: an OptionError."""
         if self.free_running:
-            raise OptionError("netlist: is free-running, which this cannot take; compile it without --free-running")
+            raise OptionError(
+                "netlist: is free-running, which this cannot take; compile it without --free-running"
+            )
 
     def in_a_row(self, events: EventArray, lengths: IntArray | None) -> IntArray | None:  # noqa: ARG002
         """Votes (samples, classes) of recordings that follow each other on a free-running chip; None on another."""
@@ -239,7 +241,9 @@ class Machine(ABC):
         """Cut one layer out of spikes or membranes of a trace, (samples, steps, neurons)."""
 
     @abstractmethod
-    def simulate(self, channels: EventArray, lengths: IntArray | None, *, spikes: bool, membranes: bool) -> Any:
+    def simulate(
+        self, channels: EventArray, lengths: IntArray | None, *, spikes: bool, membranes: bool
+    ) -> Any:
         """Trace of recordings (samples, channels, steps), clocks among the channels; the rest is as for :meth:`run`."""
 
     @abstractmethod
@@ -248,7 +252,13 @@ class Machine(ABC):
 
     @abstractmethod
     def priced(
-        self, channels: EventArray, lengths: IntArray | None, chip: Target, bin_s: float, detail: str, progress: Done
+        self,
+        channels: EventArray,
+        lengths: IntArray | None,
+        chip: Target,
+        bin_s: float,
+        detail: str,
+        progress: Done,
     ) -> tuple[Any, Price]:
         """Trace and price of recordings (samples, channels, steps), by the tables of a chip; see :meth:`price`."""
 
@@ -273,13 +283,18 @@ class Machine(ABC):
         return None
 
     def run(
-        self, events: EventArray, *, lengths: IntArray | None = None, spikes: bool = False, membranes: bool = False
+        self,
+        events: EventArray,
+        *,
+        lengths: IntArray | None = None,
+        spikes: bool = False,
+        membranes: bool = False,
     ) -> Run:
         """Run recordings, each from rest.
 
-        `events` are (samples, taxels, polarities, steps), any value but zero an event; the network's clocks tick by
-        themselves. `lengths` (samples,) are the data steps of each; `spikes` and `membranes` say what to keep. Raises
-        DataError for another sensor, NumericRangeError where a register overflows.
+        `events` are (samples, taxels, polarities, steps), any value but zero an event; the network's clocks
+        tick by themselves. `lengths` (samples,) are the data steps of each; `spikes` and `membranes` say
+        what to keep. Raises DataError for another sensor, NumericRangeError where a register overflows.
         """
         channels = with_clocks(events, self.netlist.clocks)
         return self._run(self.simulate(channels, lengths, spikes=spikes, membranes=membranes))
@@ -300,13 +315,15 @@ class Machine(ABC):
     ) -> tuple[Run, Price]:
         """Run recordings as :meth:`run` does, keep no spikes, and price them.
 
-        `bin_s` are the seconds of a bin at the pace of the sensor, `detail` is one of `details`, `table` the name of a
-        table of prices or a TOML file with some; `progress` is called with the number of recordings done. Raises
-        OptionError if there is no such table or detail.
+        `bin_s` are the seconds of a bin at the pace of the sensor, `detail` is one of `details`, `table` the
+        name of a table of prices or a TOML file with some; `progress` is called with the number of
+        recordings done. Raises OptionError if there is no such table or detail.
         """
         if detail not in self.details:
             allowed = ", ".join(self.details)
-            raise OptionError(f"--detail {detail}: {self.netlist.target} has no such price model; allowed: {allowed}")
+            raise OptionError(
+                f"--detail {detail}: {self.netlist.target} has no such price model; allowed: {allowed}"
+            )
         chip = self.target if table is None else with_tables(self.target, table)
         channels = with_clocks(events, self.netlist.clocks)
         trace, price = self.priced(channels, lengths, chip, bin_s, detail, progress)
@@ -320,7 +337,8 @@ class Machine(ABC):
     def beside(self, engine: str) -> Callable[[EventArray, IntArray | None], int] | None:
         """Make one of ``ENGINES`` ready to run recordings of some lengths; None for our own.
 
-        It gives the spikes and votes in which it and our simulator differ. OptionError or ModelError if there is none.
+        It gives the spikes and votes in which it and our simulator differ. OptionError or ModelError if
+        there is none.
         """
         if engine != ENGINES[0]:
             raise OptionError(f"--engine {engine}: is not for {self.target.title}; omit it")
@@ -328,7 +346,9 @@ class Machine(ABC):
 
     def votes(self, channels: EventArray) -> IntArray:
         """Votes (samples, classes) of recordings (samples, channels, steps), clocks among the channels."""
-        return class_counts(self.netlist, self.simulate(channels, None, spikes=False, membranes=False).counts.votes)
+        return class_counts(
+            self.netlist, self.simulate(channels, None, spikes=False, membranes=False).counts.votes
+        )
 
     def effects(self, channels: EventArray, changes: Changes) -> Effects:
         """What changes of a recording (channels, steps) bring about; runs each, unless the chip knows better."""
@@ -354,4 +374,6 @@ class Machine(ABC):
 
     def stream(self) -> Stream:
         """State of one grasp that runs bin after bin; OptionError if the simulator runs whole recordings only."""
-        raise OptionError(f"{self.target.title}: runs whole recordings, not bin after bin; give one for another chip")
+        raise OptionError(
+            f"{self.target.title}: runs whole recordings, not bin after bin; give one for another chip"
+        )

@@ -20,8 +20,9 @@ from spikeloom.runtime.machines.deviations import Deviations
 class Comparable(Machine):
     """Its layers are a float model's, neuron by neuron.
 
-    Runs count time as the float model does, and have membranes: registers before the comparison, so that ``register /
-    (scale * 2**MEMBRANE_SHIFT)`` is in the model's units. What the chip does not hold stays at zero.
+    Runs count time as the float model does, and have membranes: registers before the comparison, so that
+    ``register / (scale * 2**MEMBRANE_SHIFT)`` is in the model's units. What the chip does not hold stays at
+    zero.
     """
 
     @property
@@ -48,9 +49,9 @@ class Comparable(Machine):
 class Cumulative:
     """Sums over chip steps up to and with each; after a recording's end they stay as they are.
 
-    Votes (samples, steps, classes) are those after each step of the read-out, which lags `depth` chip steps behind the
-    data; operations, joules by table and seconds by table and the simple model are (samples, chip steps). Tables that
-    cannot price the run are missing, and all times for several chips.
+    Votes (samples, steps, classes) are those after each step of the read-out, which lags `depth` chip steps
+    behind the data; operations, joules by table and seconds by table and the simple model are (samples, chip
+    steps). Tables that cannot price the run are missing, and all times for several chips.
     """
 
     votes: IntArray
@@ -94,19 +95,22 @@ class Threaded(Comparable):
     """Several recordings can run side by side, a thread each."""
 
     @abstractmethod
-    def on_a_thread(self, channels: EventArray, lengths: IntArray, first: int) -> tuple[Iterable[BoolArray], IntArray]:
+    def on_a_thread(
+        self, channels: EventArray, lengths: IntArray, first: int
+    ) -> tuple[Iterable[BoolArray], IntArray]:
         """Spikes of each layer from the step `first` on, (samples, steps, neurons), and clipped membranes, (samples,).
 
-        Channels (samples, channels, steps) include the clocks. Raises NumericRangeError if a register overflows in any
-        recording.
+        Channels (samples, channels, steps) include the clocks. Raises NumericRangeError if a register
+        overflows in any recording.
         """
 
 
 class Memory(ABC):
     """What a chip stores of a network, and the float network beside it: damage is done to both alike.
 
-    The float network changes by as much in its own units, which is the same relative change up to rounding. Neurons are
-    those that the chip holds, in its order; one that it does not hold stays as it is in the float network.
+    The float network changes by as much in its own units, which is the same relative change up to rounding.
+    Neurons are those that the chip holds, in its order; one that it does not hold stays as it is in the
+    float network.
     """
 
     netlist: Netlist
@@ -185,7 +189,9 @@ LONGEST = 4096
 """Steps after which :attr:`Stoppable.least_intervals` looks no further: a spike may follow then."""
 
 
-def require_explainable(machine: Machine, path: str = "netlist", command: str = "this command") -> Explainable:
+def require_explainable(
+    machine: Machine, path: str = "netlist", command: str = "this command"
+) -> Explainable:
     """The same machine, if its differences can be explained; else an OptionError, which names file and command."""
     if not isinstance(machine, Explainable):
         raise _lacking(machine, path, command)

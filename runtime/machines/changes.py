@@ -26,7 +26,8 @@ class Changes(NamedTuple):
 class Effects(NamedTuple):
     """What changes bring about."""
 
-    # come, gone: (changes, classes) int64; votes that a changed run has and the known one has not, and the other way
+    # come, gone: (changes, classes) int64; votes that a changed run has and the known one has not, and the
+    # other way
     come: IntArray
     gone: IntArray
     end: IntArray  # (changes,) int64; chip step from which on a changed run is the known one, in every register
@@ -41,7 +42,8 @@ class Forgetting(NamedTuple):
     """What is open in a recording where nothing was known before a step."""
 
     lag: int  # Steps from an event to the first vote that it can alter
-    # quiet, back: (steps + 1,) int64; by that step, the first from which on every spike is known, and every register
+    # quiet, back: (steps + 1,) int64; by that step, the first from which on every spike is known, and every
+    # register
     quiet: IntArray
     back: IntArray
     # gone, come: (steps + 1, steps, classes) int16; votes that may go, and that may come, by step
@@ -76,7 +78,9 @@ def by_running(run: Callable[[Any], IntArray], channels: AnyArray, changes: Chan
             row[channel, step] ^= 1
         votes.append(run(changed))
     moved = np.concatenate([np.zeros((0, len(known)), np.int64), *votes]) - known
-    return Effects(np.maximum(moved, 0), np.maximum(-moved, 0), np.full(len(moved), channels.shape[1] + LATE))
+    return Effects(
+        np.maximum(moved, 0), np.maximum(-moved, 0), np.full(len(moved), channels.shape[1] + LATE)
+    )
 
 
 LATE = 1 << 20

@@ -51,7 +51,9 @@ class NetlistCheck(Shown):
     @property
     def text(self) -> str:
         """One line for people."""
-        return f"NOT what this network is lowered to: {'; '.join(self.faults)}" if self.faults else self.claim
+        return (
+            f"NOT what this network is lowered to: {'; '.join(self.faults)}" if self.faults else self.claim
+        )
 
 
 def sections(check: NetlistCheck) -> list[Section]:

@@ -86,7 +86,11 @@ def fingertip(taxels: Taxels) -> Drawing:
 
     n = len(taxels.events)
     turn = 2 * math.pi * np.arange(n) / n - math.pi / 2
-    points = np.stack([np.cos(turn), np.sin(turn)], axis=1) if taxels.positions_mm is None else taxels.positions_mm
+    points = (
+        np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        if taxels.positions_mm is None
+        else taxels.positions_mm
+    )
     panels = {"input events": taxels.events}
     if taxels.spikes is not None:
         panels[f"{taxels.layer} spikes on the chip"] = taxels.spikes
@@ -101,7 +105,9 @@ def fingertip(taxels: Taxels) -> Drawing:
                 drawing.tips.append((axes, x, y, f"taxel {taxel}: {value:,.1f} {name} in a mean recording"))
         radii = largest * (0.25 + 0.75 * np.sqrt(values / (values.max() or 1.0)))
         for taxel, ((x, y), radius) in enumerate(zip(points.tolist(), radii, strict=True)):
-            axes.add_patch(Circle((x, y), radius, facecolor=COLOURS[1], edgecolor=GREY, alpha=0.7, lw=0.6, zorder=2))
+            axes.add_patch(
+                Circle((x, y), radius, facecolor=COLOURS[1], edgecolor=GREY, alpha=0.7, lw=0.6, zorder=2)
+            )
             if n <= 100:
                 axes.text(x, y, str(taxel), ha="center", va="center", fontsize=6, zorder=3)
         axes.set(title=f"{name}, mean recording", aspect="equal")

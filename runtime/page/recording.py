@@ -146,7 +146,9 @@ def recording(machine: Comparable, loaded: LoadedNetwork, data: Recordings, inde
             [membranes[0] for membranes in membranes_of(loaded.network, events)],
             [
                 registers[0] / (population.scale * (1 << MEMBRANE_SHIFT))
-                for population, registers in zip(machine.integer.populations, run.membranes.values(), strict=True)
+                for population, registers in zip(
+                    machine.integer.populations, run.membranes.values(), strict=True
+                )
             ],
         ),
     )

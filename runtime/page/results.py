@@ -109,7 +109,9 @@ class Report(Shown):
     figures: Sequence[Block] = field(metadata=HIDDEN)
 
 
-def taxels(machine: Machine, loaded: LoadedNetwork, data: Recordings, counts: IntArray, sensor: str | None) -> Taxels:
+def taxels(
+    machine: Machine, loaded: LoadedNetwork, data: Recordings, counts: IntArray, sensor: str | None
+) -> Taxels:
     """Taxels, the graph over them where there is one, and what each sends and its neurons fire in a mean recording.
 
     `counts` are those of the chip's :class:`Run`; `sensor` is what the user named by ``--taxels``.
@@ -185,7 +187,9 @@ def _commands(request: ReportRequest, recording: str, bin_s: float) -> dict[str,
     """What to type, and what each is for; how the netlist was compiled is among its facts."""
 
     def name(given: Any) -> str:
-        path = "" if given is None else str(getattr(given, "source", given))  # recordings that Python handed over
+        path = (
+            "" if given is None else str(getattr(given, "source", given))
+        )  # recordings that Python handed over
         return Path(path).name or path
 
     net = name(request.netlist)

@@ -63,7 +63,9 @@ def sections(report: Report) -> list[Section]:
             [Text(in_a_sentence(report.verify)), Facts(_cards(report)), *verdict_sections(report.verify)],
         ),
         Section("Decisions", _decisions(report.decisions)),
-        Section("Cores", [*_of_chip(report.described), *([] if report.cores is None else _cores(report.cores))]),
+        Section(
+            "Cores", [*_of_chip(report.described), *([] if report.cores is None else _cores(report.cores))]
+        ),
         Section("Taxels", _taxels(report.taxels)),
         Section("One recording", [] if report.recording is None else _recording(report.recording)),
         Section("Energy and time", [*_of_chip(report.price.outcome), Section("", report.figures)]),
@@ -126,7 +128,9 @@ def _decisions(decisions: Decisions) -> list[Block]:
     classes = [[str(k), str(ours[k].sum()), str(ours[k, k]), str(chip[k, k])] for k in present]
     moved = [
         [file, *map(str, decided)]
-        for file, *decided in zip(decisions.files, decisions.labels, decisions.model, decisions.chip, strict=True)
+        for file, *decided in zip(
+            decisions.files, decisions.labels, decisions.model, decisions.chip, strict=True
+        )
         if decided[1] != decided[2]
     ]
     tables = [
@@ -220,9 +224,7 @@ def _taxels(taxels: Taxels) -> list[Block]:
         spikes = [] if taxels.spikes is None else [f"{taxels.spikes[taxel]:,.1f}"]
         rows.append([str(taxel), str(near), f"{taxels.events[taxel]:,.1f}", *spikes])
     graph = "no taxel graph" if taxels.graph is None else f"graph {taxels.graph} with {len(edges)} edges"
-    unknown = (
-        "; drawn on a circle, as their positions are not known: add --taxels COORDS.csv and the --graph of training"
-    )
+    unknown = "; drawn on a circle, as their positions are not known: add --taxels COORDS.csv and the --graph of training"
     where = unknown if taxels.positions_mm is None else ""
     caption = "Discs grow with what a taxel sends, and with what its first-layer neurons fire where there is a graph."
     table = Table(head, rows, "Activity in a mean recording, the busiest first", most=LISTED)
@@ -289,7 +291,9 @@ def _raster(layer: LayerRaster, steps: int, place: int) -> Figure:
     entries = sorted((*pair, side) for side in ("float", "chip") for pair in spikes[side].tolist())
     listed = [[str(step), str(neuron), f"{side} only"] for step, neuron, side in entries[:SPIKES]]
     more = f", the first {SPIKES:,} of {len(entries):,} (--json has all)" if len(entries) > SPIKES else ""
-    numbers = [Table(["step", kind, "fires"], listed, f"Spikes of one side only{more}", most=0)] if listed else []
+    numbers = (
+        [Table(["step", kind, "fires"], listed, f"Spikes of one side only{more}", most=0)] if listed else []
+    )
     title = f"Spikes of {layer.name}, float model and chip"
     return Figure(
         f"raster-{place}",

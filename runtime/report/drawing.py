@@ -74,7 +74,9 @@ class Drawing:
         text = text[text.index("<svg") :]
         for index, colour in enumerate(COLOURS):
             text = text.replace(colour, f"var(--c{index})")
-        assert re.fullmatch(r"[a-z0-9-]+", name), "names are ours: nothing from a file becomes a part of the page"
+        assert re.fullmatch(r"[a-z0-9-]+", name), (
+            "names are ours: nothing from a file becomes a part of the page"
+        )
         return re.sub(r'(id="|href="#|url\(#)', rf"\1{name}-", text)
 
     def values(self) -> JsonObject:

@@ -15,7 +15,9 @@ def percent(right: int, total: int) -> str:
     '88.19 % (127 of 144; 95 % interval 81.9 … 92.5)'
     """
     low, high = wilson(right, total)
-    return f"{100 * right / total:.2f} % ({right} of {total}; 95 % interval {100 * low:.1f} … {100 * high:.1f})"
+    return (
+        f"{100 * right / total:.2f} % ({right} of {total}; 95 % interval {100 * low:.1f} … {100 * high:.1f})"
+    )
 
 
 def si(value: float, unit: str) -> str:

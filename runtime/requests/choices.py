@@ -36,7 +36,9 @@ class SensorChoice(Request):
 
     graph: str | None = option(f"taxel graph: {CHOICES}", group="network")
     taxels: str | None = option(
-        "your own sensor: number of taxels, or their positions x,y[,z] in mm", metavar="N|COORDS.csv", group="network"
+        "your own sensor: number of taxels, or their positions x,y[,z] in mm",
+        metavar="N|COORDS.csv",
+        group="network",
     )
     edges: str | None = option("your own graph: source,target", metavar="EDGES.csv", group="network")
     directed: bool = option("take --edges as they are, one way", default=False, group="network")
@@ -52,7 +54,9 @@ class CheckpointChoice(SensorChoice):
         choices=WEIGHTS,
         group="network",
     )
-    beta: float | None = option("membrane decay, where the file does not say (default: 0.2)", group="network")
+    beta: float | None = option(
+        "membrane decay, where the file does not say (default: 0.2)", group="network"
+    )
     theta: float | None = option("threshold, where the file does not say (default: 0.5)", group="network")
 
 
@@ -60,7 +64,9 @@ class CheckpointChoice(SensorChoice):
 class NetworkChoice(CheckpointChoice):
     """How a network of any format is read."""
 
-    polarities: int | None = option("of an ONNX or NIR input, where its shape is flat", metavar="N", group="network")
+    polarities: int | None = option(
+        "of an ONNX or NIR input, where its shape is flat", metavar="N", group="network"
+    )
     polarities_first: bool | None = option(
         "whether they are the first axis, where the shape of an ONNX or NIR input does not say",
         group="network",
@@ -89,7 +95,9 @@ class NetworkChoice(CheckpointChoice):
 class ComparisonChoice(NetlistChoice, NetworkChoice):
     """Which compiled network, beside which float model."""
 
-    checkpoint: str | Network = option("its float model", required=True, metavar=NETWORK_FILES, group="network")
+    checkpoint: str | Network = option(
+        "its float model", required=True, metavar=NETWORK_FILES, group="network"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

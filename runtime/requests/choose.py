@@ -33,14 +33,18 @@ class SmallestRequest(SensorChoice, DataChoice):
     store: str | None = option("what is measured (default: NET.sqlite, beside the netlist)", metavar="FILE")
     jobs: int | None = option("processes at a time (default: one a core)", metavar="N")
     html: str | None = option("write a page, too", metavar="PAGE.html")
-    output: str = option("netlist; NET.pt is the network", required=True, metavar="NET.loom", flags=("-o", "--output"))
+    output: str = option(
+        "netlist; NET.pt is the network", required=True, metavar="NET.loom", flags=("-o", "--output")
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChartRequest(CheckpointChoice, DataChoice):
     """Accuracy against energy, time and size for a grid of configurations, and which one to deploy."""
 
-    checkpoints: tuple[str, ...] = option("trained networks of one data set", positional=True, metavar="CKPT")
+    checkpoints: tuple[str, ...] = option(
+        "trained networks of one data set", positional=True, metavar="CKPT"
+    )
     grid: str | None = option(
         "configurations, as in bits=2-6,8,planes=1-2,window=25-100%% (default: bits=2-6,8,window=25-100%%)",
         metavar="AXIS=V,V,…",
@@ -60,9 +64,15 @@ class LeanRequest(NetworkChoice, RecordingsChoice):
     """What of a network its recordings do not need, and a netlist without it."""
 
     checkpoint: str = option("trained network", positional=True, metavar=NETWORK_FILES)
-    differ: float = option("share of training decisions that the netlist may change", default=0.01, metavar="X")
-    output: str | None = option("write the netlist without what may go", metavar="OUT.loom", flags=("-o", "--output"))
-    network: str | None = option("write the float network without dense neurons that may go", metavar="OUT.pt")
+    differ: float = option(
+        "share of training decisions that the netlist may change", default=0.01, metavar="X"
+    )
+    output: str | None = option(
+        "write the netlist without what may go", metavar="OUT.loom", flags=("-o", "--output")
+    )
+    network: str | None = option(
+        "write the float network without dense neurons that may go", metavar="OUT.pt"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +81,8 @@ class AnytimeRequest(NetlistChoice, RecordingsChoice):
 
     calibrate: str | None = option("recordings whose train split says when a vote is sure", metavar="PATH")
     held_out: bool = option(
-        "the network was not trained on --calibrate: its decisions count, not races for second place", default=False
+        "the network was not trained on --calibrate: its decisions count, not races for second place",
+        default=False,
     )
     differ: float | None = option("share of them that may end otherwise (default: 0)", metavar="X")
     output: str | None = option(

@@ -49,7 +49,9 @@ class WatchRequest(NetlistChoice):
         choices=("zero", "first"),
     )
     speed: str = option(
-        "keep to the wall clock, or go on as soon as events allow it", default="full", choices=("real", "full")
+        "keep to the wall clock, or go on as soon as events allow it",
+        default="full",
+        choices=("real", "full"),
     )
     until_sure: float | None = option(
         "end a grasp of --bins once nothing can change the vote, or it leads by A*sqrt(bins left) (see anytime)",

@@ -1,7 +1,8 @@
 """What a user may say: a field of a request has a type, a default, and one sentence of help.
 
-From the fields of a request derive the options of its command, ``--help``, the line that repeats it, the keywords and
-the documentation of its Python function, and what is sent to workers. This module imports nothing heavy.
+From the fields of a request derive the options of its command, ``--help``, the line that repeats it, the
+keywords and the documentation of its Python function, and what is sent to workers. This module imports
+nothing heavy.
 """
 
 from __future__ import annotations
@@ -108,7 +109,9 @@ def _value(each: Field[Any], value: Any) -> Any:
         fault = f"{each.name} {reprlib.repr(value)}: {type(value).__name__} found"
         raise OptionError(f"{fault}, allowed: {ALLOWED.get(kind, kind)}; give one")
     if choices and not set(taken if kind == "tuple" else [taken]) <= set(choices):
-        raise OptionError(f"{each.name} {value!r}: allowed: {', '.join(map(str, choices))}; give one of these")
+        raise OptionError(
+            f"{each.name} {value!r}: allowed: {', '.join(map(str, choices))}; give one of these"
+        )
     return value if taken is None else taken  # networks and recordings stay what they are
 
 
@@ -135,7 +138,10 @@ def documented(kind: type[Request]) -> Callable[[F], F]:
         lines = [] if HEADING in text else ["", HEADING]
         for name, annotation in function.__annotations__.items():
             if name in options:
-                lines += [f"{name} : {annotation}", f"    {options[name].metadata['text']}".replace("%%", "%")]
+                lines += [
+                    f"{name} : {annotation}",
+                    f"    {options[name].metadata['text']}".replace("%%", "%"),
+                ]
         function.__doc__ = "\n".join([text, *lines]) + raises + errors
         return function
 

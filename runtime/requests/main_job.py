@@ -43,17 +43,27 @@ class CompileRequest(NetworkChoice):
     weight_bits: str | None = option(
         "storage width, one or one a layer: 2 to 6 or 8 (default: 8)", metavar="N[,N]", group="storage"
     )
-    planes: str | None = option("times a synapse is stored, 1 to 3 (default: 1)", metavar="N[,N]", group="storage")
-    scale_groups: str | None = option("scales in a layer, 1 to 8 (default: 1)", metavar="N[,N]", group="storage")
-    spike_exact: bool = option(
-        "add planes and scales until the training spikes are the float model's", default=False, group="storage"
+    planes: str | None = option(
+        "times a synapse is stored, 1 to 3 (default: 1)", metavar="N[,N]", group="storage"
     )
-    keep_all: bool = option("keep neurons that never fire or reach no neuron", default=False, group="storage")
+    scale_groups: str | None = option(
+        "scales in a layer, 1 to 8 (default: 1)", metavar="N[,N]", group="storage"
+    )
+    spike_exact: bool = option(
+        "add planes and scales until the training spikes are the float model's",
+        default=False,
+        group="storage",
+    )
+    keep_all: bool = option(
+        "keep neurons that never fire or reach no neuron", default=False, group="storage"
+    )
     prune_unused: bool = option(
         "leave out neurons that never fired on the training split, too", default=False, group="storage"
     )
     share_lists: bool = option(
-        "with --calibrate: round what a convolution repeats alike, for less memory", default=False, group="storage"
+        "with --calibrate: round what a convolution repeats alike, for less memory",
+        default=False,
+        group="storage",
     )
     calibrate: str | Recordings | None = option(
         "recordings whose train split chooses storage and scales", metavar="PATH", group="storage"
@@ -107,11 +117,15 @@ class VerifyRequest(ComparisonChoice, SplitChoice):
     window: str = option(
         "first part of every recording, as in 50%%", default="100%", metavar="PERCENT", group="recordings"
     )
-    original: str | None = option("float model for E2 and E3 (default: the weights of --checkpoint)", metavar="CKPT")
+    original: str | None = option(
+        "float model for E2 and E3 (default: the weights of --checkpoint)", metavar="CKPT"
+    )
     engine: str = option(
         "onnx: onnxruntime runs the integer graph beside our engine", default=ENGINES[0], choices=ENGINES
     )
-    min_agreement: float | None = option(f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})", metavar="X")
+    min_agreement: float | None = option(
+        f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})", metavar="X"
+    )
     require: str | None = option(
         "levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
         metavar="E0,E2=X,E3=X",
@@ -133,7 +147,9 @@ class EstimateRequest(NetlistChoice, RecordingsChoice):
         group="depth and prices",
     )
     table: str | None = option(
-        "energy or time by this table alone, or by your own", metavar="NAME|FILE.toml", group="depth and prices"
+        "energy or time by this table alone, or by your own",
+        metavar="NAME|FILE.toml",
+        group="depth and prices",
     )
     against_processor: bool = option(
         "train a linear rule for a small processor on the same recordings, and hold its costs beside these",

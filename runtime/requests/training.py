@@ -54,8 +54,12 @@ class TrainRequest(SensorChoice, DataChoice):
     clocks: int | None = option("clock inputs: each is active in one K-th of the recording", metavar="K")
     features: int | None = option("features of the first layer at each place", metavar="N")
     hops: int | None = option("hops of a tactilesgnet's graph convolution (default: 3)", metavar="K")
-    hidden: str | None = option("neurons of each dense layer but the last (default: 128,256)", metavar="N[,N]")
-    copies: int | None = option(f"axons per input of {NATIVE} (default: {DEFAULT_COPIES})", choices=tuple(BASES))
+    hidden: str | None = option(
+        "neurons of each dense layer but the last (default: 128,256)", metavar="N[,N]"
+    )
+    copies: int | None = option(
+        f"axons per input of {NATIVE} (default: {DEFAULT_COPIES})", choices=tuple(BASES)
+    )
     thresholds: str | None = option(
         "event counts at which counters spike (default: 1,4,16,64)", metavar="K[,K]", group="counters"
     )
@@ -97,7 +101,9 @@ class TrainRequest(SensorChoice, DataChoice):
 class FinetuneRequest(NetworkChoice, DataChoice):
     """Fine-tune a network on the integers of the chip, down to ternary weights."""
 
-    checkpoint: str | Network = option("trained network, or pretrained:NAME", positional=True, metavar=NETWORK_FILES)
+    checkpoint: str | Network = option(
+        "trained network, or pretrained:NAME", positional=True, metavar=NETWORK_FILES
+    )
     target: str = option("chip", default=DEFAULT_TARGET)
     weight_bits: str | None = option(
         "storage width, for all layers or one each: 2 to 6 or 8 (default: as compile --calibrate chooses)",
@@ -120,6 +126,10 @@ class FinetuneRequest(NetworkChoice, DataChoice):
 class JoinRequest(Request):
     """Join trained networks into one whose votes add up."""
 
-    checkpoints: tuple[str, ...] = option("networks of one system, graph and timing", positional=True, metavar="CKPT")
-    weights: str | None = option("epoch to take from each (default: the first of these that it holds)", choices=WEIGHTS)
+    checkpoints: tuple[str, ...] = option(
+        "networks of one system, graph and timing", positional=True, metavar="CKPT"
+    )
+    weights: str | None = option(
+        "epoch to take from each (default: the first of these that it holds)", choices=WEIGHTS
+    )
     output: str = option("checkpoint to write", required=True, metavar="OUT.pt", flags=("-o", "--output"))

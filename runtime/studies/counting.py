@@ -36,12 +36,16 @@ class CountersRecord:
     data_sha256: str
     plan: Plan
     strength: float  # Of the rule, chosen by cross-validation
-    cross_validation: Mapping[str, float]  # Accuracy of each strength on training recordings that it did not see
+    cross_validation: Mapping[
+        str, float
+    ]  # Accuracy of each strength on training recordings that it did not see
     counters: int
     validation: Held  # What cross-validation classified correctly, at this strength
     test_correct: int
     test_samples: int
-    bin_s: float | None = field(default=None, metadata=OPTIONAL)  # Seconds of a bin, where the recordings were events
+    bin_s: float | None = field(
+        default=None, metadata=OPTIONAL
+    )  # Seconds of a bin, where the recordings were events
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -66,7 +70,9 @@ def decisions_of(counters: Counters, data: Recordings) -> IntArray:
     return np.concatenate(decided)
 
 
-def train_counters(plan: Plan, training: Recordings, test: Recordings, command: str, output: str) -> CountersReport:
+def train_counters(
+    plan: Plan, training: Recordings, test: Recordings, command: str, output: str
+) -> CountersReport:
     """Train a counting network, write it, and read the test split."""
     progress("cross-validation")
     classes = int(training.labels.max()) + 1
@@ -83,7 +89,9 @@ def train_counters(plan: Plan, training: Recordings, test: Recordings, command: 
         strength=fitted.strength,
         cross_validation={f"{each:g}": accuracy for each, accuracy in fitted.accuracy.items()},
         counters=len(made.counter),
-        validation=Held(correct=round(fitted.accuracy[fitted.strength] * len(training)), samples=len(training)),
+        validation=Held(
+            correct=round(fitted.accuracy[fitted.strength] * len(training)), samples=len(training)
+        ),
         test_correct=int(np.sum(decisions_of(made, test) == test.labels)),
         test_samples=len(test),
         bin_s=training.bin_s,
@@ -103,4 +111,6 @@ def counters_sections(report: CountersReport) -> Iterator[Section]:
         f"test accuracy: {percent(made.test_correct, made.test_samples)}",
         f"written: {report.file}, sha256 {report.sha256}",
     ]
-    yield Section("Training", [Text(made.command), Table(["strength", "right when left out"], rows), *map(Text, lines)])
+    yield Section(
+        "Training", [Text(made.command), Table(["strength", "right when left out"], rows), *map(Text, lines)]
+    )

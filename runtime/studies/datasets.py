@@ -80,7 +80,9 @@ def describe(recordings: Recordings) -> Described:
     middle = float(np.median(total[alive])) if alive.any() else 0.0
     rate = per_taxel / (lengths.sum() * bin_s)
     totals = {name: float(rate[:, polarity].sum()) for polarity, name in enumerate(("falling", "rising"))}
-    labels = dict(zip(*(found.tolist() for found in np.unique(recordings.labels, return_counts=True)), strict=True))
+    labels = dict(
+        zip(*(found.tolist() for found in np.unique(recordings.labels, return_counts=True)), strict=True)
+    )
     ends = {"shortest": lengths.min(), "median": np.median(lengths), "longest": lengths.max()}
     return Described(
         source=recordings.source,
@@ -110,7 +112,13 @@ def described_sections(result: Described) -> Iterator[Section]:
     short, middle, long = (f"{seconds:g}" for seconds in duration.values())
     lasts = f"{long} s" if short == long else f"{short} … {long} s (median {middle} s)"
     each = sorted(set(labels.values()))
-    spread = number(each[0], "recording") if len(each) == 1 else f"{each[0]} … {each[-1]} recordings" if each else ""
+    spread = (
+        number(each[0], "recording")
+        if len(each) == 1
+        else f"{each[0]} … {each[-1]} recordings"
+        if each
+        else ""
+    )
     lines = [
         f"{result.source}, {result.split}: {number(result.recordings, 'recording')}, "
         f"{number(result.taxels, 'taxel')}, {lasts} in bins of {result.bin_s:g} s",

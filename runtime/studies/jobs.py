@@ -1,7 +1,7 @@
 """Many measurements side by side, each kept as soon as it is there.
 
-A sweep can be ended at any time, by Ctrl-C, a kill or a loss of power. What was measured is in its store, by keys that
-name everything that decides a result; the same command goes on from there. joblib does the work.
+A sweep can be ended at any time, by Ctrl-C, a kill or a loss of power. What was measured is in its store, by
+keys that name everything that decides a result; the same command goes on from there. joblib does the work.
 """
 
 import _thread
@@ -69,10 +69,10 @@ def sweep(
 ) -> dict[str, Any]:
     """Measure jobs, as far as the store does not know them; their results by key, of a `kind` that is decoded.
 
-    They are begun in this order; of those with equal keys the first is measured. `measure` makes JSON values of a job,
-    a function of a module, since it crosses process borders. `store` is an SQLite file in a folder that exists. `jobs`
-    are processes at a time (one a core), whose libraries use one thread each; `label` says what is done; half-written
-    files are removed from folders that are its `own`.
+    They are begun in this order; of those with equal keys the first is measured. `measure` makes JSON values
+    of a job, a function of a module, since it crosses process borders. `store` is an SQLite file in a folder
+    that exists. `jobs` are processes at a time (one a core), whose libraries use one thread each; `label`
+    says what is done; half-written files are removed from folders that are its `own`.
 
     What a measurement raises is raised with notes that name it and say what is kept, as does the text of a
     KeyboardInterrupt; UnfinishedError, if a process died.
@@ -94,14 +94,14 @@ def sweep(
         waiting = [first[key] for key in keys if key not in results]
 
         def standing() -> str:
-            return (
-                f"{sum(key in results for key in keys)} of {len(keys)} measurements of this stage are kept in {store}"
-            )
+            return f"{sum(key in results for key in keys)} of {len(keys)} measurements of this stage are kept in {store}"
 
         progress = Progress(len(waiting))
         try:
             progress(0, label)
-            for done, (index, found) in enumerate(side_by_side(waiting, partial(_named, measure), jobs=jobs), 1):
+            for done, (index, found) in enumerate(
+                side_by_side(waiting, partial(_named, measure), jobs=jobs), 1
+            ):
                 key = waiting[index].key
                 text = json.dumps(found, allow_nan=False)
                 with kept:
@@ -145,9 +145,9 @@ def side_by_side(
 ) -> Iterator[tuple[int, AResult]]:
     """Work on payloads, begun in this order, in processes of their own in this folder; on a single one here.
 
-    Yields the place of a payload and what `run`, a function of a module, made of it, as they come. Raises what `run`
-    raised; UnfinishedError, if a process ended while it worked, and with it what the others had not finished. If all
-    stand still what they had not finished is begun once more.
+    Yields the place of a payload and what `run`, a function of a module, made of it, as they come. Raises
+    what `run` raised; UnfinishedError, if a process ended while it worked, and with it what the others had
+    not finished. If all stand still what they had not finished is begun once more.
     """
     require_least({"jobs": jobs}, jobs=1)
     processes = min(jobs or os.cpu_count() or 1, len(payloads))
@@ -165,13 +165,17 @@ def side_by_side(
     left = dict(enumerate(payloads))
     stood = False
     with parallel_config("loky", n_jobs=processes, inner_max_num_threads=1), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "A worker stopped")  # one that has grown is replaced, and nothing lost
+        warnings.filterwarnings(
+            "ignore", "A worker stopped"
+        )  # one that has grown is replaced, and nothing lost
         while left:
             ended = threading.Event()
             watch = threading.Thread(target=_killed_when_still, args=[ended], daemon=True)
             watch.start()
             work = Parallel(return_as="generator_unordered", batch_size=1)
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # of new processes, until they work
+            before = signal.pthread_sigmask(
+                signal.SIG_BLOCK, {signal.SIGINT}
+            )  # of new processes, until they work
             try:
                 found = work(attempt(index, payload) for index, payload in list(left.items()))
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -184,7 +188,9 @@ def side_by_side(
                     raise UnfinishedError(f"{why}; use fewer --jobs") from error
                 stood = True
                 progress("")
-                tell(f"{number(len(left), 'measurement')} stood still for {STILL_S:g} s: given up, and begun once more")
+                tell(
+                    f"{number(len(left), 'measurement')} stood still for {STILL_S:g} s: given up, and begun once more"
+                )
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
                 ended.set()
@@ -200,7 +206,9 @@ def _killed_when_still(ended: threading.Event) -> None:
             for children in Path(f"/proc/{os.getpid()}/task").glob("*/children"):
                 for child in children.read_text().split():
                     if b"popen_loky" in Path(f"/proc/{child}/cmdline").read_bytes():
-                        used[int(child)] = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[11:13]
+                        used[int(child)] = (
+                            Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[11:13]
+                        )
             if used and used == before:
                 for process in used:
                     os.kill(process, signal.SIGKILL)
@@ -263,7 +271,9 @@ def only_one(output: Path) -> Iterator[None]:
     try:
         lock.acquire(timeout=0)
     except Timeout:
-        raise OptionError(f"{output}: another process is working on it; wait for it, or give another output") from None
+        raise OptionError(
+            f"{output}: another process is working on it; wait for it, or give another output"
+        ) from None
     except NotImplementedError:  # a network's file system without locks
         yield
         return

@@ -1,12 +1,12 @@
 """The same decision on a small processor: a linear rule in whole numbers, trained on the same recordings.
 
-A program raises the count of an event's channel; where that reaches a threshold, it adds a row of whole weights, as
-wide as the netlist's, to the sums of the classes, of which the largest decides: a counting network that reads its sums
-exactly. Thresholds and parts of the recording are chosen by cross-validation in the training split, the fewest
-additions that are not shown to be worse than the best.
+A program raises the count of an event's channel; where that reaches a threshold, it adds a row of whole
+weights, as wide as the netlist's, to the sums of the classes, of which the largest decides: a counting
+network that reads its sums exactly. Thresholds and parts of the recording are chosen by cross-validation in
+the training split, the fewest additions that are not shown to be worse than the best.
 
-A decision takes at least its arithmetic and memory accesses [1]_, at most the cycles of a simple program [2]_ on a
-microcontroller that one can buy. In between it sleeps, or idles with all clocks running.
+A decision takes at least its arithmetic and memory accesses [1]_, at most the cycles of a simple program
+[2]_ on a microcontroller that one can buy. In between it sleeps, or idles with all clocks running.
 
 References
 ----------
@@ -25,7 +25,14 @@ from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.targets.base import Quantity
 from spikeloom.compiler.types import BoolArray, FloatArray
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.training.counters import Plan, counter_spikes, counters_of, cross_validate, fit, run_counters
+from spikeloom.models.training.counters import (
+    Plan,
+    counter_spikes,
+    counters_of,
+    cross_validate,
+    fit,
+    run_counters,
+)
 from spikeloom.runtime.machines.base import Price
 from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.report.numbers import percent, si
@@ -43,14 +50,19 @@ PRICES = {
     "access_32": Quantity(value=20.0, unit="pJ of 64 bits in 32 KiB", source=ARITHMETIC),
     "access_1024": Quantity(value=100.0, unit="pJ of 64 bits in 1 MiB", source=ARITHMETIC),
     "cycle": Quantity(value=300.0, unit="pJ", source=f"{SOLD}100 µA/MHz", confidence="secondary"),
-    "asleep": Quantity(value=3.6e-3, unit="mW", source=f"{SOLD}1.2 µA, memory kept (Stop 2)", confidence="secondary"),
-    "idle": Quantity(value=7.2, unit="mW", source=f"{SOLD}30 µA/MHz at 80 MHz (Sleep)", confidence="secondary"),
+    "asleep": Quantity(
+        value=3.6e-3, unit="mW", source=f"{SOLD}1.2 µA, memory kept (Stop 2)", confidence="secondary"
+    ),
+    "idle": Quantity(
+        value=7.2, unit="mW", source=f"{SOLD}30 µA/MHz at 80 MHz (Sleep)", confidence="secondary"
+    ),
 }
 """Of a processor: events in pJ, static power in mW."""
 
 CLOCK_HZ = 80e6
 
-# Load, raise and store a count, load its threshold, compare, branch; load a weight and a sum, add, store, count on
+# Load, raise and store a count, load its threshold, compare, branch; load a weight and a sum, add, store,
+# count on
 EVENT_CYCLES = 12
 ADD_CYCLES = 8
 
@@ -70,7 +82,9 @@ class Processor:
     most_j: float
 
 
-def processor(*, adds: float, multiplies: float = 0.0, accesses: Mapping[int, float], cycles: float) -> Processor:
+def processor(
+    *, adds: float, multiplies: float = 0.0, accesses: Mapping[int, float], cycles: float
+) -> Processor:
     """Price an inference; `accesses` are those to 64 bits, by the bytes of a memory, the model's the last."""
     least = adds * PRICES["add"].value + multiplies * PRICES["multiply"].value
     for held, count in accesses.items():
@@ -101,8 +115,8 @@ class Side:
 class Comparison:
     """A netlist and the rule of a processor on the same recordings, of mean `events` and `seconds`.
 
-    `break_even` are the events a second from which on the chip takes less, where every price favours it; None where no
-    rate is enough.
+    `break_even` are the events a second from which on the chip takes less, where every price favours it;
+    None where no rate is enough.
     """
 
     plan: Plan
@@ -125,7 +139,8 @@ def against_processor(
 ) -> Comparison:
     """Train a rule on the training recordings, in their own bins, and hold a netlist against it.
 
-    The netlist's weights have so many `bits`; `price` and `right` (samples,) are of its run of the `test` recordings.
+    The netlist's weights have so many `bits`; `price` and `right` (samples,) are of its run of the `test`
+    recordings.
     """
     chosen = _rule(training, bits)
     rule = chosen.counters
@@ -139,11 +154,16 @@ def against_processor(
     work = processor(
         adds=2 * events + added + rule.classes,
         # of a sum 32 bits, there and back
-        accesses={2 * channels: 3 * events + added, len(rule.counter) * rule.classes * bits // 8: added * bits / 64},
+        accesses={
+            2 * channels: 3 * events + added,
+            len(rule.counter) * rule.classes * bits // 8: added * bits / 64,
+        },
         cycles=EVENT_CYCLES * events + ADD_CYCLES * (added + rule.classes),
     )
 
-    def side(correct: BoolArray, dynamic: Iterable[float], static: Iterable[float], fastest_s: float) -> Side:
+    def side(
+        correct: BoolArray, dynamic: Iterable[float], static: Iterable[float], fastest_s: float
+    ) -> Side:
         joules, watts = ((min(each), max(each)) for each in map(list, (dynamic, static)))
         low, high = (each + power * seconds for each, power in zip(joules, watts, strict=True))
         speed = events / fastest_s if fastest_s else math.inf
@@ -151,7 +171,9 @@ def against_processor(
         return Side(correct=count, dynamic_j=joules, static_w=watts, pace_j=(low, high), events_per_s=speed)
 
     fastest = next((float(each.mean()) for each in price.time_s.values()), 0.0)
-    chip = side(right, (float(each.mean()) for each in price.dynamic_j.values()), price.static_w.values(), fastest)
+    chip = side(
+        right, (float(each.mean()) for each in price.dynamic_j.values()), price.static_w.values(), fastest
+    )
     static = (1e-3 * PRICES[name].value for name in ("asleep", "idle"))
     small = side(ours, (work.least_j, work.most_j), static, work.cycles / CLOCK_HZ)
     gain = (small.dynamic_j[1] - chip.dynamic_j[0]) / events
@@ -198,7 +220,9 @@ def _rule(training: Recordings, bits: int) -> _Rule:
         counters = counters_of(data, fitted, training, classes)
         spikes = int(counter_spikes(counters, data).sum(dtype=np.int64))
         rules.append(_Rule(counters=counters, plan=plan, right=right.astype(float), spikes=spikes))
-    close = choose(rules, lambda rule: rule.values, lambda best, other: is_worse(best.right, other.right)).allowed
+    close = choose(
+        rules, lambda rule: rule.values, lambda best, other: is_worse(best.right, other.right)
+    ).allowed
     return min(close, key=lambda rule: rule.spikes)
 
 
@@ -227,7 +251,9 @@ def sections(found: Comparison) -> Iterator[Section]:
         ends = ((side.dynamic_j, "J"), (side.static_w, "W"), (side.pace_j, "J"))
         cells = [f"{si(low, unit)} … {si(high, unit)}" for (low, high), unit in ends]
         rows.append([name, percent(side.correct, found.samples), *cells])
-    table = Table(["", "right", "dynamic energy", "static power", f"a decision in {found.seconds:.3g} s"], rows)
+    table = Table(
+        ["", "right", "dynamic energy", "static power", f"a decision in {found.seconds:.3g} s"], rows
+    )
     even = "break-even: at no event rate, an event takes more on the chip by any price"
     if found.break_even is not None:
         fastest = min(found.chip.events_per_s, found.processor.events_per_s)

@@ -1,13 +1,14 @@
 """Event lines in, the running decision out.
 
-A line is ``time_s,taxel,polarity``. Bins are stepped in order, empty ones included, so that the final counts are those
-of ``run`` on the same recording. A bin is stepped
+A line is ``time_s,taxel,polarity``. Bins are stepped in order, empty ones included, so that the final counts
+are those of ``run`` on the same recording. A bin is stepped
 
 * at full speed, as soon as a line of a later bin arrives;
 * in real time, not before its end by the wall clock, which the first event of a grasp sets; and at the latest one bin
   after its end, so that decisions go on while nothing touches the sensor.
 
-An event whose bin was stepped already is late; what comes after a grasp's decision is counted apart. Neither is used.
+An event whose bin was stepped already is late; what comes after a grasp's decision is counted apart. Neither
+is used.
 """
 
 import json
@@ -164,9 +165,13 @@ class Watch:
         self.shown = None
         after = f"after {number(bins, 'bin')} ({self.bin_s * bins:f} s)"
         line = f"grasp {self.found.grasps}: {_standing(last)}{', sure' if early else ''}, {after}"
-        self._show(line, "grasp", self.found.grasps, bins, last, {} if self.may_end is None else {"early": early})
+        self._show(
+            line, "grasp", self.found.grasps, bins, last, {} if self.may_end is None else {"early": early}
+        )
 
-    def _show(self, line: str, kind: str, grasp: int, bins: int, step: Step, more: JsonObject | None = None) -> None:
+    def _show(
+        self, line: str, kind: str, grasp: int, bins: int, step: Step, more: JsonObject | None = None
+    ) -> None:
         """Print a line, if there is one, or what it says as an object."""
         if self.as_json:
             standing = {"kind": kind, "grasp": grasp, "bins": bins, "time_s": float(self.bin_s * bins)}

@@ -9,7 +9,9 @@ import sys
 def main() -> int:
     """Run the command; a request to end (SIGTERM) interrupts as Ctrl-C does, even while Python still loads it."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    atexit.register(gc.freeze)  # nobody waits for garbage to be looked for at the end: a fifth of a second with numba
+    atexit.register(
+        gc.freeze
+    )  # nobody waits for garbage to be looked for at the end: a fifth of a second with numba
     try:
         from spikeloom.runtime.cli import main as command
 

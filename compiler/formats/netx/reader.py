@@ -1,10 +1,10 @@
 """Read a network from lava-dl's ``.net`` files as what it is: integers, registers and all.
 
-``layer/0`` … each have ``type`` and ``shape``; ``dense`` and ``conv`` have ``weight`` (to, from) or (filters, channels,
-height, width), maybe ``bias``, and ``neuron`` with ``iDecay``, ``vDecay``, ``vThMant``, ``refDelay``. Shapes of images
-are (channels, height, width), as torch has them, and kernels are not turned round. Numbers are the chip's registers,
-but for three: ``iDecay`` is one more than the register of the current's decay, biases count whole weight steps, and
-weights of both signs are even.
+``layer/0`` … each have ``type`` and ``shape``; ``dense`` and ``conv`` have ``weight`` (to, from) or
+(filters, channels, height, width), maybe ``bias``, and ``neuron`` with ``iDecay``, ``vDecay``, ``vThMant``,
+``refDelay``. Shapes of images are (channels, height, width), as torch has them, and kernels are not turned
+round. Numbers are the chip's registers, but for three: ``iDecay`` is one more than the register of the
+current's decay, biases count whole weight steps, and weights of both signs are even.
 
 References
 ----------
@@ -27,8 +27,17 @@ from spikeloom.compiler.formats.assemble import ReadNetwork
 from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, entry_of, read_hdf5
 from spikeloom.compiler.formats.names import named, printable
 from spikeloom.compiler.formats.sensor_layout import sensor_layout
-from spikeloom.compiler.targets.loihi1.integers import MANTISSA, IntegerNetwork, IntegerPopulation, IntegerProjection
-from spikeloom.compiler.targets.loihi1.registers import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, kept_shares
+from spikeloom.compiler.targets.loihi1.integers import (
+    MANTISSA,
+    IntegerNetwork,
+    IntegerPopulation,
+    IntegerProjection,
+)
+from spikeloom.compiler.targets.loihi1.registers import (
+    BIAS_MANTISSA_MAX,
+    THRESHOLD_MANTISSA_MAX,
+    kept_shares,
+)
 from spikeloom.compiler.types import IntArray
 
 BIAS_EXPONENT = 6
@@ -90,8 +99,8 @@ def read_netx(
 ) -> ReadNetwork[IntegerNetwork]:
     """Read a network; polarities are as of :func:`sensor_layout.sensor_layout`.
 
-    Raises ModelError if the file cannot be read, or holds what the chip's neurons here do not do, naming the layer;
-    OptionError if there are no such polarities.
+    Raises ModelError if the file cannot be read, or holds what the chip's neurons here do not do, naming the
+    layer; OptionError if there are no such polarities.
     """
     with reading(path, ModelError, AGAIN):
         tree, sha256 = read_hdf5(Path(path), "netx file")
@@ -163,7 +172,9 @@ def _synapses(block: Block, shape: tuple[int, ...]) -> tuple[ir.Sparse, tuple[in
         if block.number:
             raise block.fail("is not the first; export one network")
         gain = block.few("weight")[0] if "weight" in block.values else DEFAULT_INPUT_WEIGHT
-        return sparse.csr_array(sparse.identity(math.prod(shape), dtype=np.int64, format="csr") * gain), shape
+        return sparse.csr_array(
+            sparse.identity(math.prod(shape), dtype=np.int64, format="csr") * gain
+        ), shape
     if isinstance(block.values.get("weight"), dict):
         raise block.fail("has complex weights, allowed are real ones; use CUBA neurons")
     if block.type in ("dense", "dense_rec"):
@@ -176,7 +187,9 @@ def _synapses(block: Block, shape: tuple[int, ...]) -> tuple[ir.Sparse, tuple[in
 
 def _matrix(block: Block, key: str, neurons: int, received: int) -> IntArray:
     weight = block.integers(key)
-    weight = weight.reshape(neurons, -1) if weight.ndim == 1 and weight.size == neurons * received else weight
+    weight = (
+        weight.reshape(neurons, -1) if weight.ndim == 1 and weight.size == neurons * received else weight
+    )
     if weight.shape != (neurons, received):
         raise block.fail(
             f"{key} has the shape {list(weight.shape)}, wanted {[neurons, received]}; the shapes disagree, {AGAIN}"
@@ -199,7 +212,12 @@ def _conv(block: Block, shape: tuple[int, ...]) -> tuple[ir.Sparse, tuple[int, .
     padding = [(zeros, zeros) for zeros in block.few("padding", 2)]
     with named(block):
         matrix, out = convolution(
-            shape, weight.astype(np.float64), stride=stride, padding=padding, dilation=dilation, groups=groups
+            shape,
+            weight.astype(np.float64),
+            stride=stride,
+            padding=padding,
+            dilation=dilation,
+            groups=groups,
         )
     declared = block.sizes()
     if declared != out:
@@ -213,7 +231,9 @@ def _planes(block: Block, weight: ir.Sparse) -> list[tuple[ir.Sparse, int]]:
     weight.sort_indices()
     data = weight.data
     if data.size and (data.min() < -256 or data.max() > 255):
-        raise block.fail(f"has weights from {data.min()} to {data.max()}, allowed are -256 to 255; netx clips them")
+        raise block.fail(
+            f"has weights from {data.min()} to {data.max()}, allowed are -256 to 255; netx clips them"
+        )
     if not np.any(data % 2):
         return [(ir.with_data(weight, data.astype(MANTISSA)), 0)]
     if np.abs(data).max() <= 127:
@@ -227,11 +247,15 @@ def _planes(block: Block, weight: ir.Sparse) -> list[tuple[ir.Sparse, int]]:
 def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopulation:
     entries: Tree = entry_of(block.values, "neuron", dict)
     if not entries:
-        raise block.fail("has no neuron, so its membranes are the result, and a chip counts spikes; remove it")
+        raise block.fail(
+            "has no neuron, so its membranes are the result, and a chip counts spikes; remove it"
+        )
     neuron = replace(block, values=entries)
     kind = entries.get("type")
     if kind not in NEURONS:
-        raise block.fail(f"has neurons of type {str(kind)[:20]!r}, allowed are {' and '.join(NEURONS)}; use them")
+        raise block.fail(
+            f"has neurons of type {str(kind)[:20]!r}, allowed are {' and '.join(NEURONS)}; use them"
+        )
     graded = entries.get("gradedSpike"), entries.get("messageBits")
     if any(isinstance(value, np.ndarray) and np.any(value) for value in graded):
         raise block.fail("sends graded spikes, which Loihi 1 does not have; train without")
@@ -266,7 +290,9 @@ def _bias(block: Block, size: int, shape: tuple[int, ...]) -> IntArray:
     if values.size not in (1, shape[0], size):
         raise block.fail(f"bias has {values.size} values for {size} neurons; the shapes disagree, {AGAIN}")
     if np.any(np.abs(values) > BIAS_MANTISSA_MAX):
-        raise block.fail(f"has biases up to {np.abs(values).max()}, allowed are {BIAS_MANTISSA_MAX} steps; train again")
+        raise block.fail(
+            f"has biases up to {np.abs(values).max()}, allowed are {BIAS_MANTISSA_MAX} steps; train again"
+        )
     return np.asarray(np.repeat(values, size // values.size))
 
 

@@ -1,8 +1,8 @@
 """Read a NIR file as a flat graph of nodes in order, nested graphs resolved, trusting nothing in it.
 
-The layout is that of nir 1.0: ``version``; ``node``, a graph with ``type``, ``nodes`` (a group each, with ``type`` and
-its parameters) and ``edges`` (pairs of names). A nested graph is a node; what goes into it reaches its Input, what
-comes out of it comes from its Output.
+The layout is that of nir 1.0: ``version``; ``node``, a graph with ``type``, ``nodes`` (a group each, with
+``type`` and its parameters) and ``edges`` (pairs of names). A nested graph is a node; what goes into it
+reaches its Input, what comes out of it comes from its Output.
 
 References
 ----------
@@ -97,7 +97,9 @@ def _flat(graph: Tree, above: str) -> tuple[dict[str, Node], list[tuple[str, str
             edges += pairs
         else:
             values = {key: value for key, value in entry.items() if key not in ("type", "metadata")}
-            nodes[full] = Node(name=full, type=kind, values=values, metadata=entry_of(entry, "metadata", dict))
+            nodes[full] = Node(
+                name=full, type=kind, values=values, metadata=entry_of(entry, "metadata", dict)
+            )
             ends[name] = (full, full)
     for source, target in _pairs(graph, where):
         for name in (source, target):
@@ -115,7 +117,9 @@ def only(nodes: Mapping[str, Node], kind: str) -> Node:
     matching = [node for node in nodes.values() if node.type == kind]
     if len(matching) != 1:
         shown = f" ({', '.join(printable(node.name) for node in matching)})" if matching else ""
-        raise ModelError(f"has {len(matching)} nodes of type {kind}{shown}, one is allowed; export one network")
+        raise ModelError(
+            f"has {len(matching)} nodes of type {kind}{shown}, one is allowed; export one network"
+        )
     return matching[0]
 
 
@@ -134,10 +138,10 @@ def _pairs(graph: Tree, where: str) -> list[tuple[str, str]]:
 def loops(graph: Graph) -> Late:
     """Recurrent nodes; ModelError if some feed each other in a circle that is no recurrent layer.
 
-    NIR says nothing of delays: its neurons are equations in continuous time. In steps, the frameworks that write or
-    read loops mean the spikes of the step before, as the chip does. So a loop through one spiking node, and stages that
-    are no neurons, is a recurrent layer, fed by its own spikes a step late. A loop through several layers is refused:
-    it takes the chip a step for each.
+    NIR says nothing of delays: its neurons are equations in continuous time. In steps, the frameworks that
+    write or read loops mean the spikes of the step before, as the chip does. So a loop through one spiking
+    node, and stages that are no neurons, is a recurrent layer, fed by its own spikes a step late. A loop
+    through several layers is refused: it takes the chip a step for each.
     """
     every = set(graph.edges)
     recurrent: dict[str, tuple[str, ...]] = {}
@@ -171,7 +175,9 @@ def in_order(graph: Graph, late: Late) -> tuple[str, ...]:
     """Names of the nodes, each after those that feed it, apart from what comes a step late."""
     now = nx.DiGraph()
     now.add_nodes_from(graph.nodes)
-    now.add_edges_from((source, target) for source, target in graph.edges if source not in late.get(target, ()))
+    now.add_edges_from(
+        (source, target) for source, target in graph.edges if source not in late.get(target, ())
+    )
     for name, node in graph.nodes.items():
         if not now.in_degree(name) and node.type != INPUT_NODE:
             raise node.fail(
@@ -179,4 +185,6 @@ def in_order(graph: Graph, late: Late) -> tuple[str, ...]:
                 "remove it"
             )
     place = {name: number for number, name in enumerate(graph.nodes)}
-    return tuple(name for ready in nx.topological_generations(now) for name in sorted(ready, key=place.__getitem__))
+    return tuple(
+        name for ready in nx.topological_generations(now) for name in sorted(ready, key=place.__getitem__)
+    )

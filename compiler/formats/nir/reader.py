@@ -22,7 +22,16 @@ from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble, by
 from spikeloom.compiler.formats.hdf5 import AGAIN, entry_of, read_hdf5
 from spikeloom.compiler.formats.names import named, printable, unique_names
 from spikeloom.compiler.formats.nir import CONVENTIONS, stages
-from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, graph_of, loops, only
+from spikeloom.compiler.formats.nir.file import (
+    INPUT_NODE,
+    OUTPUT_NODE,
+    SPIKING,
+    Graph,
+    Node,
+    graph_of,
+    loops,
+    only,
+)
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
 from spikeloom.compiler.formats.sensor_layout import sensor_layout
 from spikeloom.compiler.ir import INPUT, Form, Input, Network, Sparse
@@ -52,18 +61,21 @@ def read_nir(
 ) -> ReadNetwork[Network]:
     """Read a network, in steps of `dt` seconds, by default those that the metadata of the file tell.
 
-    The `convention` (``euler`` by default) says how time constants become decays, see :mod:`nir.stages`; polarities
-    are those of :func:`sensor_layout.sensor_layout`.
+    The `convention` (``euler`` by default) says how time constants become decays, see :mod:`nir.stages`;
+    polarities are those of :func:`sensor_layout.sensor_layout`.
 
-    Raises ModelError if the file cannot be read, or holds something else than a network that spikes, feed-forward but
-    for recurrent layers, naming the node; OptionError if there is no time step, or an option has no such value.
+    Raises ModelError if the file cannot be read, or holds something else than a network that spikes,
+    feed-forward but for recurrent layers, naming the node; OptionError if there is no time step, or an
+    option has no such value.
     """
     with reading(path, ModelError, AGAIN):
         graph = graph_of(*read_hdf5(Path(path), "NIR file"))
         dt = stages.stated_step(graph) if dt is None else dt
         if dt is None:
             written = stages.written_step(graph)
-            hint = "" if written is None else f", but its r is tau / {written:g}, as of steps of {written:g} s"
+            hint = (
+                "" if written is None else f", but its r is tau / {written:g}, as of steps of {written:g} s"
+            )
             raise OptionError(f"{path}: NIR keeps no time step{hint}; give --dt SECONDS")
         steps = stages.Steps(dt=dt, convention=convention or CONVENTIONS[0])
         stages.require_step(dt)
@@ -79,7 +91,9 @@ def network_of(
     end = only(graph.nodes, OUTPUT_NODE)
     shape = tuple(entry.integers("shape").ravel().tolist()) if entry.has("shape") else ()
     if not shape or len(shape) > AXES or min(shape) < 1 or math.prod(shape) > ELEMENTS:
-        raise entry.fail(f"has the shape {list(shape[:AXES])}, allowed are up to {ELEMENTS} values; export it again")
+        raise entry.fail(
+            f"has the shape {list(shape[:AXES])}, allowed are up to {ELEMENTS} values; export it again"
+        )
     sensor, positions, words = sensor_layout(shape, polarities=polarities, polarities_first=polarities_first)
     spiking, result = _walk(graph, steps, shape)
     if not spiking:
@@ -91,7 +105,9 @@ def network_of(
     sensor = replace(sensor, bins=bins or 1, clocks=replace(sensor.clocks, length=length))
     network = assemble(layers, sensor, voters, label)
     facts = _facts(graph, steps, spiking, f"input {printable(entry.name)}: {words}", sensor)
-    facts.append(f"classes: the spikes of {printable(spiking[voters].node.name)} in output {printable(end.name)}")
+    facts.append(
+        f"classes: the spikes of {printable(spiking[voters].node.name)} in output {printable(end.name)}"
+    )
     training = json.loads(entry_of(graph.metadata, "training", str) or "null")
     return ReadNetwork(
         network=replace(network, forms=_forms(spiking, network)),
@@ -117,7 +133,11 @@ def _forms(spiking: Sequence[Neurons], network: Network) -> tuple[Form, ...] | N
         if not within or not whole:
             raise stored.fail("has no usable storage, or thresholds that are not whole; fine-tune it again")
         forms[name] = Form(bits=bits, exponents=tuple(exponents), threshold=read_only(one.theta))
-    return tuple(forms[each.name] for each in network.populations) if len(forms) == len(network.populations) else None
+    return (
+        tuple(forms[each.name] for each in network.populations)
+        if len(forms) == len(network.populations)
+        else None
+    )
 
 
 def _walk(graph: Graph, steps: stages.Steps, shape: tuple[int, ...]) -> tuple[list[Neurons], stages.Value]:
@@ -136,7 +156,9 @@ def _walk(graph: Graph, steps: stages.Steps, shape: tuple[int, ...]) -> tuple[li
             values[name] = stages.spikes_of(INPUT, shape)
             continue
         with named(node):
-            value = stages.added([values[source] for source in received[name] if source not in late.get(name, ())])
+            value = stages.added(
+                [values[source] for source in received[name] if source not in late.get(name, ())]
+            )
         if node.type in SPIKING:
             values[name] = stages.spikes_of(len(spiking), value.shape)
             spiking.append((node, value))
@@ -157,7 +179,9 @@ def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer
     """A layer for each node, and what flows into its currents in every step, (neurons, 1)."""
     layers: list[Layer] = []
     constant = []
-    for place, (one, name) in enumerate(zip(spiking, unique_names([one.node.name for one in spiking]), strict=True)):
+    for place, (one, name) in enumerate(
+        zip(spiking, unique_names([one.node.name for one in spiking]), strict=True)
+    ):
         # Neurons of other thresholds are those of one, with their weights and biases in its units.
         theta = float(one.theta[0])
         value = scaled(one.value, theta / one.theta)
@@ -170,7 +194,9 @@ def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer
             sources[INPUT] = sources[INPUT][:, positions]
         reached = {source: weight for source, weight in sources.items() if weight.nnz}
         sources = reached if reached.keys() - {place} else sources
-        layers.append(Layer(name=name, beta=one.beta, theta=theta, bias=value.bias, sources=sources, alpha=value.alpha))
+        layers.append(
+            Layer(name=name, beta=one.beta, theta=theta, bias=value.bias, sources=sources, alpha=value.alpha)
+        )
     return layers, constant
 
 
@@ -184,7 +210,9 @@ def _with_held(layers: list[Layer], held: list[Sparse | None], sensor: Input) ->
     def with_channel(size: int, weight: Sparse | None, channel: Sparse | None) -> Sparse:
         """Weights of the input into so many neurons, if there are any, and beside them those of the channel."""
         sensed = sparse.csr_array((size, sensor.size)) if weight is None else weight
-        return sparse.hstack([sensed, sparse.csr_array((size, 1)) if channel is None else channel], format="csr")
+        return sparse.hstack(
+            [sensed, sparse.csr_array((size, 1)) if channel is None else channel], format="csr"
+        )
 
     extended = []
     for index, layer in enumerate(layers):
@@ -200,7 +228,9 @@ def _with_held(layers: list[Layer], held: list[Sparse | None], sensor: Input) ->
         source = len(layers) + step - 1 if step else INPUT
         weight = relay if step else with_channel(1, None, relay)
         name = f"always{step + 1}"
-        extended.append(Layer(name=name, beta=0.0, theta=1.0, bias=np.zeros(1), sources={source: weight}, relays=1))
+        extended.append(
+            Layer(name=name, beta=0.0, theta=1.0, bias=np.zeros(1), sources={source: weight}, relays=1)
+        )
     return extended, replace(sensor, clocks=Clocks(channels=1, steps=MOST_STEPS))
 
 
@@ -214,7 +244,9 @@ def _readout(end: Node, result: stages.Value, spiking: Sequence[Neurons]) -> tup
     ((source, counts),) = result.terms.items()
     label = class_of_each(counts)
     if label is None or (result.bias.size and np.ptp(result.bias) > 0):
-        raise end.fail(f"gets weighted spikes of {printable(spiking[source].node.name)}, a vote counts them; {remedy}")
+        raise end.fail(
+            f"gets weighted spikes of {printable(spiking[source].node.name)}, a vote counts them; {remedy}"
+        )
     return source, label
 
 
@@ -222,8 +254,9 @@ def _readout(end: Node, result: stages.Value, spiking: Sequence[Neurons]) -> tup
 class Neurons:
     """A spiking node in steps, reset to 0; all arrays (neurons,) float64.
 
-    ``u <- beta * u * (1 - s) + value``, ``s = u > theta``. An IF neuron keeps its whole membrane and gets ``dt * r *
-    I``. A neuron that resets to `v_reset` is one that resets to 0, with its threshold, leak and start shifted by it.
+    ``u <- beta * u * (1 - s) + value``, ``s = u > theta``. An IF neuron keeps its whole membrane and gets
+    ``dt * r * I``. A neuron that resets to `v_reset` is one that resets to 0, with its threshold, leak and
+    start shifted by it.
     """
 
     node: Node  # As the file has it
@@ -267,7 +300,9 @@ def _neurons(node: Node, value: stages.Value, steps: stages.Steps) -> Neurons:
         # r = tau / dt, stored in float32, makes a gain of 1 that is not quite one
         gain = np.where(np.abs(gain - 1) < stages.TOLERANCE, 1.0, gain)
     if np.any(theta <= 0):
-        raise node.fail(f"fires {theta.min():g} above its reset, allowed are thresholds above it; train it again")
+        raise node.fail(
+            f"fires {theta.min():g} above its reset, allowed are thresholds above it; train it again"
+        )
     with named(node):
         state = shifted(stages.filtered(value, alpha, gain, nothing), drive)  # a leak acts past the current
     return Neurons(node=node, value=state, beta=beta, gain=gain, theta=theta, reset=reset)
@@ -282,7 +317,9 @@ def _require_reset(node: Node) -> None:
             )
 
 
-def _facts(graph: Graph, steps: stages.Steps, spiking: Sequence[Neurons], sensor: str, clocked: Input) -> list[str]:
+def _facts(
+    graph: Graph, steps: stages.Steps, spiking: Sequence[Neurons], sensor: str, clocked: Input
+) -> list[str]:
     """How a file was read, its layers, what its input (`sensor`, in words) was taken for, and what files may lose."""
     version = printable(graph.version) or "of no version"
     facts = [f"NIR {version}, read in steps of {steps.dt:g} s ({steps.convention})", sensor]
@@ -296,9 +333,13 @@ def _facts(graph: Graph, steps: stages.Steps, spiking: Sequence[Neurons], sensor
         if np.any(np.abs(one.gain - 1) > 1e-4):
             fact += f"; a step adds {_span(one.gain)} of its input"
         facts.append(fact)
-    facts += ["v goes to its reset as NIR says; a framework that subtracts the threshold instead means another network"]
+    facts += [
+        "v goes to its reset as NIR says; a framework that subtracts the threshold instead means another network"
+    ]
     if any(one.node.type == "CubaLIF" for one in spiking):
-        facts += ["a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them"]
+        facts += [
+            "a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them"
+        ]
     if looped := [printable(one.node.name) for place, one in enumerate(spiking) if place in one.value.terms]:
         facts.append(
             f"{', '.join(looped)}: is recurrent, fed by its own spikes of the step before; snnTorch's RLeaky with "
@@ -311,11 +352,15 @@ def _facts(graph: Graph, steps: stages.Steps, spiking: Sequence[Neurons], sensor
             f"of {steps.dt:g} s its decays and gains are others than there"
         )
     if clocked.clocks.channels:
-        facts.append("biases that go through a synaptic current come from a channel that always has an event")
+        facts.append(
+            "biases that go through a synaptic current come from a channel that always has an event"
+        )
     return facts
 
 
 def _span(values: FloatArray) -> str:
     low = float(values.min())
     high = float(values.max())
-    return f"{low:.6g}" if math.isclose(low, high, rel_tol=1e-6, abs_tol=1e-12) else f"{low:.6g} … {high:.6g}"
+    return (
+        f"{low:.6g}" if math.isclose(low, high, rel_tol=1e-6, abs_tol=1e-12) else f"{low:.6g} … {high:.6g}"
+    )

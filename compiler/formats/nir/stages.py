@@ -1,7 +1,7 @@
 """What flows along the edges of a NIR graph, and what each node that is no spiking neuron makes of it.
 
-NIR neurons are differential equations and a file has no time step. In steps of `dt` a membrane with time constant tau
-keeps ``beta``, and the rest, ``1 - beta``, comes from ``v_leak + r * I``:
+NIR neurons are differential equations and a file has no time step. In steps of `dt` a membrane with time
+constant tau keeps ``beta``, and the rest, ``1 - beta``, comes from ``v_leak + r * I``:
 
 ``euler``
     ``beta = 1 - dt / tau``, the forward Euler method, which snnTorch, Norse and SpikingJelly mean;
@@ -19,7 +19,15 @@ from scipy import sparse
 from spikeloom.compiler.dynamics import MOST_STEPS
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import affine
-from spikeloom.compiler.formats.affine import Affine, Padding, block_diagonal, convolution, scaled, shifted, through
+from spikeloom.compiler.formats.affine import (
+    Affine,
+    Padding,
+    block_diagonal,
+    convolution,
+    scaled,
+    shifted,
+    through,
+)
 from spikeloom.compiler.formats.names import named
 from spikeloom.compiler.formats.nir.file import SPIKING, Graph, Node
 from spikeloom.compiler.types import FloatArray
@@ -77,7 +85,11 @@ def stated_steps(graph: Graph, name: str) -> int | None:
 
 def written_step(graph: Graph) -> float | None:
     """Step that a file was written in, as far as all of its neurons say the same."""
-    written = [_written_for(node) for node in graph.nodes.values() if node.type in SPIKING and node.type != "Threshold"]
+    written = [
+        _written_for(node)
+        for node in graph.nodes.values()
+        if node.type in SPIKING and node.type != "Threshold"
+    ]
     steps = [step for step in written if step is not None]
     same = len(steps) == len(written) and all(math.isclose(step, steps[0], rel_tol=1e-4) for step in steps)
     return steps[0] if steps and same else None
@@ -115,7 +127,9 @@ def spread(node: Node, key: str, size: int, shape: tuple[int, ...]) -> FloatArra
 def shared(node: Node, key: str, decay: FloatArray) -> float:
     """The decay that all neurons of a node share; ModelError if they have several."""
     if np.ptp(decay) > TOLERANCE:
-        raise node.fail(f"{key} is different from neuron to neuron, allowed is one for a layer; use one node for each")
+        raise node.fail(
+            f"{key} is different from neuron to neuron, allowed is one for a layer; use one node for each"
+        )
     return float(decay[0]) if decay.size else 0.0
 
 
@@ -166,10 +180,16 @@ def filtered(value: Value, alpha: float, gain: FloatArray, drive: FloatArray) ->
 def _linear(node: Node, value: Value, _steps: Steps) -> Value:
     weight = node.numbers("weight")
     if weight.ndim != 2:
-        raise node.fail(f"weight has the shape {list(weight.shape)}, allowed are (to, from); export it again")
+        raise node.fail(
+            f"weight has the shape {list(weight.shape)}, allowed are (to, from); export it again"
+        )
     rows, columns = weight.shape
     if value.shape[-1:] != (columns,):
-        missing = "a Flatten is missing before it" if value.size == columns else "the shapes disagree, export it again"
+        missing = (
+            "a Flatten is missing before it"
+            if value.size == columns
+            else "the shapes disagree, export it again"
+        )
         raise node.fail(f"weight is for {columns} values, it gets {list(value.shape)}; {missing}")
     copies = math.prod(value.shape[:-1])
     with named(node):
@@ -198,7 +218,9 @@ def _image(node: Node, value: Value, axes: int) -> tuple[int, ...]:
     return tuple(sizes)
 
 
-def _padding(node: Node, kernel: tuple[int, ...], dilation: tuple[int, ...], stride: tuple[int, ...]) -> Padding:
+def _padding(
+    node: Node, kernel: tuple[int, ...], dilation: tuple[int, ...], stride: tuple[int, ...]
+) -> Padding:
     said = node.values.get("padding")
     if not isinstance(said, str):
         return [(zeros, zeros) for zeros in node.few("padding", len(kernel))]
@@ -206,10 +228,14 @@ def _padding(node: Node, kernel: tuple[int, ...], dilation: tuple[int, ...], str
         return [(0, 0)] * len(kernel)
     if said == "same":
         if set(stride) != {1}:
-            raise node.fail(f"has the padding 'same' at a stride of {max(stride)}, allowed is 1; export it again")
+            raise node.fail(
+                f"has the padding 'same' at a stride of {max(stride)}, allowed is 1; export it again"
+            )
         total = [step * (size - 1) for size, step in zip(kernel, dilation, strict=True)]
         return [(zeros // 2, zeros - zeros // 2) for zeros in total]  # the odd zero comes after, as in torch
-    raise node.fail(f"has the padding {said[:20]!r}, allowed are numbers, 'same' and 'valid'; export it again")
+    raise node.fail(
+        f"has the padding {said[:20]!r}, allowed are numbers, 'same' and 'valid'; export it again"
+    )
 
 
 def _conv(node: Node, value: Value, _steps: Steps) -> Value:
@@ -230,7 +256,9 @@ def _conv(node: Node, value: Value, _steps: Steps) -> Value:
     padding = _padding(node, kernel, dilation, stride)
     groups = node.few("groups")[0]
     with named(node):
-        matrix, out = convolution(shape, weight, stride=stride, padding=padding, dilation=dilation, groups=groups)
+        matrix, out = convolution(
+            shape, weight, stride=stride, padding=padding, dilation=dilation, groups=groups
+        )
     result = through(matrix, value, out)
     if not node.has("bias"):
         return result
@@ -247,7 +275,9 @@ def _pool(node: Node, value: Value, _steps: Steps) -> Value:
     share = 1 / math.prod(kernel) if node.type == "AvgPool2d" else 1.0
     weight = np.full((shape[0], 1, *kernel), share)  # zeros of the padding count
     with named(node):
-        matrix, out = convolution(shape, weight, stride=stride, padding=padding, dilation=(1, 1), groups=shape[0])
+        matrix, out = convolution(
+            shape, weight, stride=stride, padding=padding, dilation=(1, 1), groups=shape[0]
+        )
     return through(matrix, value, out)
 
 
@@ -260,7 +290,9 @@ def _flatten(node: Node, value: Value, _steps: Steps) -> Value:
         # one axis is flat whatever is said about others
         if axes == 1:
             return value
-        raise node.fail(f"flattens axes {first} to {last} of {list(value.shape)}; the shapes disagree, export it again")
+        raise node.fail(
+            f"flattens axes {first} to {last} of {list(value.shape)}; the shapes disagree, export it again"
+        )
     shape = value.shape
     return replace(value, shape=(*shape[:first], math.prod(shape[first : last + 1]), *shape[last + 1 :]))
 

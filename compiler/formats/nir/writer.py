@@ -1,11 +1,12 @@
 """A netlist as a NIR file: the float network that comes closest to what the chip does.
 
-Numbers are in weight units, so that weights and thresholds are the chip's integers and sums of them exact in float32;
-decays are the registers' own. What remains different is rounding: a register is cut to a whole number in every step, a
-float is not.
+Numbers are in weight units, so that weights and thresholds are the chip's integers and sums of them exact in
+float32; decays are the registers' own. What remains different is rounding: a register is cut to a whole
+number in every step, a float is not.
 
 * A layer is an Affine or Linear for each layer that feeds it, and a LIF; an IF where it keeps its whole membrane, a
-  CubaLIF where its current outlasts a step. A CubaLIF's bias, which the chip adds past the current, is a leak voltage.
+  CubaLIF where its current outlasts a step. A CubaLIF's bias, which the chip adds past the current, is a
+  leak voltage.
 * Time constants are those of the forward Euler method for the step given: ``1 - dt / tau`` is what a step keeps, and
   ``r = tau / dt`` makes a step add its input as it is.
 * Inputs are one flat axis, ``taxel * polarities + polarity``, then the clocks. A vote of several neurons is a Linear.
@@ -37,17 +38,21 @@ DENSE_LIMIT = 2**28
 Float32 = npt.NDArray[np.float32]
 
 
-def export(network: IntegerNetwork, dt: float, *, training: str | None = None, origin: str | None = None) -> bytes:
+def export(
+    network: IntegerNetwork, dt: float, *, training: str | None = None, origin: str | None = None
+) -> bytes:
     """Content of the file, for steps of `dt` seconds; equal networks give equal bytes.
 
-    With `training`, how the network was fine-tuned, the file says how each layer is stored, too: it compiles to these
-    very integers. `origin` is what it keeps of the recordings behind any other network.
+    With `training`, how the network was fine-tuned, the file says how each layer is stored, too: it compiles
+    to these very integers. `origin` is what it keeps of the recordings behind any other network.
 
     Raises ModelError if NIR cannot say what the network does, OptionError if there is no such time step.
     """
     require_step(dt)
     # what separates names in a file becomes an underscore
-    names = plain_names([population.name for population in network.populations], taken=["input", "output", "votes"])
+    names = plain_names(
+        [population.name for population in network.populations], taken=["input", "output", "votes"]
+    )
     always = int(network.input.clocks == Clocks(channels=1, steps=MOST_STEPS))
     nodes: dict[str, Tree] = {"input": {"type": "Input", "shape": np.array([network.input.size - always])}}
     edges: list[tuple[str, str]] = []

@@ -1,7 +1,7 @@
 """What a value of an ONNX graph is, in terms of what varies: an array of constants, or affine in *atoms*.
 
-Atoms are the inputs of the graph, each tensor that is compared with a threshold (a membrane), the spikes that follow
-from it, and products of a membrane with its spikes (a reset).
+Atoms are the inputs of the graph, each tensor that is compared with a threshold (a membrane), the spikes
+that follow from it, and products of a membrane with its spikes (a reset).
 """
 
 import math
@@ -32,7 +32,9 @@ MEMBRANE = "membrane"
 SPIKE = "spike"
 PRODUCT = "product"
 
-NOT_AFFINE = "is not affine in its input; only affine operators between two spiking layers can become synapses"
+NOT_AFFINE = (
+    "is not affine in its input; only affine operators between two spiking layers can become synapses"
+)
 
 Value = AnyArray | Affine
 
@@ -64,26 +66,32 @@ class Atom:
 class Table:
     """What is met while a graph runs.
 
-    Matrices of linear operators are kept with the constants that they were made from, so that nothing else can come to
-    lie at the same address.
+    Matrices of linear operators are kept with the constants that they were made from, so that nothing else
+    can come to lie at the same address.
     """
 
     opset: int = 20
     atoms: list[Atom] = field(default_factory=list)
     known: dict[tuple[object, ...], int] = field(default_factory=dict)
-    matrices: dict[tuple[object, ...], tuple[Sparse, tuple[int, ...], list[Value]]] = field(default_factory=dict)
+    matrices: dict[tuple[object, ...], tuple[Sparse, tuple[int, ...], list[Value]]] = field(
+        default_factory=dict
+    )
 
     def room(self, shape: Sequence[int], limit: int = VALUE_LIMIT) -> tuple[int, ...]:
         """The shape itself, if a value of it, or an operator of so many coefficients, may be made."""
         size = math.prod(int(length) for length in shape)
         if size > limit or min(shape, default=0) < 0 or len(shape) > DIMENSIONS:
-            raise ModelError(f"makes {size} values or coefficients, allowed are {limit}; no chip holds such a network")
+            raise ModelError(
+                f"makes {size} values or coefficients, allowed are {limit}; no chip holds such a network"
+            )
         return tuple(int(length) for length in shape)
 
     def atom(self, kind: str, label: str, size: int, **facts: Any) -> int:
         """Add an atom, if there may be one of that size; `facts` are more fields of it."""
         if size > ATOM_LIMIT:
-            raise ModelError(f"{printable(label)} has {size} elements, allowed are {ATOM_LIMIT}; no chip holds that")
+            raise ModelError(
+                f"{printable(label)} has {size} elements, allowed are {ATOM_LIMIT}; no chip holds that"
+            )
         self.atoms.append(Atom(kind=kind, label=label, eye=sparse.eye_array(size, format="csr"), **facts))
         return len(self.atoms) - 1
 
@@ -123,7 +131,9 @@ def as_affine(value: Value | None) -> Affine:
 
 def require_finite(value: Affine, where: str = "") -> None:
     """Refuse coefficients that are not finite numbers: ModelError."""
-    if not all(np.all(np.isfinite(part)) for part in (value.bias, *(own.data for own in value.terms.values()))):
+    if not all(
+        np.all(np.isfinite(part)) for part in (value.bias, *(own.data for own in value.terms.values()))
+    ):
         raise ModelError(f"{where}has coefficients that are not finite; train it again")
 
 
@@ -156,7 +166,11 @@ def _pair(table: Table, first: int, second: int) -> int:
     if first == second and one.binary:
         return first
     inputs = one.kind == other.kind == INPUT_ATOM and first != second
-    if inputs or (one.kind == SPIKE and one.of == (second,)) or (other.kind == SPIKE and other.of == (first,)):
+    if (
+        inputs
+        or (one.kind == SPIKE and one.of == (second,))
+        or (other.kind == SPIKE and other.of == (first,))
+    ):
         return table.product(first, second)
     raise ModelError(f"multiplies {one} by {other}, so it {NOT_AFFINE}")
 
@@ -174,12 +188,20 @@ def _one_each(terms: Sparse) -> tuple[FloatArray, IntArray]:
 
 def is_binary(table: Table, value: Affine) -> bool:
     """Whether a value is zeros and ones: a spike, or an input of truth values, for each element, or the opposite."""
-    counts = sum((np.diff(own.indptr) for own in value.terms.values()), start=np.zeros(len(value.bias), np.int64))
+    counts = sum(
+        (np.diff(own.indptr) for own in value.terms.values()), start=np.zeros(len(value.bias), np.int64)
+    )
     ends = value.bias + sum(own.sum(axis=1) for own in value.terms.values())
-    return is_whole(table, value) and bool(np.all(counts <= 1)) and bool(np.isin([value.bias, ends], (0, 1)).all())
+    return (
+        is_whole(table, value)
+        and bool(np.all(counts <= 1))
+        and bool(np.isin([value.bias, ends], (0, 1)).all())
+    )
 
 
 def is_whole(table: Table, value: Affine) -> bool:
     """Whether a value is a whole number: a count of spikes."""
     parts = [value.bias, *(own.data for own in value.terms.values())]
-    return all(table.atoms[atom].binary for atom in value.terms) and all(np.all(part % 1 == 0) for part in parts)
+    return all(table.atoms[atom].binary for atom in value.terms) and all(
+        np.all(part % 1 == 0) for part in parts
+    )

@@ -80,7 +80,10 @@ class Nodes:
         """All of it as a message."""
         onnx = _onnx()
         ends = [
-            [onnx.helper.make_tensor_value_info(port.name, _type(port.kind), list(port.shape)) for port in side]
+            [
+                onnx.helper.make_tensor_value_info(port.name, _type(port.kind), list(port.shape))
+                for port in side
+            ]
             for side in (inputs, outputs)
         ]
         constants = [onnx.numpy_helper.from_array(array, key) for key, array in self.constants.items()]
@@ -128,7 +131,10 @@ def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes
         else graph.constant(f"{state.name}/rest", np.zeros((), state.kind))
         for state in states
     ]
-    kept = [Port(name=f"{name}/fired", kind=np.bool_, shape=("batch", size)) for name, (size, _) in layers.items()]
+    kept = [
+        Port(name=f"{name}/fired", kind=np.bool_, shape=("batch", size))
+        for name, (size, _) in layers.items()
+    ]
     body = nodes.graph("steps", [*states, inputs[0]], [*left, *kept])
     graph.nodes.append(
         onnx.helper.make_node(
@@ -184,7 +190,10 @@ def model_bytes(model: Model, *, name: str, about: str, facts: Mapping[str, Any]
         doc_string=about.replace("``", ""),
     )
     facts = {"version": __version__, **facts}
-    words = {k: value if isinstance(value, str) else json.dumps(value, sort_keys=True) for k, value in facts.items()}
+    words = {
+        k: value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+        for k, value in facts.items()
+    }
     onnx.helper.set_model_props(message, dict(sorted(words.items())))
     onnx.checker.check_model(message, full_check=True)
     content: bytes = message.SerializeToString(deterministic=True)

@@ -1,7 +1,8 @@
 """Operators on numbers, and linear ones as the matrix from one operand to the result while the others are constant.
 
-On numbers ONNX's own reference runs them, once the shapes that it infers for their results are allowed.
-That is for constants, and for positions of elements: an operator that only moves numbers shows by them where each goes.
+On numbers ONNX's own reference runs them, once the shapes that it infers for their results are allowed. That
+is for constants, and for positions of elements: an operator that only moves numbers shows by them where each
+goes.
 """
 
 import math
@@ -62,8 +63,8 @@ SMALL = 64
 def evaluate(node: Node, table: Table, operands: Operands) -> list[AnyArray]:
     """Results of an operator in ``NUMERIC`` on numbers, in float64, int64 or bool.
 
-    Raises ModelError if a result is too large; the package onnx raises nearly anything on operands or attributes that
-    do not fit each other.
+    Raises ModelError if a result is too large; the package onnx raises nearly anything on operands or
+    attributes that do not fit each other.
     """
     if node.op == "Cast" and operands[0] is not None:
         to = int(node.attributes["to"])
@@ -88,7 +89,9 @@ def shapes_of(node: Node, table: Table, operands: Operands) -> list[tuple[int, .
     from onnx import defs, helper, numpy_helper, shape_inference
 
     proto = _proto(node)
-    given = {name: operand for name, operand in zip(proto.input, operands, strict=True) if operand is not None}
+    given = {
+        name: operand for name, operand in zip(proto.input, operands, strict=True) if operand is not None
+    }
     types = {
         name: helper.make_tensor_type_proto(helper.np_dtype_to_tensor_dtype(array.dtype), array.shape)
         for name, array in given.items()
@@ -100,7 +103,11 @@ def shapes_of(node: Node, table: Table, operands: Operands) -> list[tuple[int, .
     shapes = []
     for name in proto.output:
         kind = inferred[name].tensor_type if name in inferred else None
-        if kind is not None and kind.HasField("shape") and all(d.HasField("dim_value") for d in kind.shape.dim):
+        if (
+            kind is not None
+            and kind.HasField("shape")
+            and all(d.HasField("dim_value") for d in kind.shape.dim)
+        ):
             shapes.append(table.room([d.dim_value for d in kind.shape.dim]))
         elif node.op == "NonZero" and operands[0] is not None:
             shapes.append(table.room([operands[0].ndim, operands[0].size]))  # at most
@@ -137,10 +144,15 @@ Matrix = Callable[[Node, Table, Sequence[Any], int], Sparse]
 """Of an operator, from the operand of that place, flat in C order; who asks for it adds the biases of Conv and Gemm."""
 
 
-def _contract(table: Table, labels: Sequence[str], out: str, sides: Sequence[AnyArray], which: int) -> Sparse:
+def _contract(
+    table: Table, labels: Sequence[str], out: str, sides: Sequence[AnyArray], which: int
+) -> Sparse:
     """Matrix of the einsum of two sides by their labels; the side `which` holds positions of an operand."""
     every = out + "".join(sorted({*labels[0], *labels[1]} - {*out}))
-    if any(len(set(each)) != len(each) for each in (*labels, out)) or not set(out) <= {*labels[0], *labels[1]}:
+    if any(len(set(each)) != len(each) for each in (*labels, out)) or not set(out) <= {
+        *labels[0],
+        *labels[1],
+    }:
         raise ValueError("a sum that is not known")
     sizes: dict[str, int] = {}
     for each, side in zip(labels, sides, strict=True):
@@ -178,7 +190,10 @@ def _matmul_matrix(_node: Node, table: Table, operands: Sequence[Any], which: in
 
 
 def _gemm_matrix(node: Node, table: Table, operands: Sequence[Any], which: int) -> Sparse:
-    labels = ["zy" if node.attributes.get("transA", 0) else "yz", "xz" if node.attributes.get("transB", 0) else "zx"]
+    labels = [
+        "zy" if node.attributes.get("transA", 0) else "yz",
+        "xz" if node.attributes.get("transB", 0) else "zx",
+    ]
     sides = _sides(operands, which)
     sides[1 - which] = node.attributes.get("alpha", 1.0) * sides[1 - which]
     return _contract(table, labels, "yx", sides, which)
@@ -216,7 +231,9 @@ def _reduce_matrix(node: Node, table: Table, operands: Sequence[Any], _which: in
 def _conv_matrix(node: Node, _table: Table, operands: Sequence[Any], _which: int) -> Sparse:
     """Matrix of a convolution of each recording of a batch."""
     data, weight = operands
-    if node.attributes.get("auto_pad", "NOTSET") not in ("NOTSET", "VALID") or node.attributes.get("ceil_mode", 0):
+    if node.attributes.get("auto_pad", "NOTSET") not in ("NOTSET", "VALID") or node.attributes.get(
+        "ceil_mode", 0
+    ):
         raise ValueError("auto_pad and ceil_mode are not known")
     axes = data.ndim - 2
     pads = node.attributes.get("pads", [0] * 2 * axes)
@@ -233,12 +250,16 @@ def _conv_matrix(node: Node, _table: Table, operands: Sequence[Any], _which: int
 
 def _pool_matrix(node: Node, table: Table, operands: Sequence[Any], _which: int) -> Sparse:
     data = operands[0]
-    kernel = [int(n) for n in node.attributes.get("kernel_shape", data.shape[2:])]  # all, of GlobalAveragePool
+    kernel = [
+        int(n) for n in node.attributes.get("kernel_shape", data.shape[2:])
+    ]  # all, of GlobalAveragePool
     ones = np.ones(table.room([data.shape[1], 1, *kernel]))
     depthwise = replace(node, attributes={**node.attributes, "group": data.shape[1]})
     matrix = _conv_matrix(depthwise, table, [data, ones], 0)
     inside = np.diff(matrix.indptr)
-    counted = np.full(len(inside), math.prod(kernel)) if node.attributes.get("count_include_pad", 0) else inside
+    counted = (
+        np.full(len(inside), math.prod(kernel)) if node.attributes.get("count_include_pad", 0) else inside
+    )
     matrix.data = matrix.data / np.repeat(counted, inside)
     return matrix
 

@@ -1,8 +1,9 @@
 """Read an ONNX file as plain data, trusting nothing in it: no size, no path, no order.
 
-Numbers are widened to float64, so that whatever the file computes from constants is recomputed there. A number that
-stood in the program's text, a constant without dimensions or an attribute, is read as the shortest decimal that is
-that float32 (0.2, not 0.200000003); the float32 model is the same, the float64 one is the one that was meant.
+Numbers are widened to float64, so that whatever the file computes from constants is recomputed there. A
+number that stood in the program's text, a constant without dimensions or an attribute, is read as the
+shortest decimal that is that float32 (0.2, not 0.200000003); the float32 model is the same, the float64 one
+is the one that was meant.
 """
 
 import hashlib
@@ -88,8 +89,8 @@ def _text(value: str | bytes) -> str:
 def read_graph(path: Path) -> Graph:
     """Read a file.
 
-    Raises ModelError if it is no ONNX file, or names, sizes, types or places in it cannot be right; the message lacks
-    the path.
+    Raises ModelError if it is no ONNX file, or names, sizes, types or places in it cannot be right; the
+    message lacks the path.
     """
     from onnx import ModelProto
 
@@ -135,7 +136,9 @@ def _bring_data(graph: Any, folder: Path, digest: Any) -> None:
         if tensor.data_location != tensor.EXTERNAL:
             continue
         location = next((entry.value for entry in tensor.external_data if entry.key == "location"), "")
-        with named(f"tensor {printable(_text(tensor.name))} in {printable(_text(location))!r} beside the file"):
+        with named(
+            f"tensor {printable(_text(tensor.name))} in {printable(_text(location))!r} beside the file"
+        ):
             if not (place := folder / _text(location)).is_file():  # onnx would wait for a pipe
                 raise FileFault("no such file")
             total += place.stat().st_size
@@ -207,9 +210,13 @@ def _array(proto: Any) -> AnyArray:
     with named(what):
         array = numpy_helper.to_array(proto)
     if array.dtype.kind not in "bfiu":
-        raise ModelError(f"{what}: has element type {proto.data_type}, allowed are numbers and truth values; {DAMAGED}")
+        raise ModelError(
+            f"{what}: has element type {proto.data_type}, allowed are numbers and truth values; {DAMAGED}"
+        )
     if array.dtype.kind == "f":
-        return array.astype(np.float64) if array.ndim or array.dtype != np.float32 else np.array(decimal(array))
+        return (
+            array.astype(np.float64) if array.ndim or array.dtype != np.float32 else np.array(decimal(array))
+        )
     if array.dtype == np.uint64 and np.any(array > np.iinfo(np.int64).max):
         raise ModelError(f"{what}: holds integers above 2**63; {DAMAGED}")
     return array.astype(np.bool_ if array.dtype.kind == "b" else np.int64)

@@ -1,8 +1,8 @@
 """Find the neurons in what a graph computes, ``u <- beta * u * (1 - s) + current``, ``s = u > theta``; group them.
 
-A membrane is affine in what varies. The part that comes from an earlier membrane must be what is left of that after a
-reset to zero; the rest must come from the input and from spikes of the same step. How the file writes that, by a
-product, a Where, with the reset before or after the decay, makes no difference here.
+A membrane is affine in what varies. The part that comes from an earlier membrane must be what is left of
+that after a reset to zero; the rest must come from the input and from spikes of the same step. How the file
+writes that, by a product, a Where, with the reset before or after the decay, makes no difference here.
 
 Neurons of one step are layers as they are, those of several steps by what carries on.
 """
@@ -66,11 +66,15 @@ def _read(table: Table, membrane: int, spikes: list[int], outputs: Mapping[str, 
     spike = table.atoms[spikes[0]]
     assert atom.definition is not None
     if len(spikes) > 1:
-        raise ModelError("is compared in several ways, which is no spike; compare a membrane with one threshold")
+        raise ModelError(
+            "is compared in several ways, which is no spike; compare a membrane with one threshold"
+        )
     if np.ptp(spike.theta) > 0:
         low = spike.theta.min()
         high = spike.theta.max()
-        raise ModelError(f"has thresholds from {low:g} to {high:g} in one layer; give all its neurons the same one")
+        raise ModelError(
+            f"has thresholds from {low:g} to {high:g} in one layer; give all its neurons the same one"
+        )
     terms = dict(atom.definition.terms)
     previous, gate, beta = _carried(table, membrane, spikes[0], terms, outputs)
     for other, weight in terms.items():
@@ -115,7 +119,9 @@ def _carried(
         old = table.atoms[gate]
         new = table.atoms[spike]
         if not np.array_equal(old.theta, new.theta) or old.strict != new.strict:
-            raise ModelError(f"resets {table.atoms[previous]} by another threshold than it fires by; {RESET}")
+            raise ModelError(
+                f"resets {table.atoms[previous]} by another threshold than it fires by; {RESET}"
+            )
     if table.atoms[previous].kind == INPUT_ATOM:
         _require_output(outputs, {membrane: 1.0}, f"membrane of {table.atoms[previous]}")
         if table.atoms[gate].kind == INPUT_ATOM:
@@ -128,7 +134,9 @@ def _already_reset(
 ) -> tuple[int | None, None, float | None]:
     """A state input that holds the membrane after its reset, so that nothing is reset at its use."""
     pair = table.known.get((PRODUCT, min(membrane, spike), max(membrane, spike)))
-    states = [a for a in terms if table.atoms[a].kind == INPUT_ATOM and diagonal(terms[a], EQUAL) is not None]
+    states = [
+        a for a in terms if table.atoms[a].kind == INPUT_ATOM and diagonal(terms[a], EQUAL) is not None
+    ]
     reset = {} if pair is None else {membrane: 1.0, pair: -1.0}
     ratios = [_multiple(output, reset) for output in outputs.values() if reset]
     factors = [ratio for ratio in ratios if ratio is not None]
@@ -145,7 +153,11 @@ def _already_reset(
 def _multiple(value: Affine, wanted: Mapping[int, float]) -> float | None:
     """By what the value is a multiple of a sum of atoms, if it is."""
     factors = {atom: diagonal(own) for atom, own in value.terms.items()}
-    if set(factors) != set(wanted) or np.any(value.bias) or any(factor is None for factor in factors.values()):
+    if (
+        set(factors) != set(wanted)
+        or np.any(value.bias)
+        or any(factor is None for factor in factors.values())
+    ):
         return None
     ratios = [(factors[atom] or 0.0) / factor for atom, factor in wanted.items()]
     return ratios[0] if all(abs(r - ratios[0]) <= EQUAL * abs(ratios[0]) for r in ratios) else None
@@ -165,7 +177,9 @@ def _require_current(table: Table, atom: int, terms: Sparse, previous: int | Non
     """Whether the rest is a current: from the input or from spikes; says what it is where it is not."""
     source = table.atoms[atom]
     if source.kind == MEMBRANE:
-        raise ModelError(f"takes the membrane of {source}, not its spikes, as its input or without a reset; {RESET}")
+        raise ModelError(
+            f"takes the membrane of {source}, not its spikes, as its input or without a reset; {RESET}"
+        )
     if source.kind == PRODUCT:
         raise ModelError(f"holds {source} in a way that is no reset; {RESET}")
     factor = diagonal(terms, EQUAL)
@@ -182,15 +196,16 @@ class Unrolled:
     layers: list[list[Neurons]]  # by layer, then step; one step where state goes in and out of the graph
     data: int  # atom of the input that brings the events
     shape: tuple[int, ...]  # of that input in one step
-    # stages into each layer by the place of the source or INPUT; columns of the input are flat positions in it
+    # stages into each layer by the place of the source or INPUT; columns of the input are flat positions in
+    # it
     sources: list[dict[int, Sparse]]
 
 
 def group(table: Table, neurons: Sequence[Neurons], shapes: Mapping[int, tuple[int, ...]]) -> Unrolled:
     """Bring steps together; `shapes` are those of each input of the graph by its atom.
 
-    Raises ModelError if there are no neurons, steps are unlike each other, or it is not clear which input brings the
-    events.
+    Raises ModelError if there are no neurons, steps are unlike each other, or it is not clear which input
+    brings the events.
     """
     if not neurons:
         raise ModelError(f"holds no spiking layer: no membrane is compared with a threshold; {RESET}")
@@ -214,7 +229,9 @@ def group(table: Table, neurons: Sequence[Neurons], shapes: Mapping[int, tuple[i
 
 def _chains(table: Table, neurons: Sequence[Neurons]) -> list[list[Neurons]]:
     """Neurons that carry on from each other, in order of steps."""
-    after = {n.previous: n for n in neurons if n.previous is not None and table.atoms[n.previous].kind == MEMBRANE}
+    after = {
+        n.previous: n for n in neurons if n.previous is not None and table.atoms[n.previous].kind == MEMBRANE
+    }
     chains = [[n] for n in neurons if n.previous is None or table.atoms[n.previous].kind == INPUT_ATOM]
     for chain in chains:
         while (following := after.get(chain[-1].membrane)) is not None:
@@ -283,7 +300,11 @@ def _time(
 
 
 def _sources(
-    table: Table, n: Neurons, step: int, step_of: Mapping[int, tuple[int, int]], inputs: Mapping[int, IntArray]
+    table: Table,
+    n: Neurons,
+    step: int,
+    step_of: Mapping[int, tuple[int, int]],
+    inputs: Mapping[int, IntArray],
 ) -> dict[int, Sparse]:
     """Weights from each source; of an input from its positions in this step."""
     sources = {}
@@ -293,7 +314,9 @@ def _sources(
         elif atom in step_of and step_of[atom][1] == step:
             sources[step_of[atom][0]] = weight
         else:
-            raise ModelError(f"{n.node}: takes {table.atoms[atom]}, which is no spike of a layer in this step; {RESET}")
+            raise ModelError(
+                f"{n.node}: takes {table.atoms[atom]}, which is no spike of a layer in this step; {RESET}"
+            )
     for weight in sources.values():
         weight.sort_indices()
     return sources
@@ -320,13 +343,16 @@ def _require_like(layer: list[Neurons], step: int, every: list[dict[int, Sparse]
 
 
 def _equal(first: Sparse, second: Sparse) -> bool:
-    return first is second or (first.shape == second.shape and not (abs(first - second) > EQUAL * abs(first)).nnz)
+    return first is second or (
+        first.shape == second.shape and not (abs(first - second) > EQUAL * abs(first)).nnz
+    )
 
 
 def readout(table: Table, found: Unrolled, outputs: Mapping[str, Affine]) -> tuple[int, IntArray, str]:
     """Layer that votes, the class of each of its neurons, and the output that counts them.
 
-    Raises ModelError if no output is a count of the spikes of the last layer, or several count them differently.
+    Raises ModelError if no output is a count of the spikes of the last layer, or several count them
+    differently.
     """
     received = {source for sources in found.sources for source in sources}
     ends = [index for index in range(len(found.layers)) if index not in received]

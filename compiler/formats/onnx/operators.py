@@ -1,8 +1,8 @@
 """Run a graph on values that vary: operators in order, membranes set apart as they are met.
 
-Nothing here looks for patterns. A sum, a gather, a convolution with constant weights give new coefficients; a
-comparison of a membrane with a threshold gives a spike; a product of a membrane with its own spikes is kept as what it
-is, since it is how a membrane is reset. Everything else is refused by name.
+Nothing here looks for patterns. A sum, a gather, a convolution with constant weights give new coefficients;
+a comparison of a membrane with a threshold gives a spike; a product of a membrane with its own spikes is
+kept as what it is, since it is how a membrane is reset. Everything else is refused by name.
 """
 
 import math
@@ -13,7 +13,16 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.affine import Affine, added, diagonal, picked_of_all, scaled, shifted, spread, through
+from spikeloom.compiler.formats.affine import (
+    Affine,
+    added,
+    diagonal,
+    picked_of_all,
+    scaled,
+    shifted,
+    spread,
+    through,
+)
 from spikeloom.compiler.formats.names import named, printable
 from spikeloom.compiler.formats.onnx import atoms
 from spikeloom.compiler.formats.onnx.evaluate import FLOATING, LINEAR, MOVES, NUMERIC, evaluate, shapes_of
@@ -22,10 +31,17 @@ from spikeloom.compiler.formats.onnx.file import BOOL, Graph, Node
 _SHIFTS = frozenset(("Add", "Cast", "Div", "Identity", "Mul", "Sub"))
 """Operators that may stand between a membrane and its comparison, as in ``u - theta > 0``."""
 
-MIRRORED = {"Greater": "Less", "GreaterOrEqual": "LessOrEqual", "Less": "Greater", "LessOrEqual": "GreaterOrEqual"}
+MIRRORED = {
+    "Greater": "Less",
+    "GreaterOrEqual": "LessOrEqual",
+    "Less": "Greater",
+    "LessOrEqual": "GreaterOrEqual",
+}
 """Comparisons with a threshold, and each with its sides exchanged."""
 
-CONSTANT = "is computed from constants by an operator that is not known here; fold constants before the export"
+CONSTANT = (
+    "is computed from constants by an operator that is not known here; fold constants before the export"
+)
 
 
 def run(graph: Graph, given: Mapping[str, atoms.Value], table: atoms.Table) -> list[atoms.Value]:
@@ -60,7 +76,9 @@ def _set_apart(node: Node, name: str, value: atoms.Value, table: atoms.Table) ->
     known = len(value.terms) == 1 and diagonal(value.terms[only]) == 1 and not np.any(value.bias)
     if known and table.atoms[only].kind in (atoms.INPUT_ATOM, atoms.MEMBRANE):
         return value
-    return table.value(table.atom(atoms.MEMBRANE, name, len(value.bias), definition=value, node=str(node)), value.shape)
+    return table.value(
+        table.atom(atoms.MEMBRANE, name, len(value.bias), definition=value, node=str(node)), value.shape
+    )
 
 
 def reads(node: Node) -> list[str]:
@@ -203,7 +221,9 @@ def _scattered(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | 
     if target.shape != more.shape:
         raise ValueError("updates of another shape than the indices")
     size = len(more.bias)
-    matrix = sparse.coo_array((np.ones(size), (target.ravel(), np.arange(size))), shape=(len(start.bias), size)).tocsr()
+    matrix = sparse.coo_array(
+        (np.ones(size), (target.ravel(), np.arange(size))), shape=(len(start.bias), size)
+    ).tocsr()
     return added([(1.0, start), (1.0, through(matrix, more, start.shape))], start.shape)
 
 
@@ -212,7 +232,10 @@ def _moved(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None
     places = MOVES[node.op] or range(len(operands))
     if any(isinstance(value, Affine) and place not in places for place, value in enumerate(operands)):
         raise ModelError("takes indices or sizes from what varies; only a fixed graph can be lowered")
-    if node.attributes.get("mode", "constant") != "constant" or node.attributes.get("reduction", "none") != "none":
+    if (
+        node.attributes.get("mode", "constant") != "constant"
+        or node.attributes.get("reduction", "none") != "none"
+    ):
         raise ValueError("only constant padding, and scattering that replaces or adds, are known")
     positions: list[atoms.Value | None] = list(operands)
     parts: list[Affine] = []
@@ -227,7 +250,9 @@ def _moved(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None
     return [picked_of_all(parts, rows) for rows in moved]
 
 
-def _linear(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None], varying: list[int]) -> Affine:
+def _linear(
+    node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None], varying: list[int]
+) -> Affine:
     """A linear operator through its matrix, and the bias that Conv and Gemm add."""
     has_bias = node.op in ("Conv", "Gemm")
     inner = [place for place in varying if not (has_bias and place == 2)]
@@ -243,7 +268,13 @@ def _linear(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | Non
     if not node.op.startswith("Reduce"):  # whose second operand is a list of axes
         arrays = [None if each is None else each.astype(np.float64) for each in arrays]
     constants = [operand for index, operand in enumerate(operands) if index != place and operand is not None]
-    key = (node.op, place, value.shape, str(sorted(node.attributes.items())), *(id(array) for array in constants))
+    key = (
+        node.op,
+        place,
+        value.shape,
+        str(sorted(node.attributes.items())),
+        *(id(array) for array in constants),
+    )
     if key not in table.matrices:
         shape = shapes_of(node, table, arrays)[0]
         matrix = matrix_of(node, table, arrays[:2], place)
@@ -272,7 +303,9 @@ def _normalised(node: Node, table: atoms.Table, operands: Sequence[atoms.Value |
     return shifted(scaled(value, (at_high - at_zero) / high), at_zero)
 
 
-def _elementwise(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None], varying: list[int]) -> Affine:
+def _elementwise(
+    node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None], varying: list[int]
+) -> Affine:
     op = node.op
     values = [atoms.as_affine(operand) for operand in operands]
     weights = {"Add": 1.0, "Mean": 1 / len(values), "Neg": -1.0, "Sub": 1.0, "Sum": 1.0}
@@ -284,12 +317,18 @@ def _elementwise(node: Node, table: atoms.Table, operands: Sequence[atoms.Value 
     other = parts[-1]
     if op == "Cast":
         to = int(node.attributes["to"])
-        if to not in FLOATING and not (atoms.is_binary(table, value) if to == BOOL else atoms.is_whole(table, value)):
+        if to not in FLOATING and not (
+            atoms.is_binary(table, value) if to == BOOL else atoms.is_whole(table, value)
+        ):
             raise ModelError(f"rounds its input to whole numbers, so it {atoms.NOT_AFFINE}")
         return value
     if op == "Mul":
         both = len(varying) == 2
-        return atoms.multiplied(table, value, other) if both else scaled(parts[varying[0]], parts[1 - varying[0]].bias)
+        return (
+            atoms.multiplied(table, value, other)
+            if both
+            else scaled(parts[varying[0]], parts[1 - varying[0]].bias)
+        )
     if op == "Div" and varying == [0]:
         # not a product with the reciprocal: 1 / 3 is not a number
         return scaled(value, other.bias, np.divide)
@@ -297,4 +336,6 @@ def _elementwise(node: Node, table: atoms.Table, operands: Sequence[atoms.Value 
         return _opposite(value)
     if op in ("Div", "Not"):
         raise ModelError(atoms.NOT_AFFINE)
-    return added([(-1.0 if op == "Sub" and place else weights[op], part) for place, part in enumerate(parts)], shape)
+    return added(
+        [(-1.0 if op == "Sub" and place else weights[op], part) for place, part in enumerate(parts)], shape
+    )

@@ -1,7 +1,7 @@
 """Read a spiking network from an ONNX file: one step with its state as inputs and outputs, or all steps unrolled.
 
-The graph is run on values that vary, in float64: what is affine between two spiking layers becomes weights, what is
-held against a threshold becomes a layer, and everything else is refused by name.
+The graph is run on values that vary, in float64: what is affine between two spiking layers becomes weights,
+what is held against a threshold becomes a layer, and everything else is refused by name.
 """
 
 import math
@@ -33,10 +33,12 @@ def read_onnx(
 
     Data that the file keeps beside itself must lie in its folder.
 
-    Raises ModelError if the file cannot be read, or holds something else than a feed-forward network of leaky
-    integrate-and-fire neurons with affine stages, naming the operator; OptionError if there are no such polarities.
+    Raises ModelError if the file cannot be read, or holds something else than a feed-forward network of
+    leaky integrate-and-fire neurons with affine stages, naming the operator; OptionError if there are no
+    such polarities.
     """
-    # A constant may divide by zero on its way, as degrees of lonely taxels do; what counts is checked at the end.
+    # A constant may divide by zero on its way, as degrees of lonely taxels do; what counts is checked at the
+    # end.
     with reading(path, ModelError, "export it again"), np.errstate(all="ignore"):
         return _network(read_graph(Path(path)), polarities, polarities_first)
 
@@ -49,7 +51,9 @@ def _network(file: Graph, polarities: int | None, polarities_first: bool | None)
     given = {}
     for declared in graph.inputs:
         shape = _fixed(declared, facts)
-        atom = table.atom(INPUT_ATOM, declared.name, math.prod(table.room(shape)), binary=declared.kind == BOOL)
+        atom = table.atom(
+            INPUT_ATOM, declared.name, math.prod(table.room(shape)), binary=declared.kind == BOOL
+        )
         shapes[atom], given[declared.name] = shape, table.value(atom, shape)
     results = zip(graph.outputs, run(graph, given, table), strict=True)
     outputs = {name: as_affine(value) for name, value in results}
@@ -57,7 +61,9 @@ def _network(file: Graph, polarities: int | None, polarities_first: bool | None)
         require_finite(value, f"output {printable(name)}: ")
     groups = group(table, neurons_of(table, outputs), shapes)
     voters, label, counted = readout(table, groups, outputs)
-    sensor, positions, words = sensor_layout(groups.shape, polarities=polarities, polarities_first=polarities_first)
+    sensor, positions, words = sensor_layout(
+        groups.shape, polarities=polarities, polarities_first=polarities_first
+    )
     names = _names(graph, table, groups)
     double = any(declared.kind == DOUBLE for declared in graph.inputs)
     layers = [
@@ -66,7 +72,10 @@ def _network(file: Graph, polarities: int | None, polarities_first: bool | None)
             beta=layer[-1].beta or 0.0,
             theta=_threshold(layer[0], double=double),
             bias=layer[0].bias,
-            sources={source: weight[:, positions] if source == INPUT else weight for source, weight in sources.items()},
+            sources={
+                source: weight[:, positions] if source == INPUT else weight
+                for source, weight in sources.items()
+            },
         )
         for name, layer, sources in zip(names, groups.layers, groups.sources, strict=True)
     ]
@@ -96,8 +105,15 @@ def _undecided(graph: Graph, facts: list[str]) -> Graph:
     for output in graph.outputs:
         name = output
         node = makers.get(output)
-        if node is not None and node.op == "ArgMax" and node.inputs and not node.attributes.get("select_last_index", 0):
-            facts.append(f"output {printable(name)}: the class of the largest of {printable(node.inputs[0])}")
+        if (
+            node is not None
+            and node.op == "ArgMax"
+            and node.inputs
+            and not node.attributes.get("select_last_index", 0)
+        ):
+            facts.append(
+                f"output {printable(name)}: the class of the largest of {printable(node.inputs[0])}"
+            )
             name = node.inputs[0]
         outputs += [] if name in outputs else [name]
     return replace(graph, outputs=tuple(outputs))
@@ -132,7 +148,12 @@ def _names(graph: Graph, table: Table, found: Unrolled) -> tuple[str, ...]:
 
 
 def _facts(
-    file: Graph, table: Table, found: Unrolled, outputs: Mapping[str, Affine], names: tuple[str, ...], words: str
+    file: Graph,
+    table: Table,
+    found: Unrolled,
+    outputs: Mapping[str, Affine],
+    names: tuple[str, ...],
+    words: str,
 ) -> list[str]:
     """What a reader of the file would want to check."""
     steps = len(found.layers[0])
@@ -154,5 +175,9 @@ def _facts(
         if not n.strict:
             line += "; >= is read as > the next number below"
         facts.append(line)
-    ignored = [printable(atom.label) for n, atom in enumerate(table.atoms) if atom.kind == INPUT_ATOM and n not in used]
+    ignored = [
+        printable(atom.label)
+        for n, atom in enumerate(table.atoms)
+        if atom.kind == INPUT_ATOM and n not in used
+    ]
     return facts + ([f"inputs without effect on a spike: {', '.join(ignored)}"] if ignored else [])

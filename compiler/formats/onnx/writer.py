@@ -1,8 +1,9 @@
 """A netlist as an integer ONNX graph: the chip's arithmetic, to be run by any program that reads the format.
 
-Spikes are uint8 zeros and ones; membranes and currents are registers, int32 where no input can bring a product or a
-sum beyond it and int64 otherwise. A layer is called by its name (``conv1``, ``fc1`` …), its neurons are those that the
-chip holds, in the order of the layer; the metadata list them where some were left out.
+Spikes are uint8 zeros and ones; membranes and currents are registers, int32 where no input can bring a
+product or a sum beyond it and int64 otherwise. A layer is called by its name (``conv1``, ``fc1`` …), its
+neurons are those that the chip holds, in the order of the layer; the metadata list them where some were left
+out.
 
 Form ``step``: one chip step. Feed every output ``X_next`` back as input ``X``; at the start all are zero.
 
@@ -16,13 +17,13 @@ Form ``step``: one chip step. Feed every output ``X_next`` back as input ``X``; 
 ``votes``              (batch, classes)   int32, summed up; only where a layer votes
 ====================== ================== =============================================================================
 
-Weights become matrices of int8 digits: ``weight = unit * sum_k digit_k * 256**k`` with digits from -128 to 127 and a
-unit for each neuron. A product of spikes (0 and 1) with digits is ``MatMulInteger``, exact in its
-int32 sums and faster than float32: most netlists need a single digit. Weights that several synapses of a pair store
-(planes) are added up first.
+Weights become matrices of int8 digits: ``weight = unit * sum_k digit_k * 256**k`` with digits from -128 to
+127 and a unit for each neuron. A product of spikes (0 and 1) with digits is ``MatMulInteger``, exact in its
+int32 sums and faster than float32: most netlists need a single digit. Weights that several synapses of a
+pair store (planes) are added up first.
 
-Form ``scan``: whole recordings of the same length, a loop over the form ``step``. Everything is aligned with the data:
-``LAYER.spikes[t]`` is what the layer did with data step ``t``, in chip step ``t + depth``.
+Form ``scan``: whole recordings of the same length, a loop over the form ``step``. Everything is aligned with
+the data: ``LAYER.spikes[t]`` is what the layer did with data step ``t``, in chip step ``t + depth``.
 
 ====================== ======================= ========================================================================
 ``events``             (time, batch, channels) input, uint8
@@ -42,7 +43,14 @@ from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import plain_names
-from spikeloom.compiler.formats.onnx.builder import Model, Nodes, Port, model_bytes, one_each, whole_recordings
+from spikeloom.compiler.formats.onnx.builder import (
+    Model,
+    Nodes,
+    Port,
+    model_bytes,
+    one_each,
+    whole_recordings,
+)
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.loihi1.bounds import Reach, reach
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, netlist_bytes
@@ -87,7 +95,9 @@ class Layer:
 def digits(weight: IntArray) -> tuple[Digit, ...]:
     """Write a matrix of integers in int8 digits."""
     common = np.bitwise_or.reduce(np.abs(weight), axis=0)
-    factor = np.where(common == 0, 1, common & -common)  # the largest power of two in all weights of a neuron
+    factor = np.where(
+        common == 0, 1, common & -common
+    )  # the largest power of two in all weights of a neuron
     found: list[Digit] = []
     rest = weight // factor
     while not found or rest.any():
@@ -101,15 +111,17 @@ def digits(weight: IntArray) -> tuple[Digit, ...]:
 def plan(netlist: Netlist) -> tuple[Layer, ...]:
     """Layers that have compartments, in the order of their depth.
 
-    Raises ModelError if the netlist is free-running, their weights as dense matrices are more than a file holds, or
-    some input may overflow a sum or a current, where the chip is not defined.
+    Raises ModelError if the netlist is free-running, their weights as dense matrices are more than a file
+    holds, or some input may overflow a sum or a current, where the chip is not defined.
     """
     if netlist.blank:
         raise ModelError("onnx: a free-running netlist has no windows; compile it without --free-running")
     reached = reach(netlist)
     if np.any(over := (reached.sums > ACCUMULATOR_MAX) | (reached.current > CURRENT_MAX)):
         name = netlist.layers[netlist.layer[np.argmax(over)]].name
-        raise ModelError(f"onnx: some input may overflow a register of {name}; train it with smaller weights")
+        raise ModelError(
+            f"onnx: some input may overflow a register of {name}; train it with smaller weights"
+        )
     names = plain_names([layer.name for layer in netlist.layers], taken=["input"])
     pre_of_axon = np.append(np.full(netlist.n_inputs, INPUT), netlist.layer)[netlist.axon_source]
     # zeros of dense lists are no synapses
@@ -122,9 +134,13 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
     post = netlist.layer[target]
     pairs = np.unique(np.stack([post, pre], axis=1), axis=0)
     place = netlist.number_in_layer()
-    counts = {INPUT: netlist.n_inputs} | dict(enumerate(np.bincount(netlist.layer, minlength=len(names)).tolist()))
+    counts = {INPUT: netlist.n_inputs} | dict(
+        enumerate(np.bincount(netlist.layer, minlength=len(names)).tolist())
+    )
     if (size := sum(counts[a] * counts[b] for b, a in pairs.tolist())) > SIZE_LIMIT:
-        raise ModelError(f"onnx: dense, the weights need {size} bytes, a file holds {SIZE_LIMIT}; give a smaller one")
+        raise ModelError(
+            f"onnx: dense, the weights need {size} bytes, a file holds {SIZE_LIMIT}; give a smaller one"
+        )
     row = np.append(np.arange(netlist.n_inputs), place)[netlist.axon_source[axon]]
 
     def weights(a: int, b: int) -> IntArray:
@@ -179,7 +195,9 @@ def export(netlist: Netlist, form: str) -> tuple[bytes, list[Port], list[Port]]:
     layers = plan(netlist)
     model = _chip_step(netlist, layers)
     if form == "scan":
-        model = whole_recordings(model, {each.name: (each.size, each.depth) for each in layers}, netlist.classes)
+        model = whole_recordings(
+            model, {each.name: (each.size, each.depth) for each in layers}, netlist.classes
+        )
     content = model_bytes(
         model,
         name=f"spikeloom-{form}",
@@ -278,7 +296,9 @@ def _integrate(graph: Nodes, netlist: Netlist, layer: Layer, spikes: list[str], 
     if layer.saturates:
         value = graph.add("Clip", [value, kind(-MEMBRANE_MAX), kind(MEMBRANE_MAX)], f"{name}/clipped")
     value = graph.add("Mul", [value, window], f"{name}/gated")
-    fired = graph.add("Greater", [value, one_each(netlist.threshold[ids] << MEMBRANE_SHIFT, kind)], f"{name}/fired")
+    fired = graph.add(
+        "Greater", [value, one_each(netlist.threshold[ids] << MEMBRANE_SHIFT, kind)], f"{name}/fired"
+    )
     graph.add("Where", [fired, kind(0), value], f"{name}.membrane_next")
     graph.cast(fired, f"{name}.spikes_next", np.uint8)
 
@@ -293,7 +313,9 @@ def _sum(graph: Nodes, layer: Layer, spikes: list[str]) -> str:
         product = graph.add("MatMulInteger", [received, digit], name)
         if layer.kind is not np.int32:
             product = graph.cast(product, f"{name}/wide", layer.kind)
-        scaled = graph.add("Mul", [product, one_each(factor << MEMBRANE_SHIFT, layer.kind)], f"{name}/scaled")
+        scaled = graph.add(
+            "Mul", [product, one_each(factor << MEMBRANE_SHIFT, layer.kind)], f"{name}/scaled"
+        )
         total = graph.add("Add", [total, scaled], f"{name}/sum") if total else scaled
     return total
 

@@ -73,7 +73,9 @@ def one_step_bounds(netlist: Netlist) -> tuple[IntArray, IntArray]:
     """
     synapse = np.arange(netlist.n_synapses)
     shape = netlist.n_compartments, netlist.n_synapses
-    ordered = sparse.csr_array((netlist.effective_weight(), (netlist.synapse_compartment(), synapse)), shape=shape)
+    ordered = sparse.csr_array(
+        (netlist.effective_weight(), (netlist.synapse_compartment(), synapse)), shape=shape
+    )
     return one_sided_sums(ordered.data, ordered.indptr)
 
 
@@ -203,7 +205,9 @@ def _inhibition(
     return itself, others
 
 
-def _most_spikes(population: IntegerPopulation, up: FloatArray, itself: FloatArray, length: float) -> FloatArray:
+def _most_spikes(
+    population: IntegerPopulation, up: FloatArray, itself: FloatArray, length: float
+) -> FloatArray:
     """Spikes of each neuron in a recording at most, where its registers keep all or nothing."""
     if population.decay_v != 0 or population.decay_u + 1 != DECAY_ONE:
         return np.full(population.size, length)

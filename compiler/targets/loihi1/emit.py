@@ -80,7 +80,9 @@ def _axons(
             index = core_needs.index_bits(base + chunk.size - 1, target)
             for lists in needs.lists(chunk):
                 projection = network.projections[lists.projection]
-                dense, _ = core_needs.choose_dense(lists, projection, base, chunk.size, lean=lean, target=target)
+                dense, _ = core_needs.choose_dense(
+                    lists, projection, base, chunk.size, lean=lean, target=target
+                )
                 keys = [(projection.bits, projection.exponent, 0 if flag else index) for flag in dense]
                 source = lists.source
                 if projection.pre != INPUT:
@@ -88,7 +90,9 @@ def _axons(
                 length, place, weight = _entries(lists, dense, base)
                 axons.per_core[core] += len(source)
                 axons.source.append(source)
-                axons.format.append(np.array([axons.formats.setdefault(key, len(axons.formats)) for key in keys]))
+                axons.format.append(
+                    np.array([axons.formats.setdefault(key, len(axons.formats)) for key in keys])
+                )
                 axons.length.append(length)
                 axons.target.append(place)
                 axons.weight.append(weight)
@@ -130,10 +134,16 @@ def emit(
 
     def column(name: str) -> AnyArray:
         """A field of the populations, of each compartment."""
-        return np.concatenate([getattr(network.populations[c.population], name)[c.first : c.last] for c in order])
+        return np.concatenate(
+            [getattr(network.populations[c.population], name)[c.first : c.last] for c in order]
+        )
 
     axons = _axons(network, cores, target, compartment_id)
-    known = numbers if identity is None else np.concatenate([identity[c.population][c.first : c.last] for c in order])
+    known = (
+        numbers
+        if identity is None
+        else np.concatenate([identity[c.population][c.first : c.last] for c in order])
+    )
     return Netlist(
         target=target.name,
         taxels=network.input.taxels,
@@ -141,7 +151,9 @@ def emit(
         classes=network.classes,
         layers=_layers(origin or network, unread or none_of(network)),
         core_tile=read_only(tiles),
-        core_compartments=read_only(np.cumsum([0, *(sum(chunk.size for chunk in chunks) for chunks in cores)])),
+        core_compartments=read_only(
+            np.cumsum([0, *(sum(chunk.size for chunk in chunks) for chunks in cores)])
+        ),
         core_axons=read_only(np.cumsum([0, *axons.per_core])),
         layer=read_only(layer),
         neuron=read_only(known),

@@ -48,7 +48,9 @@ def forgotten(netlist: Netlist) -> Forgotten:
     inner = sent >= 0
     weight = netlist.effective_weight() << MEMBRANE_SHIFT
     pairs = netlist.synapse_compartment()[inner], sent[inner]
-    less, more = (sparse.csr_array((part(weight[inner], 0), pairs), shape=(n, n)) for part in (np.minimum, np.maximum))
+    less, more = (
+        sparse.csr_array((part(weight[inner], 0), pairs), shape=(n, n)) for part in (np.minimum, np.maximum)
+    )
     reached = reach(netlist)
     threshold = netlist.threshold << MEMBRANE_SHIFT
     most = np.minimum(reached.current, CURRENT_MAX)
@@ -64,12 +66,16 @@ def forgotten(netlist: Netlist) -> Forgotten:
         current = np.clip(_kept(current, netlist.decay_u + 1) + sums, -most, most)
         membrane = np.clip(_kept(membrane, netlist.decay_v) + current + bias, -MEMBRANE_MAX, MEMBRANE_MAX)
         spikes = membrane > threshold
-        reset = np.stack([np.minimum(membrane[0], 0), threshold])  # what it may have left where its spike is open
+        reset = np.stack(
+            [np.minimum(membrane[0], 0), threshold]
+        )  # what it may have left where its spike is open
         membrane = np.where(spikes[0], 0, np.where(spikes[1], reset, membrane))
         if step == MOST_BLANK or all(map(np.array_equal, before, (current, membrane, spikes))):
             break
     if step == MOST_BLANK or not netlist.decay_v.all():
-        raise OptionError(f"--free-running: some membranes do not decay, or not in {MOST_BLANK} blank steps; omit it")
+        raise OptionError(
+            f"--free-running: some membranes do not decay, or not in {MOST_BLANK} blank steps; omit it"
+        )
     restless = spikes[0] != spikes[1]
     stirred = restless | ((more - less) @ restless.astype(np.int64) > 0)
     apart = np.ptp(membrane, axis=0) + np.ptp(_kept(current, netlist.decay_u + 1), axis=0)

@@ -118,7 +118,9 @@ def integer_layer(
     With `saturates` off the membrane has no limits, which tells what saturation does; `loops` as of
     :func:`float_layer`.
     """
-    keep_u, keep_v = (round(kept * DECAY_ONE) for kept in (population.realised_alpha, population.realised_beta))
+    keep_u, keep_v = (
+        round(kept * DECAY_ONE) for kept in (population.realised_alpha, population.realised_beta)
+    )
     weights = [(p, p.effective() * (1 << MEMBRANE_SHIFT)) for p in projections]
     largest = sum(abs(weight).sum(axis=1).max(initial=0) for _, weight in weights)
     largest += MEMBRANE_MAX + int(abs(population.bias).max(initial=0))
@@ -128,7 +130,9 @@ def integer_layer(
     pres, synapses = synapses_of(weights, dtype, loops=loops)
     threshold = (population.threshold << MEMBRANE_SHIFT).astype(dtype)
     registers = threshold, *(dtype(value) for value in (keep_u, keep_v, limit))
-    return Layer(pres=pres, size=population.size, fixed=(*synapses, population.bias.astype(dtype), registers))
+    return Layer(
+        pres=pres, size=population.size, fixed=(*synapses, population.bias.astype(dtype), registers)
+    )
 
 
 def integer_simulation(network: IntegerNetwork, *, saturates: bool = True) -> Simulation:

@@ -39,7 +39,9 @@ class LimitUse:
     core: int | None
 
 
-def list_words(entries: IntArray, weight_bits: IntArray | int, index_bits: IntArray | int, target: Target) -> IntArray:
+def list_words(
+    entries: IntArray, weight_bits: IntArray | int, index_bits: IntArray | int, target: Target
+) -> IntArray:
     """Words of synaptic memory that lists of `entries` synapses take.
 
     A list is cut in blocks of up to 64 synapses; a block costs its entries and a header, rounded up to whole
@@ -55,7 +57,9 @@ def list_words(entries: IntArray, weight_bits: IntArray | int, index_bits: IntAr
     return np.asarray(full * whole + part)
 
 
-def stored_once(form: IntArray, lengths: IntArray, place: IntArray, weight: IntArray, target: Target) -> IntArray:
+def stored_once(
+    form: IntArray, lengths: IntArray, place: IntArray, weight: IntArray, target: Target
+) -> IntArray:
     """Which lists of a core synaptic memory holds: a list that several axons share is there once; (stored lists,).
 
     An input axon points to a list and adds a base to its places, so axons share a list if format and weights
@@ -71,14 +75,18 @@ def stored_once(form: IntArray, lengths: IntArray, place: IntArray, weight: IntA
     """
     bounds = np.append(0, np.cumsum(lengths))
     place = place.astype(np.int32)
-    first = np.minimum.reduceat(np.append(place, np.int32(1 << 30)), bounds[:-1])  # Of an empty list anything
+    first = np.minimum.reduceat(
+        np.append(place, np.int32(1 << 30)), bounds[:-1]
+    )  # Of an empty list anything
     alike = (place - np.repeat(first, lengths) << WEIGHT_BITS) + weight
     content = alike.astype(np.int32).tobytes()
     size = 4 * bounds
     seen: dict[tuple[int, int, bytes], int] = {}
     copy = first // (target.limit("core.dense_base") + 1)
     columns = (form, copy, size[:-1], size[1:])
-    for i, (kind, above, begin, end) in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
+    for i, (kind, above, begin, end) in enumerate(
+        zip(*(column.tolist() for column in columns), strict=True)
+    ):
         seen.setdefault((kind, above, content[begin:end]), i)
     return np.array([*seen.values()], np.int64)
 
@@ -94,8 +102,12 @@ def _stored_on(netlist: Netlist, core: int, target: Target) -> IntArray:
     """Axons of a core whose lists its memory holds, for themselves and for others."""
     axons = slice(*netlist.core_axons[core : core + 2].tolist())
     ends = netlist.axon_synapses[axons.start : axons.stop + 1]
-    place, weight = (column[ends[0] : ends[-1]] for column in (netlist.synapse_target, netlist.synapse_weight))
-    stored: IntArray = axons.start + stored_once(netlist.axon_format[axons], np.diff(ends), place, weight, target)
+    place, weight = (
+        column[ends[0] : ends[-1]] for column in (netlist.synapse_target, netlist.synapse_weight)
+    )
+    stored: IntArray = axons.start + stored_once(
+        netlist.axon_format[axons], np.diff(ends), place, weight, target
+    )
     return stored
 
 
@@ -135,7 +147,10 @@ def measure(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
         for core, amount in enumerate(amounts)
     ]
     chips = np.bincount(netlist.core_tile // (target.limit("mesh.width") * target.limit("mesh.height")))
-    return (*uses, LimitUse(name="chip.cores", used=int(chips.max()), allowed=target.limit("chip.cores"), core=None))
+    return (
+        *uses,
+        LimitUse(name="chip.cores", used=int(chips.max()), allowed=target.limit("chip.cores"), core=None),
+    )
 
 
 def violation(target: Target, owner: str, rule: str, used: int) -> Violation:

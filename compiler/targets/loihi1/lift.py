@@ -65,20 +65,28 @@ def _projections(netlist: Netlist) -> list[IntegerProjection]:
     bits = netlist.format_weight_bits[form]
     sizes = {INPUT: netlist.n_inputs} | {i: layer.neurons for i, layer in enumerate(netlist.layers)}
     projections = []
-    code = ((post * (len(netlist.layers) + 1) + pre + 1) * 64 + exponent + 32) * 16 + bits  # one number sorts faster
+    code = (
+        (post * (len(netlist.layers) + 1) + pre + 1) * 64 + exponent + 32
+    ) * 16 + bits  # one number sorts faster
     for first in np.unique(code, return_index=True)[1]:
         stored = (code == code[first]) & (netlist.synapse_weight != 0)
         to, origin, power, width = (int(each[first]) for each in (post, pre, exponent, bits))
         mantissa = netlist.synapse_weight[stored].astype(np.int64)
-        weight = sparse.csr_array((mantissa, (row[stored], column[stored])), shape=(sizes[to], sizes[origin]))
+        weight = sparse.csr_array(
+            (mantissa, (row[stored], column[stored])), shape=(sizes[to], sizes[origin])
+        )
         weight.sum_duplicates()
         projections.append(IntegerProjection(pre=origin, post=to, weight=weight, exponent=power, bits=width))
     reached = {projection.post for projection in projections if projection.pre != projection.post}
     for index, layer in enumerate(netlist.layers):
         if index not in reached:
-            before = next((i for i, other in enumerate(netlist.layers) if other.depth == layer.depth - 1), INPUT)
+            before = next(
+                (i for i, other in enumerate(netlist.layers) if other.depth == layer.depth - 1), INPUT
+            )
             none = sparse.csr_array((layer.neurons, sizes[before]), dtype=np.int64)
-            projections += [IntegerProjection(pre=before, post=index, weight=none, exponent=0, bits=layer.weight_bits)]
+            projections += [
+                IntegerProjection(pre=before, post=index, weight=none, exponent=0, bits=layer.weight_bits)
+            ]
     return projections
 
 
@@ -93,7 +101,9 @@ def lift(netlist: Netlist) -> IntegerNetwork:
     if len(voting) != 1:
         raise FormatError(f"{len(voting)} layers vote for classes, one is allowed; compile it again")
     return IntegerNetwork(
-        input=Input(taxels=netlist.taxels, polarities=netlist.polarities, clocks=netlist.clocks, bins=netlist.bins),
+        input=Input(
+            taxels=netlist.taxels, polarities=netlist.polarities, clocks=netlist.clocks, bins=netlist.bins
+        ),
         populations=populations,
         projections=tuple(projections),
         readout=Readout(

@@ -44,7 +44,16 @@ MOST_BLANK = 4096
 """Blank steps after a recording."""
 
 PER_COMPARTMENT = (
-    *("neuron", "decay_u", "decay_v", "threshold", "bias_mantissa", "bias_exponent", "scale", "readout_class"),
+    *(
+        "neuron",
+        "decay_u",
+        "decay_v",
+        "threshold",
+        "bias_mantissa",
+        "bias_exponent",
+        "scale",
+        "readout_class",
+    ),
 )
 """Arrays of a netlist, beside ``layer``, with an entry for each compartment."""
 
@@ -55,7 +64,9 @@ class Layer:
 
     name: str  # ``conv1``, ``fc1`` …
     neurons: int  # Neurons of the float model's layer; the chip may hold fewer compartments
-    unread: tuple[int, ...]  # Neurons left out as their spikes reach no neuron; others that are missing cannot fire
+    unread: tuple[
+        int, ...
+    ]  # Neurons left out as their spikes reach no neuron; others that are missing cannot fire
     depth: int  # Steps that the layer lags behind the data
     beta: float  # Decay of the float model
     theta: float  # Its threshold
@@ -152,7 +163,8 @@ class Netlist(netlist_file.Netlist):
         """Neurons of each layer, (neurons,) bool, without a compartment."""
         present = (self.neuron[self.compartments_of(index)] for index in range(len(self.layers)))
         return tuple(
-            ~np.isin(np.arange(layer.neurons), neurons) for layer, neurons in zip(self.layers, present, strict=True)
+            ~np.isin(np.arange(layer.neurons), neurons)
+            for layer, neurons in zip(self.layers, present, strict=True)
         )
 
     def number_in_layer(self) -> IntArray:
@@ -210,7 +222,10 @@ def inconsistencies(netlist: Netlist) -> list[str]:
         "core_axons": (netlist.n_cores, axons),
         "axon_synapses": (axons, synapses),
     }
-    lengths = dict.fromkeys(PER_COMPARTMENT, compartments) | {"axon_format": axons, "synapse_target": synapses}
+    lengths = dict.fromkeys(PER_COMPARTMENT, compartments) | {
+        "axon_format": axons,
+        "synapse_target": synapses,
+    }
     lengths |= {"format_weight_bits": formats, "format_index_bits": formats}
     ranges = {
         "layer": (0, len(netlist.layers)),
@@ -239,11 +254,19 @@ def inconsistencies(netlist: Netlist) -> list[str]:
         found.append(f"{netlist.blank} blank steps follow a recording, layers lag up to {netlist.max_depth}")
     for index, layer in enumerate(netlist.layers):
         if layer.depth >= len(netlist.layers):
-            found.append(f"layer {layer.name} lags {layer.depth} steps behind, with {len(netlist.layers)} layers")
+            found.append(
+                f"layer {layer.name} lags {layer.depth} steps behind, with {len(netlist.layers)} layers"
+            )
         neurons = np.sort(netlist.neuron[netlist.layer == index])
         if np.intersect1d(neurons, layer.unread).size or max(layer.unread, default=0) >= layer.neurons:
-            found.append(f"layer {layer.name} holds neurons that it leaves out, or leaves out some that are not there")
-        if is_outside(neurons, 0, layer.neurons) or len(np.unique(neurons)) != len(neurons) or not len(neurons):
+            found.append(
+                f"layer {layer.name} holds neurons that it leaves out, or leaves out some that are not there"
+            )
+        if (
+            is_outside(neurons, 0, layer.neurons)
+            or len(np.unique(neurons)) != len(neurons)
+            or not len(neurons)
+        ):
             found.append(
                 f"layer {layer.name} holds none of its {layer.neurons} neurons, one twice or one that is not there"
             )

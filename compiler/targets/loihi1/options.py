@@ -57,7 +57,9 @@ def check_packings(packings: Sequence[Packing], layers: int, target: Target) -> 
                 f"allowed: {', '.join(map(str, allowed))}"
             )
         if not 1 <= packing.planes <= MAX_PLANES:
-            raise OptionError(f"--planes {packing.planes}: allowed are 1 to {MAX_PLANES}; choose one of these")
+            raise OptionError(
+                f"--planes {packing.planes}: allowed are 1 to {MAX_PLANES}; choose one of these"
+            )
         slots = target.limit("core.threshold_slots")
         if not 1 <= packing.groups <= slots:
             holds = f"a core of {target.title} holds {slots} thresholds"

@@ -44,16 +44,26 @@ class Compilation:
     options: Options  # What was asked for
     target: Target  # Chip
     network: Network = LATER  # What is compiled, where it is one of floats
-    calibration: Calibration | None = None  # What it did on training recordings, where there are any (`calibrate`)
-    rates: tuple[FloatArray, ...] | None = None  # Spikes per step by population, likewise, by which traffic weighs
-    connected: Network = LATER  # The same network without the weights of neurons that do nothing (`disconnect`)
+    calibration: Calibration | None = (
+        None  # What it did on training recordings, where there are any (`calibrate`)
+    )
+    rates: tuple[FloatArray, ...] | None = (
+        None  # Spikes per step by population, likewise, by which traffic weighs
+    )
+    connected: Network = (
+        LATER  # The same network without the weights of neurons that do nothing (`disconnect`)
+    )
     quiet: Masks = ()  # Neurons that never fired in training and are to go for it, although some input makes them fire
     gone: Masks = ()  # Neurons that are to go in any case, see :func:`without`
     integer: IntegerNetwork = LATER  # In the integers of the chip (`quantize`)
     choices: tuple[Choice, ...] = ()  # Scale of each layer and why
     packing: Packing = EIGHT_BITS.packings[0]  # Of all layers, where held-out recordings choose
-    trials: tuple[Trial, ...] = ()  # Storages that were tried, the cheapest first, where held-out recordings choose
-    exactness: tuple[Exactness, ...] = ()  # What is in the way of equal spikes, where these were asked for; else empty
+    trials: tuple[
+        Trial, ...
+    ] = ()  # Storages that were tried, the cheapest first, where held-out recordings choose
+    exactness: tuple[
+        Exactness, ...
+    ] = ()  # What is in the way of equal spikes, where these were asked for; else empty
     proofs: tuple[RangeProof, ...] = ()  # Worst-case register values of each layer (`prove`)
     held: IntegerNetwork = LATER  # What the chip holds of it (`remove`)
     identity: tuple[IntArray, ...] = ()  # Which neurons these are, by population
@@ -96,7 +106,9 @@ def _calibrate(done: Compilation) -> Compilation:
         return done
     if not (isinstance(storage, Exact) or done.options.prune_unused):
         several = isinstance(storage, Fixed) and any(packing.planes > 1 for packing in storage.packings)
-        some = calibration.evenly_spaced(np.arange(len(events)), calibration.MANY if several else calibration.FEW)
+        some = calibration.evenly_spaced(
+            np.arange(len(events)), calibration.MANY if several else calibration.FEW
+        )
         events = events[held_out.split(len(events))[0] if isinstance(storage, Cheapest) else some]
     calibrated = calibration.calibrate(done.network, channels_last(events, done.network.input.clocks))
     return replace(done, calibration=calibrated, rates=calibrated.rates)
@@ -176,7 +188,10 @@ def _place(done: Compilation) -> Compilation:
     return replace(done, layout=layout)
 
 
-@step("writes cores, axons and synapse lists down as a netlist", keeps="every synapse that is not zero, stored once")
+@step(
+    "writes cores, axons and synapse lists down as a netlist",
+    keeps="every synapse that is not zero, stored once",
+)
 def _emit(done: Compilation) -> Compilation:
     provenance = dict(done.options.provenance)
     if done.choices:
@@ -225,7 +240,11 @@ def start(source: Network | IntegerNetwork, options: Options, target: Target) ->
     """
     options.require_consistent(calibrated=options.training_events is not None)
     empty = Compilation(options=options, target=target)
-    work = replace(empty, integer=source) if isinstance(source, IntegerNetwork) else replace(empty, network=source)
+    work = (
+        replace(empty, integer=source)
+        if isinstance(source, IntegerNetwork)
+        else replace(empty, network=source)
+    )
     work.verify()
     return work
 

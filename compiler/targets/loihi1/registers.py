@@ -100,7 +100,9 @@ def step_units(bits: int, exponents: tuple[int, ...]) -> float:
     return float(weight_step(bits) * 2.0 ** exponents[0])
 
 
-def round_steps(weight: FloatArray, scale: FloatArray | float, bits: int, exponents: tuple[int, ...]) -> IntArray:
+def round_steps(
+    weight: FloatArray, scale: FloatArray | float, bits: int, exponents: tuple[int, ...]
+) -> IntArray:
     """Round weights to whole steps of the finest plane and clip them to what the planes hold.
 
     `scale`, which broadcasts against `weight`, is in weight units per real unit.

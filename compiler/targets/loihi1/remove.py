@@ -71,7 +71,9 @@ def _unread(network: IntegerNetwork, pre: int, unread: Known, silent: Known) -> 
     received = np.full(network.populations[pre].size, pre == network.readout.population)
     for p in network.projections:
         if p.pre == pre:
-            counts = np.repeat(~(silent[p.post] | unread[p.post]), np.diff(p.weight.indptr)) & (p.weight.data != 0)
+            counts = np.repeat(~(silent[p.post] | unread[p.post]), np.diff(p.weight.indptr)) & (
+                p.weight.data != 0
+            )
             received[p.weight.indices[counts]] = True
     return ~received & ~silent[pre]
 

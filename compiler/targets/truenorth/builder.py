@@ -1,6 +1,7 @@
 """Build a network of crossbar cores piece by piece: cores, axons, neurons, crossing points, wires.
 
-A draft checks nothing that a chip limits: it may break any rule, and :mod:`truenorth.legalize` lists them all.
+A draft checks nothing that a chip limits: it may break any rule, and :mod:`truenorth.legalize` lists them
+all.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,8 +43,8 @@ RELAY = Neuron()
 def history_free(weights: tuple[int, ...], threshold: int) -> Neuron:
     """A neuron that spikes when its sum reaches the threshold, and forgets everything within the tick.
 
-    The threshold is a leak: what is at least zero after it spikes and is reset to zero, what is below zero is reset to
-    zero by the negative threshold. (The encoding of RANC's ``teaconversion.py``.)
+    The threshold is a leak: what is at least zero after it spikes and is reset to zero, what is below zero
+    is reset to zero by the negative threshold. (The encoding of RANC's ``teaconversion.py``.)
     """
     return Neuron(weights=weights, leak=-threshold, threshold=0)
 
@@ -150,7 +151,10 @@ class Draft:
 
         def columns(table: Sequence[Any], *names: str) -> dict[str, Any]:
             values = np.array(table, np.int64).reshape(-1, len(names))
-            return {name: read_only(np.ascontiguousarray(column)) for name, column in zip(names, values.T, strict=True)}
+            return {
+                name: read_only(np.ascontiguousarray(column))
+                for name, column in zip(names, values.T, strict=True)
+            }
 
         wires = [
             (first[core] + number, self.cores[end].x, self.cores[end].y, line, delay)
@@ -169,14 +173,18 @@ class Draft:
             core_neurons=read_only(first),
             core_axons=read_only(np.cumsum([0, *(len(core.axons) for core in self.cores)])),
             axon_synapses=read_only(np.cumsum([0, *(len(joined) for _, _, joined in axons)])),
-            synapse_neuron=read_only(np.array([neuron for _, _, joined in axons for neuron in joined], np.int64)),
+            synapse_neuron=read_only(
+                np.array([neuron for _, _, joined in axons for neuron in joined], np.int64)
+            ),
             weight=read_only(np.array(weights, np.int64).reshape(-1, AXON_TYPES)),
             readout_class=read_only(label),
             readout_first=read_only(opens),
             **columns([(core.x, core.y) for core in self.cores], "core_x", "core_y"),
             **columns([(line, kind) for line, kind, _ in axons], "axon_line", "axon_type"),
             **columns([(layer, number) for _, layer, number in neurons], "layer", "neuron"),
-            **columns([[getattr(neuron, name) for name in parameters] for neuron, _, _ in neurons], *parameters),
+            **columns(
+                [[getattr(neuron, name) for name in parameters] for neuron, _, _ in neurons], *parameters
+            ),
             **columns(wires, "wire_neuron", "wire_x", "wire_y", "wire_line", "wire_delay"),
             **columns(self.feeds, "feed_channel", "feed_core", "feed_line", "feed_tick"),
             **columns(self.clocks, "clock_core", "clock_line", "clock_period", "clock_phase"),

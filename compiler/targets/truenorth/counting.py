@@ -1,21 +1,24 @@
 """Place a counting network on crossbar cores: the integers of its file, a tick to a data step.
 
-What a core cannot hold are sums over hundreds of counters, so these are made in two steps, by numbers of spikes:
+What a core cannot hold are sums over hundreds of counters, so these are made in two steps, by numbers of
+spikes:
 
 ============  ==========================================================================================================
 ``gates``     where a recording has several parts: spike when their channel and the clock of their part do
 ``counters``  add up events; a spike sets them to ``-BLOCK``, the one synapse onto itself that other chips need
 ``sums``      two of each class for some of the counters, for weights above zero and for those below; a counter is led
-              to axons of the types 1, 2, 4 and 8. They spike as long as they hold one or more, and give one away
+              to axons of the types 1, 2, 4 and 8. They spike as long as they hold one or more, and give one
+              away
 ``votes``     add these spikes up, those for weights below zero with -1; the leak is the ramp. They are not reset
 ============  ==========================================================================================================
 
-A neuron has one target, so there is a counter for each axon that it reaches, all alike. Cores are filled with sums and
-votes first; counters and gates go where neurons and axons are left.
+A neuron has one target, so there is a counter for each axon that it reaches, all alike. Cores are filled
+with sums and votes first; counters and gates go where neurons and axons are left.
 
-Sums spike later than they would on other chips, at most as many ticks as the largest can hold: so many ticks later the
-votes count, and the ramp starts so much lower. The votes are those of other chips, spike for spike, unless a sum
-crosses the threshold before the data end, or counters spike a second time shortly before.
+Sums spike later than they would on other chips, at most as many ticks as the largest can hold: so many ticks
+later the votes count, and the ramp starts so much lower. The votes are those of other chips, spike for
+spike, unless a sum crosses the threshold before the data end, or counters spike a second time shortly
+before.
 """
 
 from collections import defaultdict
@@ -31,7 +34,12 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, Place, history_free
-from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_LINEAR, RESET_NONE, CrossbarNetlist
+from spikeloom.compiler.targets.truenorth.netlist import (
+    AXON_TYPES,
+    RESET_LINEAR,
+    RESET_NONE,
+    CrossbarNetlist,
+)
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 
 MAGNITUDES = tuple(1 << kind for kind in range(AXON_TYPES))
@@ -52,7 +60,8 @@ class Plan:
 
     counters: Counters
     groups: tuple[slice, ...]  # Counters whose sums are made together
-    # (groups, 2 * classes, counters) int64; of each class the weights above zero, and the magnitudes of those below
+    # (groups, 2 * classes, counters) int64; of each class the weights above zero, and the magnitudes of
+    # those below
     magnitude: IntArray
 
     @property
@@ -69,7 +78,9 @@ def planned(counters: Counters, chip: Target) -> Plan:
     most = int(np.abs(counters.weight).max())
     if most > LARGEST:
         bits = LARGEST.bit_length() + 1
-        raise ModelError(f"weights of up to {most}, {LARGEST} allowed; train it with --weight-bits {bits} or fewer")
+        raise ModelError(
+            f"weights of up to {most}, {LARGEST} allowed; train it with --weight-bits {bits} or fewer"
+        )
     if counters.slope != int(counters.slope):
         raise ModelError(f"a ramp of {counters.slope:g} a step, whole numbers are allowed; train it again")
     signed = np.stack([counters.weight, -counters.weight], axis=1).clip(min=0)
@@ -87,7 +98,9 @@ def planned(counters: Counters, chip: Target) -> Plan:
     return Plan(counters=counters, groups=groups, magnitude=magnitude)
 
 
-def lower_counters(counters: Counters, chip: Target, *, provenance: Mapping[str, Any] | None = None) -> CrossbarNetlist:
+def lower_counters(
+    counters: Counters, chip: Target, *, provenance: Mapping[str, Any] | None = None
+) -> CrossbarNetlist:
     """Place a counting network; ModelError if its weights are beyond the chip, CapacityError if its cores are."""
     plan = planned(counters, chip)
     draft = Draft()
@@ -171,10 +184,15 @@ def _filled(draft: Draft, chip: Target, layer: str, wanted: Iterable[Wanted]) ->
     """Add neurons; gives each source and an axon that waits for it."""
     neurons = chip.limit("core.neurons")
     axons = chip.limit("core.axons")
-    awaited = defaultdict[int, dict[int, list[int]]](dict)  # neurons of each core by the source that they wait for
+    awaited = defaultdict[int, dict[int, list[int]]](
+        dict
+    )  # neurons of each core by the source that they wait for
     for made, number, end, sources in wanted:
         for core, held in enumerate(draft.cores):
-            if len(held.neurons) < neurons and len(held.axons) + len(awaited[core].keys() | set(sources)) <= axons:
+            if (
+                len(held.neurons) < neurons
+                and len(held.axons) + len(awaited[core].keys() | set(sources)) <= axons
+            ):
                 break
         else:
             core = draft.core()

@@ -1,7 +1,8 @@
 """Hold a network of crossbar cores against every limit of its chip: all that is wrong, at once.
 
-Several offenders against one rule on one core share a line, which names the first. A float network is refused before
-it is lowered, with every reason that no layout could avoid; one that breaks none of these may still not fit.
+Several offenders against one rule on one core share a line, which names the first. A float network is
+refused before it is lowered, with every reason that no layout could avoid; one that breaks none of these may
+still not fit.
 """
 
 from collections.abc import Callable, Iterator
@@ -40,11 +41,17 @@ def faults(netlist: CrossbarNetlist, chip: Target) -> tuple[Violation, ...]:
             rows = np.flatnonzero(broken)
             for place in np.unique(core[rows]).tolist():
                 first, *others = rows[core[rows] == place].tolist()
-                owner = f"core {place}{who(first)}" + f" (and {len(others)} more on this core)" * bool(others)
+                owner = f"core {place}{who(first)}" + f" (and {len(others)} more on this core)" * bool(
+                    others
+                )
                 name = f"{chip.name}.{rule}"
-                violations.append(Violation(owner=owner, used=used(first), allowed=allowed, rule=name, remedy=remedy))
+                violations.append(
+                    Violation(owner=owner, used=used(first), allowed=allowed, rule=name, remedy=remedy)
+                )
     if netlist.n_cores > chip.limit("chip.cores"):
-        violations.append(chip.exceeded("chip", "chip.cores", netlist.n_cores, "fewer neurons, inputs or copies"))
+        violations.append(
+            chip.exceeded("chip", "chip.cores", netlist.n_cores, "fewer neurons, inputs or copies")
+        )
     return tuple(violations)
 
 
@@ -79,7 +86,13 @@ def _cores(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
     neurons = np.diff(netlist.core_neurons)
     axons = np.diff(netlist.core_axons)
     most = chip.limit("core.neurons")
-    yield neurons > most, lambda core: f"{neurons[core]} neurons", str(most), "core.neurons", "use more cores"
+    yield (
+        neurons > most,
+        lambda core: f"{neurons[core]} neurons",
+        str(most),
+        "core.neurons",
+        "use more cores",
+    )
     most = chip.limit("core.axons")
     remedy = "fewer inputs or copies of inputs, or more cores"
     yield axons > most, lambda core: f"{axons[core]} axons", str(most), "core.axons", remedy
@@ -99,9 +112,14 @@ def _axons(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
 def _neurons(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
     """Numbers that do not fit their registers; neurons with more than one target: an axon, or the way out."""
     unsigned = (0, (1 << chip.limit("neuron.threshold_bits")) - 1)
-    signed = {what: signed_range(chip.limit(f"neuron.{what}_bits")) for what in ("weight", "leak", "reset", "membrane")}
+    signed = {
+        what: signed_range(chip.limit(f"neuron.{what}_bits"))
+        for what in ("weight", "leak", "reset", "membrane")
+    }
     remedy = "a smaller scale, or the input on several axons"
-    weights = [(f"weight of type {kind}", each, "weight", remedy) for kind, each in enumerate(netlist.weight.T)]
+    weights = [
+        (f"weight of type {kind}", each, "weight", remedy) for kind, each in enumerate(netlist.weight.T)
+    ]
     for name, values, register, mend in (
         *weights,
         ("leak", netlist.leak, "leak", "a smaller scale"),
@@ -118,7 +136,9 @@ def _neurons(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
         yield _beyond(values, low, high), used, f"{low} … {high}", f"neuron.{register}_bits", mend
     limit = chip.limit("neuron.targets")
     ends = np.unique(np.stack([netlist.wire_neuron, netlist.wire_x, netlist.wire_y]), axis=1)
-    wires, cores = (np.bincount(each, minlength=netlist.n_neurons) for each in (netlist.wire_neuron, ends[0]))
+    wires, cores = (
+        np.bincount(each, minlength=netlist.n_neurons) for each in (netlist.wire_neuron, ends[0])
+    )
     one = str(limit), "neuron.targets"
     many = wires > limit
     out = (wires > 0) & (netlist.readout_class >= 0)
@@ -178,8 +198,9 @@ def _needs_of(network: Network, layer: int, chip: Target) -> Iterator[tuple[str,
         beside = f"{allowed} with {copies} axon{'s' * (copies > 1)} an input"
         remedy = "fewer weights, or each input on several axons of different types"
         yield where, what, beside, "neuron.weight_bits", remedy
-    # spikes go to every core that holds neurons which receive them, and there to two axons of different types: with one
-    # each, all neurons of a core would have to divide their inputs into the same four groups of equal weights
+    # spikes go to every core that holds neurons which receive them, and there to two axons of different
+    # types: with one each, all neurons of a core would have to divide their inputs into the same four groups
+    # of equal weights
     receivers = [network.populations[each.post].size for each in network.projections if each.pre == layer]
     reached = sum(2 * -(-size // chip.limit("core.neurons")) for size in receivers)
     if reached > (targets := chip.limit("neuron.targets")):
@@ -191,7 +212,9 @@ def _distinct_weights(network: Network, layer: int) -> IntArray:
     """Number of different weights, zero left out, of each neuron of a layer; (neurons,) int64."""
     size = network.populations[layer].size
     most = np.zeros(size, np.int64)
-    for weight in (projection.weight.tocoo() for projection in network.projections if projection.post == layer):
+    for weight in (
+        projection.weight.tocoo() for projection in network.projections if projection.post == layer
+    ):
         pairs = np.unique(np.stack([weight.coords[0], weight.data])[:, weight.data != 0], axis=1)
         most = np.maximum(most, np.bincount(pairs[0].astype(np.int64), minlength=size))
     return most

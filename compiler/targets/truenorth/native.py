@@ -1,8 +1,8 @@
 """A network of whole numbers that crossbar cores hold: what is trained for TrueNorth, and how it is placed.
 
-A network is a chain of *stages*. A stage has blocks of neurons; all neurons of a block receive the same inputs, each
-input reaches one block, and every stage but the first may receive the clocks, too. With levels ``k`` of a neuron for
-its inputs,
+A network is a chain of *stages*. A stage has blocks of neurons; all neurons of a block receive the same
+inputs, each input reaches one block, and every stage but the first may receive the clocks, too. With levels
+``k`` of a neuron for its inputs,
 
     ``m_t = c_{t-1} + UNIT * sum_i k_i x_i(t) + leak``,  ``s_t = m_t >= threshold``,
     ``c_t = 0`` after a spike, ``max(m_t, -floor)`` otherwise, from ``c = 0`` on:
@@ -18,8 +18,8 @@ them; a neuron of the stage before has one target only, so there is one of it fo
 same levels, and so the same spikes. That costs neurons and neither ticks nor relays. Channels of the sensor and clocks
 come from outside and may reach any number of axons.
 
-A stage at depth d runs d ticks behind the data: clocks reach it d ticks later, its votes count from tick d on, and its
-membranes start where the leak of d ticks brings them to rest, see :func:`steepest_leak`.
+A stage at depth d runs d ticks behind the data: clocks reach it d ticks later, its votes count from tick d
+on, and its membranes start where the leak of d ticks brings them to rest, see :func:`steepest_leak`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -64,8 +64,9 @@ def highest_level(copies: int) -> int:
 def steepest_leak(threshold: IntArray, depth: int) -> IntArray:
     """Largest leak at a depth: one that reaches neither threshold nor floor in the ticks before the first data.
 
-    A stage at depth d receives data from tick d on. Its membranes start at ``-d * leak``, and the leak alone brings
-    them to rest by then, on a way that must touch no limit; the floor is no nearer than the threshold.
+    A stage at depth d receives data from tick d on. Its membranes start at ``-d * leak``, and the leak alone
+    brings them to rest by then, on a way that must touch no limit; the floor is no nearer than the
+    threshold.
     """
     return np.asarray(np.minimum((threshold - 1) // max(1, depth - 1), LEAK_MOST))
 
@@ -74,9 +75,10 @@ def steepest_leak(threshold: IntArray, depth: int) -> IntArray:
 class Stage:
     """Neurons of one layer; neuron ``block * size + n``.
 
-    `inputs` (blocks, width) are the neurons of the stage before that each block receives, channels of the sensor in the
-    first stage; `level` (blocks, width + clocks, size) is for each of these, for each clock as far as the stage
-    receives them, and for each neuron; `threshold`, `floor` and `leak` are (blocks * size,); all int64.
+    `inputs` (blocks, width) are the neurons of the stage before that each block receives, channels of the
+    sensor in the first stage; `level` (blocks, width + clocks, size) is for each of these, for each clock as
+    far as the stage receives them, and for each neuron; `threshold`, `floor` and `leak` are (blocks *
+    size,); all int64.
     """
 
     name: str
@@ -149,13 +151,19 @@ def _stage_faults(network: NativeNetwork, stage: Stage, depth: int, fan_in: int)
             return
     if np.abs(stage.level).max(initial=0) > highest_level(network.copies):
         yield f"levels beyond {highest_level(network.copies)}, the most of {network.copies} copies"
-    if np.any(stage.threshold < 1) or np.any(stage.floor < stage.threshold) or np.any(stage.floor > THRESHOLD_MOST):
+    if (
+        np.any(stage.threshold < 1)
+        or np.any(stage.floor < stage.threshold)
+        or np.any(stage.floor > THRESHOLD_MOST)
+    ):
         yield f"thresholds and floors outside 1 <= threshold <= floor <= {THRESHOLD_MOST}"
     elif np.any(np.abs(stage.leak) > steepest_leak(stage.threshold, depth)):
         yield "leaks that the ticks before the first data cannot undo"
 
 
-def lower(network: NativeNetwork, chip: Target, *, provenance: Mapping[str, Any] | None = None) -> CrossbarNetlist:
+def lower(
+    network: NativeNetwork, chip: Target, *, provenance: Mapping[str, Any] | None = None
+) -> CrossbarNetlist:
     """Place a network without faults; CapacityError if there are more cores than on the chip."""
     draft = Draft()
     ends = None
@@ -177,7 +185,9 @@ def _place(
     for block in range(stage.blocks):
         points = crossing_points(stage.level[block], BASES[copies])
         offset = block * stage.size
-        aims = [(n, end) for n in range(stage.size) for end in ([None] if ends is None else ends[offset + n])]
+        aims = [
+            (n, end) for n in range(stage.size) for end in ([None] if ends is None else ends[offset + n])
+        ]
         for first in range(0, len(aims), most):
             core = draft.core()
             part = aims[first : first + most]
@@ -189,7 +199,8 @@ def _place(
                 else:
                     draft.wire((core, number), *end)
             on_core = [n for n, _ in part]
-            # an axon that joins nothing still keeps its neuron in the network; from outside there need be none
+            # an axon that joins nothing still keeps its neuron in the network; from outside there need be
+            # none
             for row, line in draft.inputs(core, points[:, on_core], kept=width if depth else 0):
                 if row >= width:
                     draft.feed(first_clock + row - width, core, line, tick=depth)

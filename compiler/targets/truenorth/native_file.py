@@ -1,10 +1,10 @@
 """File of a network trained for crossbar cores; an archive of :mod:`compiler.archive`.
 
-Members, format version 1: the ``manifest`` (``format`` "spikeloom-native", ``version``, ``taxels``, ``polarities``,
-``classes``, ``copies``, ``clocks``, ``graph`` with ``name`` and ``edges``, ``layers``, ``towers``: 1, ``weights``: the
-sets in the file, and ``training``: how it was made and what it reached), for every set and layer ``SET/0/LAYER/PART``
-with the parts of :class:`native.Stage`, and the ``sha256``. All numbers are whole: what is in the file is what the chip
-computes.
+Members, format version 1: the ``manifest`` (``format`` "spikeloom-native", ``version``, ``taxels``,
+``polarities``, ``classes``, ``copies``, ``clocks``, ``graph`` with ``name`` and ``edges``, ``layers``,
+``towers``: 1, ``weights``: the sets in the file, and ``training``: how it was made and what it reached), for
+every set and layer ``SET/0/LAYER/PART`` with the parts of :class:`native.Stage`, and the ``sha256``. All
+numbers are whole: what is in the file is what the chip computes.
 """
 
 import os
@@ -44,8 +44,8 @@ KINDS: dict[str, archive.Kind] = {
 class Trained:
     """What a file holds: the network of the chosen set `weights`, and all `sets`.
 
-    `graph` and `edges` (edges, 2), source and target, are those of the taxel graph; `training` are JSON values: how the
-    network was made and what it reached; the hash is the file's.
+    `graph` and `edges` (edges, 2), source and target, are those of the taxel graph; `training` are JSON
+    values: how the network was made and what it reached; the hash is the file's.
     """
 
     network: NativeNetwork
@@ -111,18 +111,25 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
         sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
         chosen = sets[0] if weights is None else weights
         if chosen not in sets:
-            raise ModelError(f"--weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
+            raise ModelError(
+                f"--weights {weights}: the file holds {', '.join(sets)}; choose one that it holds"
+            )
         stages: dict[str, dict[str, Any]] = {
-            layer: {part: members[f"{chosen}/0/{layer}/{part}"] for part in PARTS} for layer in manifest["layers"]
+            layer: {part: members[f"{chosen}/0/{layer}/{part}"] for part in PARTS}
+            for layer in manifest["layers"]
         }
         archive.require_none(
-            f"{name}: {fault}" for name, parts in stages.items() for fault in archive.array_faults(parts, PARTS)
+            f"{name}: {fault}"
+            for name, parts in stages.items()
+            for fault in archive.array_faults(parts, PARTS)
         )
         network = NativeNetwork(
             **{name: manifest[name] for name in ("taxels", "polarities", "classes", "copies")},
             clocks=Clocks(**manifest["clocks"]),
             stages=tuple(
-                Stage(name=layer, **{part: read_only(array.astype(np.int64)) for part, array in parts.items()})
+                Stage(
+                    name=layer, **{part: read_only(array.astype(np.int64)) for part, array in parts.items()}
+                )
                 for layer, parts in stages.items()
             ),
         )

@@ -8,8 +8,9 @@ which of its core's lines an axon is. The crossing points of axon ``a`` that are
 ``axon_synapses[a] … axon_synapses[a+1]-1``, each with a neuron of the core (0-based on it). A spike on the axon adds
 ``weight[neuron, axon_type[axon]]`` to each of these neurons: the type belongs to the axon, the weights to the neuron.
 
-What leads to an axon stands in tables of rows: *wires* from neurons, *feeds* from input channels, *clocks*. The chip
-allows a neuron one wire only; the tables can hold more, so that :mod:`truenorth.legalize` can say what is wrong.
+What leads to an axon stands in tables of rows: *wires* from neurons, *feeds* from input channels, *clocks*.
+The chip allows a neuron one wire only; the tables can hold more, so that :mod:`truenorth.legalize` can say
+what is wrong.
 
 Time
 ----
@@ -79,13 +80,20 @@ class CrossbarNetlist(netlist_file.Netlist):
     synapse_neuron: IntArray  # (synapses,) int64; neuron on the core
     weight: IntArray  # (neurons, 4) int64; by axon type
     leak: IntArray  # (neurons,) int64; added in every tick
-    leak_reversal: IntArray  # (neurons,) int64; 1 where the leak takes the membrane's sign, and stops at zero
+    leak_reversal: (
+        IntArray  # (neurons,) int64; 1 where the leak takes the membrane's sign, and stops at zero
+    )
     threshold: IntArray  # (neurons,) int64; a spike needs a membrane of at least this
-    # reset_mode, reset: (neurons,) int64; ``RESET_TO``, ``RESET_LINEAR`` or ``RESET_NONE``, and the value of the first
+    # reset_mode, reset: (neurons,) int64; ``RESET_TO``, ``RESET_LINEAR`` or ``RESET_NONE``, and the value of
+    # the first
     reset_mode: IntArray
     reset: IntArray
-    negative_threshold: IntArray  # (neurons,) int64; magnitude; a membrane below ``-negative_threshold`` is reset, too
-    negative_saturates: IntArray  # (neurons,) int64; 1 where it stays at ``-negative_threshold`` instead of being reset
+    negative_threshold: (
+        IntArray  # (neurons,) int64; magnitude; a membrane below ``-negative_threshold`` is reset, too
+    )
+    negative_saturates: (
+        IntArray  # (neurons,) int64; 1 where it stays at ``-negative_threshold`` instead of being reset
+    )
     initial: IntArray  # (neurons,) int64; membrane before the first tick
     # layer, neuron: (neurons,) int64; which neuron of which layer it is; copies of one share the numbers
     layer: IntArray
@@ -98,7 +106,8 @@ class CrossbarNetlist(netlist_file.Netlist):
     wire_y: IntArray
     wire_line: IntArray
     wire_delay: IntArray
-    # (feeds,) int64: from an input channel (``taxel * polarities + polarity``, then `clocks`) to a line of a core
+    # (feeds,) int64: from an input channel (``taxel * polarities + polarity``, then `clocks`) to a line of a
+    # core
     feed_channel: IntArray
     feed_core: IntArray
     feed_line: IntArray
@@ -213,9 +222,13 @@ def inconsistencies(netlist: CrossbarNetlist) -> list[str]:
     if found := column_faults(netlist, bounds, lengths, ranges):
         return found
     if netlist.weight.shape != (neurons, AXON_TYPES):
-        found.append(f"weight is {' by '.join(map(str, netlist.weight.shape))}, not {neurons} by {AXON_TYPES}")
+        found.append(
+            f"weight is {' by '.join(map(str, netlist.weight.shape))}, not {neurons} by {AXON_TYPES}"
+        )
     on_core = np.diff(netlist.core_neurons)[netlist.core_of_axon()][netlist.axon_of_synapse()]
-    if netlist.n_synapses and (netlist.synapse_neuron.min() < 0 or np.any(netlist.synapse_neuron >= on_core)):
+    if netlist.n_synapses and (
+        netlist.synapse_neuron.min() < 0 or np.any(netlist.synapse_neuron >= on_core)
+    ):
         found.append("synapse_neuron points beyond its core")
     if np.any((np.diff(netlist.synapse_neuron) <= 0) & (np.diff(netlist.axon_of_synapse()) == 0)):
         found.append("synapse_neuron does not rise along an axon")

@@ -1,7 +1,7 @@
 """The passes of this chip in their order: whole numbers at the top, a netlist that obeys every rule at the end.
 
-Networks that were trained for the chip and counting networks are whole numbers already. A float network is refused,
-with every reason that no layout could avoid.
+Networks that were trained for the chip and counting networks are whole numbers already. A float network is
+refused, with every reason that no layout could avoid.
 """
 
 from collections.abc import Callable, Mapping

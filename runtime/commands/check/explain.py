@@ -44,7 +44,9 @@ def run(request: ExplainRequest) -> Outcome:
         request = replace(request, limit=LIMIT)
     data = load_recordings(request.data, request, netlist)
     machine.require_sensor(data.events)
-    chosen = range(len(data)) if request.sample is None else [find_recording(data, request.sample, "--sample")]
+    chosen = (
+        range(len(data)) if request.sample is None else [find_recording(data, request.sample, "--sample")]
+    )
 
     machine.require_windows()
     check = machine.check_lowering(loaded.network)

@@ -54,7 +54,13 @@ def run(request: AnytimeRequest) -> Outcome:
 
 def _allowed(request: AnytimeRequest) -> list[float]:
     """Shares to calibrate for, the chosen one first."""
-    given = "--held-out" if request.held_out else "" if request.differ is None else f"--differ {request.differ:g}"
+    given = (
+        "--held-out"
+        if request.held_out
+        else ""
+        if request.differ is None
+        else f"--differ {request.differ:g}"
+    )
     if given and request.calibrate is None:
         raise OptionError(f"{given}: nothing to calibrate on; add --calibrate or omit it")
     chosen = request.differ or 0.0
@@ -67,7 +73,9 @@ def _races(request: AnytimeRequest, machine: Stoppable) -> FloatArray | None:
     """Turning points of races or decisions of the training split, if there is something to calibrate on."""
     if request.calibrate is None:
         return None
-    training = load_recordings(request.calibrate, replace(request, split="train", limit=None), machine.netlist)
+    training = load_recordings(
+        request.calibrate, replace(request, split="train", limit=None), machine.netlist
+    )
     machine.require_sensor(training.events)
     progress("calibrating")
     lengths = training.step_counts

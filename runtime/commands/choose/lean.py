@@ -40,7 +40,9 @@ def run(request: LeanRequest) -> Outcome:
     require_place(request.output, "-o", request, ["loom"])
     require_place(request.network, "--network", request, ["pt"])
     loaded = load_network(request.checkpoint, request)
-    plain = loaded.checkpoint is not None and loaded.checkpoint.forms is None and loaded.checkpoint.towers == 1
+    plain = (
+        loaded.checkpoint is not None and loaded.checkpoint.forms is None and loaded.checkpoint.towers == 1
+    )
     if request.network is not None and not plain:
         raise OptionError(
             f"--network {request.network}: {request.checkpoint} is no single checkpoint in floats; omit it, or "
@@ -49,7 +51,12 @@ def run(request: LeanRequest) -> Outcome:
     require_splits(request.data)
     progress("reading the recordings")
     taken = loaded.network.input
-    shared: dict[str, Any] = {"bin_s": request.bin, "bins": taken.bins, "taxels": taken.taxels, "labels_for": "lean"}
+    shared: dict[str, Any] = {
+        "bin_s": request.bin,
+        "bins": taken.bins,
+        "taxels": taken.taxels,
+        "labels_for": "lean",
+    }
     shared |= {"classes": loaded.network.classes, "trained": origin_of(loaded.training)}
     splits = (("train", None), (request.split, request.limit))
     each = (recordings(request.data, split, limit=limit, **shared) for split, limit in splits)
@@ -60,7 +67,13 @@ def run(request: LeanRequest) -> Outcome:
         made = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256, **loaded.origin(request.run)}
         forms = loaded.network.forms
         made |= {**origin_of(loaded.training), **remembered(Fixed() if forms is None else Given(forms))}
-        made |= {"keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True, "lean": lean}
+        made |= {
+            "keep_all": False,
+            "prune_unused": True,
+            "ranges": "proven",
+            "calibrated": True,
+            "lean": lean,
+        }
         write_netlist(replace(netlist, provenance={**netlist.provenance, **made}), request.output)
     if request.network is not None and loaded.checkpoint is not None:
         from spikeloom.compiler.formats.own_checkpoint import save_again
@@ -69,7 +82,9 @@ def run(request: LeanRequest) -> Outcome:
         given = loaded.checkpoint
         edges = graph.edges if given.edges is None and graph is not None else given.edges
         typed = repeat.words({"data": test.source, "differ": result.differ})
-        made = origin_of(loaded.training) | {"command": repeat.command("lean", Path(request.checkpoint).name, *typed)}
+        made = origin_of(loaded.training) | {
+            "command": repeat.command("lean", Path(request.checkpoint).name, *typed)
+        }
         less = narrowed(replace(given, graph=loaded.graph, edges=edges), spared)
         save_again(request.network, less, training=made | {"pruned_from": loaded.sha256})
     return Outcome(result, sections)

@@ -109,7 +109,9 @@ def _made(
     trained += [*([] if counts else ["--keep", "last"]), "-o", network]
     made = repeat.words({"target": request.target})
     made += (
-        [] if counts else repeat.words({"weight_bits": candidate.storage or 8, "calibrate": data, "bin": request.bin})
+        []
+        if counts
+        else repeat.words({"weight_bits": candidate.storage or 8, "calibrate": data, "bin": request.bin})
     )
     words = {"train": trained, "compile": [network, *made, "-o", netlist]}
     words |= {"verify": [netlist, "--checkpoint", network, *read], "estimate": [netlist, *read]}
@@ -122,7 +124,9 @@ def _made(
         raise KeyboardInterrupt("what was found is kept; go on with the same command") from None
     compile.run(request_of(CompileRequest, words["compile"]))
     progress("verifying")
-    checks = {split: request_of(VerifyRequest, [*words["verify"], "--split", split]) for split in ("train", "test")}
+    checks = {
+        split: request_of(VerifyRequest, [*words["verify"], "--split", split]) for split in ("train", "test")
+    }
     verdicts = {split: verify.run(check).result for split, check in checks.items()}
     machine = machine_for(netlist)
     bins = machine.netlist.bins

@@ -69,7 +69,9 @@ def _convert(request: ConvertRequest) -> Outcome:
     require_bins(bins := request.join)
     count, places = _layout(request.taxels)
     present = tuple(SPLITS) if request.source == SYNTHETIC else data_splits(request.source)
-    loaded = [_load(request.source, split, request.bin, count, places) for split in present or (request.split,)]
+    loaded = [
+        _load(request.source, split, request.bin, count, places) for split in present or (request.split,)
+    ]
     for recordings in loaded:
         show_notes(recordings.counts)
     loaded = [joined_bins(recordings, bins) for recordings in loaded]

@@ -60,7 +60,9 @@ def run(request: ExportRequest) -> Outcome:
 
     def read(netlist: Netlist) -> Recordings:
         assert request.data is not None, "recordings are read where they are given"
-        return load_recordings(request.data, SplitChoice(split=request.split or "test", bin=request.bin), netlist)
+        return load_recordings(
+            request.data, SplitChoice(split=request.split or "test", bin=request.bin), netlist
+        )
 
     content = ExportSource(
         source=request.source,
@@ -78,11 +80,15 @@ def run(request: ExportRequest) -> Outcome:
             digest.update(chunk)
             size += len(chunk)
             file.write(chunk)
-    written = Written(path=request.output, format=request.to, bytes=size, sha256=digest.hexdigest(), facts=export.facts)
+    written = Written(
+        path=request.output, format=request.to, bytes=size, sha256=digest.hexdigest(), facts=export.facts
+    )
 
     def sections(result: Written) -> Iterator[Section]:
         where = "" if FORMATS[result.format].whole else " on the chip"
-        size = f"{result.facts.neurons} neurons{where} and {result.facts.synapses} synapses for {result.format}"
+        size = (
+            f"{result.facts.neurons} neurons{where} and {result.facts.synapses} synapses for {result.format}"
+        )
         form = "" if export.form is None else f", form {export.form}"
         lines = [f"{result.path}: {size}, {result.bytes} bytes{form}", *export.lines]
         yield Section("", [Text(line) for line in lines])

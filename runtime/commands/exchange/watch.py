@@ -70,7 +70,9 @@ def _require_length(request: WatchRequest) -> None:
     if factor is None:
         return
     if request.bins is None:
-        raise OptionError("--until-sure: what can still come is not known; give the length of a grasp with --bins")
+        raise OptionError(
+            "--until-sure: what can still come is not known; give the length of a grasp with --bins"
+        )
     if not factor >= 0:
         raise OptionError(
             f"--until-sure {factor:g}: no votes per root of a bin; give a number from 0, as spikeloom anytime prints "
@@ -109,7 +111,9 @@ def _ending(request: WatchRequest, machine: Machine) -> Callable[[int, IntArray]
 
     if request.until_sure is None or request.bins is None:
         return None
-    return exits.live(require_stoppable(machine, request.netlist, "--until-sure"), request.bins, request.until_sure)
+    return exits.live(
+        require_stoppable(machine, request.netlist, "--until-sure"), request.bins, request.until_sure
+    )
 
 
 def _opened(name: str) -> io.FileIO:
@@ -121,7 +125,9 @@ def _opened(name: str) -> io.FileIO:
     try:
         return io.FileIO(0 if name == "-" else name, closefd=name != "-")
     except OSError as error:
-        raise DataError(f"--input {name}: {error.strerror}; give event lines, or - for standard input") from error
+        raise DataError(
+            f"--input {name}: {error.strerror}; give event lines, or - for standard input"
+        ) from error
 
 
 def _duration(text: str) -> Decimal:

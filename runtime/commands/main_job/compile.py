@@ -20,7 +20,9 @@ def run(request: CompileRequest) -> Outcome:
     backend = backend_of(request.target)
     names = backend.passes
     if unknown := set(request.dump_after) - set(names):
-        raise OptionError(f"--dump-after {', '.join(sorted(unknown))}: no such pass; allowed: {', '.join(names)}")
+        raise OptionError(
+            f"--dump-after {', '.join(sorted(unknown))}: no such pass; allowed: {', '.join(names)}"
+        )
     only = trained_for(request.checkpoint)
     if only is not None and only is not backend:
         path = f"{request.checkpoint} was trained for {only.target.title}"

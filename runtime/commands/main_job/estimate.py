@@ -38,7 +38,9 @@ def run(request: EstimateRequest) -> Outcome:
         return priced.outcome
     compared = Compared(
         costs=priced.details,
-        against_processor=_against_processor(request, machine, ran, priced) if request.against_processor else None,
+        against_processor=_against_processor(request, machine, ran, priced)
+        if request.against_processor
+        else None,
         neurobench=_neurobench(request, machine) if request.neurobench else None,
         price=priced,
     )
@@ -76,7 +78,9 @@ def _neurobench(request: EstimateRequest, machine: Machine) -> NeuroBench:
 def _against_processor(request: EstimateRequest, machine: Machine, ran: Run, priced: Price) -> Comparison:
     """The same recordings in their own bins, and those of the training split, for a rule on a processor."""
     if isinstance(request.data, Recordings):
-        raise OptionError("against_processor: needs the training split beside these; give the place of the recordings")
+        raise OptionError(
+            "against_processor: needs the training split beside these; give the place of the recordings"
+        )
     window = parse_window(request.window)
     training, test = (
         load_recordings(request.data, each, machine.netlist, labels_for="--against-processor", joined=False)

@@ -100,7 +100,18 @@ def run(request: InspectRequest) -> Outcome:
         return Outcome(CountingFacts.of(counters, sha256), counting_sections)
     given = tuple(name for name in ("beta", "theta") if getattr(request, name) is not None)
     checkpoint = load_checkpoint(request.path, request)
-    same = ("layout", "system", "taxels", "classes", "beta", "theta", "assumed", "graph", "training", "sha256")
+    same = (
+        "layout",
+        "system",
+        "taxels",
+        "classes",
+        "beta",
+        "theta",
+        "assumed",
+        "graph",
+        "training",
+        "sha256",
+    )
     facts = CheckpointFacts(
         **{name: getattr(checkpoint, name) for name in same},
         hops=len(checkpoint.hops) - 1 if checkpoint.system == TACTILESGNET else None,

@@ -46,7 +46,9 @@ def run(request: ReportRequest) -> Outcome:
         battery = read_stress(request.stress, request.netlist, sha256)
     reference = backend_of(netlist.target).reference(request, netlist)
     if reference.loaded is None:
-        raise OptionError(f"--checkpoint {request.checkpoint}: there is no float model to show beside the chip")
+        raise OptionError(
+            f"--checkpoint {request.checkpoint}: there is no float model to show beside the chip"
+        )
     if isinstance(machine, Comparable):
         require_match(netlist, reference.loaded.network)
     reference.loaded.require_same(request.netlist, netlist, request.run)

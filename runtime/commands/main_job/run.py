@@ -91,7 +91,15 @@ def _write_spikes(path: str, machine: Machine, data: Recordings) -> None:
 
 def sections(found: Decisions) -> Iterator[Section]:
     """Accuracy, recordings that went wrong; decisions where no label is known."""
-    rows = list(zip(found.files, found.labels.tolist(), found.predictions.tolist(), found.counts.tolist(), strict=True))
+    rows = list(
+        zip(
+            found.files,
+            found.labels.tolist(),
+            found.predictions.tolist(),
+            found.counts.tolist(),
+            strict=True,
+        )
+    )
     unknown = [row for row in rows if row[1] == UNLABELLED]
     wrong = [row for row in rows if row[1] not in (UNLABELLED, row[2])]
     known = found.labelled
@@ -100,8 +108,12 @@ def sections(found: Decisions) -> Iterator[Section]:
         without = f", {len(unknown)} more without a label" if unknown else ""
         blocks.append(Text(f"chip accuracy: {percent(known - len(wrong), known)}{without}"))
     if wrong:
-        cells = [[file, *map(str, (label, made, votes[label], votes[made]))] for file, label, made, votes in wrong]
-        blocks.append(Table(["decided wrongly", "label", "decision", "votes for label", "for decision"], cells))
+        cells = [
+            [file, *map(str, (label, made, votes[label], votes[made]))] for file, label, made, votes in wrong
+        ]
+        blocks.append(
+            Table(["decided wrongly", "label", "decision", "votes for label", "for decision"], cells)
+        )
     if unknown:
         cells = [[file, str(chosen), str(votes[chosen])] for file, _, chosen, votes in unknown]
         blocks.append(Table(["without a label" if known else "recording", "decision", "votes"], cells))

@@ -38,7 +38,9 @@ def run(request: VerifyRequest) -> Outcome:
     netlist = machine.netlist
     reference = backend_of(netlist.target).reference(request, netlist)
     if reference.whole:
-        refuse(request, ("original", "min_agreement"), "the network is whole numbers, there is no float model")
+        refuse(
+            request, ("original", "min_agreement"), "the network is whole numbers, there is no float model"
+        )
     if isinstance(machine, Comparable):
         require_match(machine.netlist, reference.network)
     if reference.difference is not None:
@@ -56,7 +58,8 @@ def run(request: VerifyRequest) -> Outcome:
         original=reference.floats if original is None else original,
         spec_samples=request.spec_samples,
         engine_name=request.engine,
-        required=required or ({"E0": 1.0, "E1": 1.0} if reference.whole else {"E0": 1.0, "E3": MIN_AGREEMENT}),
+        required=required
+        or ({"E0": 1.0, "E1": 1.0} if reference.whole else {"E0": 1.0, "E3": MIN_AGREEMENT}),
         check=check,
         progress=lambda part, done: count(done, part),
     )

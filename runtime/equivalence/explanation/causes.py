@@ -71,13 +71,16 @@ def explain(
     )
     layers = range(len(network.populations))
     differs = [
-        (both.truth(post) != both.fired(post)) & ~mute for post, mute in zip(layers, unread or none, strict=True)
+        (both.truth(post) != both.fired(post)) & ~mute
+        for post, mute in zip(layers, unread or none, strict=True)
     ]
     resets = [both.together(post) & deviations.forgets(post) for post in layers]
     roots = find_roots(differs, resets, deviations.sources)
     causes: dict[Root, results.RootCause] = {}
     for post in layers:
-        here = sorted((root for root in roots if root.layer == post), key=lambda root: root.begin - root.step)
+        here = sorted(
+            (root for root in roots if root.layer == post), key=lambda root: root.begin - root.step
+        )
         causes |= _causes(both, post, here) if here else {}
     counts = Counter(root.layer for root in roots)
     return results.Explanation(
@@ -129,7 +132,9 @@ class _Sides:
         inputs = []
         for pre in self.deviations.sources_into(post):
             # what the chip does not hold, it has no weights from: the float model's spikes say what it lacks
-            sent = self.events if pre == INPUT else np.where(self.absent[pre], self.truth(pre), self.fired(pre))
+            sent = (
+                self.events if pre == INPUT else np.where(self.absent[pre], self.truth(pre), self.fired(pre))
+            )
             inputs.append(step_late(sent[None])[0] if pre == post else sent)
         return np.concatenate(inputs, axis=1).astype(np.float64)
 
@@ -222,7 +227,9 @@ def _cause(both: _Sides, evidence: _Evidence, place: int, root: Root) -> results
         cause=cause,
         held=was_present,
         clipped_weights=clipped,
-        sufficient=tuple(dict.fromkeys(replays.causes[variant] for variant in enough)) if was_present else (),
+        sufficient=tuple(dict.fromkeys(replays.causes[variant] for variant in enough))
+        if was_present
+        else (),
         moved=amounts if was_present else {},
         change=remedy or "none is known",
         dragged=root.dragged,

@@ -103,7 +103,9 @@ class Explanation:
                 cause=cause,
                 roots=count,
                 layers={layer.name: both[cause, layer.name] for layer in self.layers},
-                from_clipped_weights=sum(root.clipped_weights and root.cause == cause for root in self.found),
+                from_clipped_weights=sum(
+                    root.clipped_weights and root.cause == cause for root in self.found
+                ),
             )
             for cause, count in Counter(root.cause for root in self.found).most_common()
         )
@@ -159,12 +161,17 @@ def sections(explained: Explained) -> list[Section]:
     names = [layer.name for layer in why.layers]
     causes = Table(
         ["cause of roots", *names, "all"],
-        [[each.cause, *(f"{each.layers[name]:,}" for name in names), f"{each.roots:,}"] for each in why.causes],
+        [
+            [each.cause, *(f"{each.layers[name]:,}" for name in names), f"{each.roots:,}"]
+            for each in why.causes
+        ],
     )
     clipped = sum(cause.from_clipped_weights for cause in why.causes)
     line = f"  {clipped:,} of these roots would go if no large weight were cut off by its range"
     shown = (
-        f" ({len(explained.top):,} of {why.roots:,} shown, --top shows more)" if why.roots > len(explained.top) else ""
+        f" ({len(explained.top):,} of {why.roots:,} shown, --top shows more)"
+        if why.roots > len(explained.top)
+        else ""
     )
     entries = (
         f"{why.different:,} entries (neuron and step) differ from the float64 model: {why.roots:,} are roots, "
@@ -176,20 +183,29 @@ def sections(explained: Explained) -> list[Section]:
         Section("Causes", [causes, *([Text(line)] if clipped else []), *faults]),
         Section("Diagnosis", [Text(f"diagnosis: {why.diagnosis}")]),
         Section("Roots", [Text(f"roots, those first that drag most along{shown}:")]),
-        *(Section("", [Text("\n".join(_root(number, root)))]) for number, root in enumerate(explained.top, 1)),
+        *(
+            Section("", [Text("\n".join(_root(number, root)))])
+            for number, root in enumerate(explained.top, 1)
+        ),
     ]
 
 
 def _root(number: int, root: RootCause) -> list[str]:
     graph = "" if root.taxel is None else f" (taxel {root.taxel}, feature {root.feature})"
-    fires = "the float model fires, the chip does not" if root.float_fires else "the chip fires, the float model not"
+    fires = (
+        "the float model fires, the chip does not"
+        if root.float_fires
+        else "the chip fires, the float model not"
+    )
     chip = "does not hold this neuron"
     if root.chip_membrane is not None and root.chip_distance is not None and root.chip_theta is not None:
         chip = _membrane(root.chip_membrane, root.chip_distance, root.chip_theta)
         chip += f"; registers {root.chip_register} and {root.chip_threshold_register}"
     moved = root.moved.get(root.cause)
     by = "" if moved is None else f", which moved the membrane by {moved:.3g}"
-    only = "" if not root.held or root.cause in (TIE, *root.sufficient) else "; no single change is enough here"
+    only = (
+        "" if not root.held or root.cause in (TIE, *root.sufficient) else "; no single change is enough here"
+    )
     follow = f"{root.dragged:,} later differences, {root.dragged_alone:,} of them from this root alone"
     return [
         f"{number:3}. {root.layer} neuron {root.neuron}{graph}, step {root.step}: {fires}",

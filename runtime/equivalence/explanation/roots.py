@@ -37,7 +37,9 @@ class Root:
     alone: int
 
 
-def find_roots(differs: Sequence[BoolArray], resets: Sequence[BoolArray], sources: Sources) -> tuple[Root, ...]:
+def find_roots(
+    differs: Sequence[BoolArray], resets: Sequence[BoolArray], sources: Sources
+) -> tuple[Root, ...]:
     """Separate roots from what follows, in one pass over steps and layers; those that drag most along come first.
 
     `differs` are the diverging entries of each population, (steps, neurons) bool, aligned with the data,

@@ -162,7 +162,9 @@ def _lanes(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(one, nothing, _all(_STATES, 0))
 
 
-def _sum_rows(builder: Any, tables: Any, active: Any, at: Any, block: Any, *, marks: bool) -> tuple[Any, Any]:
+def _sum_rows(
+    builder: Any, tables: Any, active: Any, at: Any, block: Any, *, marks: bool
+) -> tuple[Any, Any]:
     """Emit the loop over a block's links and, within, over active sources; returns sums and who was reached."""
     before = builder.block
     names = ("links", "link", "sources", "source", "link.end", "done")
@@ -199,7 +201,9 @@ def _sum_rows(builder: Any, tables: Any, active: Any, at: Any, block: Any, *, ma
     row = builder.add(first_row, rank)
     part.add_incoming(builder.add(part, _row(builder, tables, row)), source)
     left.add_incoming(builder.xor(left, lowest), source)
-    marked.add_incoming(builder.or_(marked, _element(builder, tables["reached"], row)) if marks else marked, source)
+    marked.add_incoming(
+        builder.or_(marked, _element(builder, tables["reached"], row)) if marks else marked, source
+    )
     builder.branch(sources)
 
     builder.position_at_end(link_end)
@@ -235,7 +239,9 @@ def _each_listed(builder: Any, sources: Any, bounds: Any, values: Any, add: Func
     return values
 
 
-def _sum_listed(builder: Any, tables: Any, sources: Any, bounds: Any, block: Any, *, marks: bool) -> tuple[Any, Any]:
+def _sum_listed(
+    builder: Any, tables: Any, sources: Any, bounds: Any, block: Any, *, marks: bool
+) -> tuple[Any, Any]:
     """Emit the same for a block that every source reaches, on listed sources."""
     base = _element(builder, tables["row"], _element(builder, tables["first"], block))
 
@@ -276,7 +282,9 @@ def _integrate(
     keep = _lanes(builder, _element(builder, tables["keep"], block))
     v = _decayed(builder, old, keep, wide=lasting is not None)
     # add input and bias
-    arrived = builder.shl(builder.sext(sums, _STATES), _lanes(builder, _element(builder, tables["shift"], block)))
+    arrived = builder.shl(
+        builder.sext(sums, _STATES), _lanes(builder, _element(builder, tables["shift"], block))
+    )
     before = None
     if lasting is not None:
         before, current_place = _vector(builder, lasting["current"], position, _STATES)
@@ -325,7 +333,9 @@ def _block_step(*, listed: bool, rests: bool, lasts: bool) -> Function:
             old, last, fired = _integrate(builder, table, own, sums, block, kept_at, currents)
             if rests:
                 if last is None:
-                    last, last_at = _vector(builder, own["before"], builder.mul(block, _number(LANES)), _SUMS)
+                    last, last_at = _vector(
+                        builder, own["before"], builder.mul(block, _number(LANES)), _SUMS
+                    )
                     _store(builder, sums, last_at)
                 silent = builder.and_(
                     builder.icmp_signed("==", old, _all(_STATES, 0)),
@@ -374,7 +384,9 @@ def _bits(typing: Any, word: Any) -> Any:
     return types.int64(types.uint64), emit
 
 
-def scratch_of(blocks: Blocks, channels: int, steps: int, *, membranes: bool) -> tuple[Scratch, Lasting | None]:
+def scratch_of(
+    blocks: Blocks, channels: int, steps: int, *, membranes: bool
+) -> tuple[Scratch, Lasting | None]:
     """What recordings of up to so many steps are run in; networks without lasting currents do without the code."""
     n_words = -(-channels // LANES)
     n_blocks = blocks.keep.size
@@ -440,7 +452,9 @@ def _list(words: AnyArray, start: int, width: int, steps: int, scratch: Scratch,
 def _block_runner(*, lasts: bool) -> Function:
     """Make what runs a block of a stage through a recording, on its sources as words or listed."""
     restful, busy, restful_listed, busy_listed = (
-        _block_step(listed=listed, rests=rests, lasts=lasts) for listed in (False, True) for rests in (True, False)
+        _block_step(listed=listed, rests=rests, lasts=lasts)
+        for listed in (False, True)
+        for rests in (True, False)
     )
 
     @compiled
@@ -483,7 +497,9 @@ _run_block, _run_lasting_block = (_block_runner(lasts=lasts) for lasts in (False
 
 
 @compiled
-def _run_stages(blocks: Blocks, inputs: IntArray, steps: int, scratch: Scratch, lasting: Lasting | None) -> None:
+def _run_stages(
+    blocks: Blocks, inputs: IntArray, steps: int, scratch: Scratch, lasting: Lasting | None
+) -> None:
     """Let all stages integrate, one after the other, and count spikes and events."""
     active = scratch.words
     start = np.int64(0)
@@ -521,7 +537,9 @@ def _pack_compartments(blocks: Blocks, steps: int, words: AnyArray, out: AnyArra
                     to = blocks.whole[block] >> 6
                     by = np.uint64(blocks.whole[block] & 63)
                     out[row, to] |= left << by
-                    rest = left >> np.uint64(1) >> (np.uint64(LANES - 1) - by)  # a shift by 64 is not defined
+                    rest = (
+                        left >> np.uint64(1) >> (np.uint64(LANES - 1) - by)
+                    )  # a shift by 64 is not defined
                     if rest:
                         out[row, to + 1] |= rest
                     continue

@@ -95,7 +95,9 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
 
     # links: the rows of a block by words of sources
     words = width // LANES
-    links, first_row, link = np.unique(row_block * words + row_source // LANES, return_index=True, return_inverse=True)
+    links, first_row, link = np.unique(
+        row_block * words + row_source // LANES, return_index=True, return_inverse=True
+    )
     linked = _joined(link, row_source % LANES, len(links))
 
     size = len(seats.layer) * LANES
@@ -156,13 +158,17 @@ def _seats(netlist: Netlist) -> _Seats:
     position[order] = first + np.arange(len(order))
     layer, keep_of_block, keep_u_of_block = np.repeat(groups[:, begins], blocks, axis=1)
     stage = np.searchsorted(depth[layer], np.arange(netlist.max_depth + 2))
-    return _Seats(position=position, layer=layer, keep=keep_of_block, keep_u=keep_u_of_block, stage=stage, depth=depth)
+    return _Seats(
+        position=position, layer=layer, keep=keep_of_block, keep_u=keep_u_of_block, stage=stage, depth=depth
+    )
 
 
 def _rows(netlist: Netlist, seats: _Seats, pairs: IntArray, width: int) -> tuple[IntArray, BoolArray]:
     """Pairs of block and source that get a row, sorted, and whether those of a stage are all that there can be."""
     blocks = np.diff(seats.stage)
-    channels = np.append(netlist.n_inputs, np.bincount(seats.depth[netlist.layer], minlength=len(blocks))[:-1])
+    channels = np.append(
+        netlist.n_inputs, np.bincount(seats.depth[netlist.layer], minlength=len(blocks))[:-1]
+    )
     places = np.append(netlist.n_inputs, blocks[:-1] * LANES)
     dense = np.diff(np.searchsorted(pairs, seats.stage * width)) >= DENSE * blocks * channels
     filled = [

@@ -44,7 +44,9 @@ class CompilationFacts(Shown):
     finetune: str | None = field(default=None, metadata=OPTIONAL)
 
 
-def outcome(done: Compilation, sha256: str, facts: Sequence[str] = (), finetune: str | None = None) -> Outcome:
+def outcome(
+    done: Compilation, sha256: str, facts: Sequence[str] = (), finetune: str | None = None
+) -> Outcome:
     """Facts of a compilation, whose netlist was written to a file with a hash, with their layout."""
     storage = done.options.storage
     keep = storage.keep if done.trials and isinstance(storage, Cheapest) else None
@@ -80,7 +82,9 @@ def sections(facts: CompilationFacts) -> Iterator[Section]:
 def _storage(facts: CompilationFacts) -> Iterator[Block]:
     """How weights were rounded."""
     if facts.calibration[0].flips is None:
-        yield Text("scales taken from the weights and the proven bounds; --calibrate chooses them on training data")
+        yield Text(
+            "scales taken from the weights and the proven bounds; --calibrate chooses them on training data"
+        )
     else:
         rows = [
             [
@@ -93,7 +97,9 @@ def _storage(facts: CompilationFacts) -> Iterator[Block]:
             ]
             for choice in facts.calibration
         ]
-        receives = "the float model's own input" if facts.exactness else "what the rounded ones before it send"
+        receives = (
+            "the float model's own input" if facts.exactness else "what the rounded ones before it send"
+        )
         yield Text(f"storage chosen on training recordings (each layer on {receives}):")
         yield Table(["layer", "tried", "weights clipped", "errors", "spikes moved", "of"], rows)
         yield from _exactness(facts.exactness)
@@ -126,13 +132,17 @@ def _tried(facts: CompilationFacts) -> Iterator[Block]:
     )
     yield Table(["storage", "decisions kept", "operations a recording", "synapse words", "cores"], rows)
     if facts.finetune is not None:
-        yield Text(f"--spike-exact names the registers in the way; to train on the chip's integers: {facts.finetune}")
+        yield Text(
+            f"--spike-exact names the registers in the way; to train on the chip's integers: {facts.finetune}"
+        )
 
 
 def _exactness(layers: Sequence[Exactness]) -> Iterator[Block]:
     """What was tried for equal spikes, and what is in the way."""
     if layers and not any(layer.flips for layer in layers):
-        yield Text("spike-exact: every spike of every layer on all training recordings is the float64 model's")
+        yield Text(
+            "spike-exact: every spike of every layer on all training recordings is the float64 model's"
+        )
     elif layers:
         rows = [
             [
@@ -154,7 +164,9 @@ def _removed(facts: CompilationFacts) -> Iterator[str]:
     reasons = {
         "that no input can make fire": [layer.silent for layer in facts.removals],
         "whose spikes reach no neuron": [layer.unread for layer in facts.removals],
-        "that did not fire in training (by evidence, not by proof)": [layer.never_fired for layer in facts.removals],
+        "that did not fire in training (by evidence, not by proof)": [
+            layer.never_fired for layer in facts.removals
+        ],
     }
     for why, neurons in reasons.items():
         counts = [f"{layer.layer} {n:,}" for layer, n in zip(facts.removals, neurons, strict=True) if n]

@@ -87,7 +87,9 @@ class NetlistFacts(Shown):
 def inspect(path: str | os.PathLike[str]) -> Outcome:
     """What a netlist file holds, with its layout; raises as :func:`netlist.read_netlist` does."""
     netlist = read_netlist(path)
-    return Outcome(describe(netlist, measure(netlist, load_target(netlist.target)), sha256_of(path)), sections)
+    return Outcome(
+        describe(netlist, measure(netlist, load_target(netlist.target)), sha256_of(path)), sections
+    )
 
 
 def describe(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> NetlistFacts:
@@ -164,7 +166,9 @@ def sections(facts: NetlistFacts) -> Iterator[Section]:
     if facts.clocks is not None and facts.clocks.channels:
         channels = facts.clocks.channels
         steps = facts.clocks.steps
-        lines.append(f"  {channels} clocks of {steps} steps each, {channels * steps} in all, beside the sensor")
+        lines.append(
+            f"  {channels} clocks of {steps} steps each, {channels * steps} in all, beside the sensor"
+        )
     if facts.clocks is not None and facts.clocks.length is not None:
         lines.append(f"  a recording is run for {facts.clocks.length} steps, whatever its own length")
     if facts.synapse_words < SHARED * facts.synapse_words_unrolled:
@@ -203,7 +207,10 @@ def _layer_table(layers: Sequence[LayerFacts]) -> Table:
         "stored": [f"{layer.synapses_stored:,}" for layer in layers],
         "from itself": [f"{layer.synapses_from_itself or 0:,}" for layer in layers],
         "fan-in": [str(layer.max_fan_in) for layer in layers],
-        "bits": [f"{len(x.exponents)}×{x.weight_bits}" if len(x.exponents) > 1 else str(x.weight_bits) for x in layers],
+        "bits": [
+            f"{len(x.exponents)}×{x.weight_bits}" if len(x.exponents) > 1 else str(x.weight_bits)
+            for x in layers
+        ],
         "scale": [_span(layer.scale) for layer in layers],
         "threshold": [_span(layer.threshold) for layer in layers],
         "θ": [_span(layer.theta_realised) for layer in layers],

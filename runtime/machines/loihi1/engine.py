@@ -20,7 +20,13 @@ from spikeloom.compiler.layer_kernel import require_below
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.machines.base import Done, require_channels
-from spikeloom.runtime.machines.loihi1.block_kernel import CHARGES, Blocks, add_charges, run_recordings, scratch_of
+from spikeloom.runtime.machines.loihi1.block_kernel import (
+    CHARGES,
+    Blocks,
+    add_charges,
+    run_recordings,
+    scratch_of,
+)
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.kernel import State, Tables, chip_steps, state_of, tables_of
 from spikeloom.runtime.machines.loihi1.trace import (
@@ -67,7 +73,13 @@ def start(engine: Engine) -> State:
     """State before a recording: at rest, or what a free-running chip comes to in blank steps."""
     state = state_of(engine.netlist)
     if engine.netlist.blank:
-        advance(engine, state, np.zeros((engine.netlist.n_inputs, 0), np.uint8), length=0, steps=engine.netlist.blank)
+        advance(
+            engine,
+            state,
+            np.zeros((engine.netlist.n_inputs, 0), np.uint8),
+            length=0,
+            steps=engine.netlist.blank,
+        )
         for counts in (state.spikes, state.updates, state.saturations):
             counts[:] = 0
     return state
@@ -182,7 +194,9 @@ def simulate(
         fired, worked = run_part(engine, given[part], ends[part], trace, part)
         if charges is not None and trace.charged is not None:
             totals = np.empty(sources.shape[1], np.int64)
-            add_charges(given[part], ends[part], fired, worked, sources, kinds, members, trace.charged[part], totals)
+            add_charges(
+                given[part], ends[part], fired, worked, sources, kinds, members, trace.charged[part], totals
+            )
 
     parts = [slice(i, min(i + size, recordings)) for i in range(0, recordings, size)]
     workers = min(threads or os.cpu_count() or 1, len(parts))
@@ -210,7 +224,9 @@ def _run_layers(
         spikes = trace.packed[part]
     run_recordings(
         blocks,
-        *scratch_of(blocks, events.shape[1], int(ends.max(initial=0)), membranes=trace.membranes is not None),
+        *scratch_of(
+            blocks, events.shape[1], int(ends.max(initial=0)), membranes=trace.membranes is not None
+        ),
         events,
         ends,
         trace.counts.inputs[part],

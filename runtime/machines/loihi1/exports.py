@@ -63,7 +63,9 @@ def _sanafe(request: ExportSource) -> Export:
         f"of the inputs: {', '.join(facts.input_cores)}",
     ]
     if facts.floating_currents:
-        lines.append(f"currents of {', '.join(facts.floating_currents)} are floats there, so spikes may differ")
+        lines.append(
+            f"currents of {', '.join(facts.floating_currents)} are floats there, so spikes may differ"
+        )
     content = (f"{line}\n".encode() for line in sanafe.export(netlist, target))
     return Export(content=content, facts=facts, lines=tuple(lines))
 
@@ -74,7 +76,11 @@ def _onnx(request: ExportSource) -> Export:
     content, *ports = onnx.export(netlist, form)
     inputs, outputs = ([str(port) for port in side] for side in ports)
     facts = OnnxFacts(
-        neurons=netlist.n_compartments, synapses=netlist.n_synapses, form=form, inputs=inputs, outputs=outputs
+        neurons=netlist.n_compartments,
+        synapses=netlist.n_synapses,
+        form=form,
+        inputs=inputs,
+        outputs=outputs,
     )
     lines = ("inputs:", *(f"  {port}" for port in inputs), "outputs:", *(f"  {port}" for port in outputs))
     return Export(content=[content], facts=facts, form=form, lines=lines)
@@ -92,7 +98,9 @@ def _nir(request: ExportSource) -> Export:
     )
     lines = (f"in steps of {dt:g} s ({facts.convention})",)
     with reading(request.source, FormatError, "compile it again"):
-        content = nir.export(lift(netlist), dt, origin=None if width is None else json.dumps({"bin_s": width}))
+        content = nir.export(
+            lift(netlist), dt, origin=None if width is None else json.dumps({"bin_s": width})
+        )
     return Export(content=[content], facts=facts, lines=lines)
 
 
@@ -104,7 +112,12 @@ FORMATS = (
         ending="yaml",
     ),
     Format(
-        name="onnx", title="a netlist as an integer ONNX graph, bit for bit the chip", write=_onnx, options=("form",)
+        name="onnx",
+        title="a netlist as an integer ONNX graph, bit for bit the chip",
+        write=_onnx,
+        options=("form",),
     ),
-    Format(name="nir", title="a netlist as a NIR file in weight units", write=_nir, options=("dt",), whole=True),
+    Format(
+        name="nir", title="a netlist as a NIR file in weight units", write=_nir, options=("dt",), whole=True
+    ),
 )

@@ -8,7 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spikeloom.compiler.layer_kernel import charged, compiled, compiled_and_cached, copy, decayed, integrated, saturated
+from spikeloom.compiler.layer_kernel import (
+    charged,
+    compiled,
+    compiled_and_cached,
+    copy,
+    decayed,
+    integrated,
+    saturated,
+)
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.registers import (
     ACCUMULATOR_MAX,

@@ -106,7 +106,9 @@ def _finetune(request: CompileRequest, *, checkpoint: bool) -> str:
     """What to type for training on the chip's integers."""
     read = typed(request, (*NETWORK, *LAYOUT))
     data = ("--data", str(request.calibrate), "--weight-bits", "8")
-    return command("finetune", str(request.checkpoint), *read, *data, "-o", "TUNED.pt" if checkpoint else "TUNED.nir")
+    return command(
+        "finetune", str(request.checkpoint), *read, *data, "-o", "TUNED.pt" if checkpoint else "TUNED.nir"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -100,12 +100,18 @@ class Loihi(Damageable, Explainable, Stoppable):
     def differing(self, run: Run, layer: str, expected: BoolArray, first: int, lengths: IntArray) -> int:
         """Of neurons whose spikes reach a neuron; both count time as the float model does."""
         compared = self.compared()[self.layers.index(layer)]
-        return int(np.count_nonzero(run.spikes[layer][..., compared] != cut(expected, lengths)[..., compared]))
+        return int(
+            np.count_nonzero(run.spikes[layer][..., compared] != cut(expected, lengths)[..., compared])
+        )
 
-    def simulate(self, channels: EventArray, lengths: IntArray | None, *, spikes: bool, membranes: bool) -> Trace:
+    def simulate(
+        self, channels: EventArray, lengths: IntArray | None, *, spikes: bool, membranes: bool
+    ) -> Trace:
         """Spikes and membranes by chip step."""
         try:
-            return engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
+            return engine.simulate(
+                self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes
+            )
         except NumericRangeError as error:
             error.args = (f"{self.file}: {error}",)
             raise
@@ -160,7 +166,9 @@ class Loihi(Damageable, Explainable, Stoppable):
             steps = channels.shape[1]
             engine.advance(self._stepwise, state, channels, length=steps, steps=steps + lag)
             counts.append(state.spikes - before)
-            engine.advance(self._stepwise, state, channels[:, :0], length=steps, steps=self.netlist.blank - lag)
+            engine.advance(
+                self._stepwise, state, channels[:, :0], length=steps, steps=self.netlist.blank - lag
+            )
         return class_counts(self.netlist, np.array(counts))
 
     def beside(self, engine: str) -> Callable[[EventArray, IntArray | None], int] | None:
@@ -204,7 +212,9 @@ class Loihi(Damageable, Explainable, Stoppable):
 
         return cumulative.steady(self.netlist)
 
-    def on_a_thread(self, channels: EventArray, lengths: IntArray, first: int) -> tuple[Iterable[BoolArray], IntArray]:
+    def on_a_thread(
+        self, channels: EventArray, lengths: IntArray, first: int
+    ) -> tuple[Iterable[BoolArray], IntArray]:
         """Spikes by layer, as the float model counts time; at a bit each until they are looked at."""
         trace = engine.simulate(self._engine, channels, lengths=lengths, packed=True, threads=1)
         assert trace.packed is not None, "packed spikes were wanted"
@@ -238,7 +248,9 @@ class Loihi(Damageable, Explainable, Stoppable):
             return super().effects(channels, changes)
         from spikeloom.runtime.machines.loihi1.changes import kernel
 
-        return kernel.effects(self._chip, kernel.known_run(self._chip, channels), self.netlist.classes, changes)
+        return kernel.effects(
+            self._chip, kernel.known_run(self._chip, channels), self.netlist.classes, changes
+        )
 
     def forgetting(self, channels: EventArray) -> Forgetting | None:
         """By interval arithmetic on registers."""
@@ -246,7 +258,9 @@ class Loihi(Damageable, Explainable, Stoppable):
             return None
         from spikeloom.runtime.machines.loihi1.changes import forgetting, kernel
 
-        return forgetting.forgetting(self._chip, kernel.known_run(self._chip, channels), self.netlist.classes)
+        return forgetting.forgetting(
+            self._chip, kernel.known_run(self._chip, channels), self.netlist.classes
+        )
 
     def core_map(self, events: EventArray, lengths: IntArray, counts: IntArray) -> CoreMap:
         """Cores on the mesh."""
@@ -254,7 +268,9 @@ class Loihi(Damageable, Explainable, Stoppable):
 
         within = np.arange(events.shape[-1]) < lengths[:, None, None]
         inputs = ((with_clocks(events, self.netlist.clocks) != 0) & within).sum(axis=2)
-        return page.core_map(self.netlist, self.target, np.concatenate([inputs, counts], axis=1).mean(axis=0))
+        return page.core_map(
+            self.netlist, self.target, np.concatenate([inputs, counts], axis=1).mean(axis=0)
+        )
 
     def figures(self, price: Price) -> list[Block]:
         """Energy by layer and part, time by core."""
@@ -263,14 +279,22 @@ class Loihi(Damageable, Explainable, Stoppable):
         return page.figures(price.outcome.result)
 
     def priced(
-        self, channels: EventArray, lengths: IntArray | None, chip: Target, bin_s: float, detail: str, progress: Done
+        self,
+        channels: EventArray,
+        lengths: IntArray | None,
+        chip: Target,
+        bin_s: float,
+        detail: str,
+        progress: Done,
     ) -> tuple[Trace, Price]:
         """Costs, of the cores' tiles and times too."""
         from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
         from spikeloom.runtime.machines.loihi1.costs.result import cost_report
         from spikeloom.runtime.machines.loihi1.costs.sections import sections
 
-        trace, estimated = estimate(self._engine, chip, channels, lengths=lengths, detail=detail, progress=progress)
+        trace, estimated = estimate(
+            self._engine, chip, channels, lengths=lengths, detail=detail, progress=progress
+        )
         report = cost_report(self.netlist, chip, estimated, bin_s=bin_s * self.netlist.bins)
         energy = {name: each.sum(axis=1) for name, each in estimated.costs.energy.items()}
         return trace, Price(

@@ -116,7 +116,9 @@ class _Weights:
         self.gained += np.bincount(row, np.maximum(error, 0), len(self.gained))
 
 
-def check_rounding(netlist: Netlist, integer: IntegerNetwork, target: Target, network: Network) -> NetlistCheck:
+def check_rounding(
+    netlist: Netlist, integer: IntegerNetwork, target: Target, network: Network
+) -> NetlistCheck:
     """Hold what a netlist stores against the float network that it should have been compiled from; simulates nothing.
 
     `integer` is the netlist, cores forgotten. A network that was fine-tuned on the chip's integers
@@ -151,7 +153,9 @@ def check_rounding(netlist: Netlist, integer: IntegerNetwork, target: Target, ne
         other = [what for what, digest in stored[name].items() if known.get(what) != digest]
         for what in () if faults else other:
             where = f"; {weights.where}" if what == "weights" else ""
-            faults.append(f"{name} has other {what} than the compiler chose, by the netlist's own record{where}")
+            faults.append(
+                f"{name} has other {what} than the compiler chose, by the netlist's own record{where}"
+            )
         layers[name] = LayerRounding(
             weights=weights.count,
             nearest=weights.count - weights.wrong,
@@ -191,7 +195,9 @@ def _claim(layers: Mapping[str, LayerRounding]) -> str:
     return f"{claim}; by compensation, as the netlist records, not to the nearest: {', '.join(moved)}"
 
 
-def _other_registers(netlist: Netlist, integer: IntegerNetwork, network: Network, post: int) -> Iterator[str]:
+def _other_registers(
+    netlist: Netlist, integer: IntegerNetwork, network: Network, post: int
+) -> Iterator[str]:
     """What is not the checkpoint's of a layer, beside weights and biases: its numbers, its window, its votes."""
     chip = integer.populations[post]
     wanted = network.populations[post]
@@ -234,7 +240,9 @@ def summed(stage: Network | IntegerNetwork, pre: int, post: int) -> Sparse:
     projections: tuple[Projection | IntegerProjection, ...] = stage.projections
     for projection in projections:
         if (projection.pre, projection.post) == (pre, post):
-            weight = projection.effective() if isinstance(projection, IntegerProjection) else projection.weight
+            weight = (
+                projection.effective() if isinstance(projection, IntegerProjection) else projection.weight
+            )
             total = total + weight.astype(np.float64)
     return total
 
@@ -247,11 +255,15 @@ def _compare_weights(
     planes = [projection for projection in integer.projections if projection.post == post]
     bits = min(plane.bits for plane in planes)
     exponents = tuple(sorted({plane.exponent for plane in planes if plane.weight.nnz}))
-    exponents = exponents or (coarsest,)  # a layer that stores no weight: all of them rounded to zero at some step
+    exponents = exponents or (
+        coarsest,
+    )  # a layer that stores no weight: all of them rounded to zero at some step
     step = registers.step_units(bits, exponents)
     most = registers.reach(bits, exponents) * step
     weights = _Weights(lost=np.zeros(chip.size), gained=np.zeros(chip.size))
-    for pre in sorted({each.pre for stage in (network, integer) for each in stage.projections if each.post == post}):
+    for pre in sorted(
+        {each.pre for stage in (network, integer) for each in stage.projections if each.post == post}
+    ):
         real = summed(network, pre, post)
         stored = summed(integer, pre, post)
         real.data = np.clip(real.data * np.repeat(chip.scale, np.diff(real.indptr)), -most, most)
@@ -267,7 +279,13 @@ def _compare_weights(
 
 
 def _wrong_numbers(
-    network: Network, integer: IntegerNetwork, post: int, silence: _Silence, weights: _Weights, *, compensates: bool
+    network: Network,
+    integer: IntegerNetwork,
+    post: int,
+    silence: _Silence,
+    weights: _Weights,
+    *,
+    compensates: bool,
 ) -> Iterator[str]:
     """Weights that are not the nearest, and biases that are neither that nor make up for what weights lost."""
     wanted = network.populations[post]

@@ -61,7 +61,9 @@ def decayed(value: IntArray, lost: IntArray | int) -> IntArray:
 
 def read_synapses(netlist: Netlist) -> list[tuple[IntArray, IntArray]]:
     """Targets and effective weights, ``mantissa * 2**exponent``, of the axons of each source, planes one by one."""
-    of_source: list[list[tuple[IntArray, IntArray]]] = [[] for _ in range(netlist.n_inputs + netlist.n_compartments)]
+    of_source: list[list[tuple[IntArray, IntArray]]] = [
+        [] for _ in range(netlist.n_inputs + netlist.n_compartments)
+    ]
     core_of_axon = netlist.core_of_axon()
     for axon, (source, form) in enumerate(zip(netlist.axon_source, netlist.axon_format, strict=True)):
         first_on_core = netlist.core_compartments[core_of_axon[axon]]
@@ -165,7 +167,9 @@ def _require_range(
 ) -> None:
     """Refuse registers that may not overflow."""
     sums = np.where(UNIT * positive > ACCUMULATOR_MAX, positive, -negative) * UNIT
-    for over in np.flatnonzero(window & ((np.abs(sums) > ACCUMULATOR_MAX) | (np.abs(current) > CURRENT_MAX)))[:1]:
+    for over in np.flatnonzero(
+        window & ((np.abs(sums) > ACCUMULATOR_MAX) | (np.abs(current) > CURRENT_MAX))
+    )[:1]:
         if abs(sums[over]) > ACCUMULATOR_MAX:
             raise range_error(netlist, "synaptic sum", over, t, sums[over])
         raise range_error(netlist, "current", over, t, current[over])

@@ -66,7 +66,9 @@ class Stream:
             )
         netlist = self._engine.netlist
         if self.index == netlist.clocks.length:
-            raise DataError(f"stream: a step after the network's {self.index} found; call finish() for the decision")
+            raise DataError(
+                f"stream: a step after the network's {self.index} found; call finish() for the decision"
+            )
         bin_ = _one_bin(netlist, events)
         self._column[: len(bin_), 0] = bin_
         self._column[len(bin_) :] = netlist.clocks.events(1, first=self.index)
@@ -80,7 +82,9 @@ class Stream:
         does.
         """
         if self._ended:
-            raise DataError("stream: a second end found, a grasp has one; call reset() to begin the next grasp")
+            raise DataError(
+                "stream: a second end found, a grasp has one; call reset() to begin the next grasp"
+            )
         netlist = self._engine.netlist
         silence = np.zeros((netlist.taxels, netlist.polarities), np.uint8)
         rest = [self.step(silence) for _ in range(self.index, netlist.clocks.length or 0)]
@@ -108,7 +112,9 @@ class Stream:
         spikes[self._place[state.fired[: state.counter[1]]]] = True
         counts = class_counts(netlist, state.spikes[None])[0]
         spikes.flags.writeable = counts.flags.writeable = False
-        return Step(index=index, spikes=tuple([spikes[begin:end] for begin, end in self._bounds]), counts=counts)
+        return Step(
+            index=index, spikes=tuple([spikes[begin:end] for begin, end in self._bounds]), counts=counts
+        )
 
 
 def _one_bin(netlist: Netlist, events: npt.ArrayLike) -> npt.NDArray[np.generic]:
@@ -125,7 +131,9 @@ def _one_bin(netlist: Netlist, events: npt.ArrayLike) -> npt.NDArray[np.generic]
             "give the events of one bin of this network's sensor"
         )
     if array.dtype.kind not in "biuf":
-        raise DataError(f"stream: a bin of type {array.dtype} found, allowed are numbers and bool; give 0 and 1")
+        raise DataError(
+            f"stream: a bin of type {array.dtype} found, allowed are numbers and bool; give 0 and 1"
+        )
     outside = (array != 0) & (array != 1)
     if outside.any():
         raise DataError(

@@ -101,7 +101,9 @@ def aligned(netlist: Netlist, array: AnyArray, layer: int) -> AnyArray:
     return whole
 
 
-def range_error(netlist: Netlist, register: str, compartment: int, chip_step: int, value: int) -> NumericRangeError:
+def range_error(
+    netlist: Netlist, register: str, compartment: int, chip_step: int, value: int
+) -> NumericRangeError:
     """Error of a register that would overflow; `register` is a key of `REGISTER_LIMITS`."""
     layer = netlist.layers[netlist.layer[compartment]].name
     neuron = netlist.neuron[compartment]

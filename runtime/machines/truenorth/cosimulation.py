@@ -1,11 +1,12 @@
 """Crossbar cores in a simulator of the hardware description of RANC, which others designed, beside our own.
 
-The cores, their routers and the output bus are RANC's; the wires between these, and what reads and writes files, are
-``harness.v``. Each recording is a run of its own, from memories as they are written, for the description clears
-nothing. Every spike and every membrane of every neuron is compared, and every packet on the output bus.
+The cores, their routers and the output bus are RANC's; the wires between these, and what reads and writes
+files, are ``harness.v``. Each recording is a run of its own, from memories as they are written, for the
+description clears nothing. Every spike and every membrane of every neuron is compared, and every packet on
+the output bus.
 
-Verilator 5.006 makes wrong code of these sources where it inlines gates, so that it is built without; Icarus runs them
-as they are, about a hundred times slower.
+Verilator 5.006 makes wrong code of these sources where it inlines gates, so that it is built without; Icarus
+runs them as they are, about a hundred times slower.
 """
 
 from __future__ import annotations
@@ -95,14 +96,18 @@ def sources_in(folder: str) -> list[Path]:
     for place in (Path(folder) / IN_A_CLONE, Path(folder)):
         if (place / "Core.v").is_file():
             return [each.absolute() for each in sorted(place.glob("*.v")) if each.name not in FRONT_END]
-    raise OptionError(f"--rtl {folder}: no Core.v in it; give a clone of github.com/UA-RCL/RANC, or its {IN_A_CLONE}")
+    raise OptionError(
+        f"--rtl {folder}: no Core.v in it; give a clone of github.com/UA-RCL/RANC, or its {IN_A_CLONE}"
+    )
 
 
 def simulator_for(wanted: str | None) -> str:
     """The program that is wanted, or the fastest that is installed; OptionError if there is none."""
     installed = [name for name in SIMULATORS if wanted in (None, name) and shutil.which(name)]
     if not installed:
-        raise OptionError(f"{wanted or ' or '.join(SIMULATORS)}: not found; install it, it builds the hardware")
+        raise OptionError(
+            f"{wanted or ' or '.join(SIMULATORS)}: not found; install it, it builds the hardware"
+        )
     return installed[0]
 
 
@@ -146,10 +151,16 @@ class Built:
             fields = words & ((1 << bits) - 1)
             fields -= (fields >> (bits - 1)) << bits
             count = spikes[:, ours].shape[1]
-            wrong_spikes += int(np.count_nonzero(fired[:, :count] != spikes[:, ours]) + fired[:, count:].sum())
+            wrong_spikes += int(
+                np.count_nonzero(fired[:, :count] != spikes[:, ours]) + fired[:, count:].sum()
+            )
             wrong_membranes += int(np.count_nonzero(fields[:, :count] != membranes[:, ours]))
-        votes = np.zeros((ticks, netlist.classes + 1), np.int64)  # the last is the way out of neurons without a target
-        np.add.at(votes.T, np.where(netlist.readout_class < 0, netlist.classes, netlist.readout_class), spikes.T)
+        votes = np.zeros(
+            (ticks, netlist.classes + 1), np.int64
+        )  # the last is the way out of neurons without a target
+        np.add.at(
+            votes.T, np.where(netlist.readout_class < 0, netlist.classes, netlist.readout_class), spikes.T
+        )
         out = np.array((here / "out.txt").read_text("utf-8").split(), np.int64)
         np.subtract.at(votes, (out[::2], out[1::2]), 1)
         return Compared(
@@ -168,13 +179,21 @@ class Built:
 def build(machine: TrueNorth, folder: Path, sources: Sequence[Path], simulator: str, ticks: int) -> Built:
     """Write the memories of a network, and build it where that was not done already.
 
-    ModelError if RANC has not what it uses, in recordings of so many `ticks`; OptionError if the sources are no good.
+    ModelError if RANC has not what it uses, in recordings of so many `ticks`; OptionError if the sources are
+    no good.
     """
     terms = expressed(machine.netlist, ticks)
     widths = sizes(terms, machine.target)
-    files = {"sizes.vh": "".join(f"localparam {name} = {value};\n" for name, value in widths.items()), "empty.mem": ""}
+    files = {
+        "sizes.vh": "".join(f"localparam {name} = {value};\n" for name, value in widths.items()),
+        "empty.mem": "",
+    }
     words = [*shlex.split(SIMULATORS[simulator]), str(HARNESS), *map(str, sources)]
-    parts = [SIMULATORS[simulator], files["sizes.vh"], *(each.read_text("utf-8") for each in (HARNESS, *sources))]
+    parts = [
+        SIMULATORS[simulator],
+        files["sizes.vh"],
+        *(each.read_text("utf-8") for each in (HARNESS, *sources)),
+    ]
     made = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     if not (stamp := folder / "built").is_file() or stamp.read_text("utf-8") != made:
         _write(folder, files)
@@ -196,8 +215,12 @@ def _call(words: Sequence[str | Path], folder: Path) -> None:
         words, cwd=folder, capture_output=True, text=True, errors="replace", check=False
     )
     if done.returncode:
-        said = next((line for line in done.stderr.splitlines() if "rror" in line), f"exit code {done.returncode}")
-        raise OptionError(f"--rtl: {Path(words[0]).name} fails: {said.strip()}; give RANC's sources as they are")
+        said = next(
+            (line for line in done.stderr.splitlines() if "rror" in line), f"exit code {done.returncode}"
+        )
+        raise OptionError(
+            f"--rtl: {Path(words[0]).name} fails: {said.strip()}; give RANC's sources as they are"
+        )
 
 
 def cosimulate(
@@ -205,7 +228,8 @@ def cosimulate(
 ) -> Outcome:
     """Run recordings through the hardware description; exit code 1 where something differs.
 
-    What is finished stays in the `folder`, and is not done again. Raises as :func:`build` and :meth:`Built.run`.
+    What is finished stays in the `folder`, and is not done again. Raises as :func:`build` and
+    :meth:`Built.run`.
     """
     sources = sources_in(rtl)
     program = simulator_for(simulator)

@@ -1,10 +1,11 @@
 """What a run of crossbar cores costs: synaptic events, spikes, hops, ticks, and energy by two readings.
 
-A *synaptic event* is a set crossing point that a spike on its axon meets. The chip's measured power can be read in two
-ways, which are never added up: all of it divided by the events of one workload (26 pJ each, standing power within), or
-a price for what an event adds on top of a floor that the whole chip takes for as long as it runs. The first flatters a
-network that does little, the second charges it with 4,096 cores of which it uses some; the share of the cores in use
-stands beside it. A tick takes its time in full, whatever happens in it.
+A *synaptic event* is a set crossing point that a spike on its axon meets. The chip's measured power can be
+read in two ways, which are never added up: all of it divided by the events of one workload (26 pJ each,
+standing power within), or a price for what an event adds on top of a floor that the whole chip takes for as
+long as it runs. The first flatters a network that does little, the second charges it with 4,096 cores of
+which it uses some; the share of the cores in use stands beside it. A tick takes its time in full, whatever
+happens in it.
 """
 
 from collections.abc import Callable, Mapping
@@ -189,10 +190,17 @@ def sections(found: Estimate) -> list[Section]:
     """The same for people."""
     columns = [found.per_inference, found.min, found.max]
     *counted, _, _ = Amounts.__dataclass_fields__
-    rows = [[name.replace("_", " "), *(f"{getattr(column, name):,.0f}" for column in columns)] for name in counted]
+    rows = [
+        [name.replace("_", " "), *(f"{getattr(column, name):,.0f}" for column in columns)]
+        for name in counted
+    ]
     rows.append(["time, 1 tick a millisecond", *(si(column.time_s, "s") for column in columns)])
-    rows += [[f"energy, {name}", *(si(c.energy_j[name], "J") for c in columns)] for name in columns[0].energy_j]
-    layers = [[layer.name, f"{layer.synaptic_events:,.0f}", f"{layer.spikes:,.0f}"] for layer in found.layers]
+    rows += [
+        [f"energy, {name}", *(si(c.energy_j[name], "J") for c in columns)] for name in columns[0].energy_j
+    ]
+    layers = [
+        [layer.name, f"{layer.synaptic_events:,.0f}", f"{layer.spikes:,.0f}"] for layer in found.layers
+    ]
     head = f"per inference on {found.cores:,} of {found.cores_of_chip:,} cores, over {found.samples} recordings:"
     pace = found.pace
     seconds = found.per_inference.time_s / pace.step_s * pace.bin_s

@@ -111,7 +111,9 @@ def describe(netlist: CrossbarNetlist, sha256: str) -> Outcome:
         wires=len(netlist.wire_neuron),
         cores=netlist.n_cores,
         layers=tuple(layer(*each) for each in enumerate(netlist.layers)),
-        limits=tuple(LimitFill(rule, int(used.max(initial=0)), chip.limit(rule)) for rule, used in fullest.items()),
+        limits=tuple(
+            LimitFill(rule, int(used.max(initial=0)), chip.limit(rule)) for rule, used in fullest.items()
+        ),
         max_crossing_points_of_an_axon=int(degree.max(initial=0)),
         provenance=netlist.provenance,
         sha256=sha256,
@@ -126,10 +128,20 @@ def sections(found: Description) -> list[Section]:
         f"{found.target}: {found.neurons:,} neurons, {found.axons:,} axons, {found.crossing_points:,} crossing points, "
         f"{found.cores:,} cores; {ticks} tick{'s' * (ticks > 1)} a data step, {found.drain_ticks} more to drain"
         + (f"; a step joins {found.bins} bins" if found.bins else "")
-        + (f"; trained on bins of {origin['bin_s']:g} s" if "bin_s" in (origin := origin_of(found.provenance)) else "")
+        + (
+            f"; trained on bins of {origin['bin_s']:g} s"
+            if "bin_s" in (origin := origin_of(found.provenance))
+            else ""
+        )
     )
     layers = [
-        [layer.name, f"{layer.neurons:,}", f"{layer.distinct:,}", f"{layer.max_fan_in:,}", f"{layer.cores:,}"]
+        [
+            layer.name,
+            f"{layer.neurons:,}",
+            f"{layer.distinct:,}",
+            f"{layer.max_fan_in:,}",
+            f"{layer.cores:,}",
+        ]
         for layer in found.layers
     ]
     limits = [
@@ -202,7 +214,14 @@ def describe_trained(trained: Trained) -> Outcome:
 def trained_sections(found: TrainedDescription) -> list[Section]:
     """The same for people."""
     rows = [
-        [s.name, f"{s.blocks:,}", f"{s.inputs:,}", f"{s.clocks:,}", f"{s.neurons:,}", f"{100 * s.zeros:.0f} %"]
+        [
+            s.name,
+            f"{s.blocks:,}",
+            f"{s.inputs:,}",
+            f"{s.clocks:,}",
+            f"{s.neurons:,}",
+            f"{100 * s.zeros:.0f} %",
+        ]
         for s in found.layers
     ]
     lines = [f"  holds the epochs {', '.join(found.sets)}, shown is {found.weights}"]

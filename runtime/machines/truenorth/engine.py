@@ -74,7 +74,9 @@ def prepare(netlist: CrossbarNetlist, *, careful: bool = False) -> Engine:
         segment_bounds=bounds,
         segments=segments,
         row=row,
-        steady=np.stack([*(column[first] for column in _registers(netlist)), cap])[:, :steady].astype(np.int32),
+        steady=np.stack([*(column[first] for column in _registers(netlist)), cap])[:, :steady].astype(
+            np.int32
+        ),
         axon_synapses=np.searchsorted(axon, np.arange(axons + 1)).astype(np.int64),
         synapse_neuron=neuron.astype(np.int32),
         synapse_weight=halves,
@@ -104,10 +106,10 @@ def _steady_first(
 ) -> tuple[Twins, int, IntArray]:
     """The same kinds with steady neurons first; how many are steady; and the cap of each kind.
 
-    Steady are neurons without reversal whose registers, and all that can reach them in a tick, leave
-    the membrane within its range: those that are reset to a value, and those that are held at their negative threshold
-    and reset by their threshold, as far as they begin a tick at their cap or below: the highest membrane from which a
-    tick cannot leave the register.
+    Steady are neurons without reversal whose registers, and all that can reach them in a tick, leave the
+    membrane within its range: those that are reset to a value, and those that are held at their negative
+    threshold and reset by their threshold, as far as they begin a tick at their cap or below: the highest
+    membrane from which a tick cannot leave the register.
     """
     first = twins.first_neuron
     positive, negative = (
@@ -171,7 +173,9 @@ def _checked_steps(netlist: CrossbarNetlist, events: EventArray, lengths: IntArr
     require_below("length", steps, whole + 1)
     most = netlist.ticks(whole)
     if most >= MOST_TICKS:
-        raise NumericRangeError(f"recordings of {whole} data steps take {most} ticks, {MOST_TICKS - 1} can be counted")
+        raise NumericRangeError(
+            f"recordings of {whole} data steps take {most} ticks, {MOST_TICKS - 1} can be counted"
+        )
     return steps
 
 
@@ -185,11 +189,11 @@ def simulate(
 ) -> Trace:
     """Run recordings (samples, n_inputs, T) through the cores, as :func:`spec.simulate` does each.
 
-    `lengths` (samples,) are their data steps where some are shorter than T. Spikes and membranes are kept where they
-    are wanted, at one and four bytes a neuron and tick.
+    `lengths` (samples,) are their data steps where some are shorter than T. Spikes and membranes are kept
+    where they are wanted, at one and four bytes a neuron and tick.
 
-    DataError if the recordings have another number of input channels than the network. NumericRangeError if they would
-    take more ticks than a run can count.
+    DataError if the recordings have another number of input channels than the network. NumericRangeError if
+    they would take more ticks than a run can count.
     """
     engine = network if isinstance(network, Engine) else prepare(network)
     netlist = engine.netlist

@@ -25,7 +25,9 @@ def _ranc(request: ExportSource) -> Export:
         number = request.recording or 0
         if not 0 <= number < len(data.files):
             raise OptionError(f"--recording {number}: --data has recordings 0 to {len(data.files) - 1}")
-        events = with_clocks(data.events[number : number + 1, ..., : data.steps_of(number)], netlist.clocks)[0]
+        events = with_clocks(data.events[number : number + 1, ..., : data.steps_of(number)], netlist.clocks)[
+            0
+        ]
     ticks = None if events is None else netlist.ticks(events.shape[1]) + 1
     path = request.output
     out = request.output.removesuffix(".json") + ".out"

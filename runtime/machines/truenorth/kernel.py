@@ -1,9 +1,9 @@
 """Machine code of the engine: one recording, all its ticks; :mod:`truenorth.engine` makes the arrays.
 
-A tick visits the axons that have a spike. *Steady* neurons, the first ones, cannot leave their register in a tick that
-they begin at their cap or below, so they are computed all at once, and what an axon brings them is added in rows of
-neighbours. All but those that are reset by their threshold provably stay below their cap; where one of these does not,
-the run is broken off. The other neurons are computed one by one.
+A tick visits the axons that have a spike. *Steady* neurons, the first ones, cannot leave their register in a
+tick that they begin at their cap or below, so they are computed all at once, and what an axon brings them is
+added in rows of neighbours. All but those that are reset by their threshold provably stay below their cap;
+where one of these does not, the run is broken off. The other neurons are computed one by one.
 """
 
 from typing import Any, NamedTuple
@@ -18,11 +18,19 @@ from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 Int32 = npt.NDArray[np.int32]
 
 PARAMETERS = (
-    *("leak", "leak_reversal", "threshold", "reset_mode", "reset", "negative_threshold", "negative_saturates"),
+    *(
+        "leak",
+        "leak_reversal",
+        "threshold",
+        "reset_mode",
+        "reset",
+        "negative_threshold",
+        "negative_saturates",
+    ),
 )
 LEAK, REVERSAL, THRESHOLD, RESET_MODE, RESET, NEGATIVE, SATURATES, AXON, DELAY, VOTES_FROM = range(10)
-"""Columns of the parameters of a neuron: those of the netlist, the axon that its spikes reach (-1 for none), the ticks
-until then, and the tick from which on they count as votes (-1 for never)."""
+"""Columns of the parameters of a neuron: those of the netlist, the axon that its spikes reach (-1 for none),
+the ticks until then, and the tick from which on they count as votes (-1 for never)."""
 
 HALF, LOWER = 32, 2**32 - 1
 """Positive and negative weights are added up in one number: in its upper half, and as magnitudes in its lower."""
@@ -37,15 +45,18 @@ class Wiring(NamedTuple):
     """What does not change while a recording runs."""
 
     offsets: IntArray  # (offsets,) int64; ticks of a data step in which channels are fed
-    feed_bounds: IntArray  # (offsets, channels + 1) int64; rows of `feed_axon` that a channel feeds at an offset
+    feed_bounds: (
+        IntArray  # (offsets, channels + 1) int64; rows of `feed_axon` that a channel feeds at an offset
+    )
     feed_axon: Int32  # (feeds,) int32
     clocks: IntArray  # (clocks, 3) int64; axon, period, phase
     segment_bounds: IntArray  # (axons + 1,) int64; segments of each axon
-    # (segments, 3) int64; first steady neuron, the one after the last, and where in `row` the weights for them begin
+    # (segments, 3) int64; first steady neuron, the one after the last, and where in `row` the weights for
+    # them begin
     segments: IntArray
     row: Int32  # (…) int32; weights of segments, zero where nothing is joined
-    # (7, steady) int32; leak, threshold, reset, the negative threshold below zero, what a membrane below that becomes,
-    # 1 for a reset by the threshold, and the cap
+    # (7, steady) int32; leak, threshold, reset, the negative threshold below zero, what a membrane below
+    # that becomes, 1 for a reset by the threshold, and the cap
     steady: Int32
     axon_synapses: IntArray  # (axons + 1,) int64; crossing points with all other neurons
     synapse_neuron: Int32  # (synapses,) int32
@@ -199,7 +210,9 @@ def _update_steady(
 
 
 @compiled
-def _send(n: Any, tick: Any, ticks: Any, window: Any, slots: Any, wiring: Any, state: Any, tallies: Any) -> Any:
+def _send(
+    n: Any, tick: Any, ticks: Any, window: Any, slots: Any, wiring: Any, state: Any, tallies: Any
+) -> Any:
     """Count a spike and lead it on; 1 where it merges with another before the last tick."""
     tallies.spikes[n] += 1
     if len(tallies.raster):
@@ -229,11 +242,13 @@ def _send_steady(
 
 
 @compiled_and_cached
-def run(events: Any, bin_ticks: int, ticks: int, low: int, high: int, slots: int, wiring: Any, tallies: Any) -> int:
+def run(
+    events: Any, bin_ticks: int, ticks: int, low: int, high: int, slots: int, wiring: Any, tallies: Any
+) -> int:
     """Run one recording; fills the tallies and returns the merged spikes, or ``BROKEN_OFF``.
 
-    `events` is (steps, channels); `slots` is a power of two above every delay: spikes that are due in a tick wait in
-    the slot of its lowest bits.
+    `events` is (steps, channels); `slots` is a power of two above every delay: spikes that are due in a tick
+    wait in the slot of its lowest bits.
     """
     neurons = len(wiring.initial)
     axons = len(tallies.axons)

@@ -53,7 +53,8 @@ class TrueNorth(Machine):
         again = compile_crossbars(network, target=self.target).netlist
         what = "every neuron, axon, crossing point, wire and register"
         return NetlistCheck(
-            whole=tuple(unlike(self.netlist, again)), claim=f"{what} is what the network of the file is lowered to"
+            whole=tuple(unlike(self.netlist, again)),
+            claim=f"{what} is what the network of the file is lowered to",
         )
 
     def model(self, source: Source) -> Model:
@@ -88,7 +89,13 @@ class TrueNorth(Machine):
         return spec.simulate(self.netlist, channels), fast
 
     def priced(
-        self, channels: EventArray, lengths: IntArray | None, chip: Target, bin_s: float, detail: str, progress: Done
+        self,
+        channels: EventArray,
+        lengths: IntArray | None,
+        chip: Target,
+        bin_s: float,
+        detail: str,
+        progress: Done,
     ) -> tuple[Trace, Price]:
         """By synaptic events and ticks."""
         trace = self.simulate(channels, lengths, spikes=False)

@@ -19,7 +19,9 @@ def model_of(source: Source, target: Target) -> Model:
         first = {stage.name: index for index, stage in enumerate(source.stages)}
         return Model(first=first, spikes=partial(_run_trained, source))
     plan = planned(source, target)
-    return Model(first=plan.first, spikes=lambda events: _stacked(run_counters(plan, each) for each in events))
+    return Model(
+        first=plan.first, spikes=lambda events: _stacked(run_counters(plan, each) for each in events)
+    )
 
 
 def _run_trained(network: NativeNetwork, events: EventArray) -> Mapping[str, BoolArray]:

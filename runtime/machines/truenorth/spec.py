@@ -7,8 +7,9 @@ A tick
 1. *Arrivals.* An axon has a spike if an input event, a clock or a spike of an earlier tick is due on it; several of
    them are one.
 2. *Integrate.* The weight of the axon's type, for each axon with a spike and a crossing point. Positive and negative
-   weights are added up apart, for the order in which the chip visits its axons is not ours to rely on: a tick in
-   which *some* order would leave the register of 20 bits with sign is counted. The register saturates.
+   weights are added up apart, for the order in which the chip visits its axons is not ours to rely on: a
+   tick in which *some* order would leave the register of 20 bits with sign is counted. The register
+   saturates.
 3. *Leak.* Added, or with reversal added times the sign of the membrane; what such a leak carries past zero is zero.
 4. *Threshold.* A spike where the membrane is at least the threshold.
 5. *Reset.* To a value, by the threshold, or not at all. Without a spike a membrane below the negative threshold is
@@ -49,8 +50,8 @@ class Counts:
     votes: IntArray
     axons: IntArray  # (…, axons) int64; ticks in which an axon had a spike
     merged: IntArray  # (…) int64; spikes that reached an axon in a tick in which it had one already, and were lost
-    # (…, neurons) int64; ticks in which the membrane left its register, or would have in some order of arrivals; it
-    # saturates
+    # (…, neurons) int64; ticks in which the membrane left its register, or would have in some order of
+    # arrivals; it saturates
     overflows: IntArray
 
 
@@ -59,9 +60,11 @@ class Trace:
     """Result of a simulation."""
 
     counts: Counts
-    spikes: BoolArray | None  # (…, ticks, neurons) bool, or None; whether a neuron spiked in a tick; None unless wanted
-    # (…, ticks, neurons) int32, or None; membranes at the end of each tick, after resets; None unless wanted. In a
-    # batch a shorter recording is filled up with zeros after its last tick.
+    spikes: (
+        BoolArray | None
+    )  # (…, ticks, neurons) bool, or None; whether a neuron spiked in a tick; None unless wanted
+    # (…, ticks, neurons) int32, or None; membranes at the end of each tick, after resets; None unless
+    # wanted. In a batch a shorter recording is filled up with zeros after its last tick.
     membranes: MembraneArray | None
 
 
@@ -92,9 +95,9 @@ def saturated(value: int, bits: int) -> int:
 def neuron_tick(neuron: Neuron, positive: int, negative: int, bits: int) -> tuple[bool, bool]:
     """Let one neuron live through a tick: its membrane is replaced.
 
-    `positive` and `negative` are the sums of the weights that arrived, as magnitudes, `bits` is the width of the
-    register. Returns whether it spiked, and whether the register was left, or would have been in some order of
-    arrivals.
+    `positive` and `negative` are the sums of the weights that arrived, as magnitudes, `bits` is the width of
+    the register. Returns whether it spiked, and whether the register was left, or would have been in some
+    order of arrivals.
 
     A threshold of 3 reached exactly is a spike; a linear reset keeps what is above it.
 
@@ -143,7 +146,9 @@ def injected(netlist: CrossbarNetlist, events: EventArray) -> defaultdict[int, l
     """Axons that input events and clocks reach in each tick of a recording (n_inputs, T), once for each of them."""
     due: defaultdict[int, list[int]] = defaultdict(list)
     fed, clocked, _ = (aims.tolist() for aims in netlist.aims())
-    for channel, axon, offset in zip(netlist.feed_channel.tolist(), fed, netlist.feed_tick.tolist(), strict=True):
+    for channel, axon, offset in zip(
+        netlist.feed_channel.tolist(), fed, netlist.feed_tick.tolist(), strict=True
+    ):
         for step in np.flatnonzero(events[channel]).tolist():
             due[step * netlist.bin_ticks + offset].append(axon)
     periods = netlist.clock_period.tolist()
@@ -157,8 +162,8 @@ def injected(netlist: CrossbarNetlist, events: EventArray) -> defaultdict[int, l
 def simulate(netlist: CrossbarNetlist, events: EventArray) -> Trace:
     """Run one recording (n_inputs, T), uint8 or bool, through the cores of a network that breaks no rule of its chip.
 
-    Any value but zero is an event. The trace holds spikes and membranes and has no leading axis. DataError if the
-    recording has another number of input channels than the network.
+    Any value but zero is an event. The trace holds spikes and membranes and has no leading axis. DataError
+    if the recording has another number of input channels than the network.
     """
     require_channels(netlist, events.shape[0])
     bits = load_target(netlist.target).limit("neuron.membrane_bits")
@@ -170,14 +175,18 @@ def simulate(netlist: CrossbarNetlist, events: EventArray) -> Trace:
 
     # the crossing points of each axon, as pairs of neuron and weight
     points: list[list[tuple[int, int]]] = [[] for _ in range(netlist.n_axons)]
-    for axon, neuron in zip(netlist.axon_of_synapse().tolist(), netlist.neuron_of_synapse().tolist(), strict=True):
+    for axon, neuron in zip(
+        netlist.axon_of_synapse().tolist(), netlist.neuron_of_synapse().tolist(), strict=True
+    ):
         points[axon].append((neuron, int(netlist.weight[neuron, netlist.axon_type[axon]])))
 
     # what leads to the axons: from outside by tick, from neurons by their wires
     due = injected(netlist, events)
     wired = netlist.aims()[2].tolist()
     wires: list[list[tuple[int, int]]] = [[] for _ in neurons]
-    for source, axon, delay in zip(netlist.wire_neuron.tolist(), wired, netlist.wire_delay.tolist(), strict=True):
+    for source, axon, delay in zip(
+        netlist.wire_neuron.tolist(), wired, netlist.wire_delay.tolist(), strict=True
+    ):
         wires[source].append((axon, delay))
 
     spikes = np.zeros((ticks, len(neurons)), np.bool_)
@@ -209,7 +218,9 @@ def simulate(netlist: CrossbarNetlist, events: EventArray) -> Trace:
                     due[tick + delay].append(axon)
 
     tick_of = np.arange(ticks)[:, None]
-    window = (tick_of >= netlist.readout_first) & (tick_of < netlist.readout_first + steps * netlist.bin_ticks)
+    window = (tick_of >= netlist.readout_first) & (
+        tick_of < netlist.readout_first + steps * netlist.bin_ticks
+    )
     counts = Counts(
         ticks=np.array(ticks, np.int64),
         spikes=spikes.sum(axis=0, dtype=np.int64),

@@ -1,10 +1,11 @@
 """Neurons that are alike and receive the same always spike together: the engine runs one of each kind.
 
-A neuron of TrueNorth has one target, so a network has each of its neurons as often as there are axons that must receive
-it, and each of these axons brings its share of one weight. Found here from the inputs on, without knowing how the
-network was made: axons that only one thing leads to are of one kind if these are, neurons are of one kind if their
-registers are equal and the same weights reach them from the same kinds of axons. Positive and negative weights are
-added up apart, so that the counts of registers that were left stay the same, too.
+A neuron of TrueNorth has one target, so a network has each of its neurons as often as there are axons that
+must receive it, and each of these axons brings its share of one weight. Found here from the inputs on,
+without knowing how the network was made: axons that only one thing leads to are of one kind if these are,
+neurons are of one kind if their registers are equal and the same weights reach them from the same kinds of
+axons. Positive and negative weights are added up apart, so that the counts of registers that were left stay
+the same, too.
 """
 
 from dataclasses import dataclass
@@ -16,7 +17,15 @@ from spikeloom.compiler.types import BoolArray, IntArray
 
 _FEED, _CLOCK, _WIRE, _ITSELF = range(4)
 _REGISTERS = (
-    *("leak", "leak_reversal", "threshold", "reset_mode", "reset", "negative_threshold", "negative_saturates"),
+    *(
+        "leak",
+        "leak_reversal",
+        "threshold",
+        "reset_mode",
+        "reset",
+        "negative_threshold",
+        "negative_saturates",
+    ),
     *("initial", "readout_first"),
 )
 
@@ -31,8 +40,8 @@ class Twins:
     # first_neuron, first_axon: (kinds,) int64; the first of each kind
     first_neuron: IntArray
     first_axon: IntArray
-    # synapse_axon, synapse_neuron, synapse_halves: (pairs,) int64; kinds that are joined, by axon and neuron, and the
-    # weight in halves of the kernel
+    # synapse_axon, synapse_neuron, synapse_halves: (pairs,) int64; kinds that are joined, by axon and
+    # neuron, and the weight in halves of the kernel
     synapse_axon: IntArray
     synapse_neuron: IntArray
     synapse_halves: IntArray
@@ -97,7 +106,8 @@ def _sources(netlist: CrossbarNetlist, aims: tuple[IntArray, ...], single: BoolA
 def _registers(netlist: CrossbarNetlist, alone: BoolArray) -> IntArray:
     """Everything that neurons of a kind share, beside their inputs: registers, whether they vote, where they lead."""
     leads = np.full((netlist.n_neurons, 2), -1)
-    # to an axon that it has `alone`, with a delay; or to one that others reach, too, where two spikes of a tick merge
+    # to an axon that it has `alone`, with a delay; or to one that others reach, too, where two spikes of a
+    # tick merge
     leads[netlist.wire_neuron, 0] = np.where(alone, -2, netlist.wire_neuron)
     leads[netlist.wire_neuron, 1] = netlist.wire_delay
     columns = [*(getattr(netlist, name) for name in _REGISTERS), netlist.readout_class >= 0, *leads.T]
@@ -105,7 +115,9 @@ def _registers(netlist: CrossbarNetlist, alone: BoolArray) -> IntArray:
     return np.asarray(np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1))
 
 
-def _pairs(axon_kind: IntArray, neuron: IntArray, axon: IntArray, halves: IntArray) -> tuple[IntArray, IntArray]:
+def _pairs(
+    axon_kind: IntArray, neuron: IntArray, axon: IntArray, halves: IntArray
+) -> tuple[IntArray, IntArray]:
     """Neurons and kinds of axons that reach them, (2, pairs) by neuron, and the added weights."""
     most = int(axon_kind.max(initial=0)) + 1
     keys, index = np.unique(neuron * most + axon_kind[axon], return_inverse=True)

@@ -1,12 +1,12 @@
 """When a vote is decided: by proof, or as sure as other recordings say.
 
-Votes only ever add up, and the network is causal, so the decision after any step is known without running anything
-twice. A vote ends early
+Votes only ever add up, and the network is causal, so the decision after any step is known without running
+anything twice. A vote ends early
 
 * *by proof*, when no spikes whatever can change it: every rival is behind by more than it can still gain while the
-  leader gets nothing more. An output neuron gains at most one vote a step, or fewer where even its largest input takes
-  several steps to lift it over its threshold (:func:`most_votes`), and exactly one where its own spike lifts it over
-  it again (:func:`steady_classes`);
+  leader gets nothing more. An output neuron gains at most one vote a step, or fewer where even its largest
+  input takes several steps to lift it over its threshold (:func:`most_votes`), and exactly one where its own
+  spike lifts it over it again (:func:`steady_classes`);
 * *by calibration*, when the leader is ahead by more than ``a * sqrt(steps left)``: the lead of one neuron over another
   strays from its course about as the root of the steps. The factor comes from other recordings.
 
@@ -37,8 +37,8 @@ CONFIDENCE = 0.95
 class Standing:
     """Where votes stand after each step of the read-out, (samples, steps).
 
-    The class with most votes, the lowest on a tie; the votes by which it is ahead of the next; and the steps that are
-    still to come, 0 from a recording's end on.
+    The class with most votes, the lowest on a tie; the votes by which it is ahead of the next; and the steps
+    that are still to come, 0 from a recording's end on.
     """
 
     leader: IntArray
@@ -61,8 +61,8 @@ class Standing:
 def standing(votes: IntArray, lengths: IntArray) -> Standing:
     """Say who leads, by how much, and for how long that can still change.
 
-    Votes so far, (samples, steps, classes); of recordings shorter than the longest they stay as they are from their
-    end on, `lengths` (samples,) says where.
+    Votes so far, (samples, steps, classes); of recordings shorter than the longest they stay as they are
+    from their end on, `lengths` (samples,) says where.
     """
     ahead = votes[..., 0]
     if votes.shape[2] > 1:
@@ -95,7 +95,8 @@ def steady_classes(machine: Stoppable) -> BoolArray:
 def proven(votes: IntArray, at: Standing, most: IntArray, steady: BoolArray | None = None) -> BoolArray:
     """Whether the decision after each step is the last word, whatever follows; shape (samples, steps).
 
-    `most` (classes, longest + 1) is that of :func:`most_votes`, `steady` (classes,) that of :func:`steady_classes`.
+    `most` (classes, longest + 1) is that of :func:`most_votes`, `steady` (classes,) that of
+    :func:`steady_classes`.
     """
     classes = votes.shape[2]
     reach = votes + most.T[at.left]
@@ -136,8 +137,8 @@ def live(machine: Stoppable, bins: int, factor: float) -> Callable[[int, IntArra
 class Calibrated:
     """A factor, in votes per root of a step left, and what it rests on.
 
-    Of `races`, or held-out decisions, the share `allowed` may end otherwise, `differ` do; of others at most the share
-    `bound` does, with the confidence of ``CONFIDENCE`` [1]_. The proof rests on none: ``PROOF``.
+    Of `races`, or held-out decisions, the share `allowed` may end otherwise, `differ` do; of others at most
+    the share `bound` does, with the confidence of ``CONFIDENCE`` [1]_. The proof rests on none: ``PROOF``.
     """
 
     allowed: float | None
@@ -169,7 +170,9 @@ def turning_points(at: Standing) -> FloatArray:
     confidence = at.confidence
     before = np.maximum.accumulate(confidence, axis=1)[:, :-1]
     before = np.concatenate([np.zeros((len(before), 1)), before], axis=1)
-    ends = (confidence > before) & (at.leader != at.decision[:, None])  # a smaller one would have ended it already
+    ends = (confidence > before) & (
+        at.leader != at.decision[:, None]
+    )  # a smaller one would have ended it already
     return np.asarray(np.where(ends, confidence, 0.0).max(axis=1, initial=0.0), np.float64)
 
 

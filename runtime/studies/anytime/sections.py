@@ -17,7 +17,11 @@ def sections(result: Anytime) -> list[Section]:
     if result.full.correct is not None:
         accuracy = Text(f"chip accuracy:   {percent(result.full.correct, result.labelled)}")
         shown = [Section("Accuracy", [accuracy]), Section("Windows", [window_table(result)])]
-    return [*shown, Section("Rules", [rule_table(result)]), Section("Live", [Text("\n".join(_lines(result)))])]
+    return [
+        *shown,
+        Section("Rules", [rule_table(result)]),
+        Section("Live", [Text("\n".join(_lines(result)))]),
+    ]
 
 
 def _lines(result: Anytime) -> list[str]:
@@ -26,7 +30,9 @@ def _lines(result: Anytime) -> list[str]:
         return [live]
     rule = result.rules[result.chosen].stop
     assert rule.bound is not None, "a chosen rule is calibrated"
-    kind, noun = ("held-out decisions", "decisions") if result.held_out else ("races for second place", "races")
+    kind, noun = (
+        ("held-out decisions", "decisions") if result.held_out else ("races for second place", "races")
+    )
     return [
         f"calibrated on {rule.races} {kind} of {result.calibrated_on}, split train: of such {noun} at most "
         f"{100 * rule.bound:.1f} % end otherwise where {_allowed(rule)} did (95 % confidence)"

@@ -81,8 +81,9 @@ class Window:
 class Anytime(Shown):
     """How early decisions could be taken.
 
-    `bins` are those of the longest recording, `least_interval` the least steps from one spike of an output neuron to
-    its next. Windows are empty without labels; the first rule is the proof; `chosen` is the index of the user's.
+    `bins` are those of the longest recording, `least_interval` the least steps from one spike of an output
+    neuron to its next. Windows are empty without labels; the first rule is the proof; `chosen` is the index
+    of the user's.
     """
 
     samples: int
@@ -137,7 +138,9 @@ def study(
     )
 
 
-def _rule(rule: exits.Calibrated, ran: Cumulative, at: exits.Standing, sure: BoolArray, labels: IntArray) -> Rule:
+def _rule(
+    rule: exits.Calibrated, ran: Cumulative, at: exits.Standing, sure: BoolArray, labels: IntArray
+) -> Rule:
     ends = exits.exits(sure, at, rule.factor)
     last = ran.chip_steps - 1
     index = np.where(ends == ran.lengths - 1, last, np.minimum(ends + ran.depth, last))
@@ -176,7 +179,9 @@ def _costs(ran: Cumulative, index: IntArray) -> StoppedCosts:
     rows = np.arange(len(index))
     energies = {name: joules[rows, index] for name, joules in ran.energy.items()}
     times = {name: seconds[rows, index] for name, seconds in ran.time.items()}
-    return StoppedCosts.mean(ran.operations[rows, index], energies, times, chip_steps=float(np.mean(index + 1)))
+    return StoppedCosts.mean(
+        ran.operations[rows, index], energies, times, chip_steps=float(np.mean(index + 1))
+    )
 
 
 def _window(percent: int, labels: IntArray, ran: Cumulative, at: exits.Standing) -> Window:

@@ -1,7 +1,8 @@
 """What ``--grid`` says: axes and their values.
 
-A grid is ``AXIS=VALUE,VALUE,AXIS=VALUE …``; values stand between commas or slashes, whole numbers may be ranges:
-``bits=2-6,8,cores=cores/fc1:6,window=25-100%:25``. Axes that it does not name keep their usual value.
+A grid is ``AXIS=VALUE,VALUE,AXIS=VALUE …``; values stand between commas or slashes, whole numbers may be
+ranges: ``bits=2-6,8,cores=cores/fc1:6,window=25-100%:25``. Axes that it does not name keep their usual
+value.
 """
 
 import re
@@ -22,10 +23,19 @@ FEWEST = "cores"
 class Grid:
     """Values of every axis, in the order in which they were given; each once."""
 
-    bits: tuple[tuple[int, ...], ...] = ((2,), (3,), (4,), (5,), (6,), (8,))  # For all layers, or one for each
+    bits: tuple[tuple[int, ...], ...] = (
+        (2,),
+        (3,),
+        (4,),
+        (5,),
+        (6,),
+        (8,),
+    )  # For all layers, or one for each
     planes: tuple[int, ...] = (1,)  # Times that a synapse is stored
     groups: tuple[int, ...] = (1,)  # Scales in a layer
-    prune: tuple[int, ...] = (0,)  # Whether neurons that never fired on training recordings are left out: 0 or 1
+    prune: tuple[int, ...] = (
+        0,
+    )  # Whether neurons that never fired on training recordings are left out: 0 or 1
     cores: tuple[str, ...] = (FEWEST,)  # Or least cores as in ``fc1:6+conv1:4``
     window: tuple[int, ...] = (25, 50, 75, WHOLE)  # Per cent of each recording
 
@@ -43,7 +53,9 @@ def parse_grid(text: str, target: Target) -> Grid:
         name, equals, value = (part.strip() for part in word.rpartition("="))
         if equals:
             if name not in AXES or name in found:
-                raise OptionError(f"--grid {name}: give each of {', '.join(AXES)} once, as in bits=2-6,8,planes=1-2")
+                raise OptionError(
+                    f"--grid {name}: give each of {', '.join(AXES)} once, as in bits=2-6,8,planes=1-2"
+                )
             axis, found[name] = name, {}
         if not axis:
             raise OptionError(f"--grid {value}: belongs to no axis; begin with one, as in bits=2-6,8")
@@ -60,7 +72,10 @@ def _readers(target: Target) -> dict[str, tuple[Callable[[str], Sequence[Any]], 
     widths, slots = sorted(target.choices["synapse.weight_bits"]), target.limit("core.threshold_slots")
     listed = ", ".join(map(str, widths))
     return {
-        "bits": (lambda words: _widths(words, widths), f"{listed}, ranges, or a width for each layer as in 8+4+4+8"),
+        "bits": (
+            lambda words: _widths(words, widths),
+            f"{listed}, ranges, or a width for each layer as in 8+4+4+8",
+        ),
         "planes": (lambda words: _numbers(words, range(1, MAX_PLANES + 1)), f"1 to {MAX_PLANES} planes"),
         "groups": (lambda words: _numbers(words, range(1, slots + 1)), f"1 to {slots} scale groups"),
         "prune": (lambda words: _numbers(words, range(2)), "0 (keep) and 1 (leave out)"),
@@ -99,4 +114,6 @@ def _cores(words: str) -> list[str]:
         return [words]
     parts = [re.fullmatch(r"([^:+]+):([1-9][0-9]{0,3})", part, re.ASCII) for part in words.split("+")]
     cores = {part[1]: part[2] for part in parts if part is not None}
-    return ["+".join(f"{layer}:{count}" for layer, count in cores.items())] if len(cores) == len(parts) else []
+    return (
+        ["+".join(f"{layer}:{count}" for layer, count in cores.items())] if len(cores) == len(parts) else []
+    )

@@ -68,14 +68,20 @@ class NetworkFile:
     weights: str  # Which of those in the file
     system: str
     bins: int = 1  # Bins of the recordings that a step joins
-    length: int | None = field(default=None, metadata=HIDDEN)  # Steps that every recording is run, where it says so
-    options: tuple[tuple[str, Any], ...] = field(metadata=HIDDEN)  # How it is read: as typed, if they suit it
+    length: int | None = field(
+        default=None, metadata=HIDDEN
+    )  # Steps that every recording is run, where it says so
+    options: tuple[tuple[str, Any], ...] = field(
+        metadata=HIDDEN
+    )  # How it is read: as typed, if they suit it
     sees: str = field(default="", metadata=HIDDEN)  # Hash over what its first layer sees
     taxels: int = field(metadata=HIDDEN)
     classes: int = field(metadata=HIDDEN)
     layers: tuple[str, ...] = field(metadata=HIDDEN)  # Names
     training: Mapping[str, Any] = field(metadata=HIDDEN, compare=False)  # As far as the file knows it
-    forms: tuple[Form, ...] | None = field(default=None, metadata=HIDDEN, compare=False)  # That it was fine-tuned for
+    forms: tuple[Form, ...] | None = field(
+        default=None, metadata=HIDDEN, compare=False
+    )  # That it was fine-tuned for
 
     @property
     def validation(self) -> float | None:
@@ -212,4 +218,6 @@ def require_grid(networks: Sequence[NetworkFile], grid: Grid, target: Target) ->
             for part in layout.split("+") if ":" in layout else ():
                 layer = part.partition(":")[0]
                 if layer not in layers:
-                    raise OptionError(f"--grid cores={layout}: {path} has no layer {layer}; it has {', '.join(layers)}")
+                    raise OptionError(
+                        f"--grid cores={layout}: {path} has no layer {layer}; it has {', '.join(layers)}"
+                    )

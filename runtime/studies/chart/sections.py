@@ -34,7 +34,9 @@ MEANINGS = (
 
 def sections(chart: Chart) -> list[Section]:
     """All of a chart, in the order of its page."""
-    figure = Figure("chart", partial(picture, chart), "Test accuracy over energy and time of a mean inference.")
+    figure = Figure(
+        "chart", partial(picture, chart), "Test accuracy over energy and time of a mean inference."
+    )
     by, points = chart.chosen_by, chart.points
     return [
         Section("Which one to deploy", _choice(chart)),
@@ -65,10 +67,14 @@ def _choice(chart: Chart) -> list[Block]:
         f"{data.train} training recordings; chosen on the training split, test figures are reported beside"
     ]
     if pick.budgets:
-        lines.append(f"{' and '.join(pick.budgets)}: {pick.fitting or 'none'} of {len(chart.points)} points fit")
+        lines.append(
+            f"{' and '.join(pick.budgets)}: {pick.fitting or 'none'} of {len(chart.points)} points fit"
+        )
     lines.append(f"{'take' if pick.fits else 'the nearest is'} #{point.number} {point.label}")
     if better := ", ".join(f"#{each.number}" for each in above_on_test(chart)):
-        lines += [f"on the test split its interval lies below those of {better}, which the training split did not show"]
+        lines += [
+            f"on the test split its interval lies below those of {better}, which the training split did not show"
+        ]
     return [Text("\n".join(lines)), _table([point], chart.chosen_by, "The choice"), *_commands([point])]
 
 
@@ -89,7 +95,9 @@ def _refused(chart: Chart) -> Iterator[str]:
 def _provenance(chart: Chart) -> list[Block]:
     files = [["recordings", chart.data.path, chart.data.sha256]]
     files += [[each.name, each.path, each.sha256] for each in chart.networks]
-    titles = [[f"{kind}, {name}", title] for kind, tables in chart.tables.items() for name, title in tables.items()]
+    titles = [
+        [f"{kind}, {name}", title] for kind, tables in chart.tables.items() for name, title in tables.items()
+    ]
     return [
         Text(MEANINGS),
         Table(["", "name", "sha256"], files, "Files", words=True),
@@ -101,7 +109,15 @@ def _provenance(chart: Chart) -> list[Block]:
 
 def _head(by: ChosenBy) -> list[str]:
     timed = [] if by.time is None else [f"time ({by.time})"]
-    figures = ["expected %", "test %", "interval", "float %", "equal", f"dynamic energy ({by.energy})", *timed]
+    figures = [
+        "expected %",
+        "test %",
+        "interval",
+        "float %",
+        "equal",
+        f"dynamic energy ({by.energy})",
+        *timed,
+    ]
     return ["#", "configuration", *figures, "operations", "cores"]
 
 
@@ -143,7 +159,10 @@ def picture(chart: Chart) -> Drawing:
     by = chart.chosen_by
     name = chart.data.path.rstrip("/").rsplit("/", 1)[-1]
     title = f"{len(chart.points)} configurations, {chart.data.test} test recordings of {name}"
-    axes = {"energy": ("J", f"dynamic energy of a mean inference ({by.energy})"), "time": ("s", f"time ({by.time})")}
+    axes = {
+        "energy": ("J", f"dynamic energy of a mean inference ({by.energy})"),
+        "time": ("s", f"time ({by.time})"),
+    }
     costs = list(by.of(chart.chosen.test.costs))
     drawing = sheet(title, 3 * len(costs) + 1, width=6.4)
     panels = drawing.figure.subplots(len(costs), squeeze=False, sharey=True)[:, 0]

@@ -1,7 +1,7 @@
 """A chart from networks and a grid: measure every configuration, find fronts, and choose which one to deploy.
 
-The *choice* is made on the training split alone; test figures are reported beside. *Fronts* are drawn on the test
-split: they describe.
+The *choice* is made on the training split alone; test figures are reported beside. *Fronts* are drawn on the
+test split: they describe.
 """
 
 from collections.abc import Mapping, Sequence
@@ -98,13 +98,15 @@ def chart(
 def with_expectations(points: Sequence[Point], networks: Sequence[NetworkFile]) -> list[Point]:
     """Points with the accuracy that is expected of them.
 
-    That is what the network's training reached on the recordings that it had left out (its validation), times the
-    share of the float model's training accuracy that the point keeps. If a checkpoint knows no validation, all points
-    have their training accuracy instead.
+    That is what the network's training reached on the recordings that it had left out (its validation),
+    times the share of the float model's training accuracy that the point keeps. If a checkpoint knows no
+    validation, all points have their training accuracy instead.
     """
     reached = {network.name: network.validation for network in networks}
     whole = {
-        name: max((point for point in points if point.network == name), key=lambda point: point.window).train.model
+        name: max(
+            (point for point in points if point.network == name), key=lambda point: point.window
+        ).train.model
         for name in {point.network for point in points}
     }
 
@@ -121,15 +123,18 @@ def with_fronts(points: Sequence[Point], by: ChosenBy) -> list[Point]:
     gains = [point.test.accuracy for point in points]
     costs = [by.of(point.test.costs) for point in points]
     on = {name: front(gains, [each[name] for each in costs]) for name in costs[0]}
-    return [replace(point, front={name: marks[i] for name, marks in on.items()}) for i, point in enumerate(points)]
+    return [
+        replace(point, front={name: marks[i] for name, marks in on.items()})
+        for i, point in enumerate(points)
+    ]
 
 
 def pick(points: Sequence[Point], budgets: Sequence[Budget], by: ChosenBy) -> Pick:
     """The point to deploy, by training figures.
 
-    It is the cheapest that fits the budgets and is expected to be at most a point less accurate than the best that
-    fits; where an accuracy is wanted, the cheapest that fits. If nothing fits, the point that misses by the smallest
-    factor.
+    It is the cheapest that fits the budgets and is expected to be at most a point less accurate than the
+    best that fits; where an accuracy is wanted, the cheapest that fits. If nothing fits, the point that
+    misses by the smallest factor.
     """
     choice = choose(points, partial(_values, by=by), _less_accurate, budgets)
     chosen = min(choice.allowed, key=lambda point: point.train.costs.energy_j[by.energy])

@@ -1,7 +1,7 @@
 """What a chart measures: a network in one storage, in every layout, on parts of every recording.
 
-Everything here is a function of files and of a request, so that a netlist is the file, byte for byte, that the command
-``compile`` would write. A network is rounded once for any number of layouts.
+Everything here is a function of files and of a request, so that a netlist is the file, byte for byte, that
+the command ``compile`` would write. A network is rounded once for any number of layouts.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,13 @@ from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
-from spikeloom.compiler.targets.compartments import Compilation, Options, lay_out_again, to_integers, write_netlist
+from spikeloom.compiler.targets.compartments import (
+    Compilation,
+    Options,
+    lay_out_again,
+    to_integers,
+    write_netlist,
+)
 from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part
@@ -76,7 +82,9 @@ def measurement(
         label=f"{network.name} {storage.label()}",
         network=network,
         storage=storage,
-        files={layout: folder / "netlists" / f"{keyed('netlist', layout=layout)}.loom" for layout in grid.cores},
+        files={
+            layout: folder / "netlists" / f"{keyed('netlist', layout=layout)}.loom" for layout in grid.cores
+        },
         windows=windows,
         data=data,
     )
@@ -135,7 +143,8 @@ def _decided(network: NetworkFile, data: Data, windows: tuple[int, ...]) -> dict
         return vote(votes_so_far(loaded.network, part)[:, -1])
 
     return {
-        window: {split: decisions(_part(network, part, window)) for split, part in splits.items()} for window in windows
+        window: {split: decisions(_part(network, part, window)) for split, part in splits.items()}
+        for window in windows
     }
 
 
@@ -166,7 +175,9 @@ def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
     asked = _compile_request(work, layout)
     placing = Options(
         cores_for=parse_cores(asked.cores_for),
-        provenance=provenance(asked, _loaded(work.network), calibrated=_in_steps(work.data, work.network)["train"]),
+        provenance=provenance(
+            asked, _loaded(work.network), calibrated=_in_steps(work.data, work.network)["train"]
+        ),
     )
     try:
         netlist = lay_out_again(stored, placing).netlist

@@ -62,8 +62,8 @@ class TaxelUse:
 class Lean(Shown):
     """What a network can do without; the first row is the whole one.
 
-    `samples` counts recordings of ``training`` and ``test``. `taken` is the row of least energy in training among those
-    that change few enough decisions.
+    `samples` counts recordings of ``training`` and ``test``. `taken` is the row of least energy in training
+    among those that change few enough decisions.
     """
 
     taken: int
@@ -91,7 +91,10 @@ def sections(result: Lean) -> list[Section]:
         Section("Accuracy", [Text(f"chip accuracy: {right}")]),
         Section(
             "Use",
-            [Table(["layer", "neurons", "on chip", "never fired in training"], layers), Text(_taxels(result.taxels))],
+            [
+                Table(["layer", "neurons", "on chip", "never fired in training"], layers),
+                Text(_taxels(result.taxels)),
+            ],
         ),
         Section("Without", [_rows(result)]),
         Section("Taken", [Text("\n".join(last))]),
@@ -125,7 +128,11 @@ def _rows(result: Lean) -> Table:
     for row in result.rows:
         costs = row.costs
         cells = [row.name, f"{row.training.differ} of {trained}", f"{row.test.differ} of {tested}"]
-        cells += [str(row.test.right), f"{costs.operations:,.0f}", _saved(costs.operations, whole.operations)]
+        cells += [
+            str(row.test.right),
+            f"{costs.operations:,.0f}",
+            _saved(costs.operations, whole.operations),
+        ]
         for name, joules in costs.energy_j.items():
             cells += [si(joules, "J"), _saved(joules, whole.energy_j[name])]
         cells += [si(each, "s") for each in costs.time_s.values()]

@@ -39,8 +39,8 @@ def study(
 ) -> tuple[Lean, Netlist, Mapping[str, IntArray]]:
     """Take from a network what the training split does not need: the share `differ` of its decisions may change.
 
-    Hands back the network without what is taken, too, which will be written to `output`, and the numbers of the neurons
-    that may go, by layer.
+    Hands back the network without what is taken, too, which will be written to `output`, and the numbers of
+    the neurons that may go, by layer.
     """
     progress("compiling")
     forms = loaded.network.forms

@@ -1,8 +1,9 @@
 """What of a compiled network its recordings do not need: each part is taken away and the decisions are counted again.
 
-A part is taken away by silencing it: synapses from it weigh nothing, so every other spike is as if it were not there.
-What is silenced together is found by bisection along a ranking, least effect first: of the sets that are looked at, the
-largest that changes no more training decisions than allowed. Nothing is chosen on the recordings that are reported.
+A part is taken away by silencing it: synapses from it weigh nothing, so every other spike is as if it were
+not there. What is silenced together is found by bisection along a ranking, least effect first: of the sets
+that are looked at, the largest that changes no more training decisions than allowed. Nothing is chosen on
+the recordings that are reported.
 """
 
 from collections.abc import Callable, Mapping
@@ -54,7 +55,9 @@ def spared_neurons(netlist: Netlist, spikes: IntArray, fits: Callable[[Netlist],
     return order[: most_spared(len(order), never, lambda count: fits(silenced(netlist, sources[:count])))]
 
 
-def spared_taxels(netlist: Netlist, training: Recordings, alone: IntArray, fits: Callable[[Netlist], bool]) -> IntArray:
+def spared_taxels(
+    netlist: Netlist, training: Recordings, alone: IntArray, fits: Callable[[Netlist], bool]
+) -> IntArray:
     """Taxels that may go together; those first without which, `alone`, fewest decisions change."""
     events = training.events.sum(axis=(0, 2, 3), dtype=np.int64)
     order = np.lexsort((events, alone))
@@ -66,7 +69,8 @@ def spared_taxels(netlist: Netlist, training: Recordings, alone: IntArray, fits:
 def effects(netlist: Netlist, spikes: IntArray) -> FloatArray:
     """Share that each compartment has in what its layer sends on; shape (compartments,).
 
-    Spikes (compartments,) count by the weights that they meet, in thresholds; those that vote have the share infinity.
+    Spikes (compartments,) count by the weights that they meet, in thresholds; those that vote have the share
+    infinity.
     """
     met = np.zeros(netlist.n_inputs + netlist.n_compartments)
     for core in range(netlist.n_cores):
@@ -143,11 +147,15 @@ def changed_alone(netlist: Netlist, of: Recordings, wanted: IntArray) -> IntArra
         if of.events[:, taxel].any():
             without_it = of.events.copy()
             without_it[:, taxel] = 0
-            changed[taxel] = np.count_nonzero(machine.run(without_it, lengths=of.lengths).decisions != wanted)
+            changed[taxel] = np.count_nonzero(
+                machine.run(without_it, lengths=of.lengths).decisions != wanted
+            )
     return changed
 
 
-def without_hops(compilation: Compilation, loaded: LoadedNetwork, hops: tuple[int, ...]) -> Compilation | None:
+def without_hops(
+    compilation: Compilation, loaded: LoadedNetwork, hops: tuple[int, ...]
+) -> Compilation | None:
     """A first layer that lacks some hops, rounded to the storage that it has; others as they are.
 
     Neurons that were left out stay out. None where a register cannot hold what is left.

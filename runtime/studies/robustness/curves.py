@@ -55,9 +55,13 @@ def parse_requirement(words: str) -> Requirement:
     left, given, right = words.partition(">=")
     name, named, level = (part.strip() for part in left.partition(":"))
     if not (given and named):
-        raise OptionError(f"--require {words}: is not NAME:LEVEL>=SHARE; write for example taxels_dead:3>=0.85")
+        raise OptionError(
+            f"--require {words}: is not NAME:LEVEL>=SHARE; write for example taxels_dead:3>=0.85"
+        )
     if name not in SAMPLED:
-        raise OptionError(f"--require {words}: {name!r} is no perturbation; choose from {', '.join(SAMPLED)}")
+        raise OptionError(
+            f"--require {words}: {name!r} is no perturbation; choose from {', '.join(SAMPLED)}"
+        )
     try:
         share = float(right)
     except ValueError:
@@ -87,7 +91,9 @@ def spread(right: Sequence[int], recordings: int) -> Spread:
     return Spread(mean=fmean(values), low=max(low, 0.0), high=min(high, 1.0), values=values)
 
 
-def curve(name: str, runs: Mapping[Level, Sequence[Run]], clean: Run, recordings: int, classes: int) -> Curve:
+def curve(
+    name: str, runs: Mapping[Level, Sequence[Run]], clean: Run, recordings: int, classes: int
+) -> Curve:
     """Curve and verdict of one perturbation, from the runs of each seed by level, from mild to harsh."""
     levels = tuple(_point(level, every, clean, recordings) for level, every in runs.items())
     breaks = {}
@@ -95,7 +101,9 @@ def curve(name: str, runs: Mapping[Level, Sequence[Run]], clean: Run, recordings
         floor = wilson(clean.right[side], recordings)[0]
         below = {point.level: point.spread(side).mean for point in levels if point.spread(side).mean < floor}
         chance = (
-            level for level, mean in below.items() if wilson(round(mean * recordings), recordings)[0] <= 1 / classes
+            level
+            for level, mean in below.items()
+            if wilson(round(mean * recordings), recordings)[0] <= 1 / classes
         )
         breaks[side] = Breaks(leaves=next(iter(below), None), chance=next(chance, None))
     chip = breaks["chip"]
@@ -119,7 +127,9 @@ def _overlap(one: Spread, other: Spread) -> bool:
 
 
 def _point(level: Level, runs: Sequence[Run], clean: Run, recordings: int) -> Point:
-    layers = {name: tuple(map(sum, zip(*(run.layers[name] for run in runs), strict=True))) for name in clean.layers}
+    layers = {
+        name: tuple(map(sum, zip(*(run.layers[name] for run in runs), strict=True))) for name in clean.layers
+    }
     accuracy = {side: spread([run.right[side] for run in runs], recordings) for side in SIDES}
     return Point(
         level=level,

@@ -101,7 +101,9 @@ class Sampled(Perturbation):
         if not self.least <= level <= self.most or (whole and level != int(level)):
             kind = "a whole number" if whole else "a number"
             limits = f"from {self.least:g}" + ("" if self.most == np.inf else f" to {self.most:g}")
-            raise OptionError(f"{self.name}:{words}: {words!r} is no level of it; give {kind} {limits} ({self.unit})")
+            raise OptionError(
+                f"{self.name}:{words}: {words!r} is no level of it; give {kind} {limits} ({self.unit})"
+            )
         return int(level) if level == int(level) else level
 
     def levels_of(self, taxels: int, also: Sequence[Level] = ()) -> tuple[Level, ...]:

@@ -135,7 +135,9 @@ def _flip_each(machine: Machine, events: Events, most: int, tally: Tally | None)
     _, first, those = np.unique(alike, return_index=True, return_inverse=True)
     effects = machine.effects(channels, single(cells.cells[first]))
     decided = (effects.votes + votes).argmax(axis=1)[those]
-    return _Singles(channels=channels, votes=votes, cells=cells, counted=counted, effects=effects, decided=decided)
+    return _Singles(
+        channels=channels, votes=votes, cells=cells, counted=counted, effects=effects, decided=decided
+    )
 
 
 def _decide_flips(machine: Machine, kind: Exhaustive, singles: _Singles) -> tuple[Decided, tuple[int, ...]]:

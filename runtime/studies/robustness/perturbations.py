@@ -1,11 +1,11 @@
 """The one list of perturbations: of recordings, of the state that they find, of what the chip stores.
 
-Those above are drawn by ``stress``, at several levels; of those at the end ``certify`` decides every case. All are
-pure functions. Those of events take and give (recordings, taxels, 2, T) uint8, zeros and ones, in the recordings' own
-bins, before a network joins them; clocks are no taxels and not among them.
+Those above are drawn by ``stress``, at several levels; of those at the end ``certify`` decides every case.
+All are pure functions. Those of events take and give (recordings, taxels, 2, T) uint8, zeros and ones, in
+the recordings' own bins, before a network joins them; clocks are no taxels and not among them.
 
-For one seed a stronger perturbation contains the weaker one wherever that makes sense: five dead taxels are the three
-and two more, an event that is lost at a rate of 0.1 is lost at 0.2.
+For one seed a stronger perturbation contains the weaker one wherever that makes sense: five dead taxels are
+the three and two more, an event that is lost at a rate of 0.1 is lost at 0.2.
 """
 
 from collections.abc import Callable, Iterator
@@ -62,7 +62,9 @@ def taxels_dead(events: Events, count: int, rng: np.random.Generator) -> Events:
 
 
 @sampled(TAXELS, COUNTS, most=np.inf)
-def taxels_dead_adjacent(events: Events, count: int, distance: FloatArray, rng: np.random.Generator) -> Events:
+def taxels_dead_adjacent(
+    events: Events, count: int, distance: FloatArray, rng: np.random.Generator
+) -> Events:
     """A taxel and its nearest ones send nothing."""
     return set_taxels(events, neighbours(distance, count, rng), 0)
 
@@ -74,7 +76,9 @@ def taxels_stuck(events: Events, count: int, rng: np.random.Generator) -> Events
 
 
 @sampled(TAXELS, COUNTS, most=np.inf)
-def taxels_stuck_adjacent(events: Events, count: int, distance: FloatArray, rng: np.random.Generator) -> Events:
+def taxels_stuck_adjacent(
+    events: Events, count: int, distance: FloatArray, rng: np.random.Generator
+) -> Events:
     """A taxel and its nearest ones send both polarities in every step."""
     return set_taxels(events, neighbours(distance, count, rng), 1)
 

@@ -41,7 +41,9 @@ def stress(request: StressRequest, names: Sequence[str], requirements: Sequence[
         (name, level, seed)
         for name in names
         if reasons[name] is None
-        for level in SAMPLED[name].levels_of(taxels, [each.level for each in requirements if each.name == name])
+        for level in SAMPLED[name].levels_of(
+            taxels, [each.level for each in requirements if each.name == name]
+        )
         for seed in range(request.seeds if SAMPLED[name].seeded else 1)
     ]
     measured: dict[str, dict[Level, list[Run]]] = {}
@@ -98,7 +100,9 @@ def measure(bench: Bench, name: str, level: Level, seed: int, reference: Outcome
         pair = Pair(netlist=damaged.netlist, network=damaged.network)
         inputs = whole(bench.events, pair.netlist, bench.lengths)
     else:
-        events = by_length(bench.events, bench.lengths, lambda part: trouble.done(part, level, bench.distance, rng))
+        events = by_length(
+            bench.events, bench.lengths, lambda part: trouble.done(part, level, bench.distance, rng)
+        )
         inputs = whole(events, pair.netlist, bench.lengths)
     return _run(bench, evaluate(pair, inputs), seed, inputs, reference)
 

@@ -41,7 +41,10 @@ def sections(result: Stress) -> list[Section]:
     return [
         *overview(result),
         Section("Key", [Text(CURVE_KEY)]),
-        *(Section(name, [Text(_title(name, each)), _table(each)]) for name, each in result.perturbations.items()),
+        *(
+            Section(name, [Text(_title(name, each)), _table(each)])
+            for name, each in result.perturbations.items()
+        ),
         Section("Required", [Text("\n".join(required))]),
     ]
 
@@ -51,7 +54,9 @@ def overview(result: Stress) -> list[Section]:
     clean = result.clean
     recordings = result.recordings
     lines = [f"{side} accuracy, clean: {percent(clean.right[side], recordings)}" for side in SIDES]
-    lines.append(f"decisions equal, clean: {clean.equal} of {recordings}; chance {100 / result.classes:.1f} %")
+    lines.append(
+        f"decisions equal, clean: {clean.equal} of {recordings}; chance {100 / result.classes:.1f} %"
+    )
     title = "Accuracy under each perturbation"
     caption = (
         f"{title} over its level, from mild to harsh, with 95 % intervals. Grey: interval of the clean accuracy on the "
@@ -126,7 +131,9 @@ def picture(result: Stress) -> Drawing:
     """The figure as a file has it: it says by itself what it is of."""
     about = result.provenance
     seeds = number(result.seeds, "seed")
-    title = f"{about.netlist} on {result.recordings} recordings of {about.data}, {seeds}; accuracy in per cent"
+    title = (
+        f"{about.netlist} on {result.recordings} recordings of {about.data}, {seeds}; accuracy in per cent"
+    )
     drawn = figure(result, title, across=5)
     drawn.figure.supxlabel(title, fontsize=9)
     return drawn

@@ -12,7 +12,10 @@ _SHARE = {"": 0.01, "%": 0.01}
 _NUMBER = {"": 1.0}
 
 LIMITED = {
-    "energy": ({"J": 1.0, "mJ": 1e-3, "uJ": 1e-6, "µJ": 1e-6, "μJ": 1e-6, "nJ": 1e-9, "pJ": 1e-12}, "as in 0.1mJ"),
+    "energy": (
+        {"J": 1.0, "mJ": 1e-3, "uJ": 1e-6, "µJ": 1e-6, "μJ": 1e-6, "nJ": 1e-9, "pJ": 1e-12},
+        "as in 0.1mJ",
+    ),
     "time": (_SECONDS, "as in 5ms"),
     "accuracy": (_SHARE, "in per cent, as in 88"),
     "certified": (_SHARE, "in per cent, as in 90"),
@@ -37,7 +40,9 @@ class Budget:
     words: str
 
 
-def parse_budgets(given: Sequence[str], limits: Collection[str] = ("energy", "time", "accuracy")) -> tuple[Budget, ...]:
+def parse_budgets(
+    given: Sequence[str], limits: Collection[str] = ("energy", "time", "accuracy")
+) -> tuple[Budget, ...]:
     """Read the words of every ``--budget``; an OptionError says which is none of what has `limits`."""
     budgets: dict[str, Budget] = {}
     for words in given:
@@ -59,7 +64,9 @@ def parse_budgets(given: Sequence[str], limits: Collection[str] = ("energy", "ti
             )
         limit = float(f"{number[1]}e{number[2] or 0}") * unit
         if limit <= 0 or (units is _SHARE and limit > 1):
-            raise OptionError(f"--budget {words}: allowed is {'0 to 100' if units is _SHARE else 'more than 0'}")
+            raise OptionError(
+                f"--budget {words}: allowed is {'0 to 100' if units is _SHARE else 'more than 0'}"
+            )
         budgets[what] = Budget(what=what, limit=limit, words=words)
     return tuple(budgets.values())
 

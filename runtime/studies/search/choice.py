@@ -69,8 +69,9 @@ def choose(
 ) -> Selection[Candidate]:
     """Find the candidates of which the cheapest is to be taken.
 
-    `values` are what budgets limit, ``energy`` and ``accuracy`` among them; `worse` says of the best and another one
-    whether that is shown to be worse. Where an accuracy is wanted, all that reach it are good enough.
+    `values` are what budgets limit, ``energy`` and ``accuracy`` among them; `worse` says of the best and
+    another one whether that is shown to be worse. Where an accuracy is wanted, all that reach it are good
+    enough.
     """
 
     def miss(each: Candidate) -> float:

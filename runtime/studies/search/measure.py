@@ -30,7 +30,9 @@ def measure(machine: Machine, data: Recordings, bin_s: float) -> tuple[IntArray,
         return {table: np.concatenate([of(price)[table] for price in prices]) for table in of(prices[0])}
 
     operations = np.concatenate([price.synaptic_operations for price in prices])
-    costs = Costs.mean(operations, by_table(lambda price: price.energy_j), by_table(lambda price: price.time_s))
+    costs = Costs.mean(
+        operations, by_table(lambda price: price.energy_j), by_table(lambda price: price.time_s)
+    )
     return np.concatenate([run.decisions for run, _ in runs]), costs
 
 

@@ -28,7 +28,9 @@ class Mark:
         return self.cost, 100 * self.accuracy
 
 
-def draw_front(drawing: Drawing, panel: Any, marks: Sequence[Mark], chosen: Mark, unit: str, label: str) -> None:
+def draw_front(
+    drawing: Drawing, panel: Any, marks: Sequence[Mark], chosen: Mark, unit: str, label: str
+) -> None:
     """Draw marks over a cost, the front as a line and a ring around the choice; `unit` and `label` are the cost's."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -49,7 +51,9 @@ def draw_front(drawing: Drawing, panel: Any, marks: Sequence[Mark], chosen: Mark
     panel.autoscale(False)  # intervals may reach far beyond the marks
     for mark in marks:
         if mark.large or mark is chosen:
-            panel.plot([mark.cost] * 2, [100 * mark.low, 100 * mark.high], color=GREY, lw=1.0, alpha=0.6, zorder=1)
+            panel.plot(
+                [mark.cost] * 2, [100 * mark.low, 100 * mark.high], color=GREY, lw=1.0, alpha=0.6, zorder=1
+            )
     drawing.tips += [(panel, *mark.place, mark.tip) for mark in sorted(marks, key=lambda mark: mark.cost)]
     panel.set_xlabel(label)
     panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))

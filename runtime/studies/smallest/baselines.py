@@ -21,9 +21,12 @@ STRENGTHS = {LINEAR: (0.1, 0.01, 1.0), RBF: (10.0, 1.0, 3.0, 30.0)}
 
 PARTS = (1, 5, 10)
 
-MISSING = "no baselines: support vector machines need scikit-learn; install it with pip install 'spikeloom[study]'"
+MISSING = (
+    "no baselines: support vector machines need scikit-learn; install it with pip install 'spikeloom[study]'"
+)
 
-# For an event load, add and store a count; for a product two loads and a multiply-accumulate; two loads of a table
+# For an event load, add and store a count; for a product two loads and a multiply-accumulate; two loads of a
+# table
 EVENT_CYCLES, PRODUCT_CYCLES, LOOKUP_CYCLES = 6, 5, 4
 
 

@@ -14,8 +14,8 @@ from spikeloom.runtime.studies.smallest.work import Measured
 class Tried(Measured):
     """A candidate as far as it came: what was measured, and its accuracy by cross-validation with the Wilson interval.
 
-    `behind` is what the best has ahead of it on the same recordings, with its standard error. It is on the `front` if
-    no other one that came as far is cheaper and as accurate.
+    `behind` is what the best has ahead of it on the same recordings, with its standard error. It is on the
+    `front` if no other one that came as far is cheaper and as accurate.
     """
 
     number: int
@@ -35,8 +35,8 @@ class Tried(Measured):
 class Choice:
     """Numbers of candidates: the best that the budgets allow, the cheapest not shown to be worse, by each table.
 
-    If nothing `fits` the budgets, the one that misses by the smallest factor. `ahead` is the cheapest candidate that is
-    a point more accurate.
+    If nothing `fits` the budgets, the one that misses by the smallest factor. `ahead` is the cheapest
+    candidate that is a point more accurate.
     """
 
     budgets: tuple[str, ...]
@@ -51,8 +51,9 @@ class Choice:
 class Checked:
     """The choice, trained on the whole training split: its files, and float model beside chip on both splits.
 
-    `different` are spikes in the recordings of ``train`` and ``test``; `right` is the chip's on the test split, which
-    nothing else has looked at. `pace` says which term of the energy is the larger at the pace of the sensor.
+    `different` are spikes in the recordings of ``train`` and ``test``; `right` is the chip's on the test
+    split, which nothing else has looked at. `pace` says which term of the energy is the larger at the pace
+    of the sensor.
     """
 
     network: str

@@ -31,10 +31,14 @@ def sections(result: Smallest) -> Iterator[Section]:
     """All of a search."""
     every = [*sorted(result.tried, key=lambda each: energy(each) if each.costs else 0.0), *result.baselines]
     last = [each for each in every if each.rung == RUNGS]
-    dropped = sorted((each for each in every if each.rung < RUNGS), key=lambda each: (-each.rung, -each.accuracy))
+    dropped = sorted(
+        (each for each in every if each.rung < RUNGS), key=lambda each: (-each.rung, -each.accuracy)
+    )
     yield Section("The choice", [*map(Text, [*_why(result), _needless(result)])])
     figure = Figure("front", partial(picture, result), "Accuracy over energy of a mean inference.")
-    yield Section("Accuracy against cost", [figure, Details("What is drawn", [Text(MEANINGS)], unfolded=True)])
+    yield Section(
+        "Accuracy against cost", [figure, Details("What is drawn", [Text(MEANINGS)], unfolded=True)]
+    )
     lines = [f"dropped before the last rung: {number(len(dropped), 'candidate')}"]
     if refused := [each for each in result.tried if each.refused]:
         first = f"{refused[0].candidate.name}: {refused[0].refused}"
@@ -52,7 +56,9 @@ def sections(result: Smallest) -> Iterator[Section]:
 def page(result: Smallest) -> str:
     """The same as one HTML file."""
     name = result.data.path.rstrip("/").rsplit("/", 1)[-1]
-    return html.page(f"The smallest network for {name}", "What was tried, what was taken, and why.", sections(result))
+    return html.page(
+        f"The smallest network for {name}", "What was tried, what was taken, and why.", sections(result)
+    )
 
 
 def _spent(each: Tried) -> str:
@@ -115,13 +121,17 @@ def _needless(result: Smallest) -> str:
     if not last:
         return baselines.MISSING
     enough, joules = [pair for pair in last if not worse(result.chosen, pair[0])], energy(result.chosen)
-    each, costs = min(enough, key=lambda pair: pair[1].most_j) if enough else max(last, key=lambda p: p[0].accuracy)
+    each, costs = (
+        min(enough, key=lambda pair: pair[1].most_j) if enough else max(last, key=lambda p: p[0].accuracy)
+    )
     words = f"{each.candidate.name}, {100 * each.accuracy:.1f} %, {_spent(each)} on a processor"
     if not enough:
         return f"without spikes: the best is {words}; that is shown to be worse"
     if costs.most_j < joules:
         return f"no spiking network is needed here: {words}, is not shown to be worse, and takes less in any case"
-    rest = "; whether it takes less depends on the processor" if costs.least_j < joules else ", but takes more"
+    rest = (
+        "; whether it takes less depends on the processor" if costs.least_j < joules else ", but takes more"
+    )
     return f"without spikes: {words}, is not shown to be worse{rest}"
 
 
@@ -134,11 +144,25 @@ def _table(result: Smallest, tried: Sequence[Tried], caption: str, most: int | N
         if plain is not None:
             name, spent, size = "processor", _spent(each), [f"{plain.operations:,.0f}", "–"]
         elif costs is not None:
-            marks = {"choice": each is result.chosen, "best": each.number == result.choice.best, "front": each.front}
-            name, spent = " ".join([name, *(mark for mark, on in marks.items() if on)]), si(energy(each), "J")
+            marks = {
+                "choice": each is result.chosen,
+                "best": each.number == result.choice.best,
+                "front": each.front,
+            }
+            name, spent = (
+                " ".join([name, *(mark for mark, on in marks.items() if on)]),
+                si(energy(each), "J"),
+            )
             size = [f"{costs.operations:,.0f}", str(costs.cores)]
             time = "–" if by.time is None else si(costs.time_s[by.time], "s")
-        known = [each.candidate.name, name, f"{100 * each.accuracy:.1f}", _interval(each), _behind(each), spent]
+        known = [
+            each.candidate.name,
+            name,
+            f"{100 * each.accuracy:.1f}",
+            _interval(each),
+            _behind(each),
+            spent,
+        ]
         rows.append([*known, *([] if by.time is None else [time]), *size])
     head = ["candidate", "#", "accuracy %", "95 % interval", "behind the best %", f"energy ({by.energy})"]
     head += [] if by.time is None else [f"time ({by.time})"]
@@ -178,9 +202,13 @@ def picture(result: Smallest) -> Drawing:
         drawing.tips += [(panel, joules, height, _tip(each)) for joules in ends]
     panel.autoscale(True, axis="x")
     shown = [*(each for each in result.tried if each.rung == RUNGS), *last]
-    panel.set_ylim(100 * min(each.low for each in shown) - LOWER, min(100, 100 * max(each.high for each in shown) + 2))
+    panel.set_ylim(
+        100 * min(each.low for each in shown) - LOWER, min(100, 100 * max(each.high for each in shown) + 2)
+    )
     panel.set_ylabel("accuracy by cross-validation (%)")
-    drawing.figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
+    drawing.figure.legend(
+        *panel.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8
+    )
     return drawing
 
 

@@ -46,7 +46,9 @@ class Candidate:
 
     system: str
     options: Mapping[str, Any]
-    storage: int | None = field(default=None, metadata=OPTIONAL)  # Bits of a weight, where not those of `compile`
+    storage: int | None = field(
+        default=None, metadata=OPTIONAL
+    )  # Bits of a weight, where not those of `compile`
 
     json_properties = ("name",)
 
@@ -97,15 +99,31 @@ def networks(steps: int, systems: Collection[str]) -> Iterator[Candidate]:
     """Networks of some systems that are trained by gradients, for recordings of so many bins."""
     for system, join, features, hidden in NETWORKS:
         if system in systems and join <= steps // 2:
-            options = {"recipe": "timed", "join": join, "features": features, "hidden": hidden, "epochs": EPOCHS}
+            options = {
+                "recipe": "timed",
+                "join": join,
+                "features": features,
+                "hidden": hidden,
+                "epochs": EPOCHS,
+            }
             yield Candidate(system=system, options=options)
 
 
 def _counters(**options: Any) -> Candidate:
     """Options that are usual are omitted."""
-    usual = {"thresholds": None, "parts": 1, "ramp": 32, "levels": 1, "window": 100, "join": 1, "weight_bits": 8}
+    usual = {
+        "thresholds": None,
+        "parts": 1,
+        "ramp": 32,
+        "levels": 1,
+        "window": 100,
+        "join": 1,
+        "weight_bits": 8,
+    }
     given = {name: options.get(name, value) for name, value in usual.items()}
-    return Candidate(system=COUNTING, options={name: each for name, each in given.items() if each != usual[name]})
+    return Candidate(
+        system=COUNTING, options={name: each for name, each in given.items() if each != usual[name]}
+    )
 
 
 def variants(candidate: Candidate, rung: int) -> list[Candidate]:

@@ -1,8 +1,8 @@
 """The smallest network for some recordings: candidates by successive halving, a choice, and what that reaches.
 
-On the first rung every candidate is cross-validated once at one strength; what may still be chosen goes on, with more
-strengths, and from there to five rounds. Everything happens on the training split but the last look at the choice.
-Taken is the cheapest that is not shown to be worse than the best.
+On the first rung every candidate is cross-validated once at one strength; what may still be chosen goes on,
+with more strengths, and from there to five rounds. Everything happens on the training split but the last
+look at the choice. Taken is the cheapest that is not shown to be worse than the best.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -117,7 +117,11 @@ def most_accurate(tried: Sequence[Tried], rung: int) -> list[Tried]:
     """Baselines that go on from a rung: three of each kind, then one."""
     ordered = sorted(tried, key=lambda each: -each.accuracy)
     kinds = dict.fromkeys(each.candidate.system for each in tried)
-    return [each for kind in kinds for each in [e for e in ordered if e.candidate.system == kind][: {1: 3, 2: 1}[rung]]]
+    return [
+        each
+        for kind in kinds
+        for each in [e for e in ordered if e.candidate.system == kind][: {1: 3, 2: 1}[rung]]
+    ]
 
 
 def _tried(number: int, trial: work.Trial, measured: Measured) -> Tried:
@@ -150,7 +154,9 @@ def promote(tried: Iterable[Tried], rung: int, budgets: Sequence[Budget] = ()) -
     """
     priced = [each for each in tried if each.costs is not None]
     limits = [budget for budget in budgets if budget.what not in SHARES]
-    able = [each for each in priced if all(excess(values(each), budget) <= SLACK for budget in limits)] or priced
+    able = [
+        each for each in priced if all(excess(values(each), budget) <= SLACK for budget in limits)
+    ] or priced
     top = max((each.accuracy for each in able), default=0.0)
 
     def lag(each: Tried) -> float:
@@ -169,9 +175,9 @@ def energy(tried: Tried, table: str | None = None) -> float:
 def pick(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
     """The cheapest of the last rung, by each table, that fits the budgets and is not shown to be worse than the best.
 
-    Worse is one whose accuracy is lower by more than a standard error of the difference, recording by recording. Where
-    an accuracy is wanted, all that reach it are good enough. Where no candidate of the last rung fits, earlier ones
-    may.
+    Worse is one whose accuracy is lower by more than a standard error of the difference, recording by
+    recording. Where an accuracy is wanted, all that reach it are good enough. Where no candidate of the last
+    rung fits, earlier ones may.
     """
     priced = [each for each in tried if each.costs is not None]
     if not priced:
@@ -184,7 +190,10 @@ def pick(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
     allowed = selection.allowed
     assert selection.best.costs is not None, "all of these are priced"
     tables = list(selection.best.costs.energy_j)
-    cheapest = {table: min(allowed, key=lambda each: (energy(each, table), -each.accuracy)).number for table in tables}
+    cheapest = {
+        table: min(allowed, key=lambda each: (energy(each, table), -each.accuracy)).number
+        for table in tables
+    }
     chosen = next(each for each in allowed if each.number == cheapest[tables[0]])
     above = [each for each in pool if each.accuracy >= chosen.accuracy + POINT - NEAR]
     return Choice(

@@ -56,7 +56,9 @@ def plan_of(candidate: Candidate, sensor: Sensor, training: Recordings) -> Plan:
     )
 
 
-def without(plan: Plan, training: Recordings, held: IntArray, epochs: int, target: Target, storage: int | None) -> Any:
+def without(
+    plan: Plan, training: Recordings, held: IntArray, epochs: int, target: Target, storage: int | None
+) -> Any:
     """The netlist of a network that some recordings are left out of."""
     from spikeloom.models.network_kinds import kind_of  # torch, so only here
     from spikeloom.models.training.train import train

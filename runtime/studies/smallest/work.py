@@ -83,7 +83,9 @@ class Measured:
     whole: NetlistCosts | None = field(default=None, metadata=OPTIONAL)
     refused: str | None = field(default=None, metadata=OPTIONAL)  # Why the chip does not hold it
     processor: Processor | None = field(default=None, metadata=OPTIONAL)  # Costs of a baseline
-    certified: float | None = field(default=None, metadata=OPTIONAL)  # Share that no event alters, of some left out
+    certified: float | None = field(
+        default=None, metadata=OPTIONAL
+    )  # Share that no event alters, of some left out
 
     @property
     def shares(self) -> FloatArray:
@@ -94,15 +96,34 @@ class Measured:
 
 
 def trial(
-    candidate: Candidate, rung: int, setting: float | None, data: Data, sensor: Sensor, target: str, *, certify: bool
+    candidate: Candidate,
+    rung: int,
+    setting: float | None,
+    data: Data,
+    sensor: Sensor,
+    target: str,
+    *,
+    certify: bool,
 ) -> Trial:
     """Work whose key is of everything that decides the result; on the last rung it may `certify`."""
     graph = arrays_digest({"edges": sensor.graph.edges, "coordinates": sensor.graph.coordinates})
-    about = {"format": FORMAT, "spikeloom": __version__, "data": data.sha256, "bin_s": data.bin_s, "graph": graph}
+    about = {
+        "format": FORMAT,
+        "spikeloom": __version__,
+        "data": data.sha256,
+        "bin_s": data.bin_s,
+        "graph": graph,
+    }
     about |= {"target": target, "candidate": encode(candidate), "rung": rung, "setting": setting}
     if certify := certify and rung == RUNGS:
         about |= {"certified": True}
-    own: dict[str, Any] = {"candidate": candidate, "rung": rung, "setting": setting, "data": data, "sensor": sensor}
+    own: dict[str, Any] = {
+        "candidate": candidate,
+        "rung": rung,
+        "setting": setting,
+        "data": data,
+        "sensor": sensor,
+    }
     return Trial(key=content_key(about), label=candidate.name, target=target, certify=certify, **own)
 
 
@@ -116,7 +137,9 @@ def measure(work: Trial) -> JsonObject:
 
 @lru_cache(maxsize=1)
 def _training(data: Data, taxels: int) -> Recordings:
-    return recordings(data.path, "train", classes=None, taxels=taxels, bin_s=data.bin_s, labels_for="training")
+    return recordings(
+        data.path, "train", classes=None, taxels=taxels, bin_s=data.bin_s, labels_for="training"
+    )
 
 
 def some(data: Recordings) -> Recordings:
@@ -135,7 +158,9 @@ def _counting(work: Trial, training: Recordings) -> Measured:
 
     def compiled(data: Counted) -> tuple[Counters, Any]:
         rule = fit_rules(data, classes, [strength])[strength]
-        made = counters_of(data, Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest), training, classes)
+        made = counters_of(
+            data, Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest), training, classes
+        )
         return made, backend_of(work.target).lower_counters(made)
 
     costs: dict[str, Any]
@@ -143,13 +168,17 @@ def _counting(work: Trial, training: Recordings) -> Measured:
     try:
         made, netlist = compiled(data)
         if work.certify:
-            certified = share_robust_to_one_event(machine_of(compiled(data.part(~held))[1]), some(training.part(held)))
+            certified = share_robust_to_one_event(
+                machine_of(compiled(data.part(~held))[1]), some(training.part(held))
+            )
     except (CapacityError, ModelError, DataError) as error:
         costs = {"refused": str(error).splitlines()[0]}
     else:
         costs = costs_of(netlist, of_length(joined_bins(some(training), made.bins), made.clocks.length))
     rounds = (len(seeds),) * len(right)
-    return Measured(right=tuple(right.tolist()), tried=rounds, setting=strength, certified=certified, **costs)
+    return Measured(
+        right=tuple(right.tolist()), tried=rounds, setting=strength, certified=certified, **costs
+    )
 
 
 def _network(work: Trial, training: Recordings) -> Measured:
@@ -181,7 +210,10 @@ def _baseline(work: Trial, training: Recordings) -> Measured:
     system, labels, rung = work.candidate.system, training.labels, work.rung
     strengths = baselines.STRENGTHS[system]
     tried = {1: strengths[:1], 2: sorted(strengths)}.get(rung, (work.setting or 0.0,))
-    seen, seeds = baselines.features(training, work.candidate), range(1, ROUNDS + 1) if rung == RUNGS else (0,)
+    seen, seeds = (
+        baselines.features(training, work.candidate),
+        range(1, ROUNDS + 1) if rung == RUNGS else (0,),
+    )
     right = {strength: np.zeros(len(training), np.int64) for strength in tried}
     for strength, seed in product(right, seeds):
         fold = split_folds(labels, FOLDS, np.random.default_rng(seed))
@@ -191,7 +223,9 @@ def _baseline(work: Trial, training: Recordings) -> Measured:
     return Measured(right=tuple(right[best].tolist()), tried=rounds, setting=best, processor=costs)
 
 
-def cross_validated(data: Counted, classes: int, sensor: Recordings, seed: int) -> tuple[IntArray, float, float]:
+def cross_validated(
+    data: Counted, classes: int, sensor: Recordings, seed: int
+) -> tuple[IntArray, float, float]:
     """Class of each recording by a network that did not see it, the strength of all of them, and the least winning sum.
 
     The strength is chosen as ``train`` chooses it; `sensor` has the shape of the recordings.

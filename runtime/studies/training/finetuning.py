@@ -210,15 +210,21 @@ def _record(
         bin_s=training.bin_s,
         test_samples=len(test),
         before=Reached(correct=tuned.before, accuracy=tuned.before / len(test)),
-        last=ReachedLast(correct=tuned.after, accuracy=tuned.after / len(test), chosen_on=CHOSEN_ON[weights]),
+        last=ReachedLast(
+            correct=tuned.after, accuracy=tuned.after / len(test), chosen_on=CHOSEN_ON[weights]
+        ),
         history=[[epoch.loss, epoch.correct] for epoch in tuned.history],
     )
 
 
-def _require_storage(request: FinetuneRequest, widths: list[int] | None, layers: int, target: Target) -> None:
+def _require_storage(
+    request: FinetuneRequest, widths: list[int] | None, layers: int, target: Target
+) -> None:
     """Refuse widths that the chip cannot store."""
     if widths is None:
-        repeat.refuse(request, ("scale_groups",), "is for --weight-bits; held-out recordings choose the storage")
+        repeat.refuse(
+            request, ("scale_groups",), "is for --weight-bits; held-out recordings choose the storage"
+        )
     else:
         check_packings([Packing(bits=width) for width in widths], layers, target)
 
@@ -255,12 +261,18 @@ def _write_checkpoint(
     assert convolution is not None
     graph = load_graph(request, checkpoint.system)
     edges = graph.edges if checkpoint.edges is None and graph is not None else checkpoint.edges
-    changed = replace(checkpoint, graph=loaded.graph, edges=edges, forms=net.forms, **layers_of(net.tensors()))
+    changed = replace(
+        checkpoint, graph=loaded.graph, edges=edges, forms=net.forms, **layers_of(net.tensors())
+    )
     save_again(output, changed, training=record.to_json())
-    round_to_forms(expand(read_checkpoint(output), convolution.propagation), net.forms)  # it compiles, or says why not
+    round_to_forms(
+        expand(read_checkpoint(output), convolution.propagation), net.forms
+    )  # it compiles, or says why not
 
 
-def _write_nir(request: FinetuneRequest, loaded: LoadedNetwork, net: QuantisedNet, record: FinetuneRecord) -> str:
+def _write_nir(
+    request: FinetuneRequest, loaded: LoadedNetwork, net: QuantisedNet, record: FinetuneRecord
+) -> str:
     """Write the network, and the netlist that it compiles to; the name of that."""
     from spikeloom.compiler.formats.nir import writer
 

@@ -19,7 +19,17 @@ from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.requests.choices import CheckpointChoice
 from spikeloom.runtime.requests.training import JoinRequest
 
-KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "bin_s", "test_samples", "fine_tuned_from")
+KEPT = (
+    "command",
+    "seed",
+    "epochs",
+    "recipe",
+    "data",
+    "data_sha256",
+    "bin_s",
+    "test_samples",
+    "fine_tuned_from",
+)
 """Parts of a network's training record that the joined one keeps, beside what the chosen weights reached."""
 
 
@@ -76,7 +86,9 @@ def _common_origin(towers: Sequence[Mapping[str, Any]]) -> JsonObject:
     origins = [origin_of(tower) for tower in towers]
     widths = sorted({origin["bin_s"] for origin in origins if "bin_s" in origin})
     if len(widths) > 1:
-        raise ModelError(f"join: networks of bins of {widths[0]:g} s and {widths[-1]:g} s; give those of one width")
+        raise ModelError(
+            f"join: networks of bins of {widths[0]:g} s and {widths[-1]:g} s; give those of one width"
+        )
     return origins[0]
 
 
@@ -90,7 +102,9 @@ def _command(request: JoinRequest) -> str:
 def _network(name: str, weights: str | None) -> Checkpoint:
     checkpoint = load_checkpoint(name, CheckpointChoice(weights=weights))
     if checkpoint.layout != "spikeloom":
-        raise ModelError(f"{name}: does not say its graph and constants; give checkpoints that spikeloom train wrote")
+        raise ModelError(
+            f"{name}: does not say its graph and constants; give checkpoints that spikeloom train wrote"
+        )
     return checkpoint
 
 

@@ -40,7 +40,9 @@ def both_splits(data: str, taxels: int | None, bin_s: float | None) -> tuple[Rec
         test = recordings(data, "test", taxels=training.taxels, **shared)
     except DataError as error:
         if taxels is None:
-            error.add_note(f"the training recordings have {training.taxels} taxels; if more exist, give --taxels N")
+            error.add_note(
+                f"the training recordings have {training.taxels} taxels; if more exist, give --taxels N"
+            )
         raise
     progress("")
     _require_classes(training, test)
@@ -125,7 +127,16 @@ def _named_recipe(request: TrainRequest) -> Recipe:
     """The recipe of that name, or the only one of a system that has its own."""
     from spikeloom.models.network_kinds import kind_of  # torch, so only here
 
-    names = ("recipe", "current_decay", "membrane_decay", "join", "spike_penalty", "copies", "hidden", "hops")
+    names = (
+        "recipe",
+        "current_decay",
+        "membrane_decay",
+        "join",
+        "spike_penalty",
+        "copies",
+        "hidden",
+        "hops",
+    )
     options = _changed(repeat.given(request, names), {"recipe": RELEASED.name, "join": 1})
     typed = {f"--{name.replace('_', '-')}": value for name, value in options.items()}
     return kind_of(request.system or TACTILESGNET).recipe_for(request.recipe, typed)
@@ -133,7 +144,19 @@ def _named_recipe(request: TrainRequest) -> Recipe:
 
 def _words(request: TrainRequest, first: dict[str, Any], last: dict[str, Any]) -> list[str]:
     """The words that ask for the same training, without the seed and the output."""
-    names = ("bin", "join", "window", "system", "padding", "copies", "graph", "taxels", "edges", "directed", "recipe")
+    names = (
+        "bin",
+        "join",
+        "window",
+        "system",
+        "padding",
+        "copies",
+        "graph",
+        "taxels",
+        "edges",
+        "directed",
+        "recipe",
+    )
     defaults = {"join": 1, "system": TACTILESGNET, "copies": DEFAULT_COPIES, "recipe": RELEASED.name}
     recipe = _named_recipe(request)
     defaults |= {name: getattr(recipe, name, None) for name in RECIPE}

@@ -53,7 +53,9 @@ def summary(records: Sequence[TrainingRecord]) -> dict[str, Accuracies]:
     for protocol in WEIGHTS:
         values = [getattr(record, protocol).accuracy for record in records]
         spread = statistics.stdev(values) if len(values) > 1 else None
-        result[protocol] = Accuracies(mean=statistics.fmean(values), std=spread, min=min(values), max=max(values))
+        result[protocol] = Accuracies(
+            mean=statistics.fmean(values), std=spread, min=min(values), max=max(values)
+        )
     return result
 
 
@@ -74,7 +76,9 @@ def training_sections(result: TrainingReport) -> Iterable[Section]:
     lines = []
     if len(result.runs) > 1:
         typed += f" --seeds {len(result.runs)}"
-        last, best, clean = (f"{100 * s.mean:.2f} % ± {100 * (s.std or 0.0):.2f}" for s in result.protocols.values())
+        last, best, clean = (
+            f"{100 * s.mean:.2f} % ± {100 * (s.std or 0.0):.2f}" for s in result.protocols.values()
+        )
         lines.append(f"  mean of {len(result.runs)} seeds: last {last}, best on test {best}, clean {clean}")
     files = ", ".join(run.file for run in result.runs)
     lines += textwrap.wrap(f"written: {files}", WIDTH, initial_indent="  ", subsequent_indent="    ")

@@ -23,7 +23,18 @@ from spikeloom.runtime.studies.training.seeds import train_seeds
 COUNTERS_ONLY = ("thresholds", "parts", "ramp", "levels", "weight_bits")
 """Options of counting networks alone."""
 
-NOT_COUNTERS = ("padding", "graph", "edges", "directed", "copies", *RECIPE, "epochs", "resume", "keep", "picture")
+NOT_COUNTERS = (
+    "padding",
+    "graph",
+    "edges",
+    "directed",
+    "copies",
+    *RECIPE,
+    "epochs",
+    "resume",
+    "keep",
+    "picture",
+)
 """Options that counting networks do not take."""
 
 
@@ -37,9 +48,13 @@ def train_networks(request: TrainRequest) -> TrainingReport:
     recipe_of(request)  # which refuses, before the recordings are read
     graph, _ = sensor_of(request)
     percent = WHOLE if request.window is None else parse_window(request.window)
-    training, test = (first_part(each, percent) for each in both_splits(request.data, graph.n_taxels, request.bin))
+    training, test = (
+        first_part(each, percent) for each in both_splits(request.data, graph.n_taxels, request.bin)
+    )
     if percent < WHOLE:
-        tell(f"note: of every recording the first {percent} % train; give --window {percent}% to what runs the network")
+        tell(
+            f"note: of every recording the first {percent} % train; give --window {percent}% to what runs the network"
+        )
     runs = train_seeds(plan_jobs(request, training, test), resume=request.resume)
     write_picture(request.picture, lambda: picture(runs))
     return TrainingReport(runs=runs, protocols=summary(runs))
@@ -52,10 +67,14 @@ def train_counting(request: TrainRequest) -> CountersReport:
         raise OptionError("--system counters: one rule without chance; omit --recipe, --seed and --seeds")
     require_bins(request.join)
     require_place(request.output, "-o", request, ["pt"])
-    options = {name: value for name, value in repeat.given(request, COUNTERS_ONLY).items() if value is not None}
+    options = {
+        name: value for name, value in repeat.given(request, COUNTERS_ONLY).items() if value is not None
+    }
     if request.window is not None:
         options["window"] = parse_window(request.window)
-    typed = repeat.words({"data": Path(request.data).name, "system": COUNTING, "bin": request.bin, **options})
+    typed = repeat.words(
+        {"data": Path(request.data).name, "system": COUNTING, "bin": request.bin, **options}
+    )
     if request.join > 1:
         typed += ["--join", str(request.join)]
     plan = _counting_plan(request.join, options)

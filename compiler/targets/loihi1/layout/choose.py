@@ -55,7 +55,9 @@ def least_cores(
             raise OptionError(f"{option}: no such layer; layers are {', '.join(names)}")
         size = network.populations[names.index(name)].size
         if least > allowed:
-            raise OptionError(f"{option}: {owner} {allowed} cores ({target.name}.chip.cores); give {allowed} or fewer")
+            raise OptionError(
+                f"{option}: {owner} {allowed} cores ({target.name}.chip.cores); give {allowed} or fewer"
+            )
         if least > size:
             raise OptionError(f"{option}: {name} has {size} neurons on the chip; give {size} or fewer")
     return {names.index(name): least for name, least in cores_for.items()}

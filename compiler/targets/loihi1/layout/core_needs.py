@@ -133,12 +133,18 @@ class Needs:
             formats = set()
             for lists in self.lists(chunk):
                 projection = self.network.projections[lists.projection]
-                dense, taken = choose_dense(lists, projection, base, chunk.size, lean=lean, target=self.target)
+                dense, taken = choose_dense(
+                    lists, projection, base, chunk.size, lean=lean, target=self.target
+                )
                 if not unrolled:
-                    taken = taken[stored_once(dense, lists.nonzero, lists.row + base, lists.mantissa, self.target)]
+                    taken = taken[
+                        stored_once(dense, lists.nonzero, lists.row + base, lists.mantissa, self.target)
+                    ]
                 words += int(taken.sum())
                 index = index_bits(base + chunk.size - 1, self.target)
-                formats |= {(projection.bits, projection.exponent, 0 if flag else index) for flag in np.unique(dense)}
+                formats |= {
+                    (projection.bits, projection.exponent, 0 if flag else index) for flag in np.unique(dense)
+                }
             self._stored[key] = words, frozenset(formats)
         return self._stored[key]
 
@@ -193,7 +199,9 @@ class Needs:
             for lists in self.lists(chunk):
                 pre = self.network.projections[lists.projection].pre
                 if pre != INPUT:
-                    axons.setdefault(pre, np.zeros(self.network.populations[pre].size, np.int64))[lists.source] += 1
+                    axons.setdefault(pre, np.zeros(self.network.populations[pre].size, np.int64))[
+                        lists.source
+                    ] += 1
         return axons
 
     def charge(self, axons: dict[int, IntArray]) -> None:

@@ -80,11 +80,15 @@ def _worst(needs: Needs, population: int) -> tuple[Violation, ...]:
     """For each limit that single neurons of a population break: the one that breaks it most."""
     worst: dict[str, tuple[int, int]] = {}
     for neuron in range(needs.network.populations[population].size):
-        for rule, used in needs.excess((Chunk(population=population, first=neuron, last=neuron + 1),)).items():
+        for rule, used in needs.excess(
+            (Chunk(population=population, first=neuron, last=neuron + 1),)
+        ).items():
             if rule not in worst or used > worst[rule][0]:
                 worst[rule] = used, neuron
     name = needs.network.populations[population].name
-    return tuple(violation(needs.target, f"{name} neuron {n}", rule, used) for rule, (used, n) in worst.items())
+    return tuple(
+        violation(needs.target, f"{name} neuron {n}", rule, used) for rule, (used, n) in worst.items()
+    )
 
 
 def order_on_core(needs: Needs, chunks: Core) -> Core:
@@ -199,7 +203,9 @@ def arrange(needs: Needs, groups: Iterable[Core], chips: int = 1) -> Cores:
     cores = sorted((order_on_core(needs, group) for group in groups), key=min)
     allowed = chips * needs.target.limit("chip.cores")
     if len(cores) > allowed:
-        excess = violation(needs.target, "chip" if chips == 1 else f"{chips} chips", "chip.cores", len(cores))
+        excess = violation(
+            needs.target, "chip" if chips == 1 else f"{chips} chips", "chip.cores", len(cores)
+        )
         raise CapacityError((replace(excess, allowed=allowed),))
     return tuple(cores)
 

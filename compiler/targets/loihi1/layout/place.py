@@ -127,7 +127,10 @@ def place(traffic: FloatArray, target: Target) -> Placement:
     y, x = np.divmod(np.arange(width * height), width)
     price = np.abs(x[:, None] - x) + (1 + TIE) * np.abs(y[:, None] - y)  # of a packet between each two sites
     heaviest = np.argsort(-between.sum(axis=1), kind="stable")[:STARTS]
-    grown = [_improve(between, price, tile_cores, _grow(between, price, tile_cores, int(core))) for core in heaviest]
+    grown = [
+        _improve(between, price, tile_cores, _grow(between, price, tile_cores, int(core)))
+        for core in heaviest
+    ]
     site = min(grown, key=lambda layout: float((between * price[np.ix_(layout, layout)]).sum()))
     tiles = tuple(site.tolist())
     spent = sum(between[a, b] * sum(hops(tiles[a], tiles[b], width)) for a in range(cores) for b in range(a))

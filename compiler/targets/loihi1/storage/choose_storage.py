@@ -65,16 +65,24 @@ class Choice:
     clipped: int  # Weights that the range cuts off
     zeroed: int  # Weights that round to zero
     weights: int  # All that are not zero
-    compensated: bool  # Whether weights were rounded so that their errors cancel, rather than each to the nearest
+    compensated: (
+        bool  # Whether weights were rounded so that their errors cancel, rather than each to the nearest
+    )
     candidates: int  # Scales that were compared
     flips: int | None  # Calibration spikes that differ from float64; None without calibration
     spikes: int | None  # Calibration spikes of the float64 model
-    headroom: float  # Share that the worst case leaves free of the register that it fills first, see ``Rounded``
+    headroom: (
+        float  # Share that the worst case leaves free of the register that it fills first, see ``Rounded``
+    )
 
 
 def _register(population: Population) -> str:
     """Register that the sums of a population fill first."""
-    return "current" if current_load(decay_registers(population.beta, population.alpha)[0]) > 1 else "accumulator"
+    return (
+        "current"
+        if current_load(decay_registers(population.beta, population.alpha)[0]) > 1
+        else "accumulator"
+    )
 
 
 def _repeats(stored: Rounded, target: Target) -> bool:
@@ -125,8 +133,12 @@ def best_scale(
         )
     tried = len(candidates)
     if calibration is not None and tried > FINALISTS:
-        candidates = sorted(candidates, key=lambda c: with_spike_errors(c, post, calibration, 1).cost)[:FINALISTS]
-    best = min((with_spike_errors(stored, post, calibration) for stored in candidates), key=attrgetter("cost"))
+        candidates = sorted(candidates, key=lambda c: with_spike_errors(c, post, calibration, 1).cost)[
+            :FINALISTS
+        ]
+    best = min(
+        (with_spike_errors(stored, post, calibration) for stored in candidates), key=attrgetter("cost")
+    )
     if packing.groups > 1:
         several = grouped(layer, best, packing.groups)
         if several is not None:

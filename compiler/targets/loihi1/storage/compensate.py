@@ -23,7 +23,13 @@ import numpy.typing as npt
 from spikeloom.compiler.ir import PART, Projection
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.registers import ONE_STEP_SUM_MAX, reach, step_units
-from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, rounded, spike_cost, with_spike_errors
+from spikeloom.compiler.targets.loihi1.storage.scales import (
+    FloatLayer,
+    Rounded,
+    rounded,
+    spike_cost,
+    with_spike_errors,
+)
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, nearest_steps, scales
 from spikeloom.compiler.types import FloatArray, IntArray
 
@@ -69,7 +75,9 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
         share = _share(together)
         for rows in np.array_split(neurons, -(-len(neurons) * len(inputs) // PART) or 1):
             places = [_places(p, rows) for p in projections]
-            weight = np.concatenate([p.weight.data[at] for p, at in zip(projections, places, strict=True)], axis=1)
+            weight = np.concatenate(
+                [p.weight.data[at] for p, at in zip(projections, places, strict=True)], axis=1
+            )
             exact = np.clip(weight * (scale[rows] / step)[:, None], -limit, limit)
             whole = np.rint(exact)
             whole[:, shown] = np.clip(_round_in_turn(exact[:, shown], share), -limit, limit)
@@ -86,7 +94,9 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
         return None
     before = plain.moved
     after = with_spike_errors(stored, layer.post, calibration).moved
-    back = (spike_cost(after) > spike_cost(before)) | (loads(stored.population, stored.projections) > ONE_STEP_SUM_MAX)
+    back = (spike_cost(after) > spike_cost(before)) | (
+        loads(stored.population, stored.projections) > ONE_STEP_SUM_MAX
+    )
     for p, each, instead in zip(projections, steps, nearest, strict=True):
         np.copyto(each, instead, where=np.repeat(back, np.diff(p.weight.indptr)))
     stored = rounded(layer, form, steps, population.bias + np.where(back, 0, errors))
@@ -104,7 +114,9 @@ def _alike(layer: FloatLayer) -> Iterator[tuple[IntArray, IntArray]]:
         kinds[tuple(each.tobytes() for each in inputs)].append(neuron)
     for neurons in kinds.values():
         ends = [w.indptr[neurons[0] : neurons[0] + 2] for w in weights]
-        inputs = [first + w.indices[slice(*end)] for w, first, end in zip(weights, firsts, ends, strict=False)]
+        inputs = [
+            first + w.indices[slice(*end)] for w, first, end in zip(weights, firsts, ends, strict=False)
+        ]
         yield np.array(neurons), np.concatenate(inputs)
 
 

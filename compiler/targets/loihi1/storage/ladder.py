@@ -21,7 +21,9 @@ class Trial:
     groups: int  # Scales in a layer, at most
     equal: int = 0  # Decisions of quarters of held-out recordings that are the float model's
     decisions: int = 0  # All of them
-    operations: float = 0.0  # Synaptic operations of a training recording, where spikes are the float model's
+    operations: float = (
+        0.0  # Synaptic operations of a training recording, where spikes are the float model's
+    )
     synapse_words: int = 0  # Memory of all cores
     cores: int = 0
     refused: str | None = field(default=None, metadata={"optional": True})  # Why the chip does not hold it

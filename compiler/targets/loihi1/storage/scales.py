@@ -54,7 +54,9 @@ class FloatLayer:
 def layer_of(network: Network, post: int, calibration: Calibration | None = None) -> FloatLayer:
     """One layer of a network."""
     into = tuple(p for p in network.projections if p.post == post)
-    return FloatLayer(population=network.populations[post], projections=into, post=post, calibration=calibration)
+    return FloatLayer(
+        population=network.populations[post], projections=into, post=post, calibration=calibration
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -108,7 +110,9 @@ def rounded(
     return Rounded(form=form, population=integer, projections=planes, reached=reached)
 
 
-def with_spike_errors(layer: Rounded, post: int, calibration: Calibration | None, parts: int | None = None) -> Rounded:
+def with_spike_errors(
+    layer: Rounded, post: int, calibration: Calibration | None, parts: int | None = None
+) -> Rounded:
     """The same with what the calibration says of it, or its first `parts`, given what the layers before it send."""
     if calibration is None:
         return layer
@@ -281,7 +285,9 @@ def grouped(layer: FloatLayer, uniform: Rounded, groups: int) -> Rounded | None:
         return None
     finest = finest_thresholds(layer, uniform.form.bits, uniform.form.exponents)
     threshold = group_by_fineness(np.maximum(finest, uniform.form.threshold), groups)
-    while (stored := rounded(layer, replace(uniform.form, threshold=threshold))) and stored.reached > ONE_STEP_SUM_MAX:
+    while (
+        stored := rounded(layer, replace(uniform.form, threshold=threshold))
+    ) and stored.reached > ONE_STEP_SUM_MAX:
         over = loads(stored.population, stored.projections) > ONE_STEP_SUM_MAX
         threshold = threshold - np.isin(threshold, threshold[over])
     return stored

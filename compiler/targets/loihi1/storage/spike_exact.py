@@ -56,7 +56,9 @@ class Exactness:
     tried: tuple[tuple[int, int, int], ...]
     flips: int  # Spikes that move in what was taken, on all calibration recordings
     spikes: int  # All spikes of the float64 model
-    limits: tuple[tuple[str, int], ...]  # Spikes that still move, by what keeps their neuron's scale from being finer
+    limits: tuple[
+        tuple[str, int], ...
+    ]  # Spikes that still move, by what keeps their neuron's scale from being finer
     decay: int  # Spikes that move if nothing but the 12-bit decay deviates
 
 

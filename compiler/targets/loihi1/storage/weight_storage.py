@@ -44,13 +44,17 @@ def store_steps(projection: ir.Projection, steps: IntArray, form: ir.Form) -> tu
     pre = projection.pre
     post = projection.post
     stored = list[IntegerProjection]()
-    for exponent, mantissa in zip(form.exponents, split_planes(steps, form.bits, form.exponents), strict=True):
+    for exponent, mantissa in zip(
+        form.exponents, split_planes(steps, form.bits, form.exponents), strict=True
+    ):
         weight = ir.with_data(projection.weight, mantissa.astype(MANTISSA))
         if stored:
             weight = weight.copy()
             weight.eliminate_zeros()
         if weight.nnz or not stored:
-            stored.append(IntegerProjection(pre=pre, post=post, weight=weight, exponent=exponent, bits=form.bits))
+            stored.append(
+                IntegerProjection(pre=pre, post=post, weight=weight, exponent=exponent, bits=form.bits)
+            )
     return tuple(stored)
 
 

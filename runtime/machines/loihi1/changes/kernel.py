@@ -265,7 +265,9 @@ def _span(chip: Chip, known: Known, run: Any, t: Any, begin: Any) -> Any:
 
 
 @compiled
-def _part(chip: Chip, known: Known, run: Any, t: Any, moved: Any, span: Any, come: Any, gone: Any) -> tuple[Any, Any]:
+def _part(
+    chip: Chip, known: Known, run: Any, t: Any, moved: Any, span: Any, come: Any, gone: Any
+) -> tuple[Any, Any]:
     """One step of some blocks; how many sources now differ, and whether a register does."""
     begin, end = span
     first = np.uint64(begin * LANES)

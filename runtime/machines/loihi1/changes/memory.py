@@ -146,13 +146,19 @@ class LoihiMemory(Memory):
 
     def with_late_layers(self, steps: int) -> LoihiMemory:
         """Move windows of the netlist, from which the float network takes its depths."""
-        layers = [replace(layer, depth=layer.depth + steps) if layer.depth else layer for layer in self.netlist.layers]
+        layers = [
+            replace(layer, depth=layer.depth + steps) if layer.depth else layer
+            for layer in self.netlist.layers
+        ]
         return replace(self, netlist=replace(self.netlist, layers=tuple(layers)))
 
     def with_decays(self, factor: float) -> LoihiMemory:
         """Change decay registers; the float network has what they realise."""
         decays = np.array(
-            [registers.decay_registers(layer.beta * factor, layer.alpha * factor) for layer in self.netlist.layers]
+            [
+                registers.decay_registers(layer.beta * factor, layer.alpha * factor)
+                for layer in self.netlist.layers
+            ]
         )
         decay_u, decay_v = decays[self.netlist.layer].T
         netlist = replace(self.netlist, decay_u=read_only(decay_u), decay_v=read_only(decay_v))

@@ -124,7 +124,9 @@ def prepare(netlist: Netlist, target: Target, by: Literal["layer", "core", "whol
         BETWEEN_CHIPS: caused(leaves, source, group[sender]),
         "zeros": caused(netlist.synapse_weight == 0, *entries),
     }
-    return Meter(target=target, names=tuple(amounts), caused=np.hstack(list(amounts.values())), neurons=neurons)
+    return Meter(
+        target=target, names=tuple(amounts), caused=np.hstack(list(amounts.values())), neurons=neurons
+    )
 
 
 def count(meter: Meter, counts: Counts, chip_steps: int | IntArray) -> dict[str, FloatArray]:
@@ -142,7 +144,9 @@ def count(meter: Meter, counts: Counts, chip_steps: int | IntArray) -> dict[str,
 
 def _named(table: EnergyTable, event: str) -> str:
     """The name under which a table prices an event."""
-    return "synaptic_operation" if "synaptic_operation" in table.prices and event.startswith("syn") else event
+    return (
+        "synaptic_operation" if "synaptic_operation" in table.prices and event.startswith("syn") else event
+    )
 
 
 def lacking(table: EnergyTable, events: Mapping[str, FloatArray]) -> tuple[str, ...]:
@@ -189,7 +193,9 @@ def price(meter: Meter, counts: Counts, chip_steps: int | IntArray) -> Costs:
         between_chips=amounts[BETWEEN_CHIPS],
         steps=int(np.max(chip_steps)),
         energy=energy,
-        unpriced={table.name: lacking(table, events) for table in meter.target.energy if table.name not in energy},
+        unpriced={
+            table.name: lacking(table, events) for table in meter.target.energy if table.name not in energy
+        },
     )
 
 

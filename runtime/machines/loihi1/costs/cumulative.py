@@ -45,12 +45,16 @@ def steady(netlist: Netlist) -> BoolArray:
     voters = np.flatnonzero(netlist.readout_class >= 0)
     sender = netlist.axon_source[netlist.axon_of_synapse()] - netlist.n_inputs
     receiver = netlist.synapse_compartment()
-    itself = np.bincount(receiver, np.where(sender == receiver, netlist.effective_weight(), 0), netlist.n_compartments)
+    itself = np.bincount(
+        receiver, np.where(sender == receiver, netlist.effective_weight(), 0), netlist.n_compartments
+    )
     lifted = (itself > netlist.threshold) & (netlist.bias_mantissa >= 0) & (one_step_bounds(netlist)[1] == 0)
     return np.asarray(lifted[voters])
 
 
-def run(prepared: engine.Engine, target: Target, events: EventArray, lengths: IntArray, *, lag: int) -> Cumulative:
+def run(
+    prepared: engine.Engine, target: Target, events: EventArray, lengths: IntArray, *, lag: int
+) -> Cumulative:
     """Run recordings (samples, n_inputs, T), each for its own length in data steps (samples,), once.
 
     `lag` are the chip steps by which the votes are behind the data.
@@ -93,6 +97,8 @@ def run(prepared: engine.Engine, target: Target, events: EventArray, lengths: In
 
 def _events(meter: cost.Meter, happened: IntArray, runs: BoolArray) -> dict[str, FloatArray]:
     """Amount of each priced event in each chip step; (samples, chip steps)."""
-    amounts = dict(zip((*meter.names, "neuron_active"), np.moveaxis(happened.astype(np.float64), 2, 0), strict=True))
+    amounts = dict(
+        zip((*meter.names, "neuron_active"), np.moveaxis(happened.astype(np.float64), 2, 0), strict=True)
+    )
     amounts["neuron_idle"] = runs * meter.neurons - amounts["neuron_active"]
     return {event: amounts[event] for event in cost.EVENTS}

@@ -71,18 +71,26 @@ def estimate(
     detailed: dict[str, list[DetailedTimes]] = {name: [] for name in latencies if deep}
     counts = []
     updates = []
-    entries = 2 * netlist.n_compartments if deep else 8 * max(1, 0 if charges is None else charges.sources.shape[1])
+    entries = (
+        2 * netlist.n_compartments
+        if deep
+        else 8 * max(1, 0 if charges is None else charges.sources.shape[1])
+    )
     size = max(1, HELD // (entries * (events.shape[2] + netlist.drain)))
     for first in range(0, max(1, len(events)), size):
         part = slice(first, first + size)
-        trace = engine.simulate(prepared, events[part], lengths=steps[part], spikes=deep, updated=deep, charges=charges)
+        trace = engine.simulate(
+            prepared, events[part], lengths=steps[part], spikes=deep, updated=deep, charges=charges
+        )
         counts.append(trace.counts)
         sums = [] if trace.charged is None else np.split(trace.charged, len(latencies), axis=2)
         for (name, tables), charged in zip(latencies.items(), sums, strict=True):
             simple[name].append(timing.simple_times(tables, charged, chip_steps[part]))
         if trace.spikes is not None and trace.updated is not None:
             updates.append(cost.updates_by_core(netlist, trace.updated))
-            given = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after the end
+            given = events[part] * (
+                np.arange(events.shape[2]) < steps[part, None, None]
+            )  # nothing after the end
             for name, times in detailed.items():
                 run = latencies[name], trace.spikes, trace.updated, given
                 times.append(timing.detailed(*run, steps=chip_steps[part]))
@@ -104,4 +112,6 @@ def estimate(
 
 def _joined(kind: type[T], parts: Sequence[T]) -> T:
     """One dataclass of arrays from those of some recordings each."""
-    return kind(**{each.name: np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(kind)})
+    return kind(
+        **{each.name: np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(kind)}
+    )

@@ -49,7 +49,9 @@ def core_map(netlist: Netlist, target: Target, fired: FloatArray) -> CoreMap:
             )
         )
     return CoreMap(
-        mesh=Mesh(width=width, height=target.limit("mesh.height"), tile_cores=target.limit("mesh.tile_cores")),
+        mesh=Mesh(
+            width=width, height=target.limit("mesh.height"), tile_cores=target.limit("mesh.tile_cores")
+        ),
         cores=tuple(placed),
         traffic=_traffic(netlist, target, fired),
     )
@@ -67,7 +69,9 @@ def _traffic(netlist: Netlist, target: Target, fired: FloatArray) -> tuple[Way, 
     for (pre, post), sent, count in zip(pairs.T.tolist(), packets.tolist(), axons.tolist(), strict=True):
         near = pre != AT_INPUT and chip[pre] == chip[post]
         distance = sum(hops(tile[pre], tile[post], target.limit("mesh.width"))) if near else None
-        ways.append(Way(source=None if pre == AT_INPUT else pre, to=post, packets=sent, axons=count, hops=distance))
+        ways.append(
+            Way(source=None if pre == AT_INPUT else pre, to=post, packets=sent, axons=count, hops=distance)
+        )
     return tuple(ways)
 
 
@@ -95,7 +99,12 @@ def figures(found: CostReport) -> list[Block]:
 
 
 def _bars(
-    name: str, title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str], unit: str, caption: str
+    name: str,
+    title: str,
+    rows: Mapping[str, Sequence[float]],
+    series: Sequence[str],
+    unit: str,
+    caption: str,
 ) -> Figure:
     """Bars, with their numbers as a table."""
     cells = [[label, *(si(value, unit) for value in values)] for label, values in rows.items()]

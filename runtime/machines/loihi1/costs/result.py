@@ -237,7 +237,9 @@ def _links(chips: int, costs: Costs) -> list[str]:
     """What is not known of a netlist on several chips."""
     if chips == 1:
         return []
-    left, sent = (float(amount.sum(axis=1).mean()) for amount in (costs.between_chips, costs.events["packet"]))
+    left, sent = (
+        float(amount.sum(axis=1).mean()) for amount in (costs.between_chips, costs.events["packet"])
+    )
     return [
         f"links between the {chips} chips: {left:,.0f} of {sent:,.0f} packets of an inference leave their chip; their "
         "hops and latency are left out, and so are all times (no public figures)"
@@ -260,8 +262,15 @@ def _times(table: str, model: str, times: StepTimes) -> Times:
     return Times(
         table=table,
         model=model,
-        inference_s={"mean": float(seconds.mean()), "min": float(seconds.min()), "max": float(seconds.max())},
-        step_s={"mean": float(times.duration_ns[ran].mean() * 1e-9), "max": float(times.duration_ns.max() * 1e-9)},
+        inference_s={
+            "mean": float(seconds.mean()),
+            "min": float(seconds.min()),
+            "max": float(seconds.max()),
+        },
+        step_s={
+            "mean": float(times.duration_ns[ran].mean() * 1e-9),
+            "max": float(times.duration_ns.max() * 1e-9),
+        },
         critical_core=tuple(
             CriticalCore(
                 core=int(core),

@@ -36,7 +36,10 @@ def inference_table(report: CostReport) -> Table:
     tables = report.per_inference.energy_j
     rows += [[f"{DYNAMIC}{name}", *(si(each.energy_j[name], "J") for each in columns)] for name in tables]
     rows += [
-        [f"time, {each.table}, {each.model} model", *(si(each.inference_s[end], "s") for end in ("mean", "min", "max"))]
+        [
+            f"time, {each.table}, {each.model} model",
+            *(si(each.inference_s[end], "s") for end in ("mean", "min", "max")),
+        ]
         for each in report.time
     ]
     return Table(["", "mean", "min", "max"], rows)
@@ -47,7 +50,10 @@ def layer_table(report: CostReport) -> Table:
 
     def cells(amounts: Amounts) -> list[str]:
         counts = amounts.synaptic_operations, amounts.spikes, amounts.neuron_updates
-        return [*(f"{count:,.0f}" for count in counts), *(si(joules, "J") for joules in amounts.energy_j.values())]
+        return [
+            *(f"{count:,.0f}" for count in counts),
+            *(si(joules, "J") for joules in amounts.energy_j.values()),
+        ]
 
     head = ["layer (mean)", "synaptic operations", "spikes", "neuron updates"]
     head += [f"{DYNAMIC}{name}" for name in report.per_inference.energy_j]
@@ -56,7 +62,11 @@ def layer_table(report: CostReport) -> Table:
 
 def core_table(report: CostReport) -> Table:
     """What each core does, and in how many steps the others wait for it."""
-    critical = {(each.model, found.core): found.share_of_steps for each in report.time for found in each.critical_core}
+    critical = {
+        (each.model, found.core): found.share_of_steps
+        for each in report.time
+        for found in each.critical_core
+    }
     models = [each.model for each in report.time]
     head = ["core", "layers", "sweep and send", "receive", *(f"slowest, {model}" for model in models)]
     energies = list(report.cores[0].energy_j) if report.cores else []
@@ -94,13 +104,17 @@ def _lines(report: CostReport) -> list[str]:
         if each.blocked_s is not None
     ]
     for static in report.static:
-        full = ", ".join(f"{si(each.energy_j, 'J')} ({each.time_table}, {each.model})" for each in static.full_speed_j)
+        full = ", ".join(
+            f"{si(each.energy_j, 'J')} ({each.time_table}, {each.model})" for each in static.full_speed_j
+        )
         lines.append(
             f"static, not in the above: {si(static.chip_w, 'W')} a chip ({static.source}), so an inference "
             f"{'' if static.chips == 1 else f'on {static.chips} chips '}takes {si(static.real_time_j, 'J')} at the "
             "sensor's pace" + (f"; at full speed {full}" if full else "")
         )
     if report.static and report.per_inference.energy_j:
-        lines.append(dominant([each.real_time_j for each in report.static], report.per_inference.energy_j.values()))
+        lines.append(
+            dominant([each.real_time_j for each in report.static], report.per_inference.energy_j.values())
+        )
     lines += [f"not modelled: {line}" for line in report.not_modelled]
     return [*lines, *(f"not priced: {line}" for line in report.not_priced)]

@@ -40,7 +40,9 @@ class StepTimes:
     """What a model says of a batch of recordings; nothing happens after a recording's own steps."""
 
     duration_ns: FloatArray  # (samples, steps) float64; of each chip step, barrier included
-    critical_core: IntArray  # (samples, steps) int64; core that took longest; the lowest of several, -1 after the end
+    critical_core: (
+        IntArray  # (samples, steps) int64; core that took longest; the lowest of several, -1 after the end
+    )
     receiving: BoolArray  # (samples, steps) bool; whether it took longest to receive
 
     @property
@@ -64,7 +66,9 @@ class DetailedTimes(StepTimes):
     # when the last core ended its sweep and sending, and when the last message was processed
     sent_ns: FloatArray
     processed_ns: FloatArray
-    blocked_ns: FloatArray  # for which cores could not send because the links were full, summed over the cores
+    blocked_ns: (
+        FloatArray  # for which cores could not send because the links were full, summed over the cores
+    )
     # most messages on any link at any time; one on its way counts as one spread evenly over its links and
     # its end
     peak_load: FloatArray
@@ -140,7 +144,9 @@ def prepare(netlist: Netlist, target: Target, table: TimeTable) -> Tables:
         channel_processing=processing[injected],
         route_first=np.cumsum([0, *map(len, ways)]),
         route_link=np.array([link for way in ways for link in way], np.int64),
-        route_hops=np.array([sum(hop[abs(a - b) == 1] for a, b in pairwise(way)) for way in tiles], np.float64),
+        route_hops=np.array(
+            [sum(hop[abs(a - b) == 1] for a, b in pairwise(way)) for way in tiles], np.float64
+        ),
         route_share=np.array([unit // (len(way) + 1) for way in ways], np.int64),
         unit=unit,
         capacity=int(table.link_buffer.value),
@@ -203,7 +209,12 @@ def simple_times(tables: Tables, charged: IntArray, steps: IntArray) -> SimpleTi
 
 
 def detailed(
-    tables: Tables, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps: IntArray | None = None
+    tables: Tables,
+    spikes: BoolArray,
+    updated: BoolArray,
+    events: EventArray,
+    *,
+    steps: IntArray | None = None,
 ) -> DetailedTimes:
     """Time a batch of recordings by the detailed model.
 
@@ -211,7 +222,9 @@ def detailed(
     for `events` (samples, n_inputs, T); `steps` (samples,) are the chip steps of each recording, by default
     all.
     """
-    fired, worked, seen = (np.ascontiguousarray(bits).view(np.uint8) for bits in (spikes, updated, events != 0))
+    fired, worked, seen = (
+        np.ascontiguousarray(bits).view(np.uint8) for bits in (spikes, updated, events != 0)
+    )
     cores = tables.start.size - 1
     samples, length, _ = spikes.shape
     lengths = np.full(samples, length) if steps is None else steps

@@ -51,7 +51,9 @@ class Tables(NamedTuple):
 
 
 @compiled
-def _inject(first: IntArray, destination: IntArray, cost: IntArray, events: AnyArray, t: int, busy: Any) -> None:
+def _inject(
+    first: IntArray, destination: IntArray, cost: IntArray, events: AnyArray, t: int, busy: Any
+) -> None:
     """Let each core process the input events of a step."""
     if t < events.shape[1]:
         for channel in range(first.size - 1):
@@ -62,7 +64,12 @@ def _inject(first: IntArray, destination: IntArray, cost: IntArray, events: AnyA
 
 @compiled
 def _list_messages(
-    tables: Tables, row: AnyArray, worked: AnyArray, delivery: IntArray, generation: IntArray, queue: IntArray
+    tables: Tables,
+    row: AnyArray,
+    worked: AnyArray,
+    delivery: IntArray,
+    generation: IntArray,
+    queue: IntArray,
 ) -> None:
     """List what each core sends in a step: delivery (-1 for work after its last message) and time it takes."""
     start = tables.start
@@ -229,4 +236,6 @@ def schedule(
         free = spent[t, cores:]
         _inject(first, destination, cost, events, t, free)
         _list_messages(tables, fired[t], updated[t], delivery, generation, queue)
-        blocked[t], peak[t] = _send_all(tables, delivery, generation, queue, received, later, load, done, free)
+        blocked[t], peak[t] = _send_all(
+            tables, delivery, generation, queue, received, later, load, done, free
+        )

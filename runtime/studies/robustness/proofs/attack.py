@@ -16,7 +16,9 @@ CANDIDATES = 2000
 ROUNDS = 6
 
 
-def attack(machine: Machine, channels: EventArray, votes: IntArray, cells: Cells, effects: Effects) -> IntArray:
+def attack(
+    machine: Machine, channels: EventArray, votes: IntArray, cells: Cells, effects: Effects
+) -> IntArray:
     """Entries whose flips together alter the decision of a recording (channels, steps); empty if none do.
 
     Those that cost the decision most votes against one class are taken, none while another still has an
@@ -84,7 +86,9 @@ def _against(
     return None
 
 
-def _without_idle(machine: Machine, channels: EventArray, votes: IntArray, cells: Cells, taken: IntArray) -> IntArray:
+def _without_idle(
+    machine: Machine, channels: EventArray, votes: IntArray, cells: Cells, taken: IntArray
+) -> IntArray:
     """Entries whose flips still alter the decision when none can be dropped alone."""
     while len(taken) > 1:
         fewer = [np.delete(taken, place) for place in range(len(taken))]

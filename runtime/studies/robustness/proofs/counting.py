@@ -115,7 +115,9 @@ def least(
     """
     recording = recording[: tally.channels]  # without clocks
     ramp = tally.slope * np.arange(1, tally.steps + 1)
-    membranes = tally.of(slice(None), tally.events(recording)[:, tally.group]) + ramp[:, None]  # without a reset
+    membranes = (
+        tally.of(slice(None), tally.events(recording)[:, tally.group]) + ramp[:, None]
+    )  # without a reset
     above = membranes > tally.threshold
     crossing = np.where(above.any(axis=0), above.argmax(axis=0), tally.steps)
     last = int(cells.cells[-1, 1])
@@ -193,14 +195,20 @@ def _against(
     most: int,
 ) -> tuple[int, IntArray] | None:
     """Fewest events, up to `most`, with which a class overtakes the decision after the step `last`, and which."""
-    wanted = [(option.cost, int(option.gain[decision]), int(option.gain[other])) for each in options for option in each]
+    wanted = [
+        (option.cost, int(option.gain[decision]), int(option.gain[other]))
+        for each in options
+        for option in each
+    ]
     lead = np.zeros(most + 1, np.int64)
     tie = tally.slope if other < decision else 0
     for each in options:
         before = lead.copy()
         for option in each:
             gain = int(option.gain[other] - option.gain[decision])
-            lead[option.cost :] = np.maximum(lead[option.cost :], before[: max(most + 1 - option.cost, 0)] + gain)
+            lead[option.cost :] = np.maximum(
+                lead[option.cost :], before[: max(most + 1 - option.cost, 0)] + gain
+            )
     # no class that comes before the decision has to cross if no sum does
     silent = tally.threshold - tally.slope * tally.steps if other == 0 else -FAR
     if most < 1 or (lead[-1] + sums[other] - sums[decision] <= -tie and silent == -FAR):
@@ -224,7 +232,9 @@ def _against(
                 best[better], choice[better] = moved[better], index
         trail.append(choice)
     ours = sums[decision] + unit * (np.arange(best.shape[1]) - reach)
-    level = tally.threshold - tally.slope * (np.arange(last, tally.steps) + 1)  # of a sum that crosses in each step
+    level = tally.threshold - tally.slope * (
+        np.arange(last, tally.steps) + 1
+    )  # of a sum that crosses in each step
     for count in range(1, most + 1):
         hit = best[count] > -FAR // 2
         # the first step in which the decision crosses; before it, or with it for a lower class, the other
