@@ -241,7 +241,10 @@ def test_a_network_that_is_trained_by_gradients(few, monkeypatch):
     found = as_json(*words, "--budget", "certified=1")
     network, stored = found["tried"]
     assert all(0.01 < each["certified"] <= 1 for each in found["tried"])
-    assert "no single event alters" in (few / "a.html").read_text()
+    written = (few / "a.html").read_text()
+    assert "no single event alters" in written
+    assert "not tried to the end: 2 networks trained by gradients, the longest (mlp" in written
+    assert "for 2 epochs, held against 100 %" in written
     assert (network["system"], network["rung"], "storage" in network, stored["storage"]) == (
         "mlp",
         3,

@@ -121,7 +121,8 @@ def test_several_grasps_are_runs_of_their_own(lively_file, lines):
     grasps = [random_events(seed, length) for seed, length in ((1, 40), (2, 25), (3, 33))]
     first, second, third = (as_lines(events) for events in grasps)
     header = f"{HEADER.upper()}\n"
-    content = f"\ufeff# first\n\n# {header}# {header}{first}\n{header}{second}# pause\nreset\n\n   \nreset\n{third.rstrip()}"
+    content = f"\ufeff# first\n\n# {header}# {header}{first}\n{header}{second}# pause\n"
+    content += f"reset\n\n   \nreset\n{third.rstrip()}"
     for text in (content, content.replace("\n", "\r\n"), content.replace(",", " ,  ")):
         found = objects(lively_file, lines(text))
         shown = [(grasp["grasp"], grasp["bins"], grasp["counts"]) for grasp in found["grasp"]]

@@ -82,7 +82,7 @@ from spikeloom.compiler.systems import (
     shape_faults,
 )
 from spikeloom.compiler.targets.loihi1.registers import THRESHOLD_MANTISSA_MAX, plane_distance
-from spikeloom.compiler.types import AnyArray, IntArray
+from spikeloom.compiler.types import AnyArray, IntArray, JsonObject
 
 FORMAT = "spikeloom-checkpoint"
 VERSION = 6
@@ -196,20 +196,22 @@ def save_checkpoint(
         manifest["grid"] = grid.to_json()
     if forms is not None:
         layers = ["conv1", *(f"fc{stage}" for stage in range(1, stages + 1))]
-        manifest["forms"] = [
-            {
-                "layer": layer,
-                "bits": form.bits,
-                "exponents": list(form.exponents),
-                "threshold": form.threshold.tolist(),
-            }
-            for layer, form in zip(layers, forms, strict=True)
-        ]
+        manifest["forms"] = [_form_entry(layer, form) for layer, form in zip(layers, forms, strict=True)]
     manifest["sha256"] = content_digest(manifest, arrays)
     members: dict[str, bytes | str] = {"manifest.json": json.dumps(manifest, indent=1, allow_nan=False)}
     content = zip_bytes(members | {f"{name}.npy": npy_bytes(array) for name, array in arrays.items()})
     with write_atomically(path) as file:
         file.write(content)
+
+
+def _form_entry(layer: str, form: Form) -> JsonObject:
+    """How a layer is stored, as JSON values."""
+    return {
+        "layer": layer,
+        "bits": form.bits,
+        "exponents": list(form.exponents),
+        "threshold": form.threshold.tolist(),
+    }
 
 
 def save_again(path: str | os.PathLike[str], checkpoint: Checkpoint, *, training: Mapping[str, Any]) -> None:

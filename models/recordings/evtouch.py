@@ -205,7 +205,8 @@ def parse_width(source: str, members: Members, recording: str) -> float | None:
 
 def other_taxels(found: int, wanted: int) -> str:
     """What is said of recordings of another sensor."""
-    return f"has {found} taxels, the network has {wanted}; use recordings of its sensor, or train on these with --taxels"
+    remedy = "use recordings of its sensor, or train on these with --taxels"
+    return f"has {found} taxels, the network has {wanted}; {remedy}"
 
 
 def parse_bins(where: str, opener: Callable[[], IO[Any]], taxels: int | None) -> EventArray:

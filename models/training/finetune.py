@@ -96,8 +96,8 @@ def finetune(
     """
     require_least({"epochs": epochs, "seed": seed}, epochs=1, seed=0)
     require_chance(robust)
-    packings = [Packing(bits=width, groups=groups) for width in bits or ()]
-    storage = Fixed(tuple(packings)) if packings else Cheapest()
+    packings = tuple(Packing(bits=width, groups=groups) for width in bits or ())
+    storage = Fixed(packings) if packings else Cheapest()
     options = Options(storage=storage, keep_all=True, training_events=training.events)
     chosen = compile_network(network, options, target=target).integer
     released = has_released_dynamics(network)
@@ -108,13 +108,8 @@ def finetune(
         net.start_at(chosen)
         net.make_legal()
         identity = _identity(net, training, test)
-        identity |= {
-            "chip": target.name,
-            "scale groups": groups,
-            "epochs": epochs,
-            "seed": seed,
-            "robust": robust,
-        }
+        identity |= {"chip": target.name, "scale groups": groups}
+        identity |= {"epochs": epochs, "seed": seed, "robust": robust}
         course = Course(
             options=identity,
             network=net,

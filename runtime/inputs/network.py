@@ -66,7 +66,10 @@ class LoadedNetwork:
                 value_here = getattr(ours, name)
                 due = getattr(layer, name, value_here)
                 if due != value_here:
-                    return f"{layer.name} was compiled with {name} {due:g}, this has {value_here:g}; give --{name} {due:g}"
+                    remedy = f"give --{name} {due:g}"
+                    return (
+                        f"{layer.name} was compiled with {name} {due:g}, this has {value_here:g}; {remedy}"
+                    )
         return None
 
     def require_same(self, path: str, netlist: Netlist, run: int) -> None:

@@ -94,7 +94,8 @@ def sweep(
         waiting = [first[key] for key in keys if key not in results]
 
         def standing() -> str:
-            return f"{sum(key in results for key in keys)} of {len(keys)} measurements of this stage are kept in {store}"
+            done = sum(key in results for key in keys)
+            return f"{done} of {len(keys)} measurements of this stage are kept in {store}"
 
         progress = Progress(len(waiting))
         try:

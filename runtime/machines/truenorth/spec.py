@@ -159,6 +159,15 @@ def injected(netlist: CrossbarNetlist, events: EventArray) -> defaultdict[int, l
     return due
 
 
+def _voting(netlist: CrossbarNetlist, ticks: int, steps: int) -> BoolArray:
+    """Which spikes vote, (ticks, neurons): those of read-out neurons, in its window."""
+    tick = np.arange(ticks)[:, None]
+    last = netlist.readout_first + steps * netlist.bin_ticks
+    window = (tick >= netlist.readout_first) & (tick < last)
+    voting: BoolArray = window & (netlist.readout_class >= 0)
+    return voting
+
+
 def simulate(netlist: CrossbarNetlist, events: EventArray) -> Trace:
     """Run one recording (n_inputs, T), uint8 or bool, through the cores of a network that breaks no rule of its chip.
 
@@ -175,18 +184,15 @@ def simulate(netlist: CrossbarNetlist, events: EventArray) -> Trace:
 
     # the crossing points of each axon, as pairs of neuron and weight
     points: list[list[tuple[int, int]]] = [[] for _ in range(netlist.n_axons)]
-    for axon, neuron in zip(
-        netlist.axon_of_synapse().tolist(), netlist.neuron_of_synapse().tolist(), strict=True
-    ):
+    crossing = np.stack([netlist.axon_of_synapse(), netlist.neuron_of_synapse()], axis=1)
+    for axon, neuron in crossing.tolist():
         points[axon].append((neuron, int(netlist.weight[neuron, netlist.axon_type[axon]])))
 
     # what leads to the axons: from outside by tick, from neurons by their wires
     due = injected(netlist, events)
-    wired = netlist.aims()[2].tolist()
     wires: list[list[tuple[int, int]]] = [[] for _ in neurons]
-    for source, axon, delay in zip(
-        netlist.wire_neuron.tolist(), wired, netlist.wire_delay.tolist(), strict=True
-    ):
+    wired = np.stack([netlist.wire_neuron, netlist.aims()[2], netlist.wire_delay], axis=1)
+    for source, axon, delay in wired.tolist():
         wires[source].append((axon, delay))
 
     spikes = np.zeros((ticks, len(neurons)), np.bool_)
@@ -217,14 +223,10 @@ def simulate(netlist: CrossbarNetlist, events: EventArray) -> Trace:
                 for axon, delay in wires[n]:
                     due[tick + delay].append(axon)
 
-    tick_of = np.arange(ticks)[:, None]
-    window = (tick_of >= netlist.readout_first) & (
-        tick_of < netlist.readout_first + steps * netlist.bin_ticks
-    )
     counts = Counts(
         ticks=np.array(ticks, np.int64),
         spikes=spikes.sum(axis=0, dtype=np.int64),
-        votes=(spikes & window & (netlist.readout_class >= 0)).sum(axis=0, dtype=np.int64),
+        votes=(spikes & _voting(netlist, ticks, steps)).sum(axis=0, dtype=np.int64),
         axons=np.array(axons, np.int64),
         merged=np.array(merged, np.int64),
         overflows=np.array(overflows, np.int64),

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
+from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.report import html
 from spikeloom.runtime.report.drawing import COLOURS, Drawing, sheet, styled
@@ -99,7 +100,7 @@ def _why(result: Smallest) -> Iterator[str]:
     whole = f"; to the end {_spent(replace(chosen, costs=chosen.whole))}" if chosen.whole else ""
     yield f"take {_named(chosen)} (95 % interval {_interval(chosen)}), {_spent(chosen)}{whole}"
     if chosen.number == best.number:
-        yield "it is the best of them, and nothing cheaper is as good"
+        yield "it is the best of what was tried, and nothing cheaper that was tried is as good"
     else:
         ahead = f"recording by recording it is {_behind(chosen)} % ahead (± standard error)"
         yield f"the best is {_named(best)} for {_spent(best)}; {ahead}"
@@ -108,11 +109,27 @@ def _why(result: Smallest) -> Iterator[str]:
             other = result.candidate(index)
             yield f"by the table {table} it would be {_named(other)}, {_spent(other)}"
     if choice.ahead is None:
-        yield "no candidate is 1 % more accurate"
+        yield "nothing that was tried is 1 % more accurate"
     else:
         more = result.candidate(choice.ahead)
         times = energy(more) / energy(chosen)
         yield f"1 % more accuracy costs {times:.1f} times the energy: {_named(more)}, {_spent(more)}"
+    yield _unfinished(result)
+
+
+def _unfinished(result: Smallest) -> str:
+    """Which families were not tried to the end: a search trains for a few epochs and looks at no learning curve."""
+    trained = [each for each in result.tried if each.candidate.system != COUNTING and not each.refused]
+    if not trained:
+        return "not tried: networks trained by gradients"
+    longest = max(trained, key=lambda each: (each.rung, each.setting))
+    epochs = number(int(longest.setting), "epoch")
+    decided = 100 * sum(map(bool, longest.tried)) / len(longest.tried)
+    return (
+        f"not tried to the end: {number(len(trained), 'network')} trained by gradients, the longest "
+        f"({longest.candidate.name}) for {epochs}, held against {decided:.0f} % of the recordings; trained longer, "
+        "one may decide better: compare with spikeloom train"
+    )
 
 
 def _needless(result: Smallest) -> str:
