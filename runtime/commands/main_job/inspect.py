@@ -16,11 +16,11 @@ from spikeloom.runtime.inputs.files import require_inspectable, shipped
 from spikeloom.runtime.inputs.network import COUNTING
 from spikeloom.runtime.inputs.repeat import NETWORK, refuse
 from spikeloom.runtime.machines.backends import describe, trained_for
+from spikeloom.runtime.report.checkpoints import LayerSize, tower_line
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.requests.main_job import InspectRequest
-from spikeloom.runtime.studies.training.joining import LayerSize, tower_line
 
 CLOCKING = ("parts", "bins", "steps", "ramp")
 """What a counting network says of time."""

@@ -14,6 +14,7 @@ from spikeloom.compiler.types import JsonObject
 from spikeloom.runtime.inputs.checkpoint import load_checkpoint
 from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.inputs.recordings import origin_of
+from spikeloom.runtime.report.checkpoints import LayerSize, tower_line
 from spikeloom.runtime.report.sections import Section, Text
 from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.requests.choices import CheckpointChoice
@@ -31,14 +32,6 @@ KEPT = (
     "fine_tuned_from",
 )
 """Parts of a network's training record that the joined one keeps, beside what the chosen weights reached."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LayerSize:
-    """Neurons of a layer."""
-
-    name: str
-    neurons: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -130,9 +123,3 @@ def sections(result: Joined) -> Iterable[Section]:
     lines = [result.command, f"  {len(result.towers)} towers: {layers}, {result.classes} classes"]
     lines += [f"    {index}: {tower_line(tower)}" for index, tower in enumerate(result.towers)]
     yield Section("Joined", [Text("\n".join([*lines, f"  written: {result.file}"]))])
-
-
-def tower_line(tower: Mapping[str, Any]) -> str:
-    """Where a tower of a joined network is from, in one line."""
-    notes = (f"{key} {tower[key]}" for key in ("weights", "seed", "sha256") if key in tower)
-    return f"{tower.get('file')}, {', '.join(notes)}"
