@@ -349,15 +349,10 @@ def run_layer(
                 clear(sums)
             at = recording * steps + t
             now = fired[recording % kept, t % last]
+            earlier = fired[recording % kept, (t - 1) % last]
             arrive(arriving, synapses, raster.source, raster.bounds[at], raster.bounds[at + 1])
             if len(own.run) and t:  # a plain 0 is a type of its own: all would be compiled once more
-                arrive(
-                    arriving,
-                    own,
-                    before,
-                    np.int64(0),
-                    list_fired(fired[recording % kept, (t - 1) % last], before),
-                )
+                arrive(arriving, own, before, np.int64(0), list_fired(earlier, before))
             if len(registers) == 3:
                 integrate_float(membrane, current, bias, registers[1], registers[2], now)
             else:

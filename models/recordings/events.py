@@ -62,11 +62,10 @@ def load_data(
 
     The path is a folder or zip in the released layout; a folder of ``.csv``, ``.npz`` and ``.npy``
     recordings, flat (it stands for any split) or with ``train/`` and ``test/``; one such file; or the name
-    of a data set that was fetched. `bin_s` is the width of a time bin in seconds, by default
-    `default_bin_s`; the released layout and ``.npy`` files have bins already, see `require_events`. The
-    network expects so many `taxels` and `classes`; without `taxels` the highest taxel with an event decides.
-    Labels are `UNLABELLED` where nothing says them, see `need_labels`. In the released layout all recordings
-    have labels, the same steps and taxels, and no counts.
+    of a fetched data set. `bin_s` is the width of a time bin in seconds, by default `default_bin_s`; the
+    released layout and ``.npy`` files have bins already, see `require_events`. `taxels` and `classes` are
+    the network's; without `taxels` the highest with an event decides. Labels are `UNLABELLED` where nothing
+    says them. In the released layout all recordings have labels, the same steps and taxels, and no counts.
 
     DataError if a recording cannot be used; OptionError if `bin_s` or `limit` cannot be, or bins are there.
     """
@@ -76,9 +75,8 @@ def load_data(
     with _data_set(place, split) as (members, splits):
         if split not in splits and "" not in splits:
             present = ", ".join(sorted(splits))
-            raise DataError(
-                f"{source}: split {split!r} is missing or empty; splits with recordings: {present}"
-            )
+            fault = f"split {split!r} is missing or empty"
+            raise DataError(f"{source}: {fault}; splits with recordings: {present}")
         folder = split if split in splits else ""
         chosen = sorted(splits[folder].items())[:limit]
         binned = all(name.lower().endswith(".npy") for name, _ in chosen)
@@ -89,8 +87,8 @@ def load_data(
         files = [(place.parent if place.is_file() else place) / member for _, member in chosen]
         table, notes = labels_beside(place, files, source)
         released = bool(folder) and binned
-        read: list[_Recording] = []
         size = 0
+        read: list[_Recording] = []
         for file, (name, member) in zip(files, chosen, strict=True):
             where = source if place == file else f"{source}: {Path(folder, name).as_posix()}"
             read.append(_read(file, members[member], where, width, taxels, table.get(file)))

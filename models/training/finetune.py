@@ -107,11 +107,10 @@ def finetune(
         rate = LEARNING_RATE if released else GENTLE_RATE
         net.start_at(chosen)
         net.make_legal()
-        identity = _identity(net, training, test)
-        identity |= {"chip": target.name, "scale groups": groups}
-        identity |= {"epochs": epochs, "seed": seed, "robust": robust}
+        settings = {"chip": target.name, "scale groups": groups, "epochs": epochs}
+        settings |= {"seed": seed, "robust": robust}
         course = Course(
-            options=identity,
+            options=_identity(net, training, test) | settings,
             network=net,
             optimizer=torch.optim.Adam(net.parameters(), lr=rate, amsgrad=True),
             draw=np.random.default_rng(seed),
@@ -126,14 +125,16 @@ def finetune(
             lambda index: _run_epoch(course, net, training, teacher, robust, rate, index, epochs),
             state=state,
             after_epoch=after_epoch,
-            shown=lambda epoch: {
-                "loss": f"{epoch.loss:.4f}",
-                "training": f"{epoch.correct}/{len(training)}",
-            },
+            shown=lambda epoch: _shown(epoch, len(training)),
             label="finetune",
         )
         _, after = evaluate(net, test)
     return Tuned(net=net, history=tuple(course.history), before=before, after=after)
+
+
+def _shown(epoch: TunedEpoch, recordings: int) -> dict[str, str]:
+    """What the bar says after an epoch."""
+    return {"loss": f"{epoch.loss:.4f}", "training": f"{epoch.correct}/{recordings}"}
 
 
 def _identity(net: QuantisedNet, training: Recordings, test: Recordings) -> JsonObject:

@@ -1,9 +1,8 @@
 """A netlist as an integer ONNX graph: the chip's arithmetic, to be run by any program that reads the format.
 
-Spikes are uint8 zeros and ones; membranes and currents are registers, int32 where no input can bring a
-product or a sum beyond it and int64 otherwise. A layer is called by its name (``conv1``, ``fc1`` …), its
-neurons are those that the chip holds, in the order of the layer; the metadata list them where some were left
-out.
+Spikes are uint8 zeros and ones; membranes and currents are registers, int32 where no input can bring a product or a
+sum beyond it and int64 otherwise. A layer is called by its name (``conv1``, ``fc1`` …), its neurons are those that the
+chip holds, in the order of the layer; the metadata list them where some were left out.
 
 Form ``step``: one chip step. Feed every output ``X_next`` back as input ``X``; at the start all are zero.
 
@@ -17,13 +16,13 @@ Form ``step``: one chip step. Feed every output ``X_next`` back as input ``X``; 
 ``votes``              (batch, classes)   int32, summed up; only where a layer votes
 ====================== ================== =============================================================================
 
-Weights become matrices of int8 digits: ``weight = unit * sum_k digit_k * 256**k`` with digits from -128 to
-127 and a unit for each neuron. A product of spikes (0 and 1) with digits is ``MatMulInteger``, exact in its
-int32 sums and faster than float32: most netlists need a single digit. Weights that several synapses of a
-pair store (planes) are added up first.
+Weights become matrices of int8 digits: ``weight = unit * sum_k digit_k * 256**k`` with digits from -128 to 127 and a
+unit for each neuron. A product of spikes (0 and 1) with digits is ``MatMulInteger``, exact in its
+int32 sums and faster than float32: most netlists need a single digit. Weights that several synapses of a pair store
+(planes) are added up first.
 
-Form ``scan``: whole recordings of the same length, a loop over the form ``step``. Everything is aligned with
-the data: ``LAYER.spikes[t]`` is what the layer did with data step ``t``, in chip step ``t + depth``.
+Form ``scan``: whole recordings of the same length, a loop over the form ``step``. Everything is aligned with the data:
+``LAYER.spikes[t]`` is what the layer did with data step ``t``, in chip step ``t + depth``.
 
 ====================== ======================= ========================================================================
 ``events``             (time, batch, channels) input, uint8

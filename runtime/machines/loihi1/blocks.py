@@ -95,11 +95,9 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
 
     # links: the rows of a block by words of sources
     words = width // LANES
-    links, first_row, link = np.unique(
-        row_block * words + row_source // LANES, return_index=True, return_inverse=True
-    )
+    word = row_block * words + row_source // LANES
+    links, first_row, link = np.unique(word, return_index=True, return_inverse=True)
     linked = _joined(link, row_source % LANES, len(links))
-
     size = len(seats.layer) * LANES
     bias = np.zeros(size, np.int32)
     threshold = np.full(size, NEVER, np.int32)

@@ -187,10 +187,9 @@ def simulate(
     spikes: bool = False,
     membranes: bool = False,
 ) -> Trace:
-    """Run recordings (samples, n_inputs, T) through the cores, as :func:`spec.simulate` does each.
+    """Run recordings (samples, n_inputs, T), each as :func:`spec.simulate` does; `lengths` (samples,) are their steps.
 
-    `lengths` (samples,) are their data steps where some are shorter than T. Spikes and membranes are kept
-    where they are wanted, at one and four bytes a neuron and tick.
+    Spikes and membranes are kept where they are wanted, at one and four bytes a neuron and tick.
 
     DataError if the recordings have another number of input channels than the network. NumericRangeError if
     they would take more ticks than a run can count.

@@ -28,6 +28,26 @@ LOSS = 0.01
 """Accuracy that may be given up for less energy: a point."""
 
 
+def _point(
+    number: int, axes: Mapping[str, Any], measured: work.Measurement, built: work.Built, window: Any
+) -> Point:
+    """A configuration that the chip holds, run on a share of the recordings."""
+    layout = axes["cores"]
+    return Point(
+        number=number,
+        **axes,
+        window=window,
+        n_cores=built.cores,
+        neurons=built.neurons,
+        synapses=built.synapses,
+        netlist=f"netlists/{measured.files[layout].name}",
+        netlist_sha256=built.sha256,
+        train=built.figures[window]["train"],
+        test=built.figures[window]["test"],
+        commands=work.commands(measured, layout, window),
+    )
+
+
 def chart(
     networks: Sequence[NetworkFile],
     target: Target,
@@ -60,22 +80,8 @@ def chart(
             if built.refused:
                 refused.append(Refused(**axes, why=built.refused))
                 continue
-            points += [
-                Point(
-                    number=number,
-                    **axes,
-                    window=window,
-                    n_cores=built.cores,
-                    neurons=built.neurons,
-                    synapses=built.synapses,
-                    netlist=f"netlists/{each.files[layout].name}",
-                    netlist_sha256=built.sha256,
-                    train=built.figures[window]["train"],
-                    test=built.figures[window]["test"],
-                    commands=work.commands(each, layout, window),
-                )
-                for number, window in enumerate(grid.window, len(points) + 1)
-            ]
+            for window in grid.window:
+                points.append(_point(len(points) + 1, axes, each, built, window))
     if not points:
         why = f"refuses all {len(refused)} configurations; the first: {refused[0].why[0]}"
         raise OptionError(f"--grid: {target.name} {why}")

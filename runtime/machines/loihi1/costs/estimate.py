@@ -71,11 +71,8 @@ def estimate(
     detailed: dict[str, list[DetailedTimes]] = {name: [] for name in latencies if deep}
     counts = []
     updates = []
-    entries = (
-        2 * netlist.n_compartments
-        if deep
-        else 8 * max(1, 0 if charges is None else charges.sources.shape[1])
-    )
+    charged_by = 0 if charges is None else charges.sources.shape[1]
+    entries = 2 * netlist.n_compartments if deep else 8 * max(1, charged_by)
     size = max(1, HELD // (entries * (events.shape[2] + netlist.drain)))
     for first in range(0, max(1, len(events)), size):
         part = slice(first, first + size)
@@ -88,26 +85,30 @@ def estimate(
             simple[name].append(timing.simple_times(tables, charged, chip_steps[part]))
         if trace.spikes is not None and trace.updated is not None:
             updates.append(cost.updates_by_core(netlist, trace.updated))
-            given = events[part] * (
-                np.arange(events.shape[2]) < steps[part, None, None]
-            )  # nothing after the end
+            within = np.arange(events.shape[2]) < steps[part, None, None]
+            run = trace.spikes, trace.updated, events[part] * within
             for name, times in detailed.items():
-                run = latencies[name], trace.spikes, trace.updated, given
-                times.append(timing.detailed(*run, steps=chip_steps[part]))
+                times.append(timing.detailed(latencies[name], *run, steps=chip_steps[part]))
         if progress is not None:
             progress(min(first + size, len(events)))
     whole = _joined(Counts, counts)
-    cores: Mapping[str, FloatArray] = {}
-    if deep:
-        by_core = replace(whole, updates=np.concatenate(updates))
-        cores = cost.price(cost.prepare(netlist, target, "core"), by_core, chip_steps).energy
+    by_core = replace(whole, updates=np.concatenate(updates)) if deep else None
     return Trace(counts=whole, spikes=None, membranes=None), Estimate(
         costs=cost.price(cost.prepare(netlist, target), whole, chip_steps),
         steps=steps + netlist.blank,
         simple={name: _joined(SimpleTimes, times) for name, times in simple.items()},
         detailed={name: _joined(DetailedTimes, times) for name, times in detailed.items()},
-        cores=cores,
+        cores=_core_energies(netlist, target, by_core, chip_steps),
     )
+
+
+def _core_energies(
+    netlist: Netlist, target: Target, by_core: Counts | None, chip_steps: IntArray
+) -> Mapping[str, FloatArray]:
+    """Joules of each core, where updates were counted by core."""
+    if by_core is None:
+        return {}
+    return cost.price(cost.prepare(netlist, target, "core"), by_core, chip_steps).energy
 
 
 def _joined(kind: type[T], parts: Sequence[T]) -> T:

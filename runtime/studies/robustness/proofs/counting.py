@@ -232,9 +232,8 @@ def _against(
                 best[better], choice[better] = moved[better], index
         trail.append(choice)
     ours = sums[decision] + unit * (np.arange(best.shape[1]) - reach)
-    level = tally.threshold - tally.slope * (
-        np.arange(last, tally.steps) + 1
-    )  # of a sum that crosses in each step
+    # of a sum that crosses in each step
+    level = tally.threshold - tally.slope * (np.arange(last, tally.steps) + 1)
     for count in range(1, most + 1):
         hit = best[count] > -FAR // 2
         # the first step in which the decision crosses; before it, or with it for a lower class, the other
