@@ -286,9 +286,11 @@ def smallest(
     output: str,
     *,
     bin: float | None = None,
+    groups: str | None = None,
     target: str = DEFAULT_TARGET,
     budget: str | Sequence[str] = (),
     levels: int | None = None,
+    time: str | None = None,
     store: str | None = None,
     jobs: int | None = None,
     html: str | None = None,
@@ -297,7 +299,7 @@ def smallest(
     edges: str | None = None,
     directed: bool = False,
 ) -> Smallest:
-    """Find the cheapest network that does the job, among counting networks and some that are trained; write it.
+    """Find the cheapest network that does the job, among counting networks and networks that are trained; write it.
 
     Raises
     ------

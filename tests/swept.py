@@ -31,8 +31,6 @@ def square(job: Square) -> dict[str, Any]:
     match payload.get("trouble"):
         case "die":
             os.kill(os.getpid(), signal.SIGKILL)
-        case "stop" if begun(payload["log"]).count(number) == 1:
-            os.kill(os.getpid(), signal.SIGSTOP)
         case "data":
             raise DataError("x.zip: is empty; give another")
         case "interrupt":

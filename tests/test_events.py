@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from oracles import refused
 
 from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.models.recordings.conditions import conditions
 from spikeloom.models.recordings.counts import GAP_S
 from spikeloom.models.recordings.eventfiles import EventStream, read_stream
 from spikeloom.models.recordings.events import MAX_STEPS, bin_events, data_splits, load_data, need_labels
@@ -365,7 +366,45 @@ def test_a_table_gives_labels(listed):
     recordings = load_data(folder)
     assert recordings.files == ("a.csv", "b_label_2.csv", "c.csv")
     assert recordings.labels.tolist() == [7, 2, UNLABELLED]
-    assert recordings.counts.notes == ("own: labels.csv: gives the labels of 2 of 3 recordings",)
+    assert recordings.counts.notes == ("own: labels.csv: describes 2 of 3 recordings",)
+
+
+def test_a_table_names_classes_and_conditions(listed):
+    rows = "a.csv,wood,10,left\nb_label_2.csv,cork,9,\nc.csv,cork,10,left\n"
+    folder = listed("own/recordings.csv", f"file,label,speed,hand\n{rows}").parent
+    (folder / "b_label_2.csv").rename(folder / "b.csv")
+    (folder / "recordings.csv").write_text((folder / "recordings.csv").read_text().replace("b_label_2", "b"))
+    recordings = load_data(folder)
+    assert recordings.labels.tolist() == [1, 0, 0]  # in the order of their names
+    assert recordings.groups == {"speed": ("10", "9", "10")}  # not every recording has a hand
+    found = conditions(recordings.part([0, 1]))
+    assert {name: held.tolist() for name, held in found["speed"].items()} == {
+        "speed=9": [False, True],
+        "speed=10": [True, False],
+    }
+    assert conditions(recordings.part([0, 2])) == {}
+    line = (
+        "own: b.csv: has no hand; --groups names columns of recordings.csv, or fields of file names as in "
+    )
+    assert message(load_data, folder, groups=["hand"]) == f"{line}hand3_label_7.csv"
+
+
+def test_conditions_in_file_names(write):
+    for index in range(20):
+        write(f"own/speed{index}_force0.5_label_1.csv", HEADER + "0,0,1\n")
+    recordings = load_data(tmp := write("own/speed3_force1.0_label_1.csv", HEADER + "0,0,1\n").parent)
+    assert recordings.groups == {}
+    recordings = load_data(tmp, groups=["force", "speed"])
+    found = conditions(recordings)
+    assert list(found["force"]) == ["force=0.5", "force=1.0"]
+    assert [int(held.sum()) for held in found["speed"].values()] == [
+        5,
+        4,
+        4,
+        4,
+        4,
+    ]  # many are dealt into parts
+    assert sum(held.astype(int) for held in found["speed"].values()).tolist() == [1] * 21
 
 
 def test_a_table_above_the_splits(write):
@@ -380,9 +419,10 @@ def test_a_table_above_the_splits(write):
 @pytest.mark.parametrize(
     ("rows", "line"),
     [
-        ("b_label_2.csv,3\n", "own: b_label_2.csv: label 2, and 3 in labels.csv; fix one of them"),
-        ("a.csv,x\n", "own: labels.csv: row 2: 'a.csv', label 'x'; give a file and a number from 0"),
-        ("a.csv,1\na.csv,2\n", "own: labels.csv: row 3: a.csv has labels 1 and 2; keep one"),
+        ("b_label_2.csv,3\n", "own: b_label_2.csv: label 2, and 3 in its table; fix one of them"),
+        ("a.csv,x\nc.csv,-1\n", "own: labels.csv: label '-1'; give numbers from 0, or names, in all rows"),
+        ("a.csv,1\na.csv,2\n", "own: labels.csv: row 3: a.csv stands there twice; keep one of the rows"),
+        ("a.csv\n", "own: labels.csv: row 2: ['a.csv']; give a file, and a value in each column"),
     ],
 )
 def test_a_table_that_cannot_be(listed, rows, line):

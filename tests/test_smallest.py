@@ -13,7 +13,9 @@ from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.models.training import record
 from spikeloom.models.training.counters import Plan, counters_of, fit, run_counters
 from spikeloom.runtime.commands.choose import smallest
+from spikeloom.runtime.commands.options import request_of
 from spikeloom.runtime.inputs import recordings as recordings_input
+from spikeloom.runtime.requests.training import TrainRequest
 from spikeloom.runtime.studies.counting import decisions_of
 from spikeloom.runtime.studies.search.budgets import parse_budgets
 from spikeloom.runtime.studies.search.choice import lead
@@ -21,6 +23,7 @@ from spikeloom.runtime.studies.search.results import NetlistCosts
 from spikeloom.runtime.studies.smallest import baselines, space, study, work
 from spikeloom.runtime.studies.smallest.results import Tried
 from spikeloom.runtime.studies.smallest.space import Candidate
+from spikeloom.runtime.studies.training.plan import recipe_of
 
 RECORDINGS = 40
 UJ = 1e-6
@@ -64,6 +67,17 @@ def budgets(*words):
     return parse_budgets(words, study.LIMITS)
 
 
+@pytest.fixture
+def any_margin(monkeypatch):
+    """One of these recordings is more than the margin."""
+    monkeypatch.setattr(study, "MARGIN", 1.0)
+
+
+def test_the_margin():
+    assert study.pick(POOL, ()).cheapest == {"one": 1, "two": 1}
+
+
+@pytest.mark.usefixtures("any_margin")
 def test_the_cheapest_that_is_not_shown_to_be_worse():
     found = study.pick(POOL, ())
     assert (found.best, found.cheapest, found.allowed, found.fits) == (
@@ -76,9 +90,8 @@ def test_the_cheapest_that_is_not_shown_to_be_worse():
     ahead, error = lead(POOL[0].shares, POOL[3].shares)
     wrong = np.repeat([1.0, 0.0], [4, 36])
     assert (ahead, error) == (pytest.approx(0.1), pytest.approx(wrong.std(ddof=1) / np.sqrt(40)))
-    shifted = tried(
-        6, 32, UJ, order=8
-    )  # as good as number 4, wrong elsewhere: less is known of the difference
+    # as good as number 4, wrong elsewhere: less is known of the difference
+    shifted = tried(6, 32, UJ, order=8)
     assert not study.worse(tried(1, 33, UJ), shifted)
     assert study.pick([POOL[0], POOL[3]], ()).cheapest["one"] == 1
 
@@ -92,6 +105,7 @@ def test_the_difference_is_of_recordings_that_both_decided():
     assert (ahead, error) == (pytest.approx(0.3), pytest.approx(0.3))
 
 
+@pytest.mark.usefixtures("any_margin")
 @pytest.mark.parametrize(
     ("words", "chosen", "fits"),
     [
@@ -108,6 +122,7 @@ def test_budgets(words, chosen, fits):
     assert (found.cheapest["one"], found.fits, found.budgets) == (chosen, fits, tuple(words))
 
 
+@pytest.mark.usefixtures("any_margin")
 def test_decisions_that_no_event_alters_are_a_budget():
     pool = [
         replace(each, certified=share) for each, share in zip(POOL, (0.96, 0.8, 0.9, 0.5, None), strict=True)
@@ -165,8 +180,13 @@ def test_candidates_can_all_be_trained():
     few = next(space.counting(250, bits=5))
     for each, bits in ((every[0], (8, 5, 4)), (few, (5, 4, 3))):
         assert tuple(other.plan().bits for other in (each, *space.variants(each, 2))) == bits
-    (trained,) = space.variants(next(space.networks(250, ["mlp"])), 2)
-    assert (trained.storage, "weight" in " ".join(trained.words)) == (4, False)
+    systems = ("tactilesgnet", "mlp", "gcn", "grid-cnn")
+    trained = list(space.networks(250, systems))
+    assert len({each.name for each in trained}) == len(trained) > 30
+    assert {each.system for each in trained} == set(systems)
+    assert {each.options["join"] for each in space.networks(30, systems)} == {1}
+    for each in trained:
+        recipe_of(request_of(TrainRequest, [*each.words, "--data", "d", "-o", "o.pt"]))
 
 
 @pytest.fixture
@@ -179,7 +199,7 @@ def few(monkeypatch, tmp_path):
         recordings_input, "synthetic_split", lambda split, **_: synthetic_split(split, limit=90)
     )
     monkeypatch.setattr(work, "PRICED", 12)
-    monkeypatch.setattr(space, "NETWORKS", ())
+    monkeypatch.setattr(space, "SIZES", ())
     monkeypatch.setattr(baselines, "PARTS", (1,))
     monkeypatch.setattr(work, "ROUNDS", 2)
     monkeypatch.chdir(tmp_path)
@@ -226,37 +246,113 @@ def test_the_command(few, monkeypatch, target, table):
     assert "nothing fits" in run(*words, "--budget", "energy=1nJ")[1]
 
 
-def test_a_network_that_is_trained_by_gradients(few, monkeypatch):
+@pytest.fixture
+def trained(few, monkeypatch):
+    """Two networks that are trained by gradients, for a few epochs, and no others."""
     monkeypatch.setattr(smallest, "counting", lambda *_: [])
-    monkeypatch.setattr(space, "NETWORKS", (("mlp", 10, 4, "8,8"),))
-    monkeypatch.setattr(space, "EPOCHS", 2)
-    words = ["smallest", "--data", "synthetic", "--jobs", "1", "-o", "a.loom", "--html", "a.html"]
+    monkeypatch.setattr(space, "SIZES", (("mlp", 8, None, "8"), ("mlp", 4, None, "none")))
+    monkeypatch.setattr(space, "STEPS", (10, 10))
+    monkeypatch.setattr(space, "LASTING", ())
+    for module in (space, study, work):
+        monkeypatch.setattr(module, "EPOCHS", (2, 4, 8, 12))
+    return few
 
+
+WORDS = ("smallest", "--data", "synthetic", "--jobs", "1", "-o", "a.loom")
+
+
+def test_networks_that_are_trained_by_gradients(trained, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(record, "training_record", interrupt)
-        assert refusal(*words) == "interrupted; what was found is kept; go on with the same command"
-    found = as_json(*words, "--budget", "certified=1")
-    network, stored = found["tried"]
+        assert refusal(*WORDS) == "interrupted; what was found is kept; go on with the same command"
+    found = as_json(*WORDS, "--html", "a.html", "--budget", "certified=1")
+    large, small = found["tried"]
+    assert [each["name"] for each in (large, small)] == [
+        f"mlp recipe=rates join=10 features={features} hidden={hidden}"
+        for features, hidden in ((8, 8), (4, "none"))
+    ]
     assert all(0.01 < each["certified"] <= 1 for each in found["tried"])
-    written = (few / "a.html").read_text()
+    for each in (large, small):
+        assert [epochs for epochs, _ in each["curve"]] == [2, 4, 8, 12][: each["rung"]]
+        assert each["curve"][-1] == [each["setting"], each["accuracy"]]
+        assert each["finished"] == (each["rung"] == 3 or each["finished"])
+        assert each["costs"]["operations"] <= each["whole"]["operations"]
+    written = (trained / "a.html").read_text()
     assert "no single event alters" in written
-    assert "not tried to the end: 2 networks trained by gradients, the longest (mlp" in written
-    assert "for 2 epochs, held against 100 %" in written
-    assert (network["system"], network["rung"], "storage" in network, stored["storage"]) == (
-        "mlp",
-        3,
-        False,
-        4,
-    )
-    assert network["costs"]["operations"] <= network["whole"]["operations"]
-    assert len(found["baselines"]) in (0, 4)
-    netlist = (few / "a.loom").read_bytes()
-    assert run(*shlex.split(found["commands"][1])[1:])[0] == 0
-    assert (few / "a.loom").read_bytes() == netlist
-    assert "The smallest network for synthetic" in (few / "a.html").read_text()
+    assert "conditions not seen in training were not tested" in written
+    (family,) = found["families"]
+    assert ("mlp: tried to the end" in written) == family["finished"]
+    assert len(found["baselines"]) in (0, 5)
+    netlist = (trained / "a.loom").read_bytes()
+    for command in found["commands"][:2]:
+        assert run(*shlex.split(command)[1:])[0] == 0
+    assert (trained / "a.loom").read_bytes() == netlist
+    assert "The smallest network for synthetic" in written
+
+
+def test_a_crippled_network_is_not_called_tried_to_the_end(trained, monkeypatch):
+    monkeypatch.setattr(study, "TRAINED", {1: 1, 2: 1, 3: 1})
+    monkeypatch.setattr(space, "SIZES", (("gcn", 4, None, "none"), ("mlp", 4, None, "none")))
+    measure = work.measure
+
+    def cripple(job):
+        found = measure(job)
+        if job.candidate.system == "mlp":  # as if it learned, but late
+            keep = 0.2 * job.rung
+            right = np.array(found["right"])
+            right[int(keep * len(right)) :] = 0
+            found["right"] = right.tolist()
+        return found
+
+    monkeypatch.setattr(work, "measure", cripple)
+    status, text, _ = run(*WORDS, "--graph", "manual")
+    assert status == 0
+    assert "mlp: not tried to the end" in text
+    assert "more epochs still helped" in text
+
+
+@pytest.mark.usefixtures("trained")
+def test_time_that_is_up_is_said():
+    assert "--time: was too short" in refusal(*WORDS, "--time", "0.001s")
+    assert "--time 5: is no time" in refusal(*WORDS, "--time", "5")
+
+
+def test_conditions_are_left_out_in_turn(few):
+    data = few / "own"
+    table = ["file,label,hand"]
+    for split in ("train", "test"):
+        grasps = synthetic_split(split, limit=72)
+        (data / split).mkdir(parents=True)
+        for index, (events, label) in enumerate(zip(grasps.events, grasps.labels, strict=True)):
+            name = f"{split}{index}.npy"
+            np.save(data / split / name, events)
+            table.append(f"{split}/{name},class {label},{'left' if index % 3 else 'right'}")
+    (data / "recordings.csv").write_text("\n".join(table))
+    words = [
+        "smallest",
+        "--data",
+        data,
+        "--graph",
+        "manual",
+        "--taxels",
+        "39",
+        "--jobs",
+        "1",
+        "-o",
+        "a.loom",
+    ]
+    found = as_json(*words[:3], "--jobs", "1", "-o", "a.loom")
+    assert found["conditions"] == ["hand=left", "hand=right"]
+    chosen = found["tried"][found["choice"]["cheapest"]["davies2018"] - 1]
+    assert set(chosen["conditions"]) == {"hand=left", "hand=right"}
+    assert 0 < found["at_random"] <= 1
+    status, text, _ = run(*words[:3], "--jobs", "1", "-o", "a.loom")
+    assert status == 0
+    assert "left out in turn: hand=left, hand=right" in text
+    assert "with parts at random left out" in text
 
 
 @pytest.mark.usefixtures("few")

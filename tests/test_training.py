@@ -24,7 +24,6 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime import cli
-from spikeloom.runtime.studies import jobs as jobs_module
 from spikeloom.runtime.studies.jobs import only_one, sweep
 from spikeloom.runtime.studies.training import seeds as trainings
 
@@ -294,14 +293,11 @@ def test_a_process_that_dies_leaves_what_the_others_had(tmp_path):
     assert list(swept_here(tmp_path, points(tmp_path / "log", 6), jobs=2).values()) == expected(6)
 
 
-def test_a_process_that_is_stopped_without_dying_is_given_up_and_its_point_begun_again(
-    tmp_path, monkeypatch, capsys
-):
-    monkeypatch.setattr(jobs_module, "STILL_S", 2.0)
-    made = points(tmp_path / "log", 6, trouble={2: "stop"})
-    assert list(swept_here(tmp_path, made, jobs=2).values()) == expected(6)
-    assert "1 measurement stood still for 2 s: given up, and begun once more" in capsys.readouterr().err
-    assert sorted(begun(tmp_path / "log")) == [0, 1, 2, 2, 3, 4, 5]
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_nothing_is_begun_when_time_is_up(tmp_path, jobs):
+    made = points(tmp_path / "log", 3)
+    assert swept_here(tmp_path, made, jobs=jobs, until=time.monotonic()) == {}
+    assert begun(tmp_path / "log") == []
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

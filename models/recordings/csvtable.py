@@ -3,7 +3,8 @@
 A line holds numbers between commas. The first line may name the columns, in any order; without names they
 stand in the order that the reader asks for. Blank lines, and what follows a ``#``, do not count.
 
-A table of labels, ``labels.csv`` beside recordings, has lines ``file,label``.
+A table of recordings, ``recordings.csv`` or ``labels.csv`` beside them, has columns ``file`` and ``label``; others are
+groups, such as the speed and the force of a touch.
 """
 
 import csv
@@ -22,7 +23,7 @@ from spikeloom.models.recordings.counts import number
 
 MAX_TABLE_BYTES = 256 << 20  # some 15 million events
 
-LABELS = "labels.csv"
+TABLES = ("recordings.csv", "labels.csv")
 
 _FILE = ("file", "filename", "name", "recording")
 _LABEL = ("label", "class")
@@ -138,47 +139,70 @@ def _is_number(cell: str) -> bool:
 
 def is_table(file: Path) -> bool:
     """Whether a file is such a table, by its name."""
-    return file.name.lower() == LABELS
+    return file.name.lower() in TABLES
 
 
-def _read_labels(path: Path, where: str) -> Mapping[str, int] | None:
-    """Class by name of file in a table of labels; None if the file is another kind of table."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """What a table says of a recording: its class, if it says so, and its groups."""
+
+    label: int | None
+    groups: dict[str, str]
+
+
+NOTHING = Row(label=None, groups={})
+
+
+def _read_rows(path: Path, where: str) -> dict[str, Row] | None:
+    """Rows by name of file of a table of recordings; None if it is another kind of table.
+
+    Classes that are no numbers are numbered in the order of their names.
+    """
     rows = list(csv.reader(io.StringIO(read_text(path, where), newline="")))
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     files = [index for index, name in enumerate(header) if name in _FILE]
     classes = [index for index, name in enumerate(header) if name in _LABEL]
-    if len(files) != 1 or len(classes) != 1:
+    if len(files) != 1 or len(classes) > 1:
         return None
-    labels: dict[str, int] = {}
-    for line, row in enumerate(rows[1:], 2):
-        if not any(cell.strip() for cell in row):
+    known: dict[str, dict[str, str]] = {}
+    for line, cells in enumerate(rows[1:], 2):
+        if not any(cell.strip() for cell in cells):
             continue
-        name, label = (row[index].strip() if index < len(row) else "" for index in (files[0], classes[0]))
-        if not (name and label.isascii() and label.isdigit() and len(label) <= 6):
-            raise DataError(
-                f"{where}: row {line}: {name!r}, label {label!r}; give a file and a number from 0"
-            )
-        if labels.setdefault(name, int(label)) != int(label):
-            raise DataError(f"{where}: row {line}: {name} has labels {labels[name]} and {label}; keep one")
-    return labels
+        row = dict(zip(header, (cell.strip() for cell in cells), strict=False))
+        name = row.pop(header[files[0]])
+        if not name or len(cells) < len(header):
+            raise DataError(f"{where}: row {line}: {cells[:4]}; give a file, and a value in each column")
+        if known.setdefault(name, row) != row:
+            raise DataError(f"{where}: row {line}: {name} stands there twice; keep one of the rows")
+    number_of = _numbers([row[header[classes[0]]] for row in known.values()], where) if classes else {}
+    labels = {name: number_of[row.pop(header[classes[0]])] for name, row in known.items()} if classes else {}
+    return {name: Row(label=labels.get(name), groups=row) for name, row in known.items()}
 
 
-def labels_beside(path: Path, files: list[Path], source: str) -> tuple[dict[Path, int], list[str]]:
-    """Classes by file that tables in the folder `path` or beside `files` give, and a note on each table."""
-    labels: dict[Path, int] = {}
+def _numbers(classes: Sequence[str], where: str) -> dict[str, int]:
+    """Number of each class: what it is written as, or its place among the names."""
+    names = sorted(set(classes))
+    if all(name.isascii() and name.isdigit() and len(name) <= 6 for name in names):
+        return {name: int(name) for name in names}
+    if mixed := [name for name in names if not name or name.lstrip("-").replace(".", "").isdigit()]:
+        raise DataError(f"{where}: label {mixed[0]!r}; give numbers from 0, or names, in all rows")
+    return {name: index for index, name in enumerate(names)}
+
+
+def rows_beside(path: Path, files: list[Path], source: str) -> tuple[dict[Path, Row], list[str]]:
+    """Rows by file of tables in the folder `path` or beside `files`, and a note on each table."""
+    known: dict[Path, Row] = {}
     notes = []
     folders = {} if path.is_file() else dict.fromkeys([path, *(file.parent for file in files)])
     for folder in folders:
         for table in sorted(file for file in folder.iterdir() if is_table(file) and file.is_file()):
             where = f"{source}: {table.relative_to(path).as_posix()}"
-            rows = _read_labels(table, where)
+            rows = _read_rows(table, where)
             if rows is None:
-                notes.append(f"{where}: is not read; a table of labels has columns file and label")
+                notes.append(f"{where}: is not read; a table of recordings has columns file and label")
                 continue
             inside = [file for file in files if file.is_relative_to(folder)]
             names = {file: {file.name, file.relative_to(folder).as_posix()} & rows.keys() for file in inside}
-            labels |= {file: rows[name] for file, known in names.items() for name in known}
-            notes.append(
-                f"{where}: gives the labels of {sum(map(bool, names.values()))} of {len(files)} recordings"
-            )
-    return labels, notes
+            known |= {file: rows[name] for file, same in names.items() for name in same}
+            notes.append(f"{where}: describes {sum(map(bool, names.values()))} of {len(files)} recordings")
+    return known, notes

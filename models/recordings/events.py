@@ -19,8 +19,9 @@ import numpy as np
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.types import AnyArray, EventArray, IntArray
 from spikeloom.models.recordings import evtouch
+from spikeloom.models.recordings.conditions import groups_of
 from spikeloom.models.recordings.counts import GAP_S, EventCounts
-from spikeloom.models.recordings.csvtable import LABELS, is_table, labels_beside
+from spikeloom.models.recordings.csvtable import NOTHING, is_table, rows_beside
 from spikeloom.models.recordings.eventfiles import EventStream, read_stream
 from spikeloom.models.recordings.evtouch import BIN_S
 from spikeloom.models.recordings.fetch import DATA_SETS, find_data
@@ -57,6 +58,7 @@ def load_data(
     taxels: int | None = None,
     classes: int | None = None,
     limit: int | None = None,
+    groups: Sequence[str] | None = None,
 ) -> evtouch.Recordings:
     """Read the first `limit` recordings of a split, files in plain string order.
 
@@ -65,7 +67,9 @@ def load_data(
     of a fetched data set. `bin_s` is the width of a time bin in seconds, by default `default_bin_s`; the
     released layout and ``.npy`` files have bins already, see `require_events`. `taxels` and `classes` are
     the network's; without `taxels` the highest with an event decides. Labels are `UNLABELLED` where nothing
-    says them. In the released layout all recordings have labels, the same steps and taxels, and no counts.
+    says them. `groups` name columns of a table of recordings, or fields of file names; by default they are
+    all columns that the table has beside file and label. In the released layout all recordings have labels,
+    the same steps and taxels, and no counts.
 
     DataError if a recording cannot be used; OptionError if `bin_s` or `limit` cannot be, or bins are there.
     """
@@ -85,13 +89,17 @@ def load_data(
         if binned:
             require_events(source, bin_s, width)
         files = [(place.parent if place.is_file() else place) / member for _, member in chosen]
-        table, notes = labels_beside(place, files, source)
+        table, notes = rows_beside(place, files, source)
         released = bool(folder) and binned
         size = 0
         read: list[_Recording] = []
         for file, (name, member) in zip(files, chosen, strict=True):
             where = source if place == file else f"{source}: {Path(folder, name).as_posix()}"
-            read.append(_read(file, members[member], where, width, taxels, table.get(file)))
+            read.append(
+                _read(
+                    file, members[member], where, width, taxels, table[file].label if file in table else None
+                )
+            )
             _require_alike(read[-1], read[0], released)
             evtouch.require_class(where, read[-1].label, classes)
             size += read[-1].grid.size
@@ -107,6 +115,12 @@ def load_data(
         lengths=None if steps.min() == steps.max() else steps,
         counts=None if released else _sum_counts(read, steps, notes),
         bin_s=stated if binned else width,
+        groups=groups_of(
+            source,
+            [name for name, _ in chosen],
+            [table.get(file, NOTHING).groups for file in files],
+            groups,
+        ),
     )
 
 
@@ -354,5 +368,5 @@ def _read(
         grid, counts = bin_events(stream, bin_s, taxels=taxels)
         label = stream.label
     if listed is not None and label not in (evtouch.UNLABELLED, listed):
-        raise DataError(f"{where}: label {label}, and {listed} in {LABELS}; fix one of them")
+        raise DataError(f"{where}: label {label}, and {listed} in its table; fix one of them")
     return _Recording(where, grid, label if listed is None else listed, counts)

@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, Self
@@ -61,6 +61,8 @@ class Recordings:
     lengths: IntArray | None = None
     counts: EventCounts | None = None  # Anomalies of their events; None where they had bins already
     bin_s: float | None = None  # Seconds of a bin, where somebody said so; of those before any were joined
+    # Value of each recording by group, see :mod:`models.recordings.conditions`
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("events", "labels", "lengths"):
@@ -112,6 +114,7 @@ class Recordings:
             files=tuple(self.files[index] for index in indices),
             split=split or self.split,
             lengths=None if self.lengths is None else self.lengths[chosen],
+            groups={name: tuple(values[index] for index in indices) for name, values in self.groups.items()},
         )
 
     def identity(self) -> dict[str, AnyArray]:

@@ -28,6 +28,7 @@ ADAM = "adam"
 ADAMW = "adamw"
 STEPS = "steps"
 COSINE = "cosine"
+PLATEAU = "plateau"
 
 Decays = tuple[tuple[str, float], ...]
 """Pairs of a layer's name and its decay."""
@@ -49,7 +50,8 @@ class Recipe:
     optimizer: str = ADAM  # {"adam", "adamw"}; both with amsgrad
     weight_decay: float = 0.0  # Of AdamW
     learning_rate: float = 1e-3  # At the start
-    # {"steps", "cosine"}; A tenth every `decay_epochs`, or half a cosine down to zero over all epochs
+    # {"steps", "cosine", "plateau"}; a tenth every `decay_epochs`, half a cosine down to zero over all epochs,
+    # or a tenth for the last quarter of the epochs
     schedule: str = STEPS
     decay_epochs: int = DECAY_EPOCHS  # Of steps; the first epoch of each such block still has the old rate
     # features, hops: Outputs of the first layer per place; K of a graph convolution
@@ -115,7 +117,32 @@ TIMED = Recipe(
 )
 """For recordings that differ in when their events come: currents that last 20 steps, and clocks."""
 
-RECIPES = {recipe.name: recipe for recipe in (RELEASED, TIMED)}
+RATES = Recipe(
+    name="rates",
+    epochs=48,
+    batch=4,
+    loss=CROSS_ENTROPY,
+    gain=20.0,
+    surrogate=Surrogate(shape=FAST_SIGMOID, width=0.25, reset=False),
+    optimizer=ADAMW,
+    weight_decay=0.01,
+    schedule=PLATEAU,
+    features=16,
+    hops=1,
+    hidden=(64,),
+)
+"""Small networks that decide by how often taxels send events; they learn in half the epochs of the released recipe."""
+
+RECIPES = {recipe.name: recipe for recipe in (RELEASED, TIMED, RATES)}
+
+
+def plateau(epochs: int) -> int:
+    """Epochs before the last quarter.
+
+    >>> plateau(48), plateau(3)
+    (36, 3)
+    """
+    return epochs - epochs // 4
 
 
 def realised_decays(beta: float, alpha: float) -> tuple[float, float]:

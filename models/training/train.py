@@ -35,12 +35,15 @@ from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.networks import Sizes, SpikingNet, TrainedModule, Weights
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.evaluate import evaluate, loss_of, one_thread, require_finite
-from spikeloom.models.training.recipes import ADAMW, COSINE, RELEASED, Recipe
+from spikeloom.models.training.recipes import ADAMW, COSINE, PLATEAU, RELEASED, Recipe, plateau
 from spikeloom.models.training.resume import Course, set_rate
 from spikeloom.models.training.robust import disturb
 
 MOST_SEED = 2**63 - 1
 """What a torch generator takes."""
+
+MOST_EPOCHS = 1_000_000
+"""Stands for any number of them in the state of a plateau."""
 
 VALIDATION_SHARE = 0.2
 """Share of each class that the first training leaves out, rounded down to whole recordings."""
@@ -89,6 +92,7 @@ def train(
     keep_epoch: int | None = None,
     state: Path | None = None,
     resume: bool = False,
+    trunk: Path | None = None,
     label: str = "train",
     position: int = 0,
     after_epoch: Callable[[Epoch], None] | None = None,
@@ -99,7 +103,9 @@ def train(
     the `recipe` are already in the architecture. The `seed` is that of the initial weights and of the order
     of recordings. The weights after epoch `keep_epoch`, counted from 1, are kept too. The file `state` holds
     the state after each epoch, which the caller removes when the result is safe; `resume` goes on from it,
-    to the same weights as without interruption. `label` and `position` are name and row of the progress bar.
+    to the same weights as without interruption. `trunk` is the stem of states at the end of a plateau of the
+    learning rate: a training of more epochs goes on from there, to the same weights as from scratch. `label`
+    and `position` are name and row of the progress bar.
 
     OptionError if a number is too small, or `state` is another training's. DataError if
     recordings and architecture disagree, or the loss is no longer a number.
@@ -108,7 +114,7 @@ def train(
     for recordings in (training, test):
         _require_suited(recordings, architecture)
     options = _identity(training, test, propagation, architecture, recipe)
-    options |= {"epochs": epochs, "seed": seed, "kept epoch": keep_epoch}
+    options |= {"epochs": MOST_EPOCHS if trunk else epochs, "seed": seed, "kept epoch": keep_epoch}
     with one_thread():
         network = architecture.network(propagation, seed=seed, surrogate=recipe.surrogate)
         course = Course(
@@ -120,9 +126,11 @@ def train(
         )
         if resume and state is not None and state.exists():
             course.restore(state, keeps=lambda done: _kept_after(done, network, keep_epoch))
-        course.run(
-            epochs,
-            lambda index: _run_epoch(course, network, training, test, recipe, epochs, keep_epoch, index),
+        run = partial(
+            course.run,
+            train_epoch=lambda index: _run_epoch(
+                course, network, training, test, recipe, epochs, keep_epoch, index
+            ),
             state=state,
             after_epoch=after_epoch,
             shown=lambda epoch: {
@@ -132,7 +140,23 @@ def train(
             label=label,
             position=position,
         )
+        if trunk is not None and recipe.schedule == PLATEAU:
+            _climb(course, network, trunk, plateau(epochs), run)
+        run(epochs)
         return _trained(architecture, network.export_weights(), course)
+
+
+def _climb(
+    course: Course[Epoch], network: TrainedModule, trunk: Path, epochs: int, run: Callable[[int], None]
+) -> None:
+    """Train to the end of the plateau, from the longest state that is no longer than that."""
+    states = {int(file.suffix[1:]): file for file in trunk.parent.glob(f"{trunk.name}.*")}
+    done = max((length for length in states if length <= epochs), default=0)
+    if done:
+        course.restore(states[done], keeps=lambda done: _kept_after(done, network, None))
+    if done < epochs:
+        run(epochs)
+        course.write(trunk.with_name(f"{trunk.name}.{epochs}"))
 
 
 def _trained(architecture: Sizes, last: Weights, course: Course[Epoch]) -> Trained:
@@ -217,6 +241,9 @@ def _optimizer_of(recipe: Recipe, network: torch.nn.Module) -> torch.optim.Optim
 
 def _schedule_of(recipe: Recipe, epoch: int, epochs: int) -> Callable[[float], float] | None:
     """Learning rate within an epoch by the share of it that is done, counted from 0; None where it is constant."""
+    if recipe.schedule == PLATEAU:
+        rate = recipe.learning_rate * (1.0 if epoch < plateau(epochs) else 0.1)
+        return lambda _: rate
     if recipe.schedule != COSINE:
         return None
     return lambda share: recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * (epoch + share) / epochs))

@@ -37,13 +37,15 @@ def recordings(
     bins: int = 1,
     labels_for: str | None = None,
     trained: Mapping[str, Any] | None = None,
+    groups: str | None = None,
 ) -> Recordings:
     """Read recordings of any form, or make the package's own synthetic ones; hold both against the network.
 
     Counts of disorder in event files go to stderr. `bins` of them make a step of the network. `labels_for`
     names what needs the label of every recording. `trained` is what is known of the recordings that the
     network was trained on, see :func:`origin_of`: events come in its bins, others are refused, and what
-    looks like other recordings is warned of.
+    looks like other recordings is warned of. `groups` are names of conditions, see
+    :mod:`models.recordings.conditions`.
 
     Raises DataError or OptionError if they cannot be used, or do not suit the network.
     """
@@ -68,6 +70,7 @@ def recordings(
             limit=limit,
             classes=classes,
             taxels=taxels,
+            groups=None if groups is None else [name.strip() for name in groups.split(",")],
         )
         _require_width(data, trained_bin)
         _require_sensor(data, split, taxels)

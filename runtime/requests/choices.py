@@ -109,6 +109,18 @@ class DataChoice(Request):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ConditionChoice(DataChoice):
+    """Recordings made under several conditions."""
+
+    groups: str | None = option(
+        "conditions to leave out in turn: columns of recordings.csv, or fields of file names as in speed3_force1 "
+        "(default: all columns)",
+        metavar="NAME[,NAME]",
+        group="recordings",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class SplitChoice(Request):
     """Which recordings of a source."""
 

@@ -8,6 +8,7 @@ from spikeloom.compiler.targets import DEFAULT_TARGET
 from spikeloom.runtime.requests.choices import (
     NETWORK_FILES,
     CheckpointChoice,
+    ConditionChoice,
     DataChoice,
     NetlistChoice,
     NetworkChoice,
@@ -18,7 +19,7 @@ from spikeloom.runtime.requests.fields import option
 
 
 @dataclass(frozen=True, kw_only=True)
-class SmallestRequest(SensorChoice, DataChoice):
+class SmallestRequest(SensorChoice, ConditionChoice):
     """The cheapest network that does the job: many are tried, one is chosen, compiled and verified."""
 
     target: str = option("chip", default=DEFAULT_TARGET)
@@ -29,6 +30,9 @@ class SmallestRequest(SensorChoice, DataChoice):
         "energy=5uJ, time=5ms, operations=25000, cores=1, accuracy=88, certified=90; all of them hold",
         default=(),
         metavar="WHAT=LIMIT[,…]",
+    )
+    time: str | None = option(
+        "begin nothing new after so long, as in 30m; the same command goes on (default: 20m)", metavar="TIME"
     )
     store: str | None = option("what is measured (default: NET.sqlite, beside the netlist)", metavar="FILE")
     jobs: int | None = option("processes at a time (default: one a core)", metavar="N")

@@ -41,7 +41,7 @@ class TrainRequest(SensorChoice, DataChoice):
         choices=tuple(PADDINGS),
     )
     recipe: str = option(
-        "training recipe: as released, or with lasting currents and clocks",
+        "training recipe: as released, with lasting currents and clocks, or for small networks that decide by rates",
         default=RELEASED.name,
         choices=tuple(RECIPES),
     )
@@ -55,7 +55,7 @@ class TrainRequest(SensorChoice, DataChoice):
     features: int | None = option("features of the first layer at each place", metavar="N")
     hops: int | None = option("hops of a tactilesgnet's graph convolution (default: 3)", metavar="K")
     hidden: str | None = option(
-        "neurons of each dense layer but the last (default: 128,256)", metavar="N[,N]"
+        "neurons of each dense layer but the last, or none (default: 128,256)", metavar="N[,N]"
     )
     copies: int | None = option(
         f"axons per input of {NATIVE} (default: {DEFAULT_COPIES})", choices=tuple(BASES)

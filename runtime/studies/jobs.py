@@ -15,26 +15,22 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import takewhile
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
 
 from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, UnfinishedError, require_least
 from spikeloom.compiler.files import WRITTEN, FileFault, reading, remove_leftovers
-from spikeloom.models.recordings.counts import number
-from spikeloom.runtime.report.console import Progress, progress, tell
+from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.report.encode import decode
 
 APayload = TypeVar("APayload")
 AResult = TypeVar("AResult")
 AJob = TypeVar("AJob", bound="Job")
-
-
-STILL_S = 120.0
-"""For so long processes may use no processor before they are given up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,13 +62,15 @@ def sweep(
     label: str,
     kind: Any = Any,
     own: Sequence[Path] = (),
+    until: float | None = None,
 ) -> dict[str, Any]:
     """Measure jobs, as far as the store does not know them; their results by key, of a `kind` that is decoded.
 
     They are begun in this order; of those with equal keys the first is measured. `measure` makes JSON values
     of a job, a function of a module, since it crosses process borders. `store` is an SQLite file in a folder
     that exists. `jobs` are processes at a time (one a core), whose libraries use one thread each; `label`
-    says what is done; half-written files are removed from folders that are its `own`.
+    says what is done; half-written files are removed from folders that are its `own`. From the time `until`, by
+    the monotonic clock, none is begun.
 
     What a measurement raises is raised with notes that name it and say what is kept, as does the text of a
     KeyboardInterrupt; UnfinishedError, if a process died.
@@ -101,7 +99,7 @@ def sweep(
         try:
             progress(0, label)
             for done, (index, found) in enumerate(
-                side_by_side(waiting, partial(_named, measure), jobs=jobs), 1
+                side_by_side(waiting, partial(_named, measure), jobs=jobs, until=until), 1
             ):
                 key = waiting[index].key
                 text = json.dumps(found, allow_nan=False)
@@ -116,7 +114,7 @@ def sweep(
         except SpikeloomError as error:
             error.add_note(standing())
             raise
-        return {key: results[key] for key in keys}
+        return {key: results[key] for key in keys if key in results}
 
 
 def _named(measure: Callable[[AJob], AResult], job: AJob) -> AResult:
@@ -142,19 +140,24 @@ def _unsealed(key: str, row: str) -> Any:
 
 
 def side_by_side(
-    payloads: Sequence[APayload], run: Callable[[APayload], AResult], *, jobs: int | None = None
+    payloads: Sequence[APayload],
+    run: Callable[[APayload], AResult],
+    *,
+    jobs: int | None = None,
+    until: float | None = None,
 ) -> Iterator[tuple[int, AResult]]:
     """Work on payloads, begun in this order, in processes of their own in this folder; on a single one here.
 
-    Yields the place of a payload and what `run`, a function of a module, made of it, as they come. Raises
-    what `run` raised; UnfinishedError, if a process ended while it worked, and with it what the others had
-    not finished. If all stand still what they had not finished is begun once more.
+    Yields the place of a payload and what `run`, a function of a module, made of it, as they come; none is begun
+    from the time `until`. Raises what `run` raised; UnfinishedError, if a process ended while it worked, and with it
+    what the others had not finished.
     """
     require_least({"jobs": jobs}, jobs=1)
+    due = takewhile(lambda _: until is None or time.monotonic() < until, enumerate(payloads))
     processes = min(jobs or os.cpu_count() or 1, len(payloads))
     if processes <= 1:
         with _one_thread():
-            yield from ((index, run(payload)) for index, payload in enumerate(payloads))
+            yield from ((index, run(payload)) for index, payload in due)
         return
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.backend import resource_tracker as trackers_of_joblib
@@ -163,57 +166,22 @@ def side_by_side(
     for tracker in (resource_tracker, trackers_of_joblib):
         tracker.ensure_running()  # which makes later processes hear signals, so it comes first
     attempt = delayed(partial(_in_child, os.getpid(), Path.cwd(), run))
-    left = dict(enumerate(payloads))
-    stood = False
     with parallel_config("loky", n_jobs=processes, inner_max_num_threads=1), warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", "A worker stopped"
-        )  # one that has grown is replaced, and nothing lost
-        while left:
-            ended = threading.Event()
-            watch = threading.Thread(target=_killed_when_still, args=[ended], daemon=True)
-            watch.start()
-            work = Parallel(return_as="generator_unordered", batch_size=1)
-            before = signal.pthread_sigmask(
-                signal.SIG_BLOCK, {signal.SIGINT}
-            )  # of new processes, until they work
-            try:
-                found = work(attempt(index, payload) for index, payload in list(left.items()))
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
-                for index, result in found:
-                    yield index, result
-                    del left[index]
-            except TerminatedWorkerError as error:
-                if stood or watch.is_alive():
-                    why = f"a process {'stood still twice' if stood else 'ended early'}, perhaps for lack of memory"
-                    raise UnfinishedError(f"{why}; use fewer --jobs") from error
-                stood = True
-                progress("")
-                tell(
-                    f"{number(len(left), 'measurement')} stood still for {STILL_S:g} s: given up, and begun once more"
-                )
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
-                ended.set()
-
-
-def _killed_when_still(ended: threading.Event) -> None:
-    """Kill joblib's processes once none has used its processor for `STILL_S`, as after a stop signal; needs /proc."""
-    used: dict[int, list[str]] = {}
-    while not ended.wait(STILL_S):
-        before = used
-        used = {}
-        with suppress(OSError):  # of a process that has ended
-            for children in Path(f"/proc/{os.getpid()}/task").glob("*/children"):
-                for child in children.read_text().split():
-                    if b"popen_loky" in Path(f"/proc/{child}/cmdline").read_bytes():
-                        used[int(child)] = (
-                            Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[11:13]
-                        )
-            if used and used == before:
-                for process in used:
-                    os.kill(process, signal.SIGKILL)
-                return
+        # One that has grown is replaced, and nothing lost
+        warnings.filterwarnings("ignore", "A worker stopped")
+        work = Parallel(return_as="generator_unordered", batch_size=1)
+        # Of new processes, until they work
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            found = work(attempt(index, payload) for index, payload in due)
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            yield from found
+        except TerminatedWorkerError as error:
+            raise UnfinishedError(
+                "a process ended early, perhaps for lack of memory; use fewer --jobs"
+            ) from error
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

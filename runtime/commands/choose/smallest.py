@@ -1,20 +1,21 @@
 """The command ``smallest``: the cheapest network that does the job, chosen by cross-validation."""
 
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from spikeloom.compiler.errors import require_least
+from spikeloom.compiler.errors import DataError, OptionError, require_least
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
-from spikeloom.compiler.systems import MLP, SYSTEMS
-from spikeloom.compiler.targets.base import COMPARTMENTS
+from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS
+from spikeloom.compiler.targets.base import COMPARTMENTS, Target
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.systems import taxels_alone
+from spikeloom.models.systems import sensor_grid, taxels_alone
 from spikeloom.models.training.counters import require_levels
 from spikeloom.runtime.commands.main_job import compile, verify
 from spikeloom.runtime.commands.options import request_of
@@ -32,24 +33,28 @@ from spikeloom.runtime.requests.main_job import CompileRequest, VerifyRequest
 from spikeloom.runtime.requests.training import TrainRequest
 from spikeloom.runtime.studies.search.budgets import parse_budgets
 from spikeloom.runtime.studies.search.results import data_of, share
-from spikeloom.runtime.studies.smallest.results import Checked
-from spikeloom.runtime.studies.smallest.space import Candidate, counting, networks
+from spikeloom.runtime.studies.smallest.results import Checked, Tried
+from spikeloom.runtime.studies.smallest.space import counting, networks
 from spikeloom.runtime.studies.smallest.study import LIMITS, smallest
 from spikeloom.runtime.studies.smallest.trained import Sensor
-from spikeloom.runtime.studies.smallest.work import costs_of, some
+from spikeloom.runtime.studies.smallest.work import Scene, costs_of, some
 from spikeloom.runtime.studies.training.plan import both_splits
 
 SENSOR = ("graph", "taxels", "edges", "directed")
+
+DEFAULT_TIME = "20m"
 
 GRAPH = "manual"
 """Of the built-in sensor, unless another is named."""
 
 NOTES = """\
-Candidates are counting networks of many sizes and a few that are trained by gradients. They are cross-validated inside
-the training split, in three rungs: what a cheaper one beats is dropped early. Taken is the cheapest whose accuracy is
-at most a standard error below the best, recording by recording; it is trained on the whole training split, compiled and
-verified, and read on the test split once. Results are kept in the store; the same command goes on from there, other
-budgets ask it again; delete it to measure anew. The exit code is 1 if no candidate fits a budget.
+Candidates are counting networks and networks trained by gradients, of many sizes. They are cross-validated inside the
+training split, in rungs: what a cheaper one beats is dropped early, the others are trained for longer. If recordings
+have groups, such as speed, each of their values is left out in turn; else parts at random are, which says nothing of
+other conditions. Taken is the cheapest whose accuracy is at most 1.5 % and a standard error below the best, recording
+by recording; it is trained on the whole training split, compiled and verified, and read on the test split once. Results
+are kept in the store; the same command goes on from there, other budgets ask it again; delete it to measure anew. The
+exit code is 1 if no candidate fits a budget.
 """
 
 
@@ -69,7 +74,8 @@ def run(request: SmallestRequest) -> Outcome:
     require_least(vars(request), jobs=1, levels=1)
     budgets = parse_budgets([words for each in request.budget for words in each.split(",")], LIMITS)
     taxels = None if request.taxels is None else len(sensor_places(request.taxels))
-    training, test = both_splits(request.data, taxels, request.bin)
+    seconds = seconds_of(request.time)
+    training, test = both_splits(request.data, taxels, request.bin, request.groups)
     require_levels(request.levels or 1, int(training.labels.max()) + 1)
     bin_s = training.seconds
     request = replace(request, bin=bin_s)
@@ -78,17 +84,25 @@ def run(request: SmallestRequest) -> Outcome:
     backend = backend_of(request.target)
     target = backend.target
     bits = backend.counting_bits
-    systems = () if target.cores != COMPARTMENTS else SYSTEMS if len(sensor.graph.edges) else (MLP,)
+    scene = Scene(
+        data=data,
+        groups=request.groups,
+        sensor=sensor,
+        target=request.target,
+        states=store.with_suffix(".training"),
+    )
     found = smallest(
-        [*counting(training.steps, request.levels or 1, bits), *networks(training.steps, systems)],
-        data,
+        list(counting(training.steps, request.levels or 1, bits)),
+        list(networks(int(np.median(training.step_counts)), systems_of(target, sensor))),
+        scene,
+        training,
         target,
         budgets,
         store,
         partial(_made, sensor=sensor, splits=(training, test), request=request),
-        sensor=sensor,
         command=_command(request),
         jobs=request.jobs,
+        seconds=seconds,
     )
     if request.html is not None:
         with write_atomically(request.html) as file:
@@ -96,23 +110,42 @@ def run(request: SmallestRequest) -> Outcome:
     return Outcome(found, sections, 0 if found.choice.fits else 1)
 
 
+def systems_of(target: Target, sensor: Sensor) -> tuple[str, ...]:
+    """Systems of networks that are trained by gradients, as far as the chip and the sensor have a place for them."""
+    if target.cores != COMPARTMENTS:
+        return ()
+    try:
+        sensor_grid(sensor.graph.coordinates, "none")
+    except DataError:  # its taxels are not on a plane, or too few
+        flat = tuple(system for system in SYSTEMS if system != GRID_CNN)
+    else:
+        flat = SYSTEMS
+    return flat if len(sensor.graph.edges) else tuple(each for each in flat if each not in GRAPH_SYSTEMS)
+
+
+def seconds_of(words: str | None) -> float | None:
+    """Seconds of ``--time``; OptionError if it is no time."""
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)(s|m|h)", (words or DEFAULT_TIME).strip())
+    if match is None or float(match[1]) <= 0:
+        raise OptionError(f"--time {words}: is no time; write it as in 90s, 30m or 2h")
+    return float(match[1]) * {"s": 1, "m": 60, "h": 3600}[match[2]]
+
+
 def _made(
-    candidate: Candidate, *, sensor: Sensor, splits: tuple[Recordings, ...], request: SmallestRequest
+    tried: Tried, *, sensor: Sensor, splits: tuple[Recordings, ...], request: SmallestRequest
 ) -> tuple[Checked, tuple[str, ...]]:
     """Train a candidate on the whole training split, compile and verify it, then read the test split; the commands."""
+    candidate = tried.candidate
     netlist = request.output
     data = request.data
     network = str(Path(netlist).with_suffix(".pt"))
     counts = candidate.system == COUNTING
     read = repeat.words({"data": data, "bin": request.bin})
     trained = [*read, *repeat.words(sensor.options_of(candidate.system)), *candidate.words]
-    trained += [*([] if counts else ["--keep", "last"]), "-o", network]
+    trained += [] if counts else ["--epochs", f"{tried.setting:g}", "--keep", "last"]
+    trained += ["-o", network]
     made = repeat.words({"target": request.target})
-    made += (
-        []
-        if counts
-        else repeat.words({"weight_bits": candidate.storage or 8, "calibrate": data, "bin": request.bin})
-    )
+    made += [] if counts else repeat.words({"weight_bits": 8, "calibrate": data, "bin": request.bin})
     words = {"train": trained, "compile": [network, *made, "-o", netlist]}
     words |= {"verify": [netlist, "--checkpoint", network, *read], "estimate": [netlist, *read]}
     from spikeloom.models.training.train import state_files  # with torch
@@ -162,6 +195,8 @@ def _sensor(request: SmallestRequest, taxels: int) -> Sensor:
 
 def _command(request: SmallestRequest) -> str:
     """The words that ask for the same search."""
-    words = repeat.words(repeat.given(request, ("data", "bin", *SENSOR, "target", "levels", "store")))
+    words = repeat.words(
+        repeat.given(request, ("data", "bin", "groups", *SENSOR, "target", "levels", "store"))
+    )
     budgets = [word for budget in request.budget for word in ("--budget", budget)]
     return repeat.command("smallest", *words, *budgets, "-o", request.output)

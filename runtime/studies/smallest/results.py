@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from spikeloom.runtime.report.encode import HIDDEN, INLINE
+from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL
 from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.studies.search.results import ChosenBy, Data, NetlistCosts, Share
 from spikeloom.runtime.studies.smallest.space import Candidate
@@ -29,6 +29,10 @@ class Tried(Measured):
     behind: float = 0.0
     behind_error: float = 0.0
     front: bool = False
+    # Whether the last epochs still helped it, of networks that are trained by gradients; None where that is not known
+    finished: bool | None = field(default=None, metadata=OPTIONAL)
+    # Their accuracy after numbers of epochs, on the folds of each rung
+    curve: tuple[tuple[int, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +40,7 @@ class Choice:
     """Numbers of candidates: the best that the budgets allow, the cheapest not shown to be worse, by each table.
 
     If nothing `fits` the budgets, the one that misses by the smallest factor. `ahead` is the cheapest
-    candidate that is a point more accurate.
+    candidate that is a point more accurate, `cheaper` the most accurate for two thirds of the energy.
     """
 
     budgets: tuple[str, ...]
@@ -45,6 +49,20 @@ class Choice:
     cheapest: Mapping[str, int]
     allowed: tuple[int, ...]
     ahead: int | None
+    cheaper: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Family:
+    """Candidates of one system: how many were `tried`, the `best` of those that came farthest, by its number.
+
+    They were `finished` if some were cross-validated to the end, and none was still learning then.
+    """
+
+    system: str
+    tried: int
+    best: int
+    finished: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,7 +87,10 @@ class Checked:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Smallest(Shown):
-    """A search, its choice and what that reaches."""
+    """A search, its choice and what that reaches.
+
+    `conditions` were left out in turn; `at_random` is the accuracy of the choice where parts at random were left out.
+    """
 
     spikeloom: str
     command: str
@@ -77,9 +98,12 @@ class Smallest(Shown):
     data: Data
     tables: Mapping[str, Mapping[str, str]]
     chosen_by: ChosenBy
+    conditions: tuple[str, ...]
     tried: tuple[Tried, ...]
     baselines: tuple[Tried, ...]
     choice: Choice
+    at_random: float | None
+    families: tuple[Family, ...]
     checked: Checked
     commands: tuple[str, ...]
 

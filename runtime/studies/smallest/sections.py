@@ -21,9 +21,10 @@ LOWER = 12
 """Points below the last rung's intervals that are drawn."""
 
 MEANINGS = (
-    "Accuracy by cross-validation inside the training split, with 95 % intervals (Wilson). Small marks were dropped "
+    "Accuracy by cross-validation inside the training split, with 95 % intervals (Wilson); conditions of the "
+    "recordings are left out in turn, if they have any. Small marks were dropped "
     "before the last rung, the line is its front, the ring the choice. Where the chip can be stopped, costs are "
-    "those until the decision is proven; none changes. Bars are support vector machines, on a small processor "
+    "those until the decision is proven; none changes. Bars are classifiers without spikes, on a small processor "
     "between arithmetic and memory accesses alone, and all cycles of one that can be bought."
 )
 
@@ -31,7 +32,7 @@ MEANINGS = (
 def sections(result: Smallest) -> Iterator[Section]:
     """All of a search."""
     every = [*sorted(result.tried, key=lambda each: energy(each) if each.costs else 0.0), *result.baselines]
-    last = [each for each in every if each.rung == RUNGS]
+    last = [each for each in every if each.rung >= RUNGS]
     dropped = sorted(
         (each for each in every if each.rung < RUNGS), key=lambda each: (-each.rung, -each.accuracy)
     )
@@ -102,7 +103,9 @@ def _why(result: Smallest) -> Iterator[str]:
     if chosen.number == best.number:
         yield "it is the best of what was tried, and nothing cheaper that was tried is as good"
     else:
-        ahead = f"recording by recording it is {_behind(chosen)} % ahead (± standard error)"
+        low = 100 * (chosen.behind - 1.96 * chosen.behind_error)
+        high = 100 * (chosen.behind + 1.96 * chosen.behind_error)
+        ahead = f"recording by recording it is {100 * chosen.behind:.1f} % ahead (95 % interval {low:.1f} … {high:.1f})"
         yield f"the best is {_named(best)} for {_spent(best)}; {ahead}"
     for table, index in choice.cheapest.items():
         if index != chosen.number:
@@ -114,27 +117,63 @@ def _why(result: Smallest) -> Iterator[str]:
         more = result.candidate(choice.ahead)
         times = energy(more) / energy(chosen)
         yield f"1 % more accuracy costs {times:.1f} times the energy: {_named(more)}, {_spent(more)}"
+    if choice.cheaper is not None:
+        less = result.candidate(choice.cheaper)
+        yield f"for at most two thirds of the energy: {_named(less)}, {_spent(less)}"
+    yield from _conditions(result)
     yield _unfinished(result)
 
 
 def _unfinished(result: Smallest) -> str:
-    """Which families were not tried to the end: a search trains for a few epochs and looks at no learning curve."""
-    trained = [each for each in result.tried if each.candidate.system != COUNTING and not each.refused]
-    if not trained:
+    """Which systems were tried to the end: cross-validated on all folds until more epochs no longer helped."""
+    if not result.families:
         return "not tried: networks trained by gradients"
-    longest = max(trained, key=lambda each: (each.rung, each.setting))
-    epochs = number(int(longest.setting), "epoch")
-    decided = 100 * sum(map(bool, longest.tried)) / len(longest.tried)
-    return (
-        f"not tried to the end: {number(len(trained), 'network')} trained by gradients, the longest "
-        f"({longest.candidate.name}) for {epochs}, held against {decided:.0f} % of the recordings; trained longer, "
-        "one may decide better: compare with spikeloom train"
+    lines = []
+    for family in result.families:
+        best = result.candidate(family.best)
+        if family.system != COUNTING:
+            words = "tried to the end" if family.finished else "not tried to the end"
+            epochs = f"{best.setting:g} epochs"
+            if best.refused:
+                lines.append(f"{family.system}: not tried ({best.refused})")
+            elif family.finished:
+                lines.append(f"{family.system}: {words}, the best is {_named(best)} after {epochs}")
+            else:
+                why = (
+                    "more epochs still helped"
+                    if best.finished is False
+                    else "it was dropped, or time was short"
+                )
+                lines.append(f"{family.system}: {words}, {_named(best)} after {epochs}: {why}")
+    if all(family.system == COUNTING for family in result.families):
+        lines.append("not tried: networks trained by gradients")
+    return "\n".join(lines)
+
+
+def _conditions(result: Smallest) -> Iterator[str]:
+    """What was left out in turn, where the choice is worst, and what parts at random say."""
+    if not result.conditions:
+        yield (
+            "conditions not seen in training were not tested: the recordings have no groups (--groups), and parts at "
+            "random were left out"
+        )
+        return
+    chosen = result.chosen
+    shares = sorted(chosen.conditions.items(), key=lambda pair: pair[1])
+    yield (
+        f"left out in turn: {', '.join(result.conditions)}; of these the choice is worst at {shares[0][0]} "
+        f"({100 * shares[0][1]:.1f} %) and best at {shares[-1][0]} ({100 * shares[-1][1]:.1f} %)"
     )
+    if result.at_random is not None:
+        yield (
+            "with parts at random left out, so that all conditions are known, it reaches "
+            f"{100 * result.at_random:.1f} %: expect {100 * chosen.accuracy:.1f} % where a condition is new"
+        )
 
 
 def _needless(result: Smallest) -> str:
     """Whether a processor does the job as well: the best of the baselines, and the cheapest that is no worse."""
-    last = [(each, each.processor) for each in result.baselines if each.processor and each.rung == RUNGS]
+    last = [(each, each.processor) for each in result.baselines if each.processor and each.rung >= RUNGS]
     if not last:
         return baselines.MISSING
     enough, joules = [pair for pair in last if not worse(result.chosen, pair[0])], energy(result.chosen)
@@ -209,7 +248,7 @@ def picture(result: Smallest) -> Drawing:
     marks = {each.number: _mark(each) for each in result.tried if each.costs is not None}
     label = f"energy of a mean inference ({result.chosen_by.energy})"
     draw_front(drawing, panel, list(marks.values()), marks[result.chosen.number], "J", label)
-    last = [each for each in result.baselines if each.rung == RUNGS]
+    last = [each for each in result.baselines if each.rung >= RUNGS]
     for index, each in enumerate(last):
         assert each.processor is not None, "these are priced"
         ends = (each.processor.least_j, each.processor.most_j)
@@ -218,7 +257,7 @@ def picture(result: Smallest) -> Drawing:
         panel.hlines(height, *ends, color=colour, lw=3.0, alpha=0.8, label=each.candidate.system, zorder=4)
         drawing.tips += [(panel, joules, height, _tip(each)) for joules in ends]
     panel.autoscale(True, axis="x")
-    shown = [*(each for each in result.tried if each.rung == RUNGS), *last]
+    shown = [*(each for each in result.tried if each.rung >= RUNGS), *last]
     panel.set_ylim(
         100 * min(each.low for each in shown) - LOWER, min(100, 100 * max(each.high for each in shown) + 2)
     )
@@ -231,7 +270,7 @@ def picture(result: Smallest) -> Drawing:
 
 def _mark(each: Tried) -> Mark:
     """A candidate, large if it came to the last rung."""
-    last = each.rung == RUNGS
+    last = each.rung >= RUNGS
     return Mark(
         cost=energy(each),
         accuracy=each.accuracy,

@@ -1,18 +1,17 @@
-"""What is tried: counting networks of many sizes, a few trained ones, and support vector machines beside them."""
+"""What is tried: counting networks and networks that are trained by gradients, of many sizes, and baselines."""
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
-from spikeloom.compiler.systems import MLP, SYSTEMS, TACTILESGNET
+from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET
 from spikeloom.models.recordings.evtouch import WHOLE
 from spikeloom.models.training.counters import STRENGTHS, Plan
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import whole_numbers
-from spikeloom.runtime.report.encode import OPTIONAL
 
 JOINS = (1, 2, 5, 10, 25)
 PARTS = (1, 2, 3, 5, 10)
@@ -26,18 +25,37 @@ RAMPS = (16, 64)
 BITS = (5, 4, 3)
 """Of their weights; the two next to those of the chip."""
 
-STORAGE = 4
-"""Bits in which networks that are trained by gradients are stored, too."""
-
 MOST_COUNTERS = {100: 50, 50: 20}
 """Counters of a channel at most, by window: what is larger gains little and takes minutes."""
 
 
-NETWORKS = ((TACTILESGNET, 10, 16, "64,64"), (TACTILESGNET, 10, 32, "128,256"), (MLP, 10, 16, "64,64"))
-"""System, join, features and neurons of the dense layers of those that are trained by gradients."""
+EPOCHS = (12, 24, 48, 96)
+"""Of networks that are trained by gradients, by rung."""
 
-EPOCHS = 15
-"""Of these."""
+SIZES = (
+    (TACTILESGNET, 64, 3, "128,256"),
+    (TACTILESGNET, 16, 1, "64,128"),
+    (TACTILESGNET, 32, 1, "128"),
+    (TACTILESGNET, 32, 2, "64"),
+    (TACTILESGNET, 16, 1, "64"),
+    (TACTILESGNET, 32, 1, "none"),
+    (TACTILESGNET, 16, 1, "32"),
+    (TACTILESGNET, 8, 1, "64"),
+    (TACTILESGNET, 8, 1, "32"),
+    (TACTILESGNET, 16, 1, "none"),
+    (TACTILESGNET, 4, 1, "16"),
+    (MLP, 64, None, "128,256"),
+    (MLP, 32, None, "64"),
+    (GCN, 32, None, "64"),
+    (GRID_CNN, 32, None, "64"),
+)
+"""System, features, hops and dense layers of these, the largest first: they take longest."""
+
+LASTING = (3, 6)
+"""Those of them, by place, that are also trained with currents that last and clocks."""
+
+STEPS = (25, 130)
+"""Steps that a usual recording has in these, at least and at most, by the bins that are joined."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,10 +64,6 @@ class Candidate:
 
     system: str
     options: Mapping[str, Any]
-    storage: int | None = field(
-        default=None, metadata=OPTIONAL
-    )  # Bits of a weight, where not those of `compile`
-
     json_properties = ("name",)
 
     @property
@@ -57,7 +71,6 @@ class Candidate:
         """For tables."""
         options = dict(self.options)
         thresholds = [str(options.pop("thresholds"))] if "thresholds" in options else []
-        options |= {} if self.storage is None else {"stored": self.storage}
         return " ".join([self.system, *thresholds, *(f"{name}={value}" for name, value in options.items())])
 
     @property
@@ -96,17 +109,25 @@ def counting(steps: int, levels: int = 1, bits: int = 8) -> Iterator[Candidate]:
 
 
 def networks(steps: int, systems: Collection[str]) -> Iterator[Candidate]:
-    """Networks of some systems that are trained by gradients, for recordings of so many bins."""
-    for system, join, features, hidden in NETWORKS:
-        if system in systems and join <= steps // 2:
-            options = {
-                "recipe": "timed",
-                "join": join,
-                "features": features,
-                "hidden": hidden,
-                "epochs": EPOCHS,
-            }
-            yield Candidate(system=system, options=options)
+    """Networks of some systems that are trained by gradients, for recordings that usually have so many bins.
+
+    >>> {each.options["join"] for each in networks(250, ["mlp"])}
+    {2, 10, 5}
+    """
+    least, most = STEPS
+    joins = [join for join in JOINS if least <= steps / join <= most] or [1]
+    for place, (system, features, hops, hidden) in enumerate(SIZES):
+        for join in joins if system in systems else ():
+            for recipe in ("rates", "timed") if place in LASTING else ("rates",):
+                options = {
+                    "recipe": recipe,
+                    "join": join,
+                    "features": features,
+                    "hops": hops,
+                    "hidden": hidden,
+                }
+                given = {name: value for name, value in options.items() if value is not None}
+                yield Candidate(system=system, options=given)
 
 
 def _counters(**options: Any) -> Candidate:
@@ -127,10 +148,8 @@ def _counters(**options: Any) -> Candidate:
 
 
 def variants(candidate: Candidate, rung: int) -> list[Candidate]:
-    """What goes on from a rung beside a candidate: first other lengths of the read-out, then fewer bits of a weight."""
+    """Counting networks that go on beside one: first with other lengths of the read-out, then with fewer bits."""
     known = candidate.options
-    if candidate.system != COUNTING:
-        return [replace(candidate, storage=STORAGE)] if rung > 1 and candidate.system in SYSTEMS else []
     if rung == 1:
         return [_counters(**{**known, "ramp": ramp}) for ramp in RAMPS]
     fewer = [bits for bits in BITS if bits < known.get("weight_bits", 8)]

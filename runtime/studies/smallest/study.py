@@ -1,12 +1,17 @@
 """The smallest network for some recordings: candidates by successive halving, a choice, and what that reaches.
 
-On the first rung every candidate is cross-validated once at one strength; what may still be chosen goes on,
-with more strengths, and from there to five rounds. Everything happens on the training split but the last
-look at the choice. Taken is the cheapest that is not shown to be worse than the best.
+Counting networks are cross-validated once at one strength on the first rung; what may still be chosen goes on,
+with more strengths, and from there to five rounds. Networks that are trained by gradients are trained for twice as
+many epochs on each rung, from where they stopped; the best of each system goes on in any case, and those whose
+learning curve still rises on the last rung get one more. What is left out in turn are conditions, if the
+recordings have any. Everything happens on the training split but the last look at the choice. Taken is the
+cheapest that is at most `MARGIN` and a standard error behind the best.
 """
 
+import shutil
+import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 
@@ -14,18 +19,22 @@ import numpy as np
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.targets.base import Target
+from spikeloom.models.recordings.counts import number
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.counters import FOLDS
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.jobs import sweep
 from spikeloom.runtime.studies.search.budgets import SHARES, Budget, excess
 from spikeloom.runtime.studies.search.choice import NEAR, choose, front, is_worse, lead
-from spikeloom.runtime.studies.search.results import Data, chosen_by, titles_of
+from spikeloom.runtime.studies.search.results import chosen_by, titles_of
 from spikeloom.runtime.studies.smallest import work
 from spikeloom.runtime.studies.smallest.baselines import baselines
-from spikeloom.runtime.studies.smallest.results import Checked, Choice, Smallest, Tried
-from spikeloom.runtime.studies.smallest.space import Candidate, variants
-from spikeloom.runtime.studies.smallest.trained import Sensor
-from spikeloom.runtime.studies.smallest.work import RUNGS, Measured
+from spikeloom.runtime.studies.smallest.folds import every, folds_of
+from spikeloom.runtime.studies.smallest.results import Checked, Choice, Family, Smallest, Tried
+from spikeloom.runtime.studies.smallest.space import EPOCHS, Candidate, variants
+from spikeloom.runtime.studies.smallest.work import RUNGS, Measured, Scene
 
 POINT = 0.01
 """Accuracy whose price is told."""
@@ -33,8 +42,14 @@ POINT = 0.01
 LIMITS = ("energy", "time", "operations", "cores", "accuracy", "certified")
 """What ``--budget`` limits."""
 
-KEPT = {1: 20, 2: 14}
+KEPT = {1: 20, 2: 14, 3: 14}
 """Candidates that go on from a rung."""
+
+TRAINED = {1: 9, 2: 6, 3: 3}
+"""The same of networks that are trained by gradients; beside them goes the best of each system."""
+
+MARGIN = 0.015
+"""Accuracy that the choice may be behind the best."""
 
 VARIED = {1: 12, 2: 4}
 """Those of them, the first, of which variants go on, too."""
@@ -42,75 +57,205 @@ VARIED = {1: 12, 2: 4}
 BEST = 50
 """How much more it weighs to be behind a cheaper one than behind the best: the front goes on, down to cheap ones."""
 
+NEAR_BEST = 2
+"""The same of networks that are trained by gradients, which take long, unless a budget says how accurate is enough."""
+
 SLACK = 1.25
 """Factor by which a candidate may miss a budget on an early rung: a variant may fit."""
 
 
 def smallest(
-    candidates: Iterable[Candidate],
-    data: Data,
+    counters: Iterable[Candidate],
+    networks: Sequence[Candidate],
+    scene: Scene,
+    training: Recordings,
     target: Target,
     budgets: Sequence[Budget],
     store: Path,
-    make: Callable[[Candidate], tuple[Checked, tuple[str, ...]]],
+    make: Callable[[Tried], tuple[Checked, tuple[str, ...]]],
     *,
-    sensor: Sensor,
     command: str,
     jobs: int | None = None,
+    seconds: float | None = None,
 ) -> Smallest:
     """Search as far as the store does not know, choose, and `make` the choice: train, compile and verify it.
 
-    `command` repeats it; `make` also gives the commands that do what it does.
+    After so many `seconds` nothing new is begun. `command` repeats it; `make` also gives the commands that do what
+    it does.
     """
     certify = any(budget.what == "certified" for budget in budgets)
-    trial = partial(work.trial, data=data, sensor=sensor, target=target.name, certify=certify)
-    on = partial(promote, budgets=budgets)
-    beside = search(baselines(), most_accurate, trial, store, jobs=jobs)
-    tried = search(candidates, on, trial, store, jobs=jobs)
+    work_on = Work(
+        store=store,
+        jobs=jobs,
+        until=None if seconds is None else time.monotonic() + seconds,
+        certify=certify,
+    )
+    by_condition = folds_of(training, 1)
+    folds = sum(map(len, by_condition))
+    scene.states.mkdir(exist_ok=True)
+    beside = search(baselines(), most_accurate, scene, work_on)
+    tried = search(counters, partial(promote, budgets=budgets), scene, work_on)
+    trained = train_all(networks, folds, budgets, scene, work_on)
+    tried += [replace(each, number=len(tried) + each.number) for each in trained]
+    if not any(each.rung >= RUNGS or each.refused for each in tried):
+        raise OptionError(
+            "--time: was too short for any candidate; the same command goes on, give it longer"
+        )
     taken = pick(tried, budgets)
     best = tried[taken.best - 1]
     tried = [_beside(each, best, tried) for each in tried]
     by = chosen_by(target)
-    checked, commands = make(tried[taken.cheapest[by.energy] - 1].candidate)
+    chosen = tried[taken.cheapest[by.energy] - 1]
+    conditions = tuple(fold.condition for fold in every(by_condition) if fold.condition is not None)
+    at_random = accuracy_at_random(chosen, scene, work_on) if conditions else None
+    finished = all(each.finished is not None for each in tried if each.candidate.system != COUNTING)
+    if finished:  # else the same command goes on
+        shutil.rmtree(scene.states, ignore_errors=True)
+    checked, commands = make(chosen)
     return Smallest(
         spikeloom=__version__,
         command=command,
         target=target.name,
-        data=data,
+        data=scene.data,
         tables=titles_of(target),
         chosen_by=by,
+        conditions=conditions,
         tried=tuple(tried),
         baselines=tuple(_beside(each, best, ()) for each in beside),
         choice=taken,
+        at_random=at_random,
+        families=families(tried),
         checked=checked,
         commands=commands,
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Work:
+    """How measurements are made: where they are kept, processes, when no more are begun, and whether they certify."""
+
+    store: Path
+    jobs: int | None
+    until: float | None  # By the monotonic clock
+    certify: bool
+
+    def measure(self, works: Sequence[work.Trial], label: str) -> dict[str, Measured]:
+        """Results by key, of those that were begun in time."""
+        return sweep(
+            works,
+            work.measure,
+            self.store,
+            jobs=self.jobs,
+            label=label,
+            kind=Measured,
+            until=self.until,
+        )
+
+
 def search(
     candidates: Iterable[Candidate],
     promote: Callable[[Sequence[Tried], int], Sequence[Tried]],
-    trial: Callable[[Candidate, int, float | None], work.Trial],
-    store: Path,
-    *,
-    jobs: int | None,
+    scene: Scene,
+    work_on: Work,
 ) -> list[Tried]:
     """All candidates, as far as each came; `promote` chooses those that go on from a rung."""
     known: dict[str, Tried] = {}
     # By name, with the setting that the rung before has chosen
     alive: dict[str, tuple[Candidate, float | None]] = {each.name: (each, None) for each in candidates}
     for rung in range(1, RUNGS + 1):
-        works = [trial(each, rung, setting) for each, setting in alive.values()]
-        found = sweep(works, work.measure, store, jobs=jobs, label=f"rung {rung} of {RUNGS}", kind=Measured)
+        works = [
+            work.trial(each, rung, setting, scene, certify=work_on.certify)
+            for each, setting in alive.values()
+        ]
+        found = work_on.measure(works, f"rung {rung} of {RUNGS}")
         for job in works:
-            number = known[job.label].number if job.label in known else len(known) + 1
-            known[job.label] = _tried(number, job, found[job.key])
+            if job.key in found:
+                number = known[job.label].number if job.label in known else len(known) + 1
+                known[job.label] = _tried(number, job.candidate, rung, found[job.key])
         if rung < RUNGS:
-            on = promote([known[name] for name in alive], rung)
+            on = promote([known[name] for name in alive if name in known], rung)
             alive = {each.candidate.name: (each.candidate, each.setting) for each in on}
-            for each in on[: VARIED[rung]]:
+            for each in on[: VARIED[rung]] if any(e.costs for e in on) else ():
                 alive |= {other.name: (other, each.setting) for other in variants(each.candidate, rung)}
     return list(known.values())
+
+
+def train_all(
+    candidates: Sequence[Candidate], folds: int, budgets: Sequence[Budget], scene: Scene, work_on: Work
+) -> list[Tried]:
+    """The same for networks that are trained by gradients, of which as many epochs are asked as rungs are climbed."""
+    known: dict[str, Tried] = {}
+    alive = list(candidates)
+    for rung, epochs in enumerate(EPOCHS, 1):
+        works = {each.name: work.trials(each, rung, scene, folds, certify=work_on.certify) for each in alive}
+        label = f"{number(epochs, 'epoch')} of {number(len(alive), 'network')}"
+        found = work_on.measure([job for jobs in works.values() for job in jobs], label)
+        for each in alive:
+            parts = [found[job.key] for job in works[each.name] if job.key in found]
+            if len(parts) == len(works[each.name]):
+                measured = work.merged(parts)
+                before = known.get(each.name)
+                number_of = len(known) + 1 if before is None else before.number
+                known[each.name] = _grown(before, _tried(number_of, each, rung, measured))
+        came = [known[each.name] for each in alive if each.name in known and known[each.name].rung == rung]
+        alive = [each.candidate for each in climbing(came, rung, budgets)]
+    return list(known.values())
+
+
+def climbing(tried: Sequence[Tried], rung: int, budgets: Sequence[Budget]) -> list[Tried]:
+    """Networks that are trained for longer: those that may be chosen and the best of each system, largest first.
+
+    From the last rung on, those of them whose curve still rises.
+    """
+    if rung > RUNGS:
+        return []
+    enough = any(budget.what == "accuracy" for budget in budgets)
+    likely = promote(tried, rung, budgets, BEST if enough else NEAR_BEST)
+    on = {each.number: each for each in likely[: TRAINED[rung]]}
+    if rung < RUNGS:
+        for system in dict.fromkeys(each.candidate.system for each in tried):
+            same = [each for each in tried if each.candidate.system == system and each.costs is not None]
+            on |= {each.number: each for each in sorted(same, key=lambda each: -each.accuracy)[:1]}
+    else:
+        on = {number: each for number, each in on.items() if not each.finished}
+    return [on[number] for number in sorted(on)]
+
+
+def _grown(before: Tried | None, made: Tried) -> Tried:
+    """A network after a rung, and whether more epochs still helped it: from the rung that may be chosen on."""
+    curve = () if before is None else before.curve
+    made = replace(made, curve=(*curve, (int(made.setting), made.accuracy)))
+    if made.rung < RUNGS or before is None or made.refused is not None:
+        return replace(made, finished=True if made.refused else None)
+    gain, error = lead(made.shares, before.shares)
+    return replace(made, finished=gain <= max(error, POINT))
+
+
+def accuracy_at_random(each: Tried, scene: Scene, work_on: Work) -> float | None:
+    """Accuracy of a candidate where parts at random are left out; None where time was too short."""
+    about = {"certify": False, "at_random": True}
+    if each.candidate.system == COUNTING:
+        works = [work.trial(each.candidate, each.rung, each.setting, scene, **about)]
+    else:
+        works = work.trials(each.candidate, each.rung, scene, FOLDS, **about)
+    found = work_on.measure(works, "parts at random")
+    parts = [found[job.key] for job in works if job.key in found]
+    return accuracy(work.merged(parts)) if len(parts) == len(works) else None
+
+
+def families(tried: Sequence[Tried]) -> tuple[Family, ...]:
+    """Of each system what was best, and whether that was tried to the end."""
+    return tuple(
+        Family(
+            system=system,
+            tried=len(same),
+            best=max(same, key=lambda each: (each.rung, each.accuracy)).number,
+            finished=any(each.rung >= RUNGS for each in same)
+            and all(each.finished in (None, True) for each in same if each.rung >= RUNGS),
+        )
+        for system in dict.fromkeys(each.candidate.system for each in tried)
+        if (same := [each for each in tried if each.candidate.system == system])
+    )
 
 
 def most_accurate(tried: Sequence[Tried], rung: int) -> list[Tried]:
@@ -124,12 +269,12 @@ def most_accurate(tried: Sequence[Tried], rung: int) -> list[Tried]:
     ]
 
 
-def _tried(number: int, trial: work.Trial, measured: Measured) -> Tried:
+def _tried(number: int, candidate: Candidate, rung: int, measured: Measured) -> Tried:
     about = {each.name: getattr(measured, each.name) for each in fields(measured)}
     recordings = int(np.count_nonzero(measured.tried))
     right = accuracy(measured)
     low, high = wilson(right * recordings, recordings)
-    about |= {"number": number, "candidate": trial.candidate, "rung": trial.rung}
+    about |= {"number": number, "candidate": candidate, "rung": rung}
     return Tried(**about, accuracy=right, low=low, high=high)
 
 
@@ -141,14 +286,20 @@ def accuracy(measured: Measured) -> float:
 def _beside(each: Tried, best: Tried, tried: Sequence[Tried]) -> Tried:
     """A candidate with what the best has ahead of it, and whether it is on the front of those that came as far."""
     behind, error = lead(best.shares, each.shares)
-    peers = [other for other in tried if other.rung == each.rung and other.costs is not None]
+    peers = [
+        other
+        for other in tried
+        if min(other.rung, RUNGS) == min(each.rung, RUNGS) and other.costs is not None
+    ]
     marks = front([other.accuracy for other in peers], [energy(other) for other in peers])
     on = any(mark and other.number == each.number for mark, other in zip(marks, peers, strict=True))
     return replace(each, behind=behind, behind_error=error, front=on)
 
 
-def promote(tried: Iterable[Tried], rung: int, budgets: Sequence[Budget] = ()) -> list[Tried]:
-    """Those that may still be chosen: least behind a cheaper one, or, which weighs less, behind the best.
+def promote(
+    tried: Iterable[Tried], rung: int, budgets: Sequence[Budget] = (), weight: float = BEST
+) -> list[Tried]:
+    """Those that may still be chosen: least behind a cheaper one, or, which has less `weight`, behind the best.
 
     Where budgets are nearly met by any, those alone go on.
     """
@@ -161,7 +312,7 @@ def promote(tried: Iterable[Tried], rung: int, budgets: Sequence[Budget] = ()) -
 
     def lag(each: Tried) -> float:
         cheaper = max(other.accuracy for other in able if energy(other) <= energy(each))
-        return cheaper - each.accuracy + (top - each.accuracy) / BEST
+        return cheaper - each.accuracy + (top - each.accuracy) / weight
 
     return sorted(able, key=lambda each: (lag(each), energy(each)))[: KEPT[rung]]
 
@@ -173,16 +324,16 @@ def energy(tried: Tried, table: str | None = None) -> float:
 
 
 def pick(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
-    """The cheapest of the last rung, by each table, that fits the budgets and is not shown to be worse than the best.
+    """The cheapest of the last rung, by each table, that fits the budgets and is about as accurate as the best.
 
-    Worse is one whose accuracy is lower by more than a standard error of the difference, recording by
-    recording. Where an accuracy is wanted, all that reach it are good enough. Where no candidate of the last
-    rung fits, earlier ones may.
+    Its accuracy may be lower by `MARGIN` and by a standard error of the difference, recording by recording.
+    Where an accuracy is wanted, all that reach it are good enough. Where no candidate of the last rung fits,
+    earlier ones may.
     """
     priced = [each for each in tried if each.costs is not None]
     if not priced:
         raise OptionError(f"the chip holds no candidate; the first: {tried[0].refused}")
-    pool = [each for each in priced if each.rung == RUNGS]
+    pool = [each for each in priced if each.rung >= RUNGS]
     selection = choose(pool, values, worse, budgets)
     if not selection.fitting:
         earlier = choose(priced, values, worse, budgets)
@@ -203,12 +354,19 @@ def pick(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
         cheapest=cheapest,
         allowed=tuple(each.number for each in allowed),
         ahead=min(above, key=energy).number if above else None,
+        cheaper=_cheaper(pool, chosen),
     )
 
 
+def _cheaper(pool: Sequence[Tried], chosen: Tried) -> int | None:
+    """The most accurate that takes two thirds of the energy at most."""
+    below = [each for each in pool if 3 * energy(each) <= 2 * energy(chosen)]
+    return max(below, key=lambda each: (each.accuracy, -energy(each))).number if below else None
+
+
 def worse(best: Tried, other: Tried) -> bool:
-    """Whether one is shown to be worse than another."""
-    return is_worse(best.shares, other.shares)
+    """Whether one is more than the margin or a standard error less accurate than another."""
+    return is_worse(best.shares, other.shares) or lead(best.shares, other.shares)[0] > MARGIN + NEAR
 
 
 def values(tried: Tried) -> dict[str, float]:

@@ -1,8 +1,10 @@
 """One candidate by cross-validation inside the training split, and what it costs; work that crosses process borders."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import CapacityError, DataError, ModelError
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray, JsonObject
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.counters import (
@@ -39,21 +41,50 @@ from spikeloom.runtime.studies.search.measure import decisions as decisions_on_c
 from spikeloom.runtime.studies.search.measure import measure_netlist
 from spikeloom.runtime.studies.search.results import Data, NetlistCosts
 from spikeloom.runtime.studies.smallest import baselines
-from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF
-from spikeloom.runtime.studies.smallest.space import Candidate
+from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF, RIDGE
+from spikeloom.runtime.studies.smallest.folds import Fold, every, folds_of
+from spikeloom.runtime.studies.smallest.space import EPOCHS, Candidate
 from spikeloom.runtime.studies.smallest.trained import Sensor, plan_of, without
 
-FORMAT = 3
+FORMAT = 4
 """Of what is measured; goes up when a figure means something else."""
 
 PRICED = 48
 """Training recordings that a candidate is priced on, evenly spaced."""
 
 RUNGS = 3
-"""What comes to the last one may be chosen."""
+"""What comes to this one may be chosen; a fourth is for networks whose learning curve still rises."""
+
+FEW = {1: 2, 2: 4}
+"""Folds of the first rungs, of networks that are trained by gradients."""
 
 ROUNDS = 5
-"""Of cross-validation on the last rung."""
+"""Of cross-validation at random, of what may be chosen; networks that are trained by gradients have one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """What all candidates are tried on: recordings, their groups, a sensor and a chip; `states` of trainings."""
+
+    data: Data
+    groups: str | None
+    sensor: Sensor
+    target: str
+    states: Path
+
+    @property
+    def identity(self) -> JsonObject:
+        """JSON values that tell it from others."""
+        sensor = {"edges": self.sensor.graph.edges, "coordinates": self.sensor.graph.coordinates}
+        return {
+            "format": FORMAT,
+            "spikeloom": __version__,
+            "data": self.data.sha256,
+            "groups": self.groups,
+            "bin_s": self.data.bin_s,
+            "graph": arrays_digest(sensor),
+            "target": self.target,
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,10 +94,10 @@ class Trial(Job):
     candidate: Candidate
     rung: int  # From 1
     setting: float | None
-    data: Data
-    sensor: Sensor
-    target: str
+    scene: Scene
     certify: bool
+    at_random: bool  # Whatever conditions there are
+    fold: int | None  # The one that is left out, of networks that are trained by gradients; else all in turn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +109,9 @@ class Measured:
 
     right: tuple[int, ...]
     tried: tuple[int, ...]
-    setting: float  # Strength of the rule
+    setting: float  # Strength of the rule, or epochs
+    # Share of right decisions by condition that was left out
+    conditions: Mapping[str, float] = field(default_factory=dict)
     costs: NetlistCosts | None = field(default=None, metadata=OPTIONAL)
     whole: NetlistCosts | None = field(default=None, metadata=OPTIONAL)
     refused: str | None = field(default=None, metadata=OPTIONAL)  # Why the chip does not hold it
@@ -99,47 +132,68 @@ def trial(
     candidate: Candidate,
     rung: int,
     setting: float | None,
-    data: Data,
-    sensor: Sensor,
-    target: str,
+    scene: Scene,
     *,
     certify: bool,
+    at_random: bool = False,
+    fold: int | None = None,
 ) -> Trial:
-    """Work whose key is of everything that decides the result; on the last rung it may `certify`."""
-    graph = arrays_digest({"edges": sensor.graph.edges, "coordinates": sensor.graph.coordinates})
-    about = {
-        "format": FORMAT,
-        "spikeloom": __version__,
-        "data": data.sha256,
-        "bin_s": data.bin_s,
-        "graph": graph,
-    }
-    about |= {"target": target, "candidate": encode(candidate), "rung": rung, "setting": setting}
-    if certify := certify and rung == RUNGS:
+    """Work whose key is of everything that decides the result; from the last rung on it may `certify`."""
+    about = scene.identity | {"candidate": encode(candidate), "rung": rung, "setting": setting}
+    about |= {"at random": at_random, "fold": fold}
+    if certify := certify and rung >= RUNGS:
         about |= {"certified": True}
-    own: dict[str, Any] = {
-        "candidate": candidate,
-        "rung": rung,
-        "setting": setting,
-        "data": data,
-        "sensor": sensor,
-    }
-    return Trial(key=content_key(about), label=candidate.name, target=target, certify=certify, **own)
+    return Trial(
+        key=content_key(about),
+        label=candidate.name,
+        candidate=candidate,
+        rung=rung,
+        setting=setting,
+        scene=scene,
+        certify=certify,
+        at_random=at_random,
+        fold=fold,
+    )
+
+
+def trials(
+    candidate: Candidate, rung: int, scene: Scene, folds: int, *, certify: bool, at_random: bool = False
+) -> list[Trial]:
+    """The same for a network that is trained by gradients, fold by fold; on the first rungs a few."""
+    return [
+        trial(candidate, rung, None, scene, certify=certify, at_random=at_random, fold=fold)
+        for fold in range(min(folds, FEW.get(rung, folds)))
+    ]
+
+
+def merged(parts: Sequence[Measured]) -> Measured:
+    """What was measured in several folds, together."""
+    return replace(
+        parts[0],
+        right=tuple(map(sum, zip(*(part.right for part in parts), strict=True))),
+        tried=tuple(map(sum, zip(*(part.tried for part in parts), strict=True))),
+        conditions={name: share for part in parts for name, share in part.conditions.items()},
+        refused=next((part.refused for part in parts if part.refused), None),
+    )
 
 
 def measure(work: Trial) -> JsonObject:
     """Do one piece of work; the JSON of a :class:`Measured`."""
-    kinds = {COUNTING: _counting, LINEAR: _baseline, RBF: _baseline}
-    training = _training(work.data, len(work.sensor.graph.coordinates))
+    kinds = {COUNTING: _counting, LINEAR: _baseline, RBF: _baseline, RIDGE: _baseline}
+    training = _training(work.scene)
     found: JsonObject = encode(kinds.get(work.candidate.system, _network)(work, training))
     return found
 
 
 @lru_cache(maxsize=1)
-def _training(data: Data, taxels: int) -> Recordings:
-    return recordings(
-        data.path, "train", classes=None, taxels=taxels, bin_s=data.bin_s, labels_for="training"
-    )
+def _training_of(path: str, taxels: int, bin_s: float, groups: str | None) -> Recordings:
+    known: dict[str, Any] = {"taxels": taxels, "bin_s": bin_s, "groups": groups}
+    return recordings(path, "train", classes=None, labels_for="training", **known)
+
+
+def _training(scene: Scene) -> Recordings:
+    taxels = len(scene.sensor.graph.coordinates)
+    return _training_of(scene.data.path, taxels, scene.data.bin_s, scene.groups)
 
 
 def some(data: Recordings) -> Recordings:
@@ -150,21 +204,26 @@ def some(data: Recordings) -> Recordings:
 def _counting(work: Trial, training: Recordings) -> Measured:
     """A counting network: its strength, its decisions, its costs."""
     plan = work.candidate.plan({1: STRENGTHS[2:3], 2: STRENGTHS}.get(work.rung, (work.setting or 0.0,)))
-    classes, data = int(training.labels.max()) + 1, run_counters(training, plan)
-    right, seeds = np.zeros(len(training), np.int64), range(1, ROUNDS + 1) if work.rung == RUNGS else (0,)
-    for seed in seeds:
-        decided, strength, lowest = cross_validated(data, classes, training, seed)
+    classes = int(training.labels.max()) + 1
+    data = run_counters(training, plan)
+    right = np.zeros(len(training), np.int64)
+    shares: dict[str, float] = {}
+    rounds = _rounds(work, training)
+    for folds in rounds:
+        decided, strength, lowest = cross_validated(data, classes, training, folds)
         right += decided == training.labels
+        shares |= _by_condition(folds, decided == training.labels)
 
     def compiled(data: Counted) -> tuple[Counters, Any]:
         rule = fit_rules(data, classes, [strength])[strength]
         made = counters_of(
             data, Fitted(rule=rule, strength=strength, accuracy={}, lowest=lowest), training, classes
         )
-        return made, backend_of(work.target).lower_counters(made)
+        return made, backend_of(work.scene.target).lower_counters(made)
 
     costs: dict[str, Any]
-    certified, held = None, split_folds(data.labels, FOLDS, np.random.default_rng(0)) == 0
+    certified = None
+    held = split_folds(data.labels, FOLDS, np.random.default_rng(0)) == 0
     try:
         made, netlist = compiled(data)
         if work.certify:
@@ -175,73 +234,96 @@ def _counting(work: Trial, training: Recordings) -> Measured:
         costs = {"refused": str(error).splitlines()[0]}
     else:
         costs = costs_of(netlist, of_length(joined_bins(some(training), made.bins), made.clocks.length))
-    rounds = (len(seeds),) * len(right)
     return Measured(
-        right=tuple(right.tolist()), tried=rounds, setting=strength, certified=certified, **costs
+        right=tuple(right.tolist()),
+        tried=(len(rounds),) * len(right),
+        setting=strength,
+        conditions=shares,
+        certified=certified,
+        **costs,
     )
+
+
+def _rounds(work: Trial, training: Recordings) -> list[list[Fold]]:
+    return folds_of(training, ROUNDS if work.rung >= RUNGS else 1, at_random=work.at_random)
+
+
+def _by_condition(folds: Sequence[Fold], right: BoolArray) -> dict[str, float]:
+    """Share of right decisions in each condition."""
+    return {fold.condition: float(right[fold.held].mean()) for fold in folds if fold.condition is not None}
 
 
 def _network(work: Trial, training: Recordings) -> Measured:
-    """A network that is trained by gradients: decisions on one part, on the last rung on all; costs of the first."""
-    plan, target = plan_of(work.candidate, work.sensor, training), load_target(work.target)
-    epochs = work.candidate.options["epochs"] // (2 if work.rung == 1 else 1)
-    fold = split_folds(training.labels, FOLDS, np.random.default_rng(0))
-    right, tried = np.zeros((2, len(training)), np.int64)
-    costs: dict[str, Any] = {}
-    certified = None
+    """A network that is trained by gradients, without a fold: its decisions there, and its costs, of the first fold."""
+    assert work.fold is not None, "these are tried fold by fold"
+    fold = list(every(folds_of(training, 1, at_random=work.at_random)))[work.fold]
+    epochs = EPOCHS[work.rung - 1]
+    right = np.zeros(len(training), np.int64)
+    nothing = Measured(right=tuple(right.tolist()), tried=tuple(right.tolist()), setting=epochs)
+    known = work.scene.identity | {"candidate": encode(work.candidate), "fold": work.fold}
+    trunk = work.scene.states / content_key(known | {"at random": work.at_random})
+    try:
+        plan = plan_of(work.candidate, work.scene.sensor, training)
+        netlist = without(plan, training, fold.held, epochs, load_target(work.scene.target), trunk)
+    except (CapacityError, ModelError, DataError) as error:
+        return replace(nothing, refused=str(error).splitlines()[0])
     steps = joined_bins(training, plan.bins)
-    for part in range(FOLDS if work.rung == RUNGS else 1):
-        held = fold == part
-        try:
-            netlist = without(plan, training, held, epochs, target, work.candidate.storage)
-        except (CapacityError, ModelError) as error:
-            right[:], tried[:], costs = 0, 0, {"refused": str(error).splitlines()[0]}
-            break
-        costs = costs or costs_of(netlist, some(steps))
-        if work.certify and not part:
-            certified = share_robust_to_one_event(machine_of(netlist), some(training.part(held)))
-        right[held], tried[held] = decisions_on_chip(netlist, steps.part(held)) == training.labels[held], 1
-    decided, rounds = tuple(right.tolist()), tuple(tried.tolist())
-    return Measured(right=decided, tried=rounds, setting=epochs, certified=certified, **costs)
+    costs: dict[str, Any] = {} if work.fold else costs_of(netlist, some(steps))
+    if work.certify and not work.fold:
+        certified = share_robust_to_one_event(machine_of(netlist), some(training.part(fold.held)))
+        costs |= {"certified": certified}
+    right[fold.held] = decisions_on_chip(netlist, steps.part(fold.held)) == training.labels[fold.held]
+    return replace(
+        nothing,
+        right=tuple(right.tolist()),
+        tried=tuple(fold.held.astype(int).tolist()),
+        conditions=_by_condition([fold], right == 1),
+        **costs,
+    )
 
 
 def _baseline(work: Trial, training: Recordings) -> Measured:
-    """A support vector machine: its constant, its decisions, its costs."""
-    system, labels, rung = work.candidate.system, training.labels, work.rung
+    """A classifier without spikes: its constant, its decisions, its costs."""
+    system = work.candidate.system
     strengths = baselines.STRENGTHS[system]
-    tried = {1: strengths[:1], 2: sorted(strengths)}.get(rung, (work.setting or 0.0,))
-    seen, seeds = (
-        baselines.features(training, work.candidate),
-        range(1, ROUNDS + 1) if rung == RUNGS else (0,),
-    )
+    tried = {1: strengths[:1], 2: sorted(strengths)}.get(work.rung, (work.setting or 0.0,))
+    seen = baselines.features(training, work.candidate)
+    rounds = _rounds(work, training)
     right = {strength: np.zeros(len(training), np.int64) for strength in tried}
-    for strength, seed in product(right, seeds):
-        fold = split_folds(labels, FOLDS, np.random.default_rng(seed))
-        right[strength] += baselines.decided(system, strength, seen, labels, fold) == labels
+    shares: dict[float, dict[str, float]] = {strength: {} for strength in tried}
+    for strength, folds in product(right, rounds):
+        fitting = baselines.decided(system, strength, seen, training.labels, folds) == training.labels
+        right[strength] += fitting
+        shares[strength] |= _by_condition(folds, fitting)
     best = max(right, key=lambda strength: right[strength].sum())
-    costs, rounds = baselines.priced(system, best, training, work.candidate), (len(seeds),) * len(training)
-    return Measured(right=tuple(right[best].tolist()), tried=rounds, setting=best, processor=costs)
+    return Measured(
+        right=tuple(right[best].tolist()),
+        tried=(len(rounds),) * len(training),
+        setting=best,
+        conditions=shares[best],
+        processor=baselines.priced(system, best, training, work.candidate),
+    )
 
 
 def cross_validated(
-    data: Counted, classes: int, sensor: Recordings, seed: int
+    data: Counted, classes: int, sensor: Recordings, folds: Sequence[Fold]
 ) -> tuple[IntArray, float, float]:
     """Class of each recording by a network that did not see it, the strength of all of them, and the least winning sum.
 
     The strength is chosen as ``train`` chooses it; `sensor` has the shape of the recordings.
     """
-    fold = split_folds(data.labels, FOLDS, np.random.default_rng(seed))
-    rules = [fit_rules(data.part(fold != held), classes, data.plan.strengths) for held in range(FOLDS)]
-    sums = {strength: np.zeros((len(fold), classes)) for strength in sorted(data.plan.strengths)}
-    for strength, held in ((strength, held) for strength in sums for held in range(FOLDS)):
-        sums[strength][fold == held] = rules[held][strength].sums(data.part(fold == held))
+    held = [fold.held for fold in folds]
+    rules = [fit_rules(data.part(~each), classes, data.plan.strengths) for each in held]
+    sums = {strength: np.zeros((len(data.labels), classes)) for strength in sorted(data.plan.strengths)}
+    for strength, (each, rule) in product(sums, zip(held, rules, strict=True)):
+        sums[strength][each] = rule[strength].sums(data.part(each))
     best = max(sums, key=lambda strength: np.mean(sums[strength].argmax(axis=1) == data.labels))
-    top, decided = sums[best].max(axis=1), np.zeros(len(fold), np.int64)
-    for held in range(FOLDS):
-        lowest = float(top[fold != held].min())
-        fitted = Fitted(rule=rules[held][best], strength=best, accuracy={}, lowest=lowest)
-        made = counters_of(data.part(fold != held), fitted, sensor, classes)
-        decided[fold == held] = decisions(made, data.part(fold == held))
+    top = sums[best].max(axis=1)
+    decided = np.zeros(len(data.labels), np.int64)
+    for each, rule in zip(held, rules, strict=True):
+        fitted = Fitted(rule=rule[best], strength=best, accuracy={}, lowest=float(top[~each].min()))
+        made = counters_of(data.part(~each), fitted, sensor, classes)
+        decided[each] = decisions(made, data.part(each))
     return decided, best, float(top.min())
 
 

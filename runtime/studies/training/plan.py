@@ -30,11 +30,13 @@ RECIPE = ("current_decay", "membrane_decay", *SIZES, "batch", "decay_epochs", "s
 """Options that change single values of a recipe."""
 
 
-def both_splits(data: str, taxels: int | None, bin_s: float | None) -> tuple[Recordings, Recordings]:
+def both_splits(
+    data: str, taxels: int | None, bin_s: float | None, groups: str | None = None
+) -> tuple[Recordings, Recordings]:
     """Training and test recordings of a sensor, all of them labelled."""
     progress("reading the recordings")
     require_splits(data)
-    shared: dict[str, Any] = {"bin_s": bin_s, "labels_for": "training", "classes": None}
+    shared: dict[str, Any] = {"bin_s": bin_s, "labels_for": "training", "classes": None, "groups": groups}
     training = recordings(data, "train", taxels=taxels, **shared)
     try:
         test = recordings(data, "test", taxels=training.taxels, **shared)
@@ -104,7 +106,7 @@ def recipe_of(request: TrainRequest) -> Recipe:
     values = repeat.given(request, ("clocks", "features", "hops", "batch", "decay_epochs", "robust"))
     values["penalty"] = request.spike_penalty
     if request.hidden is not None:
-        values["hidden"] = tuple(whole_numbers(request.hidden, "--hidden"))
+        values["hidden"] = hidden_sizes(request.hidden)
     recipe = replace(recipe, **{name: value for name, value in values.items() if value is not None})
     if request.decay_epochs is not None and recipe.schedule != STEPS:
         raise OptionError(
@@ -121,6 +123,11 @@ def recipe_of(request: TrainRequest) -> Recipe:
         raise OptionError(f"--hops {request.hops}: {TITLES[request.system]} has no hops to choose; omit it")
     check_recipe(recipe)
     return recipe
+
+
+def hidden_sizes(words: str) -> tuple[int, ...]:
+    """Neurons of each dense layer but the last, from the words of ``--hidden``; ``none`` is no such layer."""
+    return () if words == "none" else tuple(whole_numbers(words, "--hidden"))
 
 
 def _named_recipe(request: TrainRequest) -> Recipe:
