@@ -22,7 +22,7 @@ from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surroga
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.models.training.evaluate import evaluate
-from spikeloom.models.training.recipes import RECIPES, RELEASED, TIMED, Recipe, parse_decays
+from spikeloom.models.training.recipes import RATES, RECIPES, RELEASED, TIMED, Recipe, parse_decays
 from spikeloom.models.training.train import train
 from spikeloom.runtime.cli import main
 
@@ -177,7 +177,7 @@ def test_what_a_file_cannot_have_is_refused(tmp_path):
 
 
 def test_the_released_recipe_is_the_released_code():
-    assert RECIPES == {"released": RELEASED, "timed": TIMED}
+    assert RECIPES == {"released": RELEASED, "timed": TIMED, "rates": RATES}
     assert RELEASED == Recipe(
         name="released",
         epochs=100,

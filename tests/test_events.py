@@ -83,7 +83,6 @@ def test_what_is_odd_is_counted(write):
             "a.csv: polarities -1 and 0 in one file, allowed are 0 and 1, or -1 and 1",
         ),
         ("0,0,up\n", "a.csv: line 2: polarity is 'up', not a number"),
-        ("", "a.csv: no rows, expected are lines of time_s, taxel, polarity[, label]"),
     ],
 )
 def test_events_that_cannot_be(write, rows, words):
@@ -338,6 +337,32 @@ def test_times_that_do_not_count_from_the_start_are_noticed(write):
     assert warned(write("late/b.csv", f"{HEADER}4,0,1\n").parent) == (f"late: a.csv: {note}",)
 
 
+def test_a_silent_recording_is_a_recording(write, tmp_path):
+    for index, last in enumerate((0.09, 0.19, 0.39)):
+        write(f"own/a{index}_label_0.csv", f"{HEADER}0,0,1\n{last},1,1\n")
+    write("own/b_label_1.csv", HEADER)
+    np.savez(tmp_path / "own/c_label_2.npz", time_s=[], taxel=[], polarity=[])
+    recordings = load_data(tmp_path / "own")
+    assert recordings.step_counts.tolist() == [5, 10, 20, 10, 10]
+    assert recordings.labels.tolist() == [0, 0, 0, 1, 2]
+    assert not recordings.events[3:].any()
+    assert recordings.counts.notes == ("own: 2 recordings without events: taken as long as the others",)
+
+
+def test_recordings_that_are_all_silent(write):
+    path = write("own/b.csv", HEADER)
+    assert message(load_data, path) == "b.csv: no events in any recording; check how they were written"
+
+
+def test_arrays_of_unequal_length(tmp_path):
+    (tmp_path / "own/test").mkdir(parents=True)
+    for index, steps in enumerate((4, 6)):
+        np.save(tmp_path / f"own/test/sample_{index}_label_{index}.npy", np.ones((2, 2, steps), np.uint8))
+    recordings = load_data(tmp_path / "own")
+    assert recordings.step_counts.tolist() == [4, 6]
+    assert recordings.events.sum(axis=(1, 2, 3)).tolist() == [16, 24]
+
+
 def test_taxels_that_count_from_one(write):
     rows = "".join(f"0.{i},{i},1\n" for i in range(1, 6))
     path = write("one/a.csv", HEADER + rows)
@@ -398,10 +423,10 @@ def test_conditions_in_file_names(write):
     found = conditions(recordings)
     assert list(found["force"]) == ["force=0.5", "force=1.0"]
     assert [int(held.sum()) for held in found["speed"].values()] == [
+        4,
+        4,
+        4,
         5,
-        4,
-        4,
-        4,
         4,
     ]  # many are dealt into parts
     assert sum(held.astype(int) for held in found["speed"].values()).tolist() == [1] * 21

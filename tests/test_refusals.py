@@ -71,8 +71,8 @@ def place(tmp_path_factory):
     (at / "plain.pkl").write_bytes(pickle.dumps({"net_list": [Evil()]}))
     (at / "pressures" / "test").mkdir(parents=True)
     np.save(at / "pressures" / "test" / "sample_0_label_0.npy", GOOD * 0.5)
-    recordings_folder(at / "lengths")
-    np.save(at / "lengths" / "test" / "sample_1_label_1.npy", GOOD[:, :, :20])
+    recordings_folder(at / "polarities")
+    np.save(at / "polarities" / "test" / "sample_1_label_1.npy", GOOD[:, :1])
     recordings_folder(at / "five", train=events(taxels=5), test=events(taxels=5))
     (at / "half.loom").write_bytes((at / "net.loom").read_bytes()[:900])
     csv_folder(at / "flat", taxels=6)
@@ -368,7 +368,7 @@ TABLE = [
         COMPILE.format("net.pt --calibrate five"),
         "five: train/sample_0_label_0.npy: has 5 taxels, the network has 6",
     ),
-    ("estimate net.loom --data lengths", "test/sample_1_label_1.npy: shape (6, 2, 20)|(6, 2, 24)"),
+    ("estimate net.loom --data polarities", "test/sample_1_label_1.npy: shape (6, 1, 24)|(6, 2, 24)"),
     (RUN.format("nowhere"), "nowhere: no such folder or file"),
     (RUN.format("net.loom"), "net.loom: no recordings"),
     (RUN.format("words.txt"), "words.txt: not a recording|.csv, .npz or .npy"),

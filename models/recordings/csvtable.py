@@ -48,10 +48,11 @@ def read_table(
     optional: tuple[str, ...] = (),
     *,
     where: str | None = None,
+    empty: bool = False,
 ) -> Table:
     """Read a CSV file with these columns, whose order counts where the file does not name them; `where` names the file.
 
-    The table has at least one row; values may be infinite or NaN.
+    The table has at least one row, unless it may be `empty` below its header; values may be infinite or NaN.
 
     DataError if the file cannot be read or is not such a table; the message names the line.
     """
@@ -73,6 +74,8 @@ def read_table(
         )
     else:
         names = known[: len(names)]
+    if names and empty and not rows:
+        return Table(where=where, columns={name: np.zeros(0) for name in names}, lines=[])
     if not rows:
         raise DataError(
             f"{where}: no rows, expected are lines of {expected}; check how the file was written"

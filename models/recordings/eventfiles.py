@@ -40,13 +40,13 @@ def read_stream(
 ) -> EventStream:
     """Read a ``.csv`` or a ``.npz`` of one-dimensional arrays, whose ``label`` may be one number.
 
-    DataError if the file cannot be read, holds no events, or one that a sensor of so many `taxels` does not
+    DataError if the file cannot be read, or holds an event that a sensor of so many `taxels` does not
     send; the message names the event.
     """
     path = Path(path)
     where = where or path.name
     if path.suffix.lower() == ".csv":
-        table = read_table(path, _REQUIRED, ("label",), where=where)
+        table = read_table(path, _REQUIRED, ("label",), where=where, empty=True)
         columns: Mapping[str, FloatArray] = table.columns
         at: Callable[[int], str] = table.at
     else:
@@ -63,7 +63,7 @@ def read_stream(
     wrong = ~((taxel >= 0) & (taxel < most) & (taxel == np.floor(taxel)))  # true for NaN too
     if wrong.any():
         row = int(np.argmax(wrong))
-        from_one = taxel.min() == 1 and taxel.max() == taxels  # false for NaN
+        from_one = taxel.min(initial=MAX_TAXELS) == 1 and taxel.max() == taxels  # false for NaN
         remedy = "they seem to count from 1" if from_one else "use recordings of this sensor"
         plain = f"{at(row)}: taxel {taxel[row]:g}, allowed are whole numbers 0..{most - 1}; count from 0"
         raise DataError(f"{plain}, {remedy}" if from_one else f"{plain} and {remedy}")
@@ -131,8 +131,6 @@ def _read_npz(path: Path, where: str) -> tuple[Mapping[str, FloatArray], Callabl
         raise DataError(
             f"{where}: shapes {shown}, allowed is one number per event in each; save flat arrays"
         )
-    if not columns["time_s"].size:
-        raise DataError(f"{where}: no events, a recording needs one or more; remove the file")
     if "label" in columns:
         columns["label"] = columns["label"].reshape(-1)
     return columns, lambda row: f"{where}: event {row}"

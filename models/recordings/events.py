@@ -7,7 +7,7 @@ own length.
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,7 +20,7 @@ from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.types import AnyArray, EventArray, IntArray
 from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.conditions import groups_of
-from spikeloom.models.recordings.counts import GAP_S, EventCounts
+from spikeloom.models.recordings.counts import GAP_S, EventCounts, number
 from spikeloom.models.recordings.csvtable import NOTHING, is_table, rows_beside
 from spikeloom.models.recordings.eventfiles import EventStream, read_stream
 from spikeloom.models.recordings.evtouch import BIN_S
@@ -67,9 +67,9 @@ def load_data(
     of a fetched data set. `bin_s` is the width of a time bin in seconds, by default `default_bin_s`; the
     released layout and ``.npy`` files have bins already, see `require_events`. `taxels` and `classes` are
     the network's; without `taxels` the highest with an event decides. Labels are `UNLABELLED` where nothing
-    says them. `groups` name columns of a table of recordings, or fields of file names; by default they are
-    all columns that the table has beside file and label. In the released layout all recordings have labels,
-    the same steps and taxels, and no counts.
+    says them. A file without events is as long as the others in the median. `groups` name columns of a table
+    of recordings, or fields of file names; by default they are all columns that the table has beside file and
+    label. In the released layout all recordings have labels and the same taxels, and no counts.
 
     DataError if a recording cannot be used; OptionError if `bin_s` or `limit` cannot be, or bins are there.
     """
@@ -77,11 +77,7 @@ def load_data(
     place = _place_of(path)
     source = place.name or str(place)
     with _data_set(place, split) as (members, splits):
-        if split not in splits and "" not in splits:
-            present = ", ".join(sorted(splits))
-            fault = f"split {split!r} is missing or empty"
-            raise DataError(f"{source}: {fault}; splits with recordings: {present}")
-        folder = split if split in splits else ""
+        folder = _folder_of(split, splits, source)
         chosen = sorted(splits[folder].items())[:limit]
         binned = all(name.lower().endswith(".npy") for name, _ in chosen)
         stated = evtouch.parse_width(source, members, chosen[0][1]) if binned else None
@@ -93,19 +89,17 @@ def load_data(
         released = bool(folder) and binned
         size = 0
         read: list[_Recording] = []
-        for file, (name, member) in zip(files, chosen, strict=True):
+        rows = [table.get(file, NOTHING) for file in files]
+        for file, (name, member), row in zip(files, chosen, rows, strict=True):
             where = source if place == file else f"{source}: {Path(folder, name).as_posix()}"
-            read.append(
-                _read(
-                    file, members[member], where, width, taxels, table[file].label if file in table else None
-                )
-            )
+            read.append(_read(file, members[member], where, width, taxels, row.label))
             _require_alike(read[-1], read[0], released)
             evtouch.require_class(where, read[-1].label, classes)
             size += read[-1].grid.size
             evtouch.require_memory(source, size)
     events, steps = _stack(read, source)
-    notes = [*notes, *_unit_notes(read), *(_taxel_notes(source, events) if taxels is None else ())]
+    notes += [*_silent_notes(read, source), *_unit_notes(read)]
+    notes += _taxel_notes(source, events) if taxels is None else []
     return evtouch.Recordings(
         events=events,
         labels=np.array([each.label for each in read], dtype=np.int64),
@@ -115,12 +109,7 @@ def load_data(
         lengths=None if steps.min() == steps.max() else steps,
         counts=None if released else _sum_counts(read, steps, notes),
         bin_s=stated if binned else width,
-        groups=groups_of(
-            source,
-            [name for name, _ in chosen],
-            [table.get(file, NOTHING).groups for file in files],
-            groups,
-        ),
+        groups=groups_of(source, [name for name, _ in chosen], [row.groups for row in rows], groups),
     )
 
 
@@ -132,6 +121,15 @@ def _require_options(bin_s: float | None, limit: int | None) -> None:
         raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
 
 
+def _folder_of(split: str, splits: Collection[str], source: str) -> str:
+    """Where a split lies, or what stands for any; DataError if there is neither."""
+    if split not in splits and "" not in splits:
+        present = ", ".join(sorted(splits))
+        fault = f"split {split!r} is missing or empty"
+        raise DataError(f"{source}: {fault}; splits with recordings: {present}")
+    return split if split in splits else ""
+
+
 def _place_of(path: str | os.PathLike[str]) -> Path:
     """Where a data set lies, which may have been fetched by its name."""
     return find_data(str(path)) if str(path) in DATA_SETS else Path(path)
@@ -140,6 +138,9 @@ def _place_of(path: str | os.PathLike[str]) -> Path:
 def _stack(read: Sequence[_Recording], source: str) -> tuple[EventArray, IntArray]:
     """Events of all recordings, filled up with silence, and the steps of each."""
     steps = np.array([each.grid.shape[2] for each in read], np.int64)
+    if not steps.any():
+        raise DataError(f"{source}: no events in any recording; check how they were written")
+    steps[steps == 0] = round(float(np.median(steps[steps > 0])))
     shape = max(each.grid.shape[0] for each in read), read[0].grid.shape[1], int(steps.max())
     evtouch.require_memory(source, len(read) * math.prod(shape))
     events = np.zeros((len(read), *shape), dtype=np.uint8)
@@ -161,15 +162,16 @@ def _sum_counts(read: Sequence[_Recording], steps: IntArray, notes: Sequence[str
 
 
 def _require_alike(read: _Recording, first: _Recording, released: bool) -> None:
-    """Refuse other polarities than the first recording has; in the released layout another shape, and no label."""
+    """Refuse other polarities than the first recording has; in the released layout other taxels, and no label."""
     if released and read.label == evtouch.UNLABELLED:
         raise DataError(
             f"{read.where}: no label in the name, allowed is sample_N_label_L.npy; rename or remove it"
         )
-    if read.grid.shape[1] != first.grid.shape[1] or (released and read.grid.shape != first.grid.shape):
+    same = slice(0 if released else 1, 2)
+    if read.grid.shape[same] != first.grid.shape[same]:
         raise DataError(
             f"{read.where}: shape {read.grid.shape}, the recordings before it have {first.grid.shape}; "
-            "all of a split must agree"
+            "taxels and polarities of a split must agree"
         )
 
 
@@ -325,6 +327,13 @@ def _unit_notes(read: Sequence[_Recording]) -> list[str]:
     return [f"{place}{others}: {note}" for place, note in odd[:1]]
 
 
+def _silent_notes(read: Sequence[_Recording], source: str) -> list[str]:
+    """One line for all recordings without events."""
+    silent = sum(each.grid.shape[2] == 0 for each in read)
+    line = f"{source}: {number(silent, 'recording')} without events: taken as long as the others"
+    return [line] if silent else []
+
+
 def other_sensor(recordings: evtouch.Recordings) -> str | None:
     """What says that events are of a smaller sensor: in many recordings none of the last quarter of the taxels."""
     last = int(np.flatnonzero(recordings.events.any(axis=(0, 2, 3))).max(initial=-1))
@@ -365,7 +374,11 @@ def _read(
         label = evtouch.label_in_name(file.name)
     else:
         stream = read_stream(file, taxels=taxels, where=where)
-        grid, counts = bin_events(stream, bin_s, taxels=taxels)
+        if len(stream.time_s):
+            grid, counts = bin_events(stream, bin_s, taxels=taxels)
+        else:
+            grid = np.zeros((taxels or 1, 2, 0), np.uint8)
+            counts = EventCounts(events=0, out_of_order=0, duplicates=0, gaps=0)
         label = stream.label
     if listed is not None and label not in (evtouch.UNLABELLED, listed):
         raise DataError(f"{where}: label {label}, and {listed} in its table; fix one of them")

@@ -111,8 +111,8 @@ def train(
     recordings and architecture disagree, or the loss is no longer a number.
     """
     _require_options(epochs, recipe.decay_epochs, seed)
-    for recordings in (training, test):
-        _require_suited(recordings, architecture)
+    _require_suited(training, architecture)
+    _require_suited(test, architecture)
     options = _identity(training, test, propagation, architecture, recipe)
     options |= {"epochs": MOST_EPOCHS if trunk else epochs, "seed": seed, "kept epoch": keep_epoch}
     with one_thread():
@@ -133,10 +133,7 @@ def train(
             ),
             state=state,
             after_epoch=after_epoch,
-            shown=lambda epoch: {
-                "loss": f"{epoch.training_loss:.4f}",
-                "test": f"{epoch.correct}/{epoch.tested}",
-            },
+            shown=_shown,
             label=label,
             position=position,
         )
@@ -144,6 +141,11 @@ def train(
             _climb(course, network, trunk, plateau(epochs), run)
         run(epochs)
         return _trained(architecture, network.export_weights(), course)
+
+
+def _shown(epoch: Epoch) -> dict[str, str]:
+    """Figures beside the progress bar."""
+    return {"loss": f"{epoch.training_loss:.4f}", "test": f"{epoch.correct}/{epoch.tested}"}
 
 
 def _climb(

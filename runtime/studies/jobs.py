@@ -82,11 +82,8 @@ def sweep(
         for folder in own:
             remove_leftovers(folder)
         with reading(store, DataError, "give another output, or delete it"):
-            kept.execute("CREATE TABLE IF NOT EXISTS results (key TEXT PRIMARY KEY, result TEXT)")
+            rows = _rows_of(kept)
             WRITTEN[str(store)] = None
-            if (said := kept.execute("PRAGMA quick_check").fetchone()) != ("ok",):
-                raise FileFault(f"is damaged ({said})")
-            rows = dict(kept.execute("SELECT key, result FROM results"))
             results = {key: decode(kind, _unsealed(key, rows[key])) for key in keys if key in rows}
         first = {point.key: point for point in reversed(points)}
         waiting = [first[key] for key in keys if key not in results]
@@ -115,6 +112,14 @@ def sweep(
             error.add_note(standing())
             raise
         return {key: results[key] for key in keys if key in results}
+
+
+def _rows_of(kept: sqlite3.Connection) -> dict[str, str]:
+    """Results of a store, which may be new, by key; FileFault if it is damaged."""
+    kept.execute("CREATE TABLE IF NOT EXISTS results (key TEXT PRIMARY KEY, result TEXT)")
+    if (said := kept.execute("PRAGMA quick_check").fetchone()) != ("ok",):
+        raise FileFault(f"is damaged ({said})")
+    return dict(kept.execute("SELECT key, result FROM results"))
 
 
 def _named(measure: Callable[[AJob], AResult], job: AJob) -> AResult:

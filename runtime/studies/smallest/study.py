@@ -64,6 +64,33 @@ SLACK = 1.25
 """Factor by which a candidate may miss a budget on an early rung: a variant may fit."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Work:
+    """How measurements are made: where they are kept, processes, when no more are begun, and whether they certify."""
+
+    store: Path
+    jobs: int | None
+    until: float | None  # By the monotonic clock
+    certify: bool
+
+    @property
+    def time_is_up(self) -> bool:
+        """Whether no more are begun."""
+        return self.until is not None and time.monotonic() >= self.until
+
+    def measure(self, works: Sequence[work.Trial], label: str) -> dict[str, Measured]:
+        """Results by key, of those that were begun in time."""
+        return sweep(
+            works,
+            work.measure,
+            self.store,
+            jobs=self.jobs,
+            label=label,
+            kind=Measured,
+            until=self.until,
+        )
+
+
 def smallest(
     counters: Iterable[Candidate],
     networks: Sequence[Candidate],
@@ -83,33 +110,24 @@ def smallest(
     After so many `seconds` nothing new is begun. `command` repeats it; `make` also gives the commands that do what
     it does.
     """
-    certify = any(budget.what == "certified" for budget in budgets)
     work_on = Work(
         store=store,
         jobs=jobs,
         until=None if seconds is None else time.monotonic() + seconds,
-        certify=certify,
+        certify=any(budget.what == "certified" for budget in budgets),
     )
-    by_condition = folds_of(training, 1)
-    folds = sum(map(len, by_condition))
+    folds = list(every(folds_of(training, 1)))
     scene.states.mkdir(exist_ok=True)
     beside = search(baselines(), most_accurate, scene, work_on)
-    tried = search(counters, partial(promote, budgets=budgets), scene, work_on)
-    trained = train_all(networks, folds, budgets, scene, work_on)
-    tried += [replace(each, number=len(tried) + each.number) for each in trained]
-    if not any(each.rung >= RUNGS or each.refused for each in tried):
-        raise OptionError(
-            "--time: was too short for any candidate; the same command goes on, give it longer"
-        )
+    tried = try_all(counters, networks, len(folds), budgets, scene, work_on)
     taken = pick(tried, budgets)
     best = tried[taken.best - 1]
     tried = [_beside(each, best, tried) for each in tried]
     by = chosen_by(target)
     chosen = tried[taken.cheapest[by.energy] - 1]
-    conditions = tuple(fold.condition for fold in every(by_condition) if fold.condition is not None)
+    conditions = tuple(fold.condition for fold in folds if fold.condition is not None)
     at_random = accuracy_at_random(chosen, scene, work_on) if conditions else None
-    finished = all(each.finished is not None for each in tried if each.candidate.system != COUNTING)
-    if finished:  # else the same command goes on
+    if not work_on.time_is_up:  # else the same command goes on
         shutil.rmtree(scene.states, ignore_errors=True)
     checked, commands = make(chosen)
     return Smallest(
@@ -130,26 +148,23 @@ def smallest(
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Work:
-    """How measurements are made: where they are kept, processes, when no more are begun, and whether they certify."""
-
-    store: Path
-    jobs: int | None
-    until: float | None  # By the monotonic clock
-    certify: bool
-
-    def measure(self, works: Sequence[work.Trial], label: str) -> dict[str, Measured]:
-        """Results by key, of those that were begun in time."""
-        return sweep(
-            works,
-            work.measure,
-            self.store,
-            jobs=self.jobs,
-            label=label,
-            kind=Measured,
-            until=self.until,
+def try_all(
+    counters: Iterable[Candidate],
+    networks: Sequence[Candidate],
+    folds: int,
+    budgets: Sequence[Budget],
+    scene: Scene,
+    work_on: Work,
+) -> list[Tried]:
+    """Counting networks, then those that are trained by gradients; OptionError if time was too short for any."""
+    tried = search(counters, partial(promote, budgets=budgets), scene, work_on)
+    trained = train_all(networks, folds, budgets, scene, work_on)
+    tried += [replace(each, number=len(tried) + each.number) for each in trained]
+    if not any(each.rung >= RUNGS or each.refused for each in tried):
+        raise OptionError(
+            "--time: was too short for any candidate; the same command goes on, give it longer"
         )
+    return tried
 
 
 def search(

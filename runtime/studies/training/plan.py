@@ -52,9 +52,10 @@ def both_splits(
 
 
 def _require_classes(training: Recordings, test: Recordings) -> None:
-    """Refuse test recordings of classes beyond those of training; warn of classes without training recordings."""
+    """Refuse test recordings of classes beyond those of training; warn of others that training has not seen."""
     highest = int(training.labels.max())
-    if missing := sorted(set(range(highest)) - set(training.labels.tolist())):
+    seen = set(training.labels.tolist())
+    if missing := sorted({label for label in test.labels.tolist() if label <= highest} - seen):
         tell(f"warning: {training.source}: no recordings to train class {', '.join(map(str, missing))} on")
     if test.labels.max() > highest:
         first = int((test.labels > highest).argmax())
