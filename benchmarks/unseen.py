@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 import spikeloom
+from spikeloom.compiler import __version__
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.studies.smallest.baselines import RIDGE, features, machine
@@ -29,6 +30,7 @@ from spikeloom.runtime.studies.smallest.space import Candidate
 
 NAME = re.compile(r"texture(?P<texture>[0-9]+)_speed(?P<speed>[0-9]+)_force(?P<force>[0-9.]+)\.npz")
 TAXELS = 9
+COMMAND = "python benchmarks/unseen.py ntp-textures.zip OUT.json"
 CONDITIONS = (
     *(f"speed={speed}" for speed in (1200, 2400, 3600, 4800, 6000)),
     "force=0.0",
@@ -126,10 +128,11 @@ def main() -> None:
             splits = [
                 recordings(str(folder), split, classes=None, taxels=TAXELS) for split in ("train", "test")
             ]
+            head = {"command": COMMAND, "spikeloom": __version__}
             row = row_of(condition, json.loads(found.to_json()), *splits)
             row["how"] = f"--time {options.time}, {options.jobs or os.cpu_count()} processes"
             rows = [*(each for each in rows if each["left_out"] != condition), row]
-            options.output.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
+            options.output.write_text(json.dumps(head | {"rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

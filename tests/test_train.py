@@ -254,7 +254,7 @@ def test_the_validation_part_is_a_fifth_of_every_class_and_disjoint():
     assert not set(fitted.files) & set(held.files)
     refused(
         DataError,
-        "class 0 has one training recording|needs 2 of each",
+        "each class has one training recording|needs 2 of some",
         validation_split,
         grasps(0, per_class=1),
     )

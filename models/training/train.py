@@ -338,18 +338,18 @@ class Reported:
 def validation_split(training: Recordings) -> tuple[Recordings, Recordings]:
     """Leave a fifth of every class out, rounded down, one at least; the same recordings whatever the training's seed.
 
-    Both parts keep the order of `training`.
+    A class of one recording is not left out. Both parts keep the order of `training`. DataError if none would be.
     """
     chosen = np.zeros(len(training.labels), np.bool_)
     draw = np.random.default_rng(0)
     for label in np.unique(training.labels):
         members = np.flatnonzero(training.labels == label)
-        if len(members) < 2:
-            raise DataError(
-                f"{training.source}: class {label} has one training recording, the clean epoch needs 2 of each; "
-                "record more or drop the class"
-            )
-        chosen[draw.permutation(members)[: max(1, int(len(members) * VALIDATION_SHARE))]] = True
+        if len(members) > 1:
+            chosen[draw.permutation(members)[: max(1, int(len(members) * VALIDATION_SHARE))]] = True
+    if not chosen.any():
+        raise DataError(
+            f"{training.source}: each class has one training recording, the clean epoch needs 2 of some; record more"
+        )
     return training.part(~chosen, "fitted"), training.part(chosen, "validation")
 
 
