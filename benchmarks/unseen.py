@@ -23,6 +23,7 @@ import numpy as np
 
 import spikeloom
 from spikeloom.compiler import __version__
+from spikeloom.compiler.files import sha256_of
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.studies.smallest.baselines import RIDGE, features, machine
@@ -128,7 +129,7 @@ def main() -> None:
             splits = [
                 recordings(str(folder), split, classes=None, taxels=TAXELS) for split in ("train", "test")
             ]
-            head = {"command": COMMAND, "spikeloom": __version__}
+            head = {"command": COMMAND, "spikeloom": __version__, "data_sha256": sha256_of(options.archive)}
             row = row_of(condition, json.loads(found.to_json()), *splits)
             row["how"] = f"--time {options.time}, {options.jobs or os.cpu_count()} processes"
             rows = [*(each for each in rows if each["left_out"] != condition), row]
