@@ -163,6 +163,10 @@ TABLE = [
     (COMPILE.format("finger.pt --graph nope"), "graph 'nope': unknown; choose manual"),
     (COMPILE.format("net.pt --target loihi2"), "--target loihi2: not modelled|allowed: loihi1, truenorth"),
     (COMPILE.format("net.pt --target ../loihi1"), "--target ../loihi1: unknown|loihi1, truenorth"),
+    (
+        "finetune net.pt --data data --target truenorth -o x.pt",
+        "--target truenorth: its cores are crossbars, this is for compartments; allowed: loihi1",
+    ),
     *((COMPILE.format(f"net.pt --weight-bits {n}"), f"--weight-bits {n}|2, 3, 4, 5, 6, 8") for n in (7, 9)),
     (COMPILE.format("net.pt --weight-bits 8.0"), "--weight-bits 8.0: not a number|8,4,4,8"),
     (COMPILE.format("net.pt --calibrate nowhere"), "nowhere: no such folder or file|train/ and test/"),

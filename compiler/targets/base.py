@@ -1,7 +1,7 @@
 """Chips: what a chip is, what events on it cost and take, and how its numbers are read.
 
 The folder of a chip has ``chip.toml``, every number once with unit and source, and the passes that lower
-networks to it. Which chips can be compiled for and run is listed in :mod:`runtime.machines.backends`.
+networks to it. Which chips a user may name is listed in :mod:`runtime.machines.backends`.
 """
 
 import math
@@ -23,8 +23,6 @@ REMEDY = "fix it"
 COMPARTMENTS = "compartments"
 CROSSBARS = "crossbars"
 """What cores are made of: lists of weighted synapses onto compartments (Loihi), or a binary crossbar (TrueNorth)."""
-
-_NOT_MODELLED = {"loihi2": "not modelled; no public per-event energies"}
 
 PRICE_UNIT = "pJ"
 POWER_UNIT = "mW"
@@ -183,22 +181,9 @@ def shipped() -> Mapping[str, Target]:
     return {file.parent.name: read_target(file) for file in files}
 
 
-def known_targets(cores: str | None = None) -> tuple[str, ...]:
-    """Names that :func:`load_target` accepts, sorted; all, or those of one kind of cores."""
-    return tuple(sorted(name for name, target in shipped().items() if cores in (None, target.cores)))
-
-
-def load_target(name: str, cores: str | None = None) -> Target:
-    """Read a target by name; its cores must be of the kind that the caller can handle, if that is given.
-
-    OptionError if there is no such target, or its cores are of the other kind.
-    """
-    target = shipped().get(name)
-    if target is None or cores not in (None, target.cores):
-        why = _NOT_MODELLED.get(name, "unknown")
-        why = why if target is None else f"its cores are {target.cores}, this is for {cores}"
-        raise OptionError(f"--target {name}: {why}; allowed: {', '.join(known_targets(cores))}")
-    return target
+def load_target(name: str) -> Target:
+    """The shipped target of that name; KeyError if there is none."""
+    return shipped()[name]
 
 
 def _entries(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

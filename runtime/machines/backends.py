@@ -20,13 +20,16 @@ BACKENDS: tuple[Backend, ...] = (Loihi1(), TrueNorth())
 NOT_MODELLED = {"loihi2": "not modelled; no public per-event energies"}
 
 
-def backend_of(name: str) -> Backend:
-    """The chip of that name; OptionError if there is none."""
-    for backend in BACKENDS:
-        if backend.name == name:
-            return backend
-    allowed = ", ".join(backend.name for backend in BACKENDS)
-    raise OptionError(f"--target {name}: {NOT_MODELLED.get(name, 'unknown')}; allowed: {allowed}")
+def backend_of(name: str, cores: str | None = None) -> Backend:
+    """The chip of that name, whose cores must be of one kind if that is given; OptionError if there is none."""
+    known = {each.name: each for each in BACKENDS}
+    fitting = {chip: each for chip, each in known.items() if cores in (None, each.target.cores)}
+    if name in fitting:
+        return fitting[name]
+    why = NOT_MODELLED.get(name, "unknown")
+    if name in known:
+        why = f"its cores are {known[name].target.cores}, this is for {cores}"
+    raise OptionError(f"--target {name}: {why}; allowed: {', '.join(fitting)}")
 
 
 def backend_for(path: str | os.PathLike[str]) -> Backend:

@@ -16,7 +16,7 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.storage import Packing
-from spikeloom.compiler.targets.base import COMPARTMENTS, Target, load_target
+from spikeloom.compiler.targets.base import COMPARTMENTS, Target
 from spikeloom.compiler.targets.compartments import check_packings, round_to_forms
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.events import joined_bins, of_length
@@ -106,7 +106,7 @@ def finetune(request: FinetuneRequest) -> Finetuned:
     require_chance(request.robust or 0.0)
     with only_one(output):
         state = _state(output, resume=request.resume)
-        target = load_target(request.target, COMPARTMENTS)
+        target = backend_of(request.target, COMPARTMENTS).target
         widths = None if request.weight_bits is None else whole_numbers(request.weight_bits, "--weight-bits")
         loaded = load_network(request.checkpoint, request)
         _require_trainable(request, loaded, output)
