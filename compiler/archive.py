@@ -248,7 +248,7 @@ def read_archive(
     kinds: Mapping[str, Kind],
     names: Callable[[Mapping[str, Any]], Iterable[str]],
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Manifest and arrays of a file of a format, one of ``FORMATS``, that matches its hash.
+    """Manifest and arrays of a file of a format that matches its hash.
 
     Entries of the manifest are of these `kinds`; `names` gives from it the names of all arrays, in their
     order. FileFault, or what parsing raises, if the file is missing, damaged, altered, or of another format
@@ -263,7 +263,7 @@ def read_archive(
     manifest = json.loads(str(text))
     kind = manifest.get("format") if isinstance(manifest, dict) else None
     if isinstance(kind, str) and kind in FORMATS and kind != wanted:
-        raise FileFault(f"holds {FORMATS[kind]}, this is for {FORMATS[wanted]}")
+        raise FileFault(f"holds {FORMATS[kind]}, this is for {FORMATS.get(wanted, wanted)}")
     if kind != wanted:
         raise FileFault(f"is not a {what}")
     if (found := manifest.get("version")) != version:

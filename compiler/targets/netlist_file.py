@@ -49,8 +49,6 @@ class Netlist:
     taxels: int  # Sensor size, and number of classes
     polarities: int
     classes: int
-    core_axons: IntArray  # (cores + 1,) int64; range bounds into the axons
-    axon_synapses: IntArray  # (axons + 1,) int64; range bounds into the synapses
     readout_class: IntArray  # (neurons,) int64; class that a spike votes for, -1 for none
     provenance: Mapping[str, Any]  # JSON values only: what it was compiled from
     clocks: (
@@ -62,6 +60,15 @@ class Netlist:
     def n_inputs(self) -> int:
         """Number of input channels."""
         return self.taxels * self.polarities + self.clocks.channels
+
+
+class AxonNetlist(Netlist):
+    """One whose cores have input axons, and these a list of synapses each."""
+
+    __slots__ = ()
+
+    core_axons: IntArray  # (cores + 1,) int64; range bounds into the axons
+    axon_synapses: IntArray  # (axons + 1,) int64; range bounds into the synapses
 
     def core_of_axon(self) -> IntArray:
         """Core of each axon; shape (axons,)."""

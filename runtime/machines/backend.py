@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from spikeloom.compiler.counters import Counters
+from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.netlist_file import Netlist
@@ -62,9 +63,9 @@ class Backend(ABC):
     """Value of ``--target``."""
 
     @property
-    @abstractmethod
     def counting_bits(self) -> int:
-        """Widest weights of a counting network."""
+        """Widest weights of a counting network; OptionError where the chip takes none."""
+        raise OptionError(f"--target {self.name}: takes no counting networks; give another chip")
 
     @property
     def target(self) -> Target:
@@ -85,9 +86,9 @@ class Backend(ABC):
     def lower(self, request: CompileRequest, after: Callable[[str, Any], object]) -> Lowered:
         """Read the network that `compile` was given and lower it; `after` as of :func:`pipeline.run`."""
 
-    @abstractmethod
     def lower_counters(self, counters: Counters) -> Netlist:
         """Lower a counting network."""
+        raise NotImplementedError(f"{self.name} takes no counting networks")
 
     @abstractmethod
     def machine(self, netlist: Any) -> Machine:

@@ -3,7 +3,7 @@
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Protocol, TypeVar
 
@@ -37,6 +37,23 @@ HELD = 1 << 25
 
 ENGINES = ("spikeloom", "onnx")
 """What can be held against a chip's specification: our simulator, or another program beside it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Counts:
+    """What happened in a whole run, int64; a chip adds what else it counts. A batch has one more leading axis."""
+
+    spikes: IntArray  # (…, neurons) int64; spikes of each neuron, in the order of the netlist
+    votes: IntArray  # (…, neurons) int64; those of them that count where the neuron votes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trace:
+    """Result of a simulation; steps are the chip's own, and a batch has one more leading axis."""
+
+    counts: Counts
+    spikes: BoolArray | None  # (…, steps, neurons) bool; None unless wanted
+    membranes: npt.NDArray[np.int32] | None  # (…, steps, neurons) int32; None unless wanted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,10 +94,12 @@ class Price(Shown):
 
     synaptic_operations: IntArray | FloatArray  # (samples,)
     energy_j: Mapping[str, FloatArray]  # By table, of each recording
-    time_s: Mapping[str, FloatArray]
-    step_s: Mapping[str, float]  # Seconds of the longest data step
-    dynamic_j: Mapping[str, FloatArray]  # The same as energy_j, but for power that flows whatever happens
-    static_w: Mapping[str, float]  # That power, of all chips, by source
+    dynamic_j: Mapping[str, FloatArray]  # The same, but for power that flows whatever happens
+    # empty where no table says so: seconds of each recording and of the longest data step, by table, and
+    # the power that flows whatever happens, of all chips, by source
+    time_s: Mapping[str, FloatArray] = field(default_factory=dict)
+    step_s: Mapping[str, float] = field(default_factory=dict)
+    static_w: Mapping[str, float] = field(default_factory=dict)
     outcome: Outcome  # All that the chip's own price model knows, with its layout
 
     @property
@@ -134,7 +153,7 @@ def one_by_one(channels: EventArray, lengths: IntArray | None) -> Iterator[Event
 def differences(slow: Any, fast: Any) -> int:
     """Entries of a trace and its counts that differ where `slow` has any; `fast` is a batch of the one recording."""
     count = 0
-    for name, one in ((field.name, getattr(slow, field.name)) for field in fields(slow)):
+    for name, one in ((each.name, getattr(slow, each.name)) for each in fields(slow)):
         batch = getattr(fast, name)
         if is_dataclass(one):
             count += differences(one, batch)
@@ -187,9 +206,9 @@ class Machine(ABC):
         return load_target(self.netlist.target)
 
     @property
-    @abstractmethod
     def layers(self) -> tuple[str, ...]:
-        """Their names."""
+        """Their names; by default the netlist has nothing else of them."""
+        return tuple(self.netlist.layers)
 
     @property
     @abstractmethod
@@ -236,18 +255,18 @@ class Machine(ABC):
         """Spikes of a layer that are not as a model has them, (samples, steps, neurons), its first in step `first`."""
         return int(np.count_nonzero(run.spikes[layer] != cut(expected, lengths)))
 
-    @abstractmethod
     def of_layer(self, array: npt.NDArray[T], index: int) -> npt.NDArray[T]:
-        """Cut one layer out of spikes or membranes of a trace, (samples, steps, neurons)."""
+        """Cut one layer out of spikes or membranes of a trace, (samples, steps, neurons); by default step by step."""
+        return np.asarray(array[:, :, self.netlist.layer == index])
 
     @abstractmethod
     def simulate(
         self, channels: EventArray, lengths: IntArray | None, *, spikes: bool, membranes: bool
-    ) -> Any:
+    ) -> Trace:
         """Trace of recordings (samples, channels, steps), clocks among the channels; the rest is as for :meth:`run`."""
 
     @abstractmethod
-    def spec_and_engine(self, channels: EventArray) -> tuple[Any, Any]:
+    def spec_and_engine(self, channels: EventArray) -> tuple[Trace, Trace]:
         """All that the specification keeps of one recording (channels, steps), and a batch of it by the simulator."""
 
     @abstractmethod
@@ -259,10 +278,10 @@ class Machine(ABC):
         bin_s: float,
         detail: str,
         progress: Done,
-    ) -> tuple[Any, Price]:
+    ) -> tuple[Trace, Price]:
         """Trace and price of recordings (samples, channels, steps), by the tables of a chip; see :meth:`price`."""
 
-    def _run(self, trace: Any) -> Run:
+    def _run(self, trace: Trace) -> Run:
         """What a trace comes to."""
 
         def by_layer(array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]]:

@@ -33,11 +33,17 @@ import numpy as np
 
 from spikeloom.compiler.archive import Kind
 from spikeloom.compiler.dynamics import MOST_STEPS, NO_CLOCKS, Clocks
-from spikeloom.compiler.targets import netlist_file
 from spikeloom.compiler.targets.loihi1.registers import (
     in_units,
 )
-from spikeloom.compiler.targets.netlist_file import MOST, NetlistFile, column_faults, is_outside, part_of
+from spikeloom.compiler.targets.netlist_file import (
+    MOST,
+    AxonNetlist,
+    NetlistFile,
+    column_faults,
+    is_outside,
+    part_of,
+)
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
 MOST_BLANK = 4096
@@ -77,7 +83,7 @@ class Layer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Netlist(netlist_file.Netlist):
+class Netlist(AxonNetlist):
     """A placed integer network; see the module docstring for ids and time."""
 
     target: str

@@ -28,8 +28,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.dynamics import MOST_STEPS, NO_CLOCKS, Clocks
-from spikeloom.compiler.targets import netlist_file
-from spikeloom.compiler.targets.netlist_file import COMMON, NetlistFile, column_faults, part_of
+from spikeloom.compiler.targets.netlist_file import COMMON, AxonNetlist, NetlistFile, column_faults, part_of
 from spikeloom.compiler.types import IntArray
 
 RESET_TO = 0
@@ -58,7 +57,7 @@ TABLES = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CrossbarNetlist(netlist_file.Netlist):
+class CrossbarNetlist(AxonNetlist):
     """A placed network of crossbar cores; see the module docstring for ids and time."""
 
     target: str

@@ -14,6 +14,7 @@ from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.registers import ACCUMULATOR_MAX, CURRENT_MAX
 from spikeloom.compiler.types import AnyArray, BoolArray, IntArray
+from spikeloom.runtime.machines import base
 
 MembraneArray = npt.NDArray[np.int32]
 
@@ -22,17 +23,15 @@ REGISTER_LIMITS = {"synaptic sum": ACCUMULATOR_MAX, "current": CURRENT_MAX}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Counts:
-    """Events of a whole run; every array is int64."""
+class Counts(base.Counts):
+    """Events of a whole run; votes are spikes that count where a compartment votes: not those of blank steps."""
 
     inputs: IntArray  # (…, n_inputs) int64; input events per channel
-    spikes: IntArray  # (…, compartments) int64; spikes per compartment
     # (…, layers) int64; neuron updates: compartment-steps inside the layer's window in which the compartment
     # had work to do, that is its membrane or its current was not zero before the step, or an active axon
     # held a synapse to it (whatever the weight), or its bias is not zero
     updates: IntArray
     saturations: IntArray  # (…, layers) int64; compartment-steps whose membrane was clipped to its register
-    votes: IntArray  # (…, compartments) int64; spikes that count where a compartment votes: not those of blank steps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,17 +49,17 @@ def side_by_side(parts: Sequence[Charges]) -> Charges:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Trace:
-    """Result of a simulation."""
+class Trace(base.Trace):
+    """Result of a simulation.
 
-    counts: Counts  # What happened, summed over chip steps
-    # the others are None unless wanted; (…, chip steps, compartments) bool, int32 and bool are the first
-    # three
-    spikes: BoolArray | None
-    # what was compared with the threshold, before a spike resets it, in 1/64 of a weight unit; zero outside
-    # the window
-    membranes: MembraneArray | None
-    updated: BoolArray | None = None  # Whether a compartment had work to do, as ``Counts.updates`` counts it
+    Membranes are what was compared with the threshold, before a spike resets it, in 1/64 of a weight unit;
+    zero outside the window.
+    """
+
+    counts: Counts
+    # the others are None unless wanted
+    # (…, chip steps, compartments) bool; whether a compartment had work to do, as ``Counts.updates`` counts it
+    updated: BoolArray | None = None
     charged: IntArray | None = None  # (…, chip steps, sums) int64; what events add up to under some charges
     # (…, chip steps, ceil(compartments / 64)) uint64; spike of compartment c at bit ``c % 64`` of word ``c
     # // 64``

@@ -5,14 +5,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars, unlike
 from spikeloom.compiler.targets.truenorth.passes import Source, compile_crossbars
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
-from spikeloom.runtime.machines.base import Done, Machine, Model, Price, Run, T
+from spikeloom.runtime.machines.base import Done, Machine, Model, Price, Run
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.truenorth import cost, engine, spec
 from spikeloom.runtime.machines.truenorth.model import model_of
@@ -29,15 +28,6 @@ class TrueNorth(Machine):
     @cached_property
     def _engine(self) -> engine.Engine:
         return engine.prepare(self.netlist)
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """Names of the layers."""
-        return self.netlist.layers
-
-    def of_layer(self, array: npt.NDArray[T], index: int) -> npt.NDArray[T]:
-        """By tick."""
-        return np.asarray(array[:, :, self.netlist.layer == index])
 
     @property
     def weight_bits(self) -> int:

@@ -29,25 +29,19 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.legalize import signed_range
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO, CrossbarNetlist
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
-from spikeloom.runtime.machines.base import require_channels
-
-MembraneArray = npt.NDArray[np.int32]
+from spikeloom.runtime.machines import base
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Counts:
-    """Events of whole runs; every array is int64, a batch adds one leading axis."""
+class Counts(base.Counts):
+    """Events of whole runs; votes are spikes in the ticks in which a neuron votes, zero for those that do not."""
 
     ticks: IntArray  # (…) int64; ticks that were run
-    spikes: IntArray  # (…, neurons) int64; spikes per neuron in all ticks
-    # (…, neurons) int64; spikes per neuron in the ticks in which it votes; zero for neurons that do not
-    votes: IntArray
     axons: IntArray  # (…, axons) int64; ticks in which an axon had a spike
     merged: IntArray  # (…) int64; spikes that reached an axon in a tick in which it had one already, and were lost
     # (…, neurons) int64; ticks in which the membrane left its register, or would have in some order of
@@ -56,16 +50,14 @@ class Counts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Trace:
-    """Result of a simulation."""
+class Trace(base.Trace):
+    """Result of a simulation.
+
+    Membranes are those at the end of each tick, after resets. In a batch a shorter recording is filled up with
+    zeros after its last tick.
+    """
 
     counts: Counts
-    spikes: (
-        BoolArray | None
-    )  # (…, ticks, neurons) bool, or None; whether a neuron spiked in a tick; None unless wanted
-    # (…, ticks, neurons) int32, or None; membranes at the end of each tick, after resets; None unless
-    # wanted. In a batch a shorter recording is filled up with zeros after its last tick.
-    membranes: MembraneArray | None
 
 
 @dataclass(slots=True)
@@ -174,7 +166,7 @@ def simulate(netlist: CrossbarNetlist, events: EventArray) -> Trace:
     Any value but zero is an event. The trace holds spikes and membranes and has no leading axis. DataError
     if the recording has another number of input channels than the network.
     """
-    require_channels(netlist, events.shape[0])
+    base.require_channels(netlist, events.shape[0])
     bits = load_target(netlist.target).limit("neuron.membrane_bits")
     steps = events.shape[1]
     ticks = netlist.ticks(steps)
