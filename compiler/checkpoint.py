@@ -41,7 +41,7 @@ class Checkpoint:
     dense: tuple[Dense, ...]  # Fully connected stages in order
     beta: float  # Membrane decay
     theta: float  # Threshold
-    layout: str  # {"spikeloom", "released", "state_dict"}; kind of file
+    layout: str  # Kind of file, as its reader calls it: ``spikeloom``, ``released``, ``state_dict``
     sha256: str  # Of the file
     assumed: tuple[str, ...] = ()  # Which of ``beta`` and ``theta`` neither the file nor the user gave
     graph: str | None = None  # Name of the graph that it was trained on

@@ -323,7 +323,8 @@ def run_layer(
     """Run the recordings of a raster in the number type of `bias`, each from rest.
 
     `registers` are the alpha, beta and theta of floats. Of whole numbers they are the thresholds, the shares
-    that current and membrane keep in 1/4096, and what no membrane passes. `state` (3, neurons) and `before`
+    that current and membrane keep in 1/4096, and what no membrane passes. Their number says which: a neuron
+    with other registers needs another number of them. `state` (3, neurons) and `before`
     (neurons,) int32 are for its own use: making them here would take compilation.
 
     `fired` (recordings, steps, neurons) uint8 is filled, and `membranes`, likewise and before the reset,

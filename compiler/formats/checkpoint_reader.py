@@ -1,14 +1,15 @@
-"""Read trained checkpoints of all systems: our own files, see :mod:`own_checkpoint`, and files of ``torch.save``."""
+"""Read trained checkpoints of all systems, whatever their layout: each has a module beside this, and a row here."""
 
 import os
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from spikeloom.compiler.archive import AGAIN, stored_members
+from spikeloom.compiler.archive import AGAIN
 from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, constant_faults
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import read_whole, reading
-from spikeloom.compiler.formats.own_checkpoint import read_own
+from spikeloom.compiler.formats.own_checkpoint import is_own, read_own
 from spikeloom.compiler.formats.torch_checkpoint import read_torch
 
 
@@ -57,14 +58,31 @@ def _require_fit(where: str, found: Checkpoint, beta: float | None, theta: float
         raise OptionError(f"--beta {beta:g}: {where} has a decay for each layer, {decays}; omit --beta")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """A kind of checkpoint file.
+
+    takes: whether content is of this kind. read: reads content, of which a run and a set of weights are wanted;
+    one that holds a single run, or the last epoch alone, need not look at these.
+    """
+
+    takes: Callable[[bytes], bool]
+    read: Callable[[bytes, int, str | None], Checkpoint]
+
+
+LAYOUTS = (
+    Layout(takes=is_own, read=lambda content, _run, weights: read_own(content, weights)),
+    Layout(takes=lambda _content: True, read=lambda content, run, _weights: read_torch(content, run)),
+)
+"""All of them; the first that takes a file reads it, the last says what is wrong with any other."""
+
+
 def _read(content: bytes, run: int, weights: str | None) -> Checkpoint:
-    """Checkpoint of any layout; no zip may claim more than it has."""
-    members = stored_members(content) if content[:2] == b"PK" else {}
-    if "manifest.json" in members:
-        if run != 0:
-            raise ModelError(f"--run {run}: the file holds only run 0; omit --run")
-        return read_own(content, members, weights)
-    checkpoint = read_torch(content, run)
-    if weights not in (None, "last"):
+    """Checkpoint of any layout, which has the run and the weights that are wanted."""
+    layout = next(layout for layout in LAYOUTS if layout.takes(content))
+    checkpoint = layout.read(content, run, weights)
+    if not 0 <= run < checkpoint.runs:
+        raise ModelError(f"--run {run}: the file holds only run 0; omit --run")
+    if weights not in (None, *checkpoint.sets):
         raise ModelError(f"--weights {weights}: the file holds the last epoch only; omit --weights")
     return checkpoint

@@ -53,6 +53,7 @@ from spikeloom.compiler.archive import (
     entry_faults,
     npy_bytes,
     read_npy,
+    stored_members,
     zip_bytes,
 )
 from spikeloom.compiler.arrays import read_only
@@ -241,9 +242,14 @@ def content_digest(manifest: Mapping[str, Any], arrays: Mapping[str, AnyArray]) 
     ).hexdigest()
 
 
-def read_own(content: bytes, members: dict[str, bytes], weights: str | None) -> Checkpoint:
+def is_own(content: bytes) -> bool:
+    """Whether a file is a zip with our manifest; no zip may claim more than it has."""
+    return content[:2] == b"PK" and "manifest.json" in stored_members(content)
+
+
+def read_own(content: bytes, weights: str | None) -> Checkpoint:
     """Check a file of our own format, and take one set of weights from its members."""
-    manifest, arrays = _signed_content(members)
+    manifest, arrays = _signed_content(stored_members(content))
     kinds = ENTRIES | {name: kind for name, kind in MORE.items() if name in manifest}
     if faults := entry_faults(manifest, kinds) or constant_faults(manifest["beta"], manifest["theta"]):
         raise FileFault("; ".join(faults))

@@ -59,7 +59,7 @@ def read_torch(content: bytes, run: int) -> Checkpoint:
         available = "only run 0" if len(states) == 1 else f"runs 0 to {len(states) - 1}"
         raise ModelError(f"--run {run}: the file holds {available}; choose one that it holds")
     return Checkpoint(
-        **layers_of(_unified(_arrays(states[run], len(content)))),
+        **layers_of(unified(_arrays(states[run], len(content)))),
         beta=BETA,
         theta=THETA,
         assumed=("beta", "theta"),
@@ -136,8 +136,11 @@ def _tensor_fault(value: Any, file_size: int) -> str | None:
     return None
 
 
-def _unified(arrays: Arrays) -> Arrays:
-    """Check everything and bring both key styles to the names of our own format."""
+def unified(arrays: Arrays) -> Arrays:
+    """Check the weights of a TactileSGNet, whose keys are torch_geometric's, new or old, and give them our names.
+
+    Raises ModelError with every fault.
+    """
     hops = [
         int(match[1]) for key in arrays if (match := re.fullmatch(r"conv1\.lins\.(0|[1-9]\d?)\.weight", key))
     ]

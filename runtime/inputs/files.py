@@ -9,7 +9,7 @@ from typing import Protocol, cast
 from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import beside, write_atomically
-from spikeloom.compiler.formats import NIR, ONNX
+from spikeloom.compiler.formats import NETWORKS, NIR, ONNX
 from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name
 from spikeloom.runtime.report.drawing import PICTURES, Drawing
 from spikeloom.runtime.requests.fields import Request
@@ -26,9 +26,6 @@ class Pictured(Protocol):
 
 
 PRETRAINED = "pretrained:"
-
-NETWORK_ENDINGS = (".pt", ".pth", ".t7", ".onnx", ".nir", ".net")
-"""Of files of trained networks."""
 
 
 def shipped(path: str) -> str:
@@ -142,9 +139,7 @@ def is_recordings(path: str) -> bool:
 
 def require_netlist(path: str) -> None:
     """Refuse what is to be a netlist and is a trained network, or recordings; OptionError."""
-    if path.startswith(PRETRAINED) or (
-        path.endswith(NETWORK_ENDINGS) and stated(Path(path), "target") is None
-    ):
+    if path.startswith(PRETRAINED) or (path.endswith(NETWORKS) and stated(Path(path), "target") is None):
         raise OptionError(
             f"{path}: is a trained network; compile it first: spikeloom compile {path} -o NET.loom"
         )

@@ -166,7 +166,11 @@ READERS = (
     COUNTING,
     CHECKPOINT,
 )
-"""All of them; the first that takes a file reads it, the last takes any."""
+"""All of them; the first that takes a file reads it, the last takes any.
+
+A further layout of checkpoints is no row here but one of :data:`checkpoint_reader.LAYOUTS`, from which ``finetune``,
+``join``, ``lean`` and ``chart`` read, too.
+"""
 
 
 def reader_of(path: str) -> Reader:
