@@ -329,10 +329,7 @@ def test_the_command(tmp_path, monkeypatch):
     code, out, err = run(*words)
     assert code == 0
     singles = events(3, samples=4).size
-    assert (
-        err
-        == f"spikeloom: trying {singles:,} single events of 4 recordings, then taxels, pairs, shifts and cuts\n"
-    )
+    assert err == f"spikeloom: trying {singles:,} single events of 4 recordings, then every other change\n"
     assert f"no single event alters the decision: {25 * result.certified(1):.2f} %" in out
     assert f"a taxel sends nothing  {'':35}{result.unaltered('dead')} of 4".replace(" ", "") in out.replace(
         " ", ""

@@ -40,9 +40,7 @@ def run(request: CertifyRequest) -> Outcome:
     machine = machine_for(request.netlist)
     data = load_recordings(request.data, request, machine.netlist, labels_for="certify", joined=False)
     singles = int(data.step_counts.sum()) * data.taxels * data.events.shape[2]
-    tell(
-        f"trying {singles:,} single events of {number(len(data), 'recording')}, then taxels, pairs, shifts and cuts"
-    )
+    tell(f"trying {singles:,} single events of {number(len(data), 'recording')}, then every other change")
     certificates = certify(machine, data, shift=request.shift, most=request.most, jobs=request.jobs)
     result = replace(
         certificates,

@@ -1,6 +1,8 @@
 """The definition: one chip step after another, all neurons in 64-bit integers, written to be read.
 
-:mod:`loihi1.engine` is the fast twin and must agree with this module on every spike, membrane and count.
+:mod:`loihi1.engine` is the fast twin and must agree with this module on every spike, membrane and count. So must
+what calls :func:`layer_kernel.decayed` (fine-tuning, changed runs, the network before it is placed), and the exported
+ONNX graph.
 
 Time
 ----

@@ -1,6 +1,7 @@
 """The one list of perturbations: of recordings, of the state that they find, of what the chip stores.
 
-Those above are drawn by ``stress``, at several levels; of those at the end ``certify`` decides every case.
+Those above are drawn by ``stress``, at several levels; of those at the end ``certify`` decides every case. A new
+one is a function here, whose parameters :class:`definition.Sampled` or :class:`definition.Exhaustive` names.
 All are pure functions. Those of events take and give (recordings, taxels, 2, T) uint8, zeros and ones, in
 the recordings' own bins, before a network joins them; clocks are no taxels and not among them.
 
