@@ -9,7 +9,6 @@ import io
 import json
 import math
 import os
-import struct
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -45,11 +44,11 @@ SIZE_LIMIT = 2**32
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 """Of every member of a zip, so that equal content gives equal bytes."""
 
-LOCAL = b"PK\x03\x04"
-"""With what a member of a zip begins."""
+END_COUNT = -12
+"""Where a zip without a comment states the number of its members, counted from its end."""
 
-UTF8 = 0x800
-"""Flag of a member whose name is not in code page 437."""
+ZIP64 = 0xFFFF
+"""What stands there for more members than two bytes count."""
 
 
 def narrow(array: Array) -> Array:
@@ -109,25 +108,18 @@ def write_archive(content: bytes, path: str | os.PathLike[str]) -> str:
 
 
 def opened_zip(file: IO[bytes]) -> zipfile.ZipFile:
-    """A zip that checks CRCs as it is read; FileFault where its directory has lost a member or its name."""
+    """A zip that checks CRCs as it is read.
+
+    FileFault, or an error of zipfile, where its directory has lost a member or the name of one.
+    """
     opened = zipfile.ZipFile(file)
-    end = 0
-    for info in sorted(opened.infolist(), key=lambda info: info.header_offset):
-        _require_no_member(file, end, info.header_offset)
-        file.seek(info.header_offset + 26)
-        name, more = struct.unpack("<HH", file.read(4))
-        if file.read(name).decode("utf-8" if info.flag_bits & UTF8 else "cp437") != info.orig_filename:
-            raise FileFault(f"has another name for {info.filename} than its directory")
-        end = info.header_offset + 30 + name + more + info.compress_size
-    _require_no_member(file, end, opened.start_dir)
-    return opened
-
-
-def _require_no_member(file: IO[bytes], begin: int, end: int) -> None:
-    """Refuse a gap of a zip in which a member lies."""
-    file.seek(begin)
-    if LOCAL in file.read(max(end - begin, 0)):
+    members = opened.infolist()
+    file.seek(END_COUNT - len(opened.comment), os.SEEK_END)
+    if int.from_bytes(file.read(2), "little") != min(len(members), ZIP64):
         raise FileFault("holds members that its directory does not list")
+    for info in members:
+        opened.open(info).close()  # compares the names
+    return opened
 
 
 def stored_members(content: bytes) -> dict[str, bytes]:

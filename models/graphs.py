@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from spikeloom.compiler.arrays import read_only, read_only_float
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.types import FloatArray, IntArray
 
@@ -29,9 +30,8 @@ MAX_NEIGHBOURS = 8
 
 _LAYOUT = tomllib.loads(Path(__file__).with_name("neutouch.toml").read_text(encoding="utf-8"))
 
-NEUTOUCH: FloatArray = np.array(_LAYOUT["coordinates_mm"], dtype=np.float64)
+NEUTOUCH = read_only_float(_LAYOUT["coordinates_mm"])
 """The 39 taxels of a NeuTouch finger, (39, 2) float64, millimetres."""
-NEUTOUCH.flags.writeable = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,12 +43,9 @@ class Graph:
     edges: IntArray  # (e, 2) int64; source and target taxel of each edge; a repeated row counts twice
 
     def __post_init__(self) -> None:
-        coordinates = check_coordinates(self.coordinates).copy()
-        edges = check_edges(self.edges, len(coordinates)).copy()
-        coordinates.flags.writeable = False
-        edges.flags.writeable = False
+        coordinates = read_only_float(check_coordinates(self.coordinates))
         object.__setattr__(self, "coordinates", coordinates)
-        object.__setattr__(self, "edges", edges)
+        object.__setattr__(self, "edges", read_only(check_edges(self.edges, len(coordinates))))
 
     @property
     def n_taxels(self) -> int:

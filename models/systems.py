@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, Grid
 from spikeloom.compiler.types import FloatArray, IntArray
@@ -37,15 +38,14 @@ def grid_cells(coordinates: FloatArray = NEUTOUCH) -> IntArray:
         raise DataError(
             f"grid-cnn: positions have {coordinates.shape[1]} numbers each, a grid needs x and y; give a flat sensor"
         )
-    cells: IntArray = np.rint(coordinates).astype(np.int64)
+    cells = np.rint(coordinates)
     cells -= cells.min(axis=0)
     if cells.max() >= MAX_CELLS:
         raise DataError(
             f"grid-cnn: the sensor spans {int(cells.max()) + 1} mm, a grid of 1 mm cells has up to {MAX_CELLS} a side; "
             "give smaller positions"
         )
-    cells.flags.writeable = False
-    return cells
+    return read_only(cells)
 
 
 def sensor_grid(coordinates: FloatArray, padding: str) -> Grid:

@@ -5,6 +5,7 @@ import tempfile
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -91,19 +92,25 @@ def released(*states: dict[str, torch.Tensor]) -> dict:
     }
 
 
+def graph_facts(graph: Graph) -> dict[str, Any]:
+    """What a checkpoint holds of a graph, as keywords of `save_checkpoint`."""
+    return {"taxels": graph.n_taxels, "graph": graph.name, "edges": graph.edges}
+
+
 def own_file(
     path: Path, *, last=None, best=None, graph: Graph | None = None, beta=0.2, theta=0.5, training=None
 ) -> Path:
     """Write a checkpoint in our own format."""
     sets = {"last": last or weights()} | ({} if best is None else {"best": best})
-    save_checkpoint(path, sets, graph or ring(), beta=beta, theta=theta, training=training or {"seed": 0})
+    constants = {"beta": beta, "theta": theta, "training": training or {"seed": 0}}
+    save_checkpoint(path, sets, **graph_facts(graph or ring()), **constants)
     return path
 
 
 def checkpoint_bytes(sets: dict, graph: Graph, **options) -> bytes:
     """What our own format makes of weights."""
     with tempfile.TemporaryDirectory() as folder:
-        save_checkpoint(Path(folder) / "x.pt", sets, graph, **options)
+        save_checkpoint(Path(folder) / "x.pt", sets, **graph_facts(graph), **options)
         return (Path(folder) / "x.pt").read_bytes()
 
 

@@ -7,6 +7,7 @@ import shlex
 import shutil
 from dataclasses import replace
 
+import made_files
 import numpy as np
 import pytest
 from hypothesis import given
@@ -55,9 +56,8 @@ def place(tmp_path_factory):
     own_file(folder / "ring.pt", training=known)
     own_file(folder / "unknown.pt", last=weights(4))
     forms = tuned(read_checkpoint(folder / "ring.pt")).forms
-    save_checkpoint(
-        folder / "tuned.pt", {"last": weights()}, ring(), beta=0.2, theta=0.5, training=known, forms=forms
-    )
+    constants = {"beta": 0.2, "theta": 0.5, "training": known, "forms": forms}
+    save_checkpoint(folder / "tuned.pt", {"last": weights()}, **made_files.graph_facts(ring()), **constants)
     own_file(folder / "elsewhere.pt", training={"data_sha256": "0" * 64, "data": "Grasps.zip"})
     network = random_network(4, taxels=6, classes=CLASSES, steps=24)
     write_trained(

@@ -221,7 +221,12 @@ def test_every_fault_of_the_tensors_is_listed(tmp_path):
 def test_own_format_round_trip(tmp_path):
     path = tmp_path / "x.pt"
     save_checkpoint(
-        path, {"last": weights(), "best": weights(2)}, ring(), beta=0.25, theta=0.75, training={"seed": 4}
+        path,
+        {"last": weights(), "best": weights(2)},
+        **made.graph_facts(ring()),
+        beta=0.25,
+        theta=0.75,
+        training={"seed": 4},
     )
     for which, seed in (("last", 1), ("best", 2)):
         read = read_checkpoint(path, weights=which)

@@ -10,11 +10,12 @@ from made_files import CLASSES, recordings_folder
 from made_modules import TAXELS
 from oracles import refused
 from scipy import sparse
+from test_dynamics import surrogate_spike
 from zoo import Specimen, specimen
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.ir import INPUT, Form, Input, Network, Population, Projection, Readout
-from spikeloom.models.networks.layers import Spike, time_first
+from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.quantised import QuantisedNet
 from spikeloom.models.training.recipes import RELEASED, TIMED
 
@@ -74,7 +75,7 @@ def test_gradients_run_through_own_spikes_and_currents(surrogate):
     for step in events.flatten(2):
         current = alpha * current + step @ given.t() + spikes @ own.t()
         membrane = beta * membrane * (1 - (spikes if surrogate.reset else spikes.detach())) + current + bias
-        spikes = Spike.apply(membrane, 0.5, surrogate)
+        spikes = surrogate_spike(surrogate)(membrane, 0.5)
         fired.append(spikes)
     (torch.stack(fired).mean(0) * wanted).sum().backward()
     theirs = torch.cat([torch.cat([given.grad, own.grad], dim=1).flatten(), bias.grad])

@@ -3,6 +3,7 @@
 import json
 import math
 
+import made_files
 import numpy as np
 import pytest
 import torch
@@ -177,7 +178,9 @@ def saved(tmp_path, network, *, padding="none", weights=None, **more):
     graph = MANUAL if system in GRAPH_SYSTEMS else taxels_alone(NEUTOUCH)
     more = {"beta": 0.2, "theta": 0.5, "grid": FORMS[padding] if system == GRID_CNN else None} | more
     sets = {"last": weights or network.export_weights()}
-    save_checkpoint(tmp_path / "x.pt", sets, graph, training={}, system=system, **more)
+    save_checkpoint(
+        tmp_path / "x.pt", sets, **made_files.graph_facts(graph), training={}, system=system, **more
+    )
     return read_checkpoint(tmp_path / "x.pt")
 
 

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import made_files
 import numpy as np
 import pytest
 from commands import as_json as answer
@@ -368,7 +369,8 @@ def test_recordings_have_one_hash_whatever_is_asked_of_them(tmp_path):
     """Also where a step of the network joins several of their bins."""
     data, model, chip = (tmp_path / name for name in ("data", "net.pt", "net.loom"))
     recordings_folder(data)
-    save_checkpoint(model, {"last": weights()}, ring(), beta=0.2, theta=0.5, training={"seed": 0}, bins=2)
+    constants = {"beta": 0.2, "theta": 0.5, "training": {"seed": 0}, "bins": 2}
+    save_checkpoint(model, {"last": weights()}, **made_files.graph_facts(ring()), **constants)
     answer("compile", model, "-o", chip)
     known = ("--data", data, "--checkpoint", model)
     hashes = {

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import made_files
 import numpy as np
 import pytest
 import torch
@@ -423,7 +424,8 @@ def test_forms_that_cannot_be_used(tmp_path, change):
     forms = tuned_forms(checkpoint, adjacency, data.events, 4)
     path = tmp_path / "tuned.pt"
     graph = ring(checkpoint.taxels)
-    save_checkpoint(path, {"last": weights()}, graph, beta=0.2, theta=0.5, training={}, forms=forms)
+    constants = {"beta": 0.2, "theta": 0.5, "training": {}}
+    save_checkpoint(path, {"last": weights()}, **made_files.graph_facts(graph), **constants, forms=forms)
     path.write_bytes(rebuilt(path.read_bytes(), lambda manifest, _: change(manifest["forms"])))
     refused(ModelError, f"{path}: the manifest has no usable forms", read_checkpoint, path)
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import made_files
 import numpy as np
 import torch
 
@@ -41,7 +42,8 @@ def written(path, system="tactilesgnet", dynamics=TIMING, seed=1, **sizes):
         "system": system,
         "grid": grid,
     }
-    save_checkpoint(path, {"last": network.export_weights()}, GRAPH, dynamics=dynamics, **constants)
+    sets = {"last": network.export_weights()}
+    save_checkpoint(path, sets, **made_files.graph_facts(GRAPH), dynamics=dynamics, **constants)
     return network, seen
 
 

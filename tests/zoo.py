@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 
+import made_files
 import made_modules
 import made_netx
 import made_nir
@@ -90,7 +91,10 @@ def stored(path: Path, checkpoint: Checkpoint, **changes: int) -> Checkpoint:
     names = ("beta", "theta", "forms", "system", "grid", "dynamics", "towers", "bins")
     facts = {name: getattr(checkpoint, name) for name in names} | {"training": {}} | changes
     save_checkpoint(
-        path, {"last": arrays_of(checkpoint)}, GRAPH, **facts | {"forms": checkpoint.forms or None}
+        path,
+        {"last": arrays_of(checkpoint)},
+        **made_files.graph_facts(GRAPH),
+        **facts | {"forms": checkpoint.forms or None},
     )
     return read_checkpoint(path)
 

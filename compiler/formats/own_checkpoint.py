@@ -38,9 +38,9 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -83,7 +83,7 @@ from spikeloom.compiler.systems import (
     shape_faults,
 )
 from spikeloom.compiler.targets.loihi1.registers import THRESHOLD_MANTISSA_MAX, plane_distance
-from spikeloom.compiler.types import AnyArray, IntArray, JsonObject
+from spikeloom.compiler.types import AnyArray, IntArray
 
 FORMAT = "spikeloom-checkpoint"
 VERSION = 6
@@ -120,36 +120,13 @@ MORE: dict[str, Kind] = {
 Tensors = Mapping[str, npt.NDArray[np.float32]]
 
 
-class TaxelGraph(Protocol):
-    """What is stored of a graph."""
-
-    @property
-    def name(self) -> str:
-        """What people call it."""
-
-    @property
-    def n_taxels(self) -> int:
-        """Number of its nodes."""
-
-    @property
-    def edges(self) -> IntArray:
-        """(edges, 2); source and target."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SavedGraph:
-    """A graph of which no more is known."""
-
-    name: str
-    n_taxels: int
-    edges: IntArray
-
-
 def save_checkpoint(
     path: str | os.PathLike[str],
     weights: Mapping[str, Tensors],
-    graph: TaxelGraph,
     *,
+    taxels: int,
+    graph: str,
+    edges: IntArray,
     beta: float,
     theta: float,
     training: Mapping[str, Any],
@@ -163,10 +140,11 @@ def save_checkpoint(
     """Write a checkpoint, whole or not at all; equal input gives equal bytes.
 
     `weights` has the tensors of at least one of ``last``, ``best`` and ``clean``: ``conv1.hops`` (filters,
-    features, channels), ``conv1.bias``, ``fc1.weight``, ``fc1.bias`` … float32. `training` are JSON values:
-    how it was made and what it reached. `forms` say how the chip stores each layer, conv1 first, where the
-    network was fine-tuned for it. `towers` lie side by side in the tensors, see :mod:`formats.tensors`; a
-    step joins so many `bins` of the recordings.
+    features, channels), ``conv1.bias``, ``fc1.weight``, ``fc1.bias`` … float32. `graph` is the name of the
+    taxel graph, `edges` (edges, 2) int64 are the source and the target of each of its edges. `training` are
+    JSON values: how it was made and what it reached. `forms` say how the chip stores each layer, conv1
+    first, where the network was fine-tuned for it. `towers` lie side by side in the tensors, see
+    :mod:`formats.tensors`; a step joins so many `bins` of the recordings.
     """
     tensors_of_one = next(iter(weights.values()))
     stages = sum(name.startswith("fc") and name.endswith(".weight") for name in tensors_of_one)
@@ -179,11 +157,11 @@ def save_checkpoint(
         "format": FORMAT,
         "version": VERSION,
         "architecture": system,
-        "taxels": graph.n_taxels,
+        "taxels": taxels,
         "classes": len(tensors_of_one[f"fc{stages}.bias"]) // towers,
         "beta": beta,
         "theta": theta,
-        "graph": {"name": graph.name, "edges": graph.edges.tolist()},
+        "graph": {"name": graph, "edges": edges.tolist()},
         "weights": list(weights),
         "training": dict(training),
     }
@@ -197,22 +175,15 @@ def save_checkpoint(
         manifest["grid"] = grid.to_json()
     if forms is not None:
         layers = ["conv1", *(f"fc{stage}" for stage in range(1, stages + 1))]
-        manifest["forms"] = [_form_entry(layer, form) for layer, form in zip(layers, forms, strict=True)]
+        manifest["forms"] = [
+            {"layer": layer} | asdict(form) | {"threshold": form.threshold.tolist()}
+            for layer, form in zip(layers, forms, strict=True)
+        ]
     manifest["sha256"] = content_digest(manifest, arrays)
     members: dict[str, bytes | str] = {"manifest.json": json.dumps(manifest, indent=1, allow_nan=False)}
     content = zip_bytes(members | {f"{name}.npy": npy_bytes(array) for name, array in arrays.items()})
     with write_atomically(path) as file:
         file.write(content)
-
-
-def _form_entry(layer: str, form: Form) -> JsonObject:
-    """How a layer is stored, as JSON values."""
-    return {
-        "layer": layer,
-        "bits": form.bits,
-        "exponents": list(form.exponents),
-        "threshold": form.threshold.tolist(),
-    }
 
 
 def save_again(path: str | os.PathLike[str], checkpoint: Checkpoint, *, training: Mapping[str, Any]) -> None:
@@ -221,7 +192,9 @@ def save_again(path: str | os.PathLike[str], checkpoint: Checkpoint, *, training
     save_checkpoint(
         path,
         {"last": arrays_of(checkpoint)},
-        SavedGraph(name=str(checkpoint.graph), n_taxels=checkpoint.taxels, edges=edges),
+        taxels=checkpoint.taxels,
+        graph=str(checkpoint.graph),
+        edges=edges,
         beta=checkpoint.beta,
         theta=checkpoint.theta,
         training=training,

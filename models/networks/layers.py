@@ -14,6 +14,7 @@ References
    IROS 2020.
 """
 
+from itertools import pairwise
 from typing import Any
 
 import numba
@@ -122,28 +123,6 @@ class _Lif(torch.autograd.Function):
         return out, None, None, None
 
 
-class Spike(torch.autograd.Function):
-    """``u > theta``, with a surrogate for its derivative."""
-
-    @staticmethod
-    def forward(ctx: Any, membrane: Tensor, theta: float, surrogate: Surrogate) -> Tensor:
-        """Zeros and ones."""
-        ctx.save_for_backward(membrane)
-        ctx.theta = theta
-        ctx.surrogate = surrogate
-        return (membrane > theta).to(membrane.dtype)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
-        """The surrogate at the distance from the threshold."""
-        (membrane,) = ctx.saved_tensors
-        surrogate: Surrogate = ctx.surrogate
-        distance = (membrane - ctx.theta).abs()
-        if surrogate.shape == FAST_SIGMOID:
-            return gradients[0] / (1 + distance / surrogate.width) ** 2, None, None
-        return gradients[0] * (distance < surrogate.width), None, None
-
-
 def lasting_current(drive: Tensor, alpha: float) -> Tensor:
     """Synaptic currents along the first axis, from rest: ``i_t = alpha * i_{t-1} + drive_t``.
 
@@ -166,8 +145,11 @@ class _LastingCurrent(torch.autograd.Function):
 
 
 def _accumulated(steps: Tensor, alpha: float, *, backwards: bool) -> Tensor:
+    """Each step plus the share `alpha` of the sum so far, from the last step on if `backwards`."""
     sums = steps.clone(memory_format=torch.contiguous_format)
-    accumulate(rows_of(sums), kind_of(sums)(alpha), backwards)
+    rows = rows_of(sums)
+    for before, row in pairwise(rows[::-1] if backwards else rows):
+        np.add(row, kind_of(sums)(alpha) * before, out=row)
     return sums
 
 
@@ -303,23 +285,6 @@ def _differentiate(
     for t in range(steps - 1, -1, -1):
         differentiate_step(spikes_gradient[t], membrane[t], later, beta, theta, width, reset, smooth, out[t])
         later = out[t]
-
-
-@numba.njit(cache=True)
-def _accumulate_step(current: Any, before: Any, alpha: Any) -> None:
-    for i in range(len(current)):
-        current[i] += alpha * before[i]
-
-
-@numba.njit(cache=True)
-def accumulate(current: Any, alpha: Any, backwards: bool) -> None:
-    """Add to each row (steps, neurons) the share `alpha` of the one before, in place; from the end if backwards."""
-    steps = len(current)
-    for t in range(1, steps):
-        if backwards:
-            _accumulate_step(current[steps - 1 - t], current[steps - t], alpha)
-        else:
-            _accumulate_step(current[t], current[t - 1], alpha)
 
 
 @numba.njit(cache=True)

@@ -4,10 +4,26 @@ A network is any ``nn.Module`` with :class:`LIF` layers in it; whatever lies bet
 affine to be compiled (:func:`module.module_network`). How it is trained is its own affair.
 """
 
+from typing import Any
+
+import torch
 from torch import Tensor, nn
 
-from spikeloom.models.networks.layers import Spike
 from spikeloom.models.networks.surrogate import RECTANGLE
+
+
+class _Spike(torch.autograd.Function):
+    """``u > theta``, with the released code's surrogate for its derivative."""
+
+    @staticmethod
+    def forward(ctx: Any, membrane: Tensor, theta: float) -> Tensor:
+        ctx.save_for_backward((membrane - theta).abs() < RECTANGLE.width)
+        return (membrane > theta).to(membrane.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        (near,) = ctx.saved_tensors
+        return gradients[0] * near, None
 
 
 class LIF(nn.Module):
@@ -39,7 +55,7 @@ class LIF(nn.Module):
             membrane = current
         else:
             membrane = self.membrane * self.beta * (1.0 - self.spikes) + current
-        spikes: Tensor = Spike.apply(membrane, self.theta, RECTANGLE)  # type: ignore[no-untyped-call]
+        spikes: Tensor = _Spike.apply(membrane, self.theta)  # type: ignore[no-untyped-call]
         self.membrane = membrane
         self.spikes = spikes
         return spikes

@@ -17,6 +17,7 @@ from typing import IO, Any, Self
 import numpy as np
 
 from spikeloom.compiler.archive import arrays_digest, opened_zip, read_npy
+from spikeloom.compiler.arrays import frozen
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.files import reading
 from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, IntArray
@@ -68,9 +69,7 @@ class Recordings:
         for name in ("events", "labels", "lengths"):
             array = getattr(self, name)
             if array is not None:
-                view = np.ascontiguousarray(array).view()
-                view.flags.writeable = False
-                object.__setattr__(self, name, view)
+                object.__setattr__(self, name, frozen(np.ascontiguousarray(array).view()))
 
     def __repr__(self) -> str:
         """One line instead of the arrays."""

@@ -1,6 +1,5 @@
 """Fetch the released recordings, once, and find them again by name."""
 
-import hashlib
 import os
 import re
 import sys
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.files import sha256_of
 
 _REPOSITORY = "https://raw.githubusercontent.com/clear-nus/TactileSGNet/master"
 
@@ -131,7 +131,4 @@ def _known(name: str) -> DataSet:
 
 def _is_released(path: Path, data: DataSet) -> bool:
     """Compare size first: a stranger may be large."""
-    if not path.is_file() or path.stat().st_size != data.size:
-        return False
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest() == data.sha256
+    return path.is_file() and path.stat().st_size == data.size and sha256_of(path) == data.sha256

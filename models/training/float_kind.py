@@ -48,7 +48,9 @@ def save(path: Path, kept: Mapping[str, Any], plan: Plan, record: Mapping[str, A
     save_checkpoint(
         path,
         kept,
-        plan.graph,
+        taxels=plan.graph.n_taxels,
+        graph=plan.graph.name,
+        edges=plan.graph.edges,
         beta=sizes.beta,
         theta=sizes.theta,
         training=record,

@@ -6,7 +6,6 @@ any other synapse.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -54,24 +53,16 @@ def _layers(network: IntegerNetwork, removed: Masks) -> tuple[Layer, ...]:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Axons:
-    """Input axons of all cores, core after core, and the synapses behind them; an array for each chunk's lists."""
-
-    per_core: IntArray  # (cores,) int64
-    formats: dict[core_needs.SynapseFormat, int] = field(default_factory=dict)  # Their numbers
-    source: list[IntArray] = field(default_factory=list)
-    format: list[IntArray] = field(default_factory=list)
-    length: list[AnyArray] = field(default_factory=list)
-    target: list[AnyArray] = field(default_factory=list)
-    weight: list[AnyArray] = field(default_factory=list)
-
-
 def _axons(
     network: IntegerNetwork, cores: core_needs.Cores, target: Target, compartment_id: Sequence[IntArray]
-) -> _Axons:
-    """Lists of every core, dense or sparse; `compartment_id` are those of the neurons of each population."""
-    axons = _Axons(np.zeros(len(cores), np.int64))
+) -> tuple[dict[str, Any], list[core_needs.SynapseFormat]]:
+    """Input axons of all cores with their synapses, by column of the netlist, and the formats that they use.
+
+    `compartment_id` are those of the neurons of each population.
+    """
+    per_core = np.zeros(len(cores), np.int64)
+    number: dict[core_needs.SynapseFormat, int] = {}
+    columns: list[tuple[AnyArray, ...]] = []
     needs = core_needs.Needs(network, target)
     for core, chunks in enumerate(cores):
         base = 0
@@ -84,20 +75,22 @@ def _axons(
                     lists, projection, base, chunk.size, lean=lean, target=target
                 )
                 keys = [(projection.bits, projection.exponent, 0 if flag else index) for flag in dense]
+                formats = np.array([number.setdefault(key, len(number)) for key in keys])
                 source = lists.source
                 if projection.pre != INPUT:
                     source = network.input.size + compartment_id[projection.pre][source]
-                length, place, weight = _entries(lists, dense, base)
-                axons.per_core[core] += len(source)
-                axons.source.append(source)
-                axons.format.append(
-                    np.array([axons.formats.setdefault(key, len(axons.formats)) for key in keys])
-                )
-                axons.length.append(length)
-                axons.target.append(place)
-                axons.weight.append(weight)
+                per_core[core] += len(source)
+                columns.append((source, formats, *_entries(lists, dense, base)))
             base += chunk.size
-    return axons
+    source, formats, length, place, weight = map(np.concatenate, zip(*columns, strict=True))
+    return {
+        "core_axons": read_only(np.cumsum([0, *per_core])),
+        "axon_source": read_only(source),
+        "axon_format": read_only(formats),
+        "axon_synapses": read_only(np.append(0, np.cumsum(length))),
+        "synapse_target": frozen(place),
+        "synapse_weight": frozen(weight),
+    }, list(number)
 
 
 def _votes(network: IntegerNetwork, layer: IntArray, neuron: IntArray) -> IntArray:
@@ -138,12 +131,10 @@ def emit(
             [getattr(network.populations[c.population], name)[c.first : c.last] for c in order]
         )
 
-    axons = _axons(network, cores, target, compartment_id)
-    known = (
-        numbers
-        if identity is None
-        else np.concatenate([identity[c.population][c.first : c.last] for c in order])
-    )
+    known = numbers
+    if identity is not None:
+        known = np.concatenate([identity[c.population][c.first : c.last] for c in order])
+    axons, formats = _axons(network, cores, target, compartment_id)
     return Netlist(
         target=target.name,
         taxels=network.input.taxels,
@@ -154,7 +145,6 @@ def emit(
         core_compartments=read_only(
             np.cumsum([0, *(sum(chunk.size for chunk in chunks) for chunks in cores)])
         ),
-        core_axons=read_only(np.cumsum([0, *axons.per_core])),
         layer=read_only(layer),
         neuron=read_only(known),
         decay_u=read_only([network.populations[post].decay_u for post in layer]),
@@ -164,14 +154,10 @@ def emit(
         bias_exponent=read_only(column("bias_exponent")),
         scale=read_only_float(column("scale")),
         readout_class=read_only(_votes(network, layer, numbers)),
-        axon_source=read_only(np.concatenate(axons.source)),
-        axon_format=read_only(np.concatenate(axons.format)),
-        axon_synapses=read_only(np.concatenate([[0], np.cumsum(np.concatenate(axons.length))])),
-        synapse_target=frozen(np.concatenate(axons.target)),
-        synapse_weight=frozen(np.concatenate(axons.weight)),
-        format_weight_bits=read_only([bits for bits, _, _ in axons.formats]),
-        format_exponent=read_only([exponent for _, exponent, _ in axons.formats]),
-        format_index_bits=read_only([index for _, _, index in axons.formats]),
+        **axons,
+        format_weight_bits=read_only([bits for bits, _, _ in formats]),
+        format_exponent=read_only([exponent for _, exponent, _ in formats]),
+        format_index_bits=read_only([index for _, _, index in formats]),
         provenance=dict(provenance),
         clocks=network.input.clocks,
         bins=network.input.bins,

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 
 from spikeloom.compiler import invariants
+from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.passes import calibrate as calibration
@@ -32,7 +33,7 @@ from spikeloom.compiler.targets.loihi1.remove import Removal
 from spikeloom.compiler.targets.loihi1.storage import held_out
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice, choose_storage, round_to_forms
 from spikeloom.compiler.targets.loihi1.storage.held_out import HeldOut
-from spikeloom.compiler.targets.loihi1.storage.ladder import Trial, choose_cheapest
+from spikeloom.compiler.targets.loihi1.storage.ladder import Trial, cheapest_first
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness, make_exact
 from spikeloom.compiler.types import AnyArray, FloatArray, IntArray
 
@@ -283,7 +284,10 @@ def _rounded(work: Compilation, after: After = None) -> Compilation:
 
 
 def _with_cheapest(work: Compilation, storage: Cheapest, events: AnyArray) -> Compilation:
-    """Round to the cheapest storage that keeps decisions of held-out recordings, or to the one that keeps most."""
+    """Round to the cheapest storage that keeps decisions of held-out recordings, or to the one that keeps most.
+
+    Each is compiled to the end. CapacityError or ModelError if the chip does not hold even the first.
+    """
     network = work.network
     few = work.calibration
     assert few is not None, "there are recordings"
@@ -294,14 +298,38 @@ def _with_cheapest(work: Compilation, storage: Cheapest, events: AnyArray) -> Co
         some = events[calibration.evenly_spaced(several, calibration.MANY)]
         return calibration.calibrate(network, channels_last(some, network.input.clocks))
 
-    def compiled(packing: Packing) -> Compilation:
-        known = many() if packing.planes > 1 or work.options.prune_unused else few
-        return run((_quantize, *INTEGERS, *LAYOUT), replace(work, packing=packing, calibration=known))
-
     judge = HeldOut(network, events[left_out])
-    best, trials = choose_cheapest(work.target, storage.keep, judge, compiled, partial(_operations, few))
+    best = work
+    most = -1
+    trials = list[Trial]()
+    for packing in cheapest_first(work.target):
+        known = many() if packing.planes > 1 or work.options.prune_unused else few
+        trial = Trial(planes=packing.planes, groups=packing.groups)
+        try:
+            tried = run((_quantize, *INTEGERS, *LAYOUT), replace(work, packing=packing, calibration=known))
+        except (CapacityError, ModelError) as error:
+            if not trials:
+                raise  # nor does what is larger fit
+            trials.append(replace(trial, refused=str(error)))
+            continue
+        equal = judge.equal(tried.integer)
+        trials.append(
+            replace(
+                trial,
+                equal=equal,
+                decisions=len(judge),
+                operations=_operations(few, tried.integer),
+                synapse_words=sum(use.used for use in tried.uses if use.name == "core.synapse_words"),
+                cores=tried.netlist.n_cores,
+            )
+        )
+        if equal > most:
+            best = tried
+            most = equal
+        if most >= storage.keep * len(judge):
+            break
     chosen = replace(work, connected=LATER, integer=best.integer, choices=best.choices)
-    return replace(chosen, packing=best.packing, trials=trials)
+    return replace(chosen, packing=best.packing, trials=tuple(trials))
 
 
 def _operations(known: Calibration, integer: IntegerNetwork) -> float:
