@@ -50,6 +50,7 @@ from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.networks.networks import Architecture
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.sensors import read_edges, read_taxels
+from spikeloom.models.training.resume import SEAL_BYTES
 from spikeloom.models.training.train import train
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.report.encode import encode
@@ -403,7 +404,15 @@ READERS = {
     "released checkpoint, older form": pickled(
         ".t7", partial(torch_files, False), together=partial(torch_bytes, new=False)
     ),
-    "training state": Reader(".state", states, trains, unpickled, torch_bytes, share=0.25),
+    "training state": Reader(
+        ".state",
+        states,
+        trains,
+        lambda content: unpickled(content[:-SEAL_BYTES]),
+        torch_bytes,
+        sealed=True,
+        share=0.25,
+    ),
     "ONNX": Reader(".onnx", onnx, partial(network, read_onnx), message, message_of, OPERATORS),
     "NIR": Reader(".nir", nir_files, nir, tree_of, hdf5_of, NIR_WORDS, share=0.25),
     "netx": Reader(

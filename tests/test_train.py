@@ -220,8 +220,10 @@ def test_a_state_of_another_training_or_a_damaged_one_is_refused(tmp_path):
         refused(error, f"{state}: {words}; ", train, data, grasps(1), ADJACENCY, SMALL, **options)
 
     refused_for("belongs to a training with other epochs, training data", OptionError, grasps(2), 2)
-    state.write_bytes(b"[")
-    refused_for("is not a checkpoint", ModelError, grasps(0), 1)
+    content = state.read_bytes()
+    for damaged in (b"[", content[:-1], content[:99] + b"x" + content[100:]):
+        state.write_bytes(damaged)
+        refused_for("is no training state, or was altered", ModelError, grasps(0), 1)
 
 
 def test_a_loss_that_is_no_number_stops_and_keeps_the_state(tmp_path, monkeypatch):

@@ -1,11 +1,11 @@
 """State of a training between two epochs, so that a killed one continues to the same weights, bit for bit."""
 
-import copy
-import math
+import hashlib
+import io
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar, get_type_hints
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -17,6 +17,8 @@ from spikeloom.compiler.formats.torch_checkpoint import load_torch
 from spikeloom.models.networks.networks import Weights
 
 E = TypeVar("E")
+
+SEAL_BYTES = 32
 
 
 @dataclass(kw_only=True, eq=False)
@@ -63,28 +65,35 @@ class Course(Generic[E]):
             "options": dict(self.options),
             "history": [asdict(epoch) for epoch in self.history],  # type: ignore[call-overload]
             "order": self.draw.bit_generator.state,
-            **_trained(self.network, self.optimizer, self.weights),
+            "network": {name: parameter.detach() for name, parameter in self.network.named_parameters()},
+            "optimizer": self.optimizer.state_dict(),
+            "kept": {
+                which: {name: torch.tensor(array) for name, array in kept.items()}
+                for which, kept in self.weights.items()
+            },
         }
+        content = io.BytesIO()
+        try:
+            torch.save(state, content)
+        except RuntimeError as error:
+            if isinstance(error.__context__, KeyboardInterrupt):  # torch then finds its file cut short
+                raise error.__context__ from None
+            raise
         with write_atomically(path) as file:
-            try:
-                torch.save(state, file)
-            except RuntimeError as error:
-                if isinstance(error.__context__, KeyboardInterrupt):  # torch then finds its file cut short
-                    raise error.__context__ from None
-                raise
+            file.write(content.getvalue() + _seal(content.getvalue()))
 
-    def restore(self, path: Path, keeps: Callable[[int], Mapping[str, Weights]] = lambda _: {}) -> None:
-        """Put back what was written; `keeps` gives weights of the shapes that are kept after so many epochs.
+    def restore(self, path: Path) -> None:
+        """Put back what was written.
 
-        ModelError if the state is missing or damaged, OptionError if it is that of another training.
+        ModelError if the state is missing, damaged or altered, OptionError if it is that of another training.
         """
         with reading(path, ModelError, "delete it and train anew"):
-            state = load_torch(read_whole(path, "training state"))
-            self._require_same(path, state)
-            self._require_history(state["history"])
-            after_epoch = _after_an_epoch(self.network, self.optimizer, keeps(len(state["history"])))
-            if not _alike({name: state[name] for name in after_epoch}, after_epoch):
-                raise FileFault("is not the state of this network")
+            sealed = read_whole(path, "training state")
+            content = sealed[:-SEAL_BYTES]
+            if _seal(content) != sealed[-SEAL_BYTES:]:
+                raise FileFault("is no training state, or was altered")
+            state = load_torch(content)
+            self._require_same(path, state["options"])
             self.network.load_state_dict(state["network"], strict=False)
             self.optimizer.load_state_dict(state["optimizer"])
             self.draw.bit_generator.state = state["order"]
@@ -94,63 +103,18 @@ class Course(Generic[E]):
             for which, arrays in state["kept"].items()
         }
 
-    def _require_same(self, path: Path, state: Any) -> None:
-        if not isinstance(state, dict) or not isinstance(written := state.get("options"), dict):
-            raise FileFault("is not a training state")
+    def _require_same(self, path: Path, written: Mapping[str, Any]) -> None:
         names = {*written, *self.options}
-        if differing := sorted(str(name) for name in names if written.get(name) != self.options.get(name)):
+        if differing := sorted(name for name in names if written.get(name) != self.options.get(name)):
             raise OptionError(
                 f"{path}: belongs to a training with other {', '.join(differing)[:100]}; give the same options and "
                 "data, or delete it to train anew"
             )
 
-    def _require_history(self, figures: Any) -> None:
-        types = get_type_hints(self.epoch)
-        typed = all({name: type(value) for name, value in each.items()} == types for each in figures)
-        last = min(len(figures), self.options["epochs"])
-        if not typed or [each["epoch"] for each in figures] != [*range(1, last + 1)]:
-            raise FileFault("has no usable history")
 
-
-def _trained(
-    network: torch.nn.Module, optimizer: torch.optim.Optimizer, weights: Mapping[str, Weights]
-) -> dict[str, Any]:
-    return {
-        "network": {name: parameter.detach() for name, parameter in network.named_parameters()},
-        "optimizer": optimizer.state_dict(),
-        "kept": {
-            which: {name: torch.tensor(array) for name, array in kept.items()}
-            for which, kept in weights.items()
-        },
-    }
-
-
-def _after_an_epoch(
-    network: torch.nn.Module, optimizer: torch.optim.Optimizer, weights: Mapping[str, Weights]
-) -> dict[str, Any]:
-    """Names, types and shapes of a state after an epoch; its numbers mean nothing."""
-    network, optimizer = copy.deepcopy((network, optimizer))
-    for parameter in network.parameters():
-        parameter.grad = torch.zeros_like(parameter)
-    optimizer.step()
-    return _trained(network, optimizer, weights)
-
-
-def _alike(found: Any, wanted: Any) -> bool:
-    """Whether two values are equal, finite real numbers aside."""
-    if type(found) is not type(wanted):
-        return False
-    match wanted:
-        case dict():
-            return found.keys() == wanted.keys() and all(
-                _alike(found[key], each) for key, each in wanted.items()
-            )
-        case list() | tuple():
-            return len(found) == len(wanted) and all(map(_alike, found, wanted))
-        case torch.Tensor():
-            same = (found.shape, found.dtype, found.layout) == (wanted.shape, wanted.dtype, wanted.layout)
-            return same and bool(found.isfinite().all())
-    return math.isfinite(found) if isinstance(found, float) else bool(found == wanted)
+def _seal(content: bytes) -> bytes:
+    """What stands behind the content of a state: nothing else is looked at in a file that it does not fit."""
+    return hashlib.sha256(content).digest()
 
 
 def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:

@@ -125,7 +125,7 @@ def train(
             epoch=Epoch,
         )
         if resume and state is not None and state.exists():
-            course.restore(state, keeps=lambda done: _kept_after(done, network, keep_epoch))
+            course.restore(state)
         run = partial(
             course.run,
             train_epoch=lambda index: _run_epoch(
@@ -138,7 +138,7 @@ def train(
             position=position,
         )
         if trunk is not None and recipe.schedule == PLATEAU:
-            _climb(course, network, trunk, plateau(epochs), run)
+            _climb(course, trunk, plateau(epochs), run)
         run(epochs)
         return _trained(architecture, network.export_weights(), course)
 
@@ -148,14 +148,12 @@ def _shown(epoch: Epoch) -> dict[str, str]:
     return {"loss": f"{epoch.training_loss:.4f}", "test": f"{epoch.correct}/{epoch.tested}"}
 
 
-def _climb(
-    course: Course[Epoch], network: TrainedModule, trunk: Path, epochs: int, run: Callable[[int], None]
-) -> None:
+def _climb(course: Course[Epoch], trunk: Path, epochs: int, run: Callable[[int], None]) -> None:
     """Train to the end of the plateau, from the longest state that is no longer than that."""
     states = {int(file.suffix[1:]): file for file in trunk.parent.glob(f"{trunk.name}.*")}
     done = max((length for length in states if length <= epochs), default=0)
     if done:
-        course.restore(states[done], keeps=lambda done: _kept_after(done, network, None))
+        course.restore(states[done])
     if done < epochs:
         run(epochs)
         course.write(trunk.with_name(f"{trunk.name}.{epochs}"))
@@ -185,13 +183,6 @@ def _identity(
         "test data": arrays_digest(test.identity()),
         "recipe": recipe.to_json(),
     }
-
-
-def _kept_after(epochs: int, network: TrainedModule, keep_epoch: int | None) -> dict[str, Weights]:
-    """Weights of the shapes that are kept after so many epochs."""
-    shapes = network.export_weights()
-    since = {"best": 1, "kept": keep_epoch}
-    return {which: shapes for which, epoch in since.items() if epoch is not None and epoch <= epochs}
 
 
 def _run_epoch(
