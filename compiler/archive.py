@@ -36,13 +36,13 @@ FORMATS = {
 """What a manifest may say that an archive is."""
 
 AGAIN = "copy or train it again"
-"""What to do about a network that is not compiled."""
+"""Remedy for a damaged file of a network that is not compiled yet."""
 
 SIZE_LIMIT = 2**32
 """Bytes that a netlist file may have, 4 GiB: some hundred times the synapses of a whole chip."""
 
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-"""Of every member of a zip, so that equal content gives equal bytes."""
+"""Date of every member of a zip, fixed so that equal content gives equal bytes."""
 
 END_COUNT = -12
 """Where a zip without a comment states the number of its members, counted from its end."""
@@ -72,7 +72,7 @@ def digest(members: Mapping[str, Array]) -> str:
 
 
 def arrays_digest(arrays: Mapping[str, Array]) -> str:
-    """The same in the order of their names."""
+    """Hex sha256 over arrays in the order of their names, as :func:`digest`."""
     return digest(dict(sorted(arrays.items())))
 
 
@@ -93,7 +93,7 @@ def zip_bytes(members: Mapping[str, bytes | str]) -> bytes:
 
 
 def archive_bytes(manifest: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:
-    """Content of a file: the manifest, the arrays in their order, and the hash over all of them."""
+    """Content of an archive: the manifest, the arrays in their order, and the hash over all of them."""
     members: dict[str, Array] = {"manifest": np.array(json.dumps(manifest, sort_keys=True))}
     members |= {name: narrow(array) for name, array in arrays.items()}
     members["sha256"] = np.array(digest(members))
@@ -175,7 +175,7 @@ def is_netlist(path: str | os.PathLike[str]) -> bool:
 
 
 LETTERS = 1000
-"""That a word of a manifest may have, the name of a layer, say."""
+"""Maximum length of a text in a manifest, such as the name of a layer."""
 
 Kind = type | tuple[int, int] | frozenset[str] | dict[str, Any] | list[Any]
 """What an entry of a manifest must be: of a type (``float``: from 0, finite), a whole number within bounds
@@ -200,7 +200,7 @@ def entry_faults(manifest: Mapping[str, Any], kinds: Mapping[str, Kind]) -> list
 def array_faults(
     arrays: Mapping[str, Array], axes: Mapping[str, int], floats: Iterable[str] = ()
 ) -> list[str]:
-    """Arrays with other axes than one, or than `axes` says, and those that are no integers, or `floats` no reals."""
+    """Arrays that have not as many axes as `axes` says, by default one, or no integers (`floats`: no real numbers)."""
     faults = []
     for name, array in arrays.items():
         due = axes.get(name, 1)

@@ -129,7 +129,7 @@ def constant_faults(beta: float | None, theta: float | None) -> list[str]:
 
 
 SHARED = -1
-"""Tower of the relays of clocks, which all receive."""
+"""Tower number of the relays of clocks, whose spikes every tower receives."""
 
 
 def towers_of(checkpoint: Checkpoint) -> tuple[IntArray, ...]:
@@ -143,7 +143,7 @@ def towers_of(checkpoint: Checkpoint) -> tuple[IntArray, ...]:
 
 
 def neurons_of(tower: int, owner: IntArray) -> BoolArray:
-    """Which neurons of a layer a tower has, the shared ones among them."""
+    """Which neurons of a layer belong to a tower, those that all towers share included."""
     return np.asarray((owner == tower) | (owner == SHARED))
 
 

@@ -11,7 +11,7 @@ from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.types import IntArray
 
 BLOCK = 127
-"""What a counter's spike takes from its membrane: the largest weight beside one of 1 in a mantissa of 8 bits."""
+"""A counter's spike lowers its membrane by this: the largest weight that 8 bits hold beside a weight of 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -23,7 +23,7 @@ MOST_CLOCKS = 64
 """Clock channels that a network may have."""
 
 MOST_STEPS = 2**20
-"""Steps that a clock may tick."""
+"""Largest number of steps that a clock may tick."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,15 +16,15 @@ class SpikeloomError(Exception):
 
 
 class ModelError(SpikeloomError):
-    """The checkpoint, its graph or its options cannot be used: the user mends the model."""
+    """The checkpoint, its graph or its options cannot be used: the user fixes the model."""
 
 
 class DataError(SpikeloomError):
-    """The recordings cannot be used: the user mends the data."""
+    """The recordings cannot be used: the user fixes the data."""
 
 
 class OptionError(SpikeloomError):
-    """An option has a value that does not exist: the user mends the command."""
+    """An option has a value that does not exist: the user fixes the command."""
 
 
 def require_least(values: Mapping[str, Any], **least: int) -> None:

@@ -16,10 +16,10 @@ SIZE_LIMIT = 2**28
 """Bytes that the file of a trained network may have: 256 MiB, a hundred times the released ones."""
 
 MOST_SAID = 300
-"""Letters of a message about a file, folders before its name not counted."""
+"""Maximum length of a message about a file, without the folders before its name."""
 
 RANDOM = 8
-"""Letters that are drawn for a name."""
+"""Random hex digits in the name of a file that is still being written."""
 
 WRITTEN: dict[str, None] = {}
 """Files that this process has written, in that order."""
@@ -77,7 +77,7 @@ class FileFault(SpikeloomError):  # noqa: N818 - the file's, no error of the pro
 
 @contextmanager
 def reading(where: object, error: type[SpikeloomError], remedy: str) -> Iterator[None]:
-    """Let whatever is raised while a file is read be one line of `MOST_SAID` letters: name, what was found, remedy.
+    """Turn whatever is raised while a file is read into one line of at most `MOST_SAID` letters: name, fault, remedy.
 
     A :class:`FileFault`, and all that parsing libraries raise, becomes an `error`; other errors of ours keep
     their kind and words, those about options pass.

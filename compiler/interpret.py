@@ -55,7 +55,7 @@ class Layer:
         return spikes, kept
 
     def moved(self, sources: Raster, wanted: EventArray) -> npt.NDArray[np.int32]:
-        """Entries in which neurons differ from those `wanted`, and spikes more than there; (2, neurons).
+        """In how many steps each neuron differs from what is `wanted`, and how many spikes more it has; (2, neurons).
 
         `wanted` (samples, steps, bytes) has a bit for each neuron, the first lowest.
         """
@@ -97,7 +97,7 @@ def float_layer(
 ) -> Layer:
     """A float population with all projections to it, in the arithmetic of `dtype`.
 
-    Without `loops` what it receives from itself comes from outside, too, as from other populations.
+    Without `loops` its own spikes are given from outside, like those of other populations.
     """
     registers = tuple(np.array([population.alpha, population.beta, population.theta], dtype))
     pres, synapses = synapses_of([(p, p.weight) for p in projections], dtype, loops=loops)

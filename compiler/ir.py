@@ -202,7 +202,7 @@ def fan_in(network: Graph, post: int) -> IntArray:
     into = ((p.pre, p.weight) for p in network.projections if p.post == post)
     ones = added_up((pre, with_data(weight, np.ones(weight.nnz, np.int32))) for pre, weight in into)
     nothing = np.zeros(network.populations[post].size, np.int64)
-    return np.asarray(sum((np.diff(weight.indptr) for weight in ones.values()), start=nothing))
+    return sum((np.diff(weight.indptr) for weight in ones.values()), start=nothing)
 
 
 def added_up(weights: Iterable[tuple[int, Sparse]]) -> dict[int, Sparse]:

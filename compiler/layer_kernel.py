@@ -65,7 +65,7 @@ def by_source(weights: Sequence[Sparse], dtype: npt.DTypeLike) -> Synapses:
 
 
 def no_synapses(dtype: npt.DTypeLike) -> Synapses:
-    """Of no source."""
+    """Synapses of a population that has no source."""
     none = np.zeros(0, np.int64)
     return Synapses(none, none, none, np.zeros(0, dtype))
 
@@ -78,7 +78,7 @@ class _Notice(numba_event.Listener):
     collects = True
 
     def on_start(self, _event: Any) -> None:
-        """A function, or one that it calls."""
+        """The compilation of a function, or of one that it calls, begins."""
         if not self.depth:
             self.collects = gc.isenabled()
             gc.disable()  # the compiler makes so many objects that a tenth of its time would go into it
@@ -88,7 +88,7 @@ class _Notice(numba_event.Listener):
         self.said = True
 
     def on_end(self, _event: Any) -> None:
-        """Compiled, or refused."""
+        """It has ended, or failed."""
         self.depth -= 1
         if not self.depth and self.collects:
             gc.enable()
@@ -155,6 +155,13 @@ def list_fired(fired: Any, listed: Any) -> Any:
             listed[n] = neuron
             n += 1
     return n
+
+
+@compiled
+def add(values: Any, more: Any) -> None:
+    """Add to each value its part of `more`."""
+    for i in range(len(values)):
+        values[i] += more[i]
 
 
 @compiled

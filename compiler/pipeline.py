@@ -19,7 +19,7 @@ class Work(Protocol):
 W = TypeVar("W", bound=Work)
 
 LATER: Any = None
-"""Of a field of the work that a pass fills in."""
+"""Value of a field of the work until a pass fills it in."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,7 +26,7 @@ class Packing:
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
-    """Storage as it is said."""
+    """Storage exactly as it is stated here."""
 
     packings: tuple[Packing, ...] = (Packing(),)  # One for each layer, or one for all
 
@@ -53,7 +53,7 @@ class Given:
 
 
 EIGHT_BITS = Fixed()
-"""What there is without anything said."""
+"""The default."""
 
 Storage = Fixed | Cheapest | Exact | Given
 """What decides how weights are stored."""

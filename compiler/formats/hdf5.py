@@ -24,7 +24,7 @@ E = TypeVar("E")
 AGAIN = "export it again"
 
 MOST_SECONDS = 3
-"""Of processor time for a file; 256 MiB of numbers take one."""
+"""CPU time that reading a file may take; 256 MiB of numbers take one second."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -10,7 +10,7 @@ from spikeloom.compiler.files import FileFault
 
 @contextmanager
 def named(where: object) -> Iterator[None]:
-    """Let an error of what is done say where: in which part of a file; what libraries raise becomes a FileFault."""
+    """Put the part of a file in front of an error of what is done; what libraries raise becomes a FileFault."""
     try:
         yield
     except (MemoryError, OptionError):
@@ -22,7 +22,7 @@ def named(where: object) -> Iterator[None]:
 
 
 def printable(name: str) -> str:
-    """Name as a message can show it: quoted and escaped where it holds more than letters."""
+    """Name as a message can show it: quoted, escaped and cut where it is long or not printable."""
     return name if name.isprintable() and len(name) < 100 else repr(name[:100])
 
 

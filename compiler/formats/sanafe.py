@@ -29,7 +29,7 @@ import numpy as np
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.layout.place import require_one_chip
+from spikeloom.compiler.targets.loihi1.layout.place import chip_tiles, require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.registers import MEMBRANE_SHIFT, kept_shares
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import FORGETS
@@ -56,13 +56,13 @@ def dense_neurons(netlist: Netlist) -> BoolArray:
     """Which compartments name the unit of dense synapses."""
     in_dense_list = netlist.format_index_bits[netlist.axon_format[netlist.axon_of_synapse()]] == 0
     balance = np.where(in_dense_list, 1.0, -1.0)
-    return np.asarray(np.bincount(netlist.synapse_compartment(), balance, netlist.n_compartments) >= 0)
+    return np.bincount(netlist.synapse_compartment(), balance, netlist.n_compartments) >= 0
 
 
 def input_tiles(netlist: Netlist, target: Target) -> tuple[int, ...]:
     """Tiles for cores that hold nothing but input channels: those in use that have room, then the others."""
     room = target.limit("mesh.tile_cores")
-    tiles = np.arange(target.limit("mesh.width") * target.limit("mesh.height"))
+    tiles = np.arange(chip_tiles(target))
     used = np.bincount(netlist.core_tile, minlength=len(tiles))
     order = tiles[np.argsort(used == 0, kind="stable")]
     free = np.repeat(order, np.maximum(room - used[order], 0))

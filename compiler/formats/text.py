@@ -17,22 +17,21 @@ def text(made: Any) -> str:
     Arrays appear as ranges and hashes; where something is from (mappings) is left out.
     """
     lines = [type(made).__name__]
-    for field in filter(_is_printed, fields(made)):
+    for field in _printed(made):
         value = getattr(made, field.name)
         entries = value if isinstance(value, tuple) else [value]
         lines += [f"  {field.name} {_shown(entry)}" for entry in entries if not isinstance(entry, Mapping)]
     return "\n".join(lines) + "\n"
 
 
-def _is_printed(field: Field[Any]) -> bool:
-    """Whether a field says something that the others do not."""
-    return field.repr
+def _printed(made: Any) -> list[Field[Any]]:
+    """Fields that say something which the others do not."""
+    return [field for field in fields(made) if field.repr]
 
 
 def _shown(value: Any) -> str:
     if is_dataclass(value):
-        printed = filter(_is_printed, fields(value))
-        return " ".join(f"({field.name} {_shown(getattr(value, field.name))})" for field in printed)
+        return " ".join(f"({field.name} {_shown(getattr(value, field.name))})" for field in _printed(value))
     if sparse.issparse(value):
         shape = " x ".join(map(str, value.shape))
         return f"{shape}, {value.nnz} synapses {_span(value.data)} #{_digest(value.indptr, value.indices, value.data)}"

@@ -129,7 +129,7 @@ def _without_voters(network: Network, masks: Masks) -> Masks:
 
 
 def of_source(masks: Sequence[BoolArray], pre: int, size: int) -> BoolArray:
-    """Of `masks` that of a source; none of the `size` channels if it is the input."""
+    """Mask of a source; if that is the input, none of its `size` channels."""
     return np.zeros(size, np.bool_) if pre == INPUT else masks[pre]
 
 

@@ -124,7 +124,7 @@ class Target:
         return int(self.limits[rule].value)
 
     def exceeded(self, owner: str, rule: str, used: int, remedy: str) -> Violation:
-        """What is said of a limit that a network breaks."""
+        """Violation of a limit by a network, for an error message."""
         return Violation(
             owner=owner, rule=f"{self.name}.{rule}", used=used, allowed=self.limit(rule), remedy=remedy
         )
@@ -187,7 +187,7 @@ def load_target(name: str) -> Target:
 
 
 def _entries(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """What is said of each dotted name."""
+    """Every entry of nested tables with its dotted name."""
     for key, entry in table.items():
         if isinstance(entry, dict) and all(isinstance(value, dict) for value in entry.values()):
             yield from _entries(entry, f"{prefix}{key}.")

@@ -42,7 +42,7 @@ class ChipLayer(torch.autograd.Function):
         steps, samples, inputs = spikes.shape
         population = integers.population
         stage = integers.stage
-        source, bounds = events_of(spikes.detach().reshape(-1, inputs).contiguous().numpy())
+        source, bounds = events_of(spikes)
         sums = np.zeros((steps * samples, population.size), np.float32)
         gather(source, bounds, integers.units[:inputs], sums)
         shape = steps, samples * population.size

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikeloom.compiler.layer_kernel import copy, integrate_float, require_below
+from spikeloom.compiler.layer_kernel import Raster, add, copy, integrate_float, raster_of, require_below
 from spikeloom.compiler.types import EventArray
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 
@@ -119,7 +119,10 @@ class _Lif(torch.autograd.Function):
         (membrane,) = ctx.saved_tensors
         out = torch.empty_like(membrane)
         rows = rows_of(gradients[0].contiguous()), rows_of(membrane)
-        differentiate(*rows, ctx.beta, ctx.theta, ctx.surrogate, rows_of(out))
+        surrogate: Surrogate = ctx.surrogate
+        kind = kind_of(membrane)
+        constants = kind(ctx.beta), kind(ctx.theta), kind(surrogate.width), kind(surrogate.reset)
+        _differentiate(*rows, *constants, surrogate.shape == FAST_SIGMOID, rows_of(out))
         return out, None, None, None
 
 
@@ -167,10 +170,9 @@ def spike_linear(spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 class _SpikeLinear(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        rows = spikes.reshape(-1, spikes.shape[-1]).contiguous()
-        source, bounds = events_of(rows.numpy())
+        source, bounds = events_of(spikes)
         require_below("input", source, len(weight))
-        out = bias.expand(len(rows), -1).clone(memory_format=torch.contiguous_format)
+        out = bias.expand(len(bounds) - 1, -1).clone(memory_format=torch.contiguous_format)
         gather(source, bounds, weight.detach().contiguous().numpy(), out.numpy())
         ctx.events = source, bounds
         ctx.save_for_backward(weight)
@@ -207,6 +209,11 @@ def rates_of(spikes: Tensor, lengths: Tensor | None) -> Tensor:
         return spikes.mean(0)
     inside = torch.arange(len(spikes))[:, None] < lengths
     return torch.sum(spikes * inside[..., None], dim=0) / lengths[:, None]
+
+
+def events_of(spikes: Tensor) -> Raster:
+    """Which inputs spiked in each row of zeros and ones (…, inputs); all axes before the last are rows."""
+    return raster_of(spikes.detach().reshape(1, -1, spikes.shape[-1]).numpy() != 0)
 
 
 def rows_of(tensor: Tensor) -> np.ndarray[Any, Any]:
@@ -260,15 +267,6 @@ def differentiate_step(
             out[i] = through_decay + (through_spike if away < width else zero)
 
 
-def differentiate(
-    spikes_gradient: Any, membrane: Any, beta: float, theta: float, surrogate: Surrogate, out: Any
-) -> None:
-    """Gradient of the current from that of the spikes, both (steps, neurons), through decay and reset."""
-    kind = np.float32 if membrane.dtype == np.float32 else np.float64
-    constants = kind(beta), kind(theta), kind(surrogate.width), kind(surrogate.reset)
-    _differentiate(spikes_gradient, membrane, *constants, surrogate.shape == FAST_SIGMOID, out)
-
-
 @numba.njit(cache=True)
 def _differentiate(
     spikes_gradient: Any,
@@ -280,6 +278,7 @@ def _differentiate(
     smooth: bool,
     out: Any,
 ) -> None:
+    """Gradient of the current from that of the spikes, both (steps, neurons), through decay and reset."""
     steps, size = membrane.shape
     later = np.zeros(size, membrane.dtype)
     for t in range(steps - 1, -1, -1):
@@ -288,32 +287,11 @@ def _differentiate(
 
 
 @numba.njit(cache=True)
-def events_of(spikes: Any) -> Any:
-    """Inputs that spiked, row after row, and where each row's begin: int32 (spikes,), int64 (rows + 1,)."""
-    rows, inputs = spikes.shape
-    source = np.empty(spikes.size, np.int32)
-    bounds = np.zeros(rows + 1, np.int64)
-    count = 0
-    for row in range(rows):
-        for i in range(inputs):
-            source[count] = i
-            count += spikes[row, i] != 0
-        bounds[row + 1] = count
-    return source[:count].copy(), bounds
-
-
-@numba.njit(cache=True)
-def _add(total: Any, term: Any) -> None:
-    for i in range(len(total)):
-        total[i] += term[i]
-
-
-@numba.njit(cache=True)
 def gather(source: Any, bounds: Any, weight: Any, out: Any) -> None:
     """Add to each row the weights (inputs, outputs) of its inputs that spiked."""
     for row in range(len(out)):
         for event in range(bounds[row], bounds[row + 1]):
-            _add(out[row], weight[source[event]])
+            add(out[row], weight[source[event]])
 
 
 @numba.njit(cache=True)
@@ -321,4 +299,4 @@ def scatter(source: Any, bounds: Any, rows: Any, out: Any) -> None:
     """Add each row to the weights (inputs, outputs) of its inputs that spiked: the gradient of :func:`gather`."""
     for row in range(len(rows)):
         for event in range(bounds[row], bounds[row + 1]):
-            _add(out[source[event]], rows[row])
+            add(out[source[event]], rows[row])

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from spikeloom.compiler.dynamics import RELAY_WEIGHT
 from spikeloom.compiler.interpret import threads
 from spikeloom.compiler.ir import Network, Population, Projection
-from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached, copy, integrate_float, keep
+from spikeloom.compiler.layer_kernel import add, compiled_and_cached, copy, integrate_float, keep
 from spikeloom.compiler.systems import GCN, TACTILESGNET, feature_major
 from spikeloom.compiler.types import AnyArray, BoolArray, EventArray
 from spikeloom.models.networks.towers import by_tower
@@ -125,12 +125,6 @@ class _Neurons:
         return fired.astype(drive.dtype), drive
 
 
-@compiled
-def _add(values: Any, more: Any) -> None:
-    for i in range(len(values)):
-        values[i] += more[i]
-
-
 @compiled_and_cached
 def _integrate(
     drive: Any, bias: Any, alpha: Any, beta: Any, theta: Any, current: Any, membrane: Any, fired: Any
@@ -138,7 +132,7 @@ def _integrate(
     """Run neurons for some steps; `drive` becomes the membranes that were compared."""
     for t in range(len(drive)):
         keep(current, alpha)
-        _add(current, drive[t])
+        add(current, drive[t])
         integrate_float(membrane, current, bias, beta, theta, fired[t])
         copy(membrane, drive[t])
 

@@ -15,11 +15,10 @@ class EventCounts:
     """What was counted while recordings were put into bins; the fields are keys in JSON."""
 
     events: int  # Events read, duplicates included
-    out_of_order: int  # Events with a time before that of an event that came earlier
-    duplicates: (
-        int  # Events whose taxel already had one of the same polarity in the same bin; they count once
-    )
-    gaps: int  # Silences longer than `gap_s` between two events of a recording
+    out_of_order: int = 0  # Events with a time before that of an event that came earlier
+    # Events whose taxel already had one of the same polarity in the same bin; they count once
+    duplicates: int = 0
+    gaps: int = 0  # Silences longer than `gap_s` between two events of a recording
     gap_s: float = GAP_S
     shorter: int = 0  # Recordings shorter than the longest
     # What is worth a second look: times that look like another unit, taxels that seem to count from 1, a

@@ -64,9 +64,10 @@ def read_stream(
     if wrong.any():
         row = int(np.argmax(wrong))
         from_one = taxel.min(initial=MAX_TAXELS) == 1 and taxel.max() == taxels  # false for NaN
-        remedy = "they seem to count from 1" if from_one else "use recordings of this sensor"
-        plain = f"{at(row)}: taxel {taxel[row]:g}, allowed are whole numbers 0..{most - 1}; count from 0"
-        raise DataError(f"{plain}, {remedy}" if from_one else f"{plain} and {remedy}")
+        remedy = ", they seem to count from 1" if from_one else " and use recordings of this sensor"
+        raise DataError(
+            f"{at(row)}: taxel {taxel[row]:g}, allowed are whole numbers 0..{most - 1}; count from 0{remedy}"
+        )
     return EventStream(
         name=path.name,
         time_s=time_s,

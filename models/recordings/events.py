@@ -66,12 +66,13 @@ def load_data(
     recordings, flat (it stands for any split) or with ``train/`` and ``test/``; one such file; or the name
     of a fetched data set. `bin_s` is the width of a time bin in seconds, by default `default_bin_s`; the
     released layout and ``.npy`` files have bins already, see `require_events`. `taxels` and `classes` are
-    the network's; without `taxels` the highest with an event decides. Labels are `UNLABELLED` where nothing
-    says them. A file without events is as long as the others in the median. `groups` name columns of a table
-    of recordings, or fields of file names; by default they are all columns that the table has beside file and
-    label. In the released layout all recordings have labels and the same taxels, and no counts.
+    those of the network; without `taxels` the highest taxel with an event decides. Labels are `UNLABELLED`
+    where nothing states them. A file without events is as long as the median of the others. `groups` are
+    columns of a table of recordings or fields of file names, by default all columns but file and label. In
+    the released layout every recording has a label, all have the same taxels, and there are no counts.
 
-    DataError if a recording cannot be used; OptionError if `bin_s` or `limit` cannot be, or bins are there.
+    DataError if a recording cannot be used; OptionError if `bin_s` or `limit` cannot, or if `bin_s` is given
+    for what has bins already.
     """
     _require_options(bin_s, limit)
     place = _place_of(path)
@@ -151,14 +152,9 @@ def _stack(read: Sequence[_Recording], source: str) -> tuple[EventArray, IntArra
 
 def _sum_counts(read: Sequence[_Recording], steps: IntArray, notes: Sequence[str]) -> EventCounts:
     """Counts of all recordings together."""
-    return EventCounts(
-        events=sum(each.counts.events for each in read),
-        out_of_order=sum(each.counts.out_of_order for each in read),
-        duplicates=sum(each.counts.duplicates for each in read),
-        gaps=sum(each.counts.gaps for each in read),
-        shorter=int(np.count_nonzero(steps < steps.max())),
-        notes=tuple(notes),
-    )
+    names = ("events", "out_of_order", "duplicates", "gaps")
+    sums = {name: sum(getattr(each.counts, name) for each in read) for name in names}
+    return EventCounts(**sums, shorter=int(np.count_nonzero(steps < steps.max())), notes=tuple(notes))
 
 
 def _require_alike(read: _Recording, first: _Recording, released: bool) -> None:
@@ -269,7 +265,7 @@ def join_bins(events: AnyArray, bins: int) -> AnyArray:
     >>> join_bins(np.array([[0, 1, 0, 0, 1]], np.uint8), 2).tolist()
     [[1, 0, 1]]
     """
-    return np.asarray(np.maximum.reduceat(events, np.arange(0, events.shape[-1], bins), axis=-1))
+    return np.maximum.reduceat(events, np.arange(0, events.shape[-1], bins), axis=-1)
 
 
 def of_length(recordings: evtouch.Recordings, steps: int | None) -> evtouch.Recordings:
@@ -295,7 +291,7 @@ def fitted(events: AnyArray, steps: int) -> AnyArray:
 def _data_set(
     path: Path, split: str = "test"
 ) -> Iterator[tuple[evtouch.Members, dict[str, dict[str, str]]]]:
-    """What opens each file, and their names and members by split, ``""`` for any; DataError if there are none."""
+    """Openers of all files, and by split, ``""`` for any, their names and members; DataError if there are none."""
     source = path.name or str(path)
     if path.is_file():
         if path.suffix.lower() in evtouch.SUFFIXES:
@@ -335,7 +331,7 @@ def _silent_notes(read: Sequence[_Recording], source: str) -> list[str]:
 
 
 def other_sensor(recordings: evtouch.Recordings) -> str | None:
-    """What says that events are of a smaller sensor: in many recordings none of the last quarter of the taxels."""
+    """Note that events are of a smaller sensor: in many recordings the last quarter of the taxels has none."""
     last = int(np.flatnonzero(recordings.events.any(axis=(0, 2, 3))).max(initial=-1))
     if (
         recordings.bin_s is None
@@ -347,7 +343,7 @@ def other_sensor(recordings: evtouch.Recordings) -> str | None:
 
 
 def _taxel_notes(source: str, events: EventArray) -> list[str]:
-    """Taxels that count from 1 leave the first silent, and no other."""
+    """A note where taxels seem to count from 1: the first is silent, and no other."""
     alive = np.asarray(events.any(axis=(0, 2, 3)), np.bool_)
     if len(alive) < 4 or alive[0] or not alive[1:].all():
         return []
@@ -370,7 +366,7 @@ def _read(
         busy = np.flatnonzero(grid.any(axis=(0, 1)))
         gaps = int(np.count_nonzero((np.diff(busy) - 1) * bin_s > GAP_S))
         sent = int(np.count_nonzero(grid))
-        counts = EventCounts(events=sent, out_of_order=0, duplicates=0, gaps=gaps)
+        counts = EventCounts(events=sent, gaps=gaps)
         label = evtouch.label_in_name(file.name)
     else:
         stream = read_stream(file, taxels=taxels, where=where)
@@ -378,7 +374,7 @@ def _read(
             grid, counts = bin_events(stream, bin_s, taxels=taxels)
         else:
             grid = np.zeros((taxels or 1, 2, 0), np.uint8)
-            counts = EventCounts(events=0, out_of_order=0, duplicates=0, gaps=0)
+            counts = EventCounts(events=0)
         label = stream.label
     if listed is not None and label not in (evtouch.UNLABELLED, listed):
         raise DataError(f"{where}: label {label}, and {listed} in its table; fix one of them")

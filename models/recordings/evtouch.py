@@ -24,7 +24,7 @@ from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, IntArray
 from spikeloom.models.recordings.counts import EventCounts
 
 MAX_POLARITIES = 8
-"""Of a taxel; an array with more has its axes in another order."""
+"""Most polarities of a taxel; an array with more has its axes in another order."""
 
 MAX_TOTAL_BYTES = 4 << 30
 MAX_FILE_BYTES = 64 << 20  # the released recordings have 0.1 MB
@@ -35,7 +35,7 @@ BIN_S = 0.02
 UNLABELLED = -1
 
 SUFFIXES = (".npy", ".npz", ".csv")
-"""Of files that hold a recording: bins, events, events."""
+"""Suffixes of files that hold a recording: bins, or else events."""
 
 WIDTH = "bins.npy"
 """File beside the splits that holds one number, seconds of a bin; the released recordings have none."""
@@ -101,7 +101,7 @@ class Recordings:
 
     def steps_of(self, index: int) -> int:
         """Time steps of one recording."""
-        return self.steps if self.lengths is None else int(self.lengths[index])
+        return int(self.step_counts[index])
 
     def part(self, chosen: slice | AnyArray, split: str | None = None) -> Self:
         """Some of the recordings, by indices, truth values or a slice; of another `split` if it has a name."""
@@ -129,7 +129,7 @@ class Recordings:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Members]:
-    """What opens each recording of a folder, or npy file of a zip, by its name with slashes; folders two levels deep.
+    """Openers of the recordings in a folder (two levels deep) or a zip (npy files), by their names with slashes.
 
     DataError if there is no such folder or zip, or the zip announces more than `MAX_TOTAL_BYTES`.
     """
@@ -206,7 +206,7 @@ def parse_width(source: str, members: Members, recording: str) -> float | None:
 
 
 def other_taxels(found: int, wanted: int) -> str:
-    """What is said of recordings of another sensor."""
+    """Message about recordings of another sensor."""
     remedy = "use recordings of its sensor, or train on these with --taxels"
     return f"has {found} taxels, the network has {wanted}; {remedy}"
 
@@ -271,7 +271,7 @@ def data_digest(training: Recordings, test: Recordings) -> str:
 
 
 WHOLE = 100
-"""Per cent of a recording."""
+"""A whole recording, in per cent."""
 
 
 def parse_window(words: str) -> int:

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.formats.sensor_layout import POLARITIES
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.native import (
     LEAK_MOST,
@@ -33,6 +34,7 @@ from spikeloom.compiler.targets.truenorth.native import (
     highest_level,
 )
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
+from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.networks import Sizes, TrainedModule
 from spikeloom.models.networks.surrogate import RECTANGLE, Surrogate
 from spikeloom.models.truenorth.neurons import block_sums, integrate
@@ -91,14 +93,15 @@ class NativeArchitecture(Sizes):
 
 
 def size_network(
-    *, taxels: int, classes: int, hops: int, features: int, copies: int, clocks: Clocks, channels: int = 2
+    *, taxels: int, classes: int, hops: int, features: int, copies: int, clocks: Clocks
 ) -> NativeArchitecture:
     """The architecture whose groups fill the axons of a core best, as few as can be; OptionError if none fit."""
     axons = load_target("truenorth").limit("core.axons")
     room = axons // copies
-    if taxels * channels > room:
+    channels = taxels * POLARITIES
+    if channels > room:
         raise OptionError(
-            f"--copies {copies}: {taxels * channels} input channels with {copies} axons each, a core of TrueNorth has "
+            f"--copies {copies}: {channels} input channels with {copies} axons each, a core of TrueNorth has "
             f"{axons}; give fewer copies, or a smaller sensor"
         )
     width = room - clocks.channels
@@ -113,7 +116,6 @@ def size_network(
     return NativeArchitecture(
         taxels=taxels,
         classes=classes,
-        channels=channels,
         hops=hops,
         features=features,
         groups=groups,
@@ -291,7 +293,6 @@ def run_network(network: NativeNetwork, events: EventArray) -> dict[str, BoolArr
 
     `events` are (samples, taxels, polarities, steps) uint8.
     """
-    given = torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32, order="C"))
     layers = [
         Rounded(
             weight=torch.from_numpy((stage.level * UNIT).astype(np.float32)),
@@ -300,7 +301,9 @@ def run_network(network: NativeNetwork, events: EventArray) -> dict[str, BoolArr
         for stage in network.stages
     ]
     with torch.no_grad():
-        computed = run_layers(layers, [stage.inputs for stage in network.stages[1:]], network.clocks, given)
+        computed = run_layers(
+            layers, [stage.inputs for stage in network.stages[1:]], network.clocks, time_first(events)
+        )
     pairs = zip(network.stages, computed, strict=True)
     return {stage.name: spikes.numpy().astype(np.bool_).swapaxes(0, 1) for stage, spikes in pairs}
 

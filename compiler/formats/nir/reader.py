@@ -45,7 +45,7 @@ from spikeloom.compiler.types import FloatArray, IntArray
 
 AXES = 8
 ELEMENTS = 2**20
-"""Of an input."""
+"""Most axes and elements of an input."""
 
 SOFT = ("subtract", "soft")
 """Words by which exporters tell a reset that leaves what exceeds the threshold."""

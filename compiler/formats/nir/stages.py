@@ -52,7 +52,7 @@ class Steps:
         if np.any(tau <= 0):
             raise node.fail(f"{key} is {tau.min():g}, allowed are numbers above 0; train it again")
         if self.convention == "exponential":
-            return np.asarray(np.exp(-self.dt / tau))
+            return np.exp(-self.dt / tau)
         kept = 1 - self.dt / tau
         if np.any(kept < -TOLERANCE):
             step = _written_for(node)
@@ -96,7 +96,7 @@ def written_step(graph: Graph) -> float | None:
 
 
 def _written_for(node: Node) -> float | None:
-    """The same by a neuron, where its parameters tell: `r` is tau over the step, and not 1."""
+    """Step that a neuron was written for, where its `r` tells: tau over the step, and not 1."""
     if not node.has("r"):
         return None
     key = {"LIF": "tau", "LI": "tau", "CubaLIF": "tau_mem"}.get(node.type)

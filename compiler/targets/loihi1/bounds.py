@@ -84,7 +84,7 @@ def largest_current(sums: IntArray | FloatArray, decay_u: IntArray | int) -> Flo
 
     What loses ``lost / 4096`` a step and gains x cannot climb beyond ``x * 4096 / lost``.
     """
-    return np.asarray(sums * (DECAY_ONE << MEMBRANE_SHIFT) / (decay_u + 1))
+    return sums * (DECAY_ONE << MEMBRANE_SHIFT) / (decay_u + 1)
 
 
 def extreme_membranes(

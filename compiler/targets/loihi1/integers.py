@@ -65,7 +65,7 @@ class IntegerPopulation:
     @property
     def realised_theta(self) -> FloatArray:
         """Thresholds in the float model's units; shape (neurons,)."""
-        return np.asarray(self.threshold / self.scale)
+        return self.threshold / self.scale
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -220,13 +220,13 @@ def _legalize(done: Compilation) -> Compilation:
 
 
 FLOATS = (_calibrate, _disconnect)
-"""On floats."""
+"""Passes on floats."""
 
 INTEGERS = (_prove, _remove)
-"""On integers, where they are no matter from."""
+"""Passes on integers, wherever these come from."""
 
 LAYOUT = (_place, _emit, _legalize)
-"""From integers to a netlist."""
+"""Passes from integers to a netlist."""
 
 PASSES = (*FLOATS, _quantize, *INTEGERS, *LAYOUT)
 

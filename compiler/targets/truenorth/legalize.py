@@ -72,7 +72,7 @@ def signed_range(bits: int) -> tuple[int, int]:
 
 def _beyond(values: IntArray, low: int, high: int) -> BoolArray:
     """Which values are outside ``low … high``."""
-    return np.asarray((values < low) | (values > high))
+    return (values < low) | (values > high)
 
 
 def _cores(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:

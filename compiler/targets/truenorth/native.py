@@ -68,7 +68,7 @@ def steepest_leak(threshold: IntArray, depth: int) -> IntArray:
     brings them to rest by then, on a way that must touch no limit; the floor is no nearer than the
     threshold.
     """
-    return np.asarray(np.minimum((threshold - 1) // max(1, depth - 1), LEAK_MOST))
+    return np.minimum((threshold - 1) // max(1, depth - 1), LEAK_MOST)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -78,5 +78,5 @@ def lay_out(
     many cores.
     """
     least = least_cores(network, cores_for or {}, target, chips)
-    cores = partition(network, target, rates, cores_for=least or None, chips=chips)
+    cores = partition(network, target, rates, cores_for=least, chips=chips)
     return Layout(cores=cores, placement=place_on_chips(core_traffic(network, cores, rates), target))

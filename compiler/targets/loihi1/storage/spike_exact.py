@@ -113,7 +113,7 @@ def _full_range(layer: FloatLayer, candidate: Rounded) -> BoolArray:
     form = candidate.form
     scale = candidate.population.scale
     steps = layer.peaks() * scale / step_units(form.bits, form.exponents)
-    return np.asarray(steps >= AT_LIMIT * reach(form.bits, form.exponents))
+    return steps >= AT_LIMIT * reach(form.bits, form.exponents)
 
 
 def _limits(layer: FloatLayer, stored: Rounded, slots: int) -> tuple[tuple[str, int], ...]:

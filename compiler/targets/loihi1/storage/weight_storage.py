@@ -36,7 +36,7 @@ FORGETS = DECAY_ONE - 1
 
 def scales(population: ir.Population, form: ir.Form) -> FloatArray:
     """Weight units per membrane unit of the float model; shape (neurons,)."""
-    return np.asarray(form.threshold / population.theta)
+    return form.threshold / population.theta
 
 
 def store_steps(projection: ir.Projection, steps: IntArray, form: ir.Form) -> tuple[IntegerProjection, ...]:
