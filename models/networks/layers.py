@@ -151,8 +151,9 @@ def _accumulated(steps: Tensor, alpha: float, *, backwards: bool) -> Tensor:
     """Each step plus the share `alpha` of the sum so far, from the last step on if `backwards`."""
     sums = steps.clone(memory_format=torch.contiguous_format)
     rows = rows_of(sums)
+    kept = kind_of(sums)(alpha)
     for before, row in pairwise(rows[::-1] if backwards else rows):
-        np.add(row, kind_of(sums)(alpha) * before, out=row)
+        np.add(row, kept * before, out=row)
     return sums
 
 

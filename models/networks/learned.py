@@ -72,21 +72,13 @@ class Stage:
         return positive, negative
 
 
-class Learned(nn.Module):
-    """What is learned of a layer; its methods change parameters in place."""
+class _Parameters(nn.Module):
+    """Parameters of a layer; methods change them in place."""
 
     def __init__(self, stage: Stage, bias: Tensor) -> None:
         super().__init__()
         self.stage = stage
         self.bias = nn.Parameter(bias)
-
-    def values(self) -> tuple[Tensor, Tensor]:
-        """Weights of all synapses that learn, and biases of the neurons that do, in float64."""
-        raise NotImplementedError
-
-    def tensors(self) -> tuple[Tensor, Tensor]:
-        """Weights and biases as a checkpoint holds them."""
-        raise NotImplementedError
 
     def start_at(self, integer: IntegerNetwork) -> None:
         """Move to where it rounds to an integer network of these forms, no farther."""
@@ -99,12 +91,8 @@ class Learned(nn.Module):
         limit = torch.tensor(bound, dtype=torch.float32) * SHRINK
         self.bias.copy_(torch.clamp(self.bias, -limit, limit))
 
-    def shrink(self, wrong: Array) -> None:
-        """Shrink what makes some neurons, (neurons,) bool, overflow."""
-        raise NotImplementedError
 
-
-class Synapses(Learned):
+class Synapses(_Parameters):
     """Each synapse and each bias by itself."""
 
     def __init__(self, stage: Stage) -> None:
@@ -114,7 +102,7 @@ class Synapses(Learned):
         self.column = stage.column[: stage.synapses]
 
     def values(self) -> tuple[Tensor, Tensor]:
-        """Weights and biases in float64."""
+        """Weights of all synapses that learn, and biases of the neurons that do, in float64."""
         return self.weight.double(), self.bias.double()
 
     def start_at(self, integer: IntegerNetwork) -> None:
@@ -141,17 +129,17 @@ class Synapses(Learned):
         super().clip_bias(bound[: self.stage.learning])
 
     def shrink(self, wrong: Array) -> None:
-        """Shrink the weights of these neurons."""
+        """Shrink what makes some neurons, (neurons,) bool, overflow: their weights."""
         self.weight[torch.tensor(wrong[self.row])] *= SHRINK
         if self.stage.population.alpha:  # what lasts fills the membrane together with the bias
             self.bias[torch.tensor(wrong[: self.stage.learning])] *= SHRINK
 
     def tensors(self) -> tuple[Tensor, Tensor]:
-        """Matrix (neurons, inputs) and biases."""
+        """Matrix (neurons, inputs) and biases, as a checkpoint holds them."""
         return self.weight.view(len(self.bias), -1), self.bias
 
 
-class Filters(Learned):
+class Filters(_Parameters):
     """Filters that all places of a first layer share; they start as they are, and no weight is clipped by itself."""
 
     def __init__(self, stage: Stage, convolution: ir.Convolution) -> None:
@@ -163,7 +151,7 @@ class Filters(Learned):
         self.features = len(convolution.bias)
 
     def values(self) -> tuple[Tensor, Tensor]:
-        """Weights of all synapses, written out, and biases in float64."""
+        """Weights of all synapses that learn, written out, and biases of the neurons that do, in float64."""
         stage = self.stage
         dense = torch.einsum("kij,kfc->ifjc", torch.tensor(self.stack), self.filters.double())
         dense = in_order(self.system, dense).reshape(stage.learning, -1)
@@ -175,12 +163,16 @@ class Filters(Learned):
         super().clip_bias(bound.min())
 
     def shrink(self, wrong: Array) -> None:
-        """Shrink the filters of these neurons."""
+        """Shrink what makes some neurons, (neurons,) bool, overflow: their filters."""
         feature = in_order(self.system, np.tile(np.arange(self.features), (self.places, 1)))
         self.filters[:, torch.tensor(np.unique(feature[wrong[: self.stage.learning]]))] *= SHRINK
         if self.stage.population.alpha and wrong.any():
             self.bias.mul_(SHRINK)
 
     def tensors(self) -> tuple[Tensor, Tensor]:
-        """Filters and biases."""
+        """Filters and biases, as a checkpoint holds them."""
         return self.filters, self.bias
+
+
+Learned = Synapses | Filters
+"""What is learned of a layer."""

@@ -15,7 +15,6 @@ from spikeloom.models.training.plan import Plan, same_graph
 from spikeloom.models.training.recipes import RECIPES, Recipe
 
 SYSTEMS: tuple[str, ...] = systems.SYSTEMS
-COPIES: tuple[int, ...] = ()
 
 read = read_checkpoint
 

@@ -53,7 +53,6 @@ class NetworkKind(Protocol):
     """What the module of a kind of network offers: its sizes, how it is stored and read back."""
 
     SYSTEMS: tuple[str, ...]
-    COPIES: tuple[int, ...]
 
     def recipe_for(self, name: str, given: Mapping[str, Any]) -> Recipe:
         """The recipe of that name; refuses options, by name and value, that the kind does not take."""

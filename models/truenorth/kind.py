@@ -6,7 +6,7 @@ from typing import Any
 
 from spikeloom.compiler.dynamics import clocks_over
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.targets.truenorth.native import BASES, DEFAULT_COPIES, SYSTEM
+from spikeloom.compiler.targets.truenorth.native import DEFAULT_COPIES, SYSTEM
 from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained, write_trained
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, Surrogate
 from spikeloom.models.training.plan import Plan, same_graph
@@ -14,7 +14,6 @@ from spikeloom.models.training.recipes import ADAMW, COSINE, CROSS_ENTROPY, Reci
 from spikeloom.models.truenorth import network
 
 SYSTEMS: tuple[str, ...] = (SYSTEM,)
-COPIES = tuple(BASES)
 
 read = read_trained
 

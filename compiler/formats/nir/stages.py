@@ -70,17 +70,22 @@ def require_step(dt: float) -> None:
         raise OptionError(f"--dt {dt:g}: is no time step; give seconds above 0")
 
 
+def _stated(graph: Graph, name: str) -> float | None:
+    """A single number in the metadata of a file."""
+    said = graph.metadata.get(name)
+    return said.item() if isinstance(said, np.ndarray) and said.size == 1 else None
+
+
 def stated_step(graph: Graph) -> float | None:
     """Seconds of a step, where the metadata of a file say so."""
-    said = graph.metadata.get("dt")
-    return float(said.ravel()[0]) if isinstance(said, np.ndarray) and said.size == 1 else None
+    dt = _stated(graph, "dt")
+    return None if dt is None else float(dt)
 
 
 def stated_steps(graph: Graph, name: str) -> int | None:
     """A number of steps or bins, where the metadata that we write say so."""
-    said = graph.metadata.get(name)
-    value = said.item() if isinstance(said, np.ndarray) and said.size == 1 else None
-    return value if isinstance(value, int) and 1 <= value <= MOST_STEPS else None
+    steps = _stated(graph, name)
+    return steps if isinstance(steps, int) and 1 <= steps <= MOST_STEPS else None
 
 
 def written_step(graph: Graph) -> float | None:
