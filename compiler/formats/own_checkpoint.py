@@ -37,7 +37,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import pairwise
 from typing import Any
@@ -54,13 +54,14 @@ from spikeloom.compiler.archive import (
     npy_bytes,
     read_npy,
     stored_members,
+    write_archive,
     zip_bytes,
 )
 from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, constant_faults, layers_of
 from spikeloom.compiler.dynamics import MOST_STEPS, PLAIN, Clocks, Dynamics, dynamics_faults
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.files import FileFault, write_atomically
+from spikeloom.compiler.files import FileFault
 from spikeloom.compiler.formats.tensors import (
     Arrays,
     apart,
@@ -83,7 +84,7 @@ from spikeloom.compiler.systems import (
     shape_faults,
 )
 from spikeloom.compiler.targets.loihi1.registers import THRESHOLD_MANTISSA_MAX, plane_distance
-from spikeloom.compiler.types import AnyArray, IntArray
+from spikeloom.compiler.types import AnyArray, IntArray, JsonObject
 
 FORMAT = "spikeloom-checkpoint"
 VERSION = 6
@@ -143,11 +144,11 @@ def save_checkpoint(
     features, channels), ``conv1.bias``, ``fc1.weight``, ``fc1.bias`` … float32. `graph` is the name of the
     taxel graph, `edges` (edges, 2) int64 are the source and the target of each of its edges. `training` are
     JSON values: how it was made and what it reached. `forms` say how the chip stores each layer, conv1
-    first, where the network was fine-tuned for it. `towers` lie side by side in the tensors, see
-    :mod:`formats.tensors`; a step joins so many `bins` of the recordings.
+    first, of a fine-tuned network. `towers` lie side by side in the tensors, see :mod:`formats.tensors`; a
+    step joins so many `bins` of the recordings.
     """
     tensors_of_one = next(iter(weights.values()))
-    stages = sum(name.startswith("fc") and name.endswith(".weight") for name in tensors_of_one)
+    stages = _dense_stages(tensors_of_one)
     arrays = {
         f"{which}/{name}": np.ascontiguousarray(array, "<f4")
         for which, tensors in weights.items()
@@ -174,16 +175,25 @@ def save_checkpoint(
     if grid is not None:
         manifest["grid"] = grid.to_json()
     if forms is not None:
-        layers = ["conv1", *(f"fc{stage}" for stage in range(1, stages + 1))]
-        manifest["forms"] = [
-            {"layer": layer} | asdict(form) | {"threshold": form.threshold.tolist()}
-            for layer, form in zip(layers, forms, strict=True)
-        ]
+        manifest["forms"] = _form_entries(forms)
     manifest["sha256"] = content_digest(manifest, arrays)
     members: dict[str, bytes | str] = {"manifest.json": json.dumps(manifest, indent=1, allow_nan=False)}
-    content = zip_bytes(members | {f"{name}.npy": npy_bytes(array) for name, array in arrays.items()})
-    with write_atomically(path) as file:
-        file.write(content)
+    members |= {f"{name}.npy": npy_bytes(array) for name, array in arrays.items()}
+    write_archive(zip_bytes(members), path)
+
+
+def _form_entries(forms: Sequence[Form]) -> list[JsonObject]:
+    """How the layers are stored, conv1 first, as JSON values."""
+    layers = ("conv1", *(f"fc{stage}" for stage in range(1, len(forms))))
+    return [
+        {"layer": layer} | asdict(form) | {"threshold": form.threshold.tolist()}
+        for layer, form in zip(layers, forms, strict=True)
+    ]
+
+
+def _dense_stages(names: Iterable[str]) -> int:
+    """Number of fully connected stages, from the names of tensors."""
+    return sum(re.fullmatch(r"fc\d+\.weight", name) is not None for name in names)
 
 
 def save_again(path: str | os.PathLike[str], checkpoint: Checkpoint, *, training: Mapping[str, Any]) -> None:
@@ -245,8 +255,7 @@ def read_own(content: bytes, weights: str | None) -> Checkpoint:
     if said := manifest.get("dynamics"):
         decays = {name: tuple(map(float, said[name])) for name in ("betas", "alphas")}
         dynamics = Dynamics(**decays, clocks=Clocks(**said["clocks"]))
-        stages = sum(re.fullmatch(r"fc\d+\.weight", name) is not None for name in chosen)
-        if wrong := dynamics_faults(dynamics, 1 + stages):
+        if wrong := dynamics_faults(dynamics, 1 + _dense_stages(chosen)):
             faults.append(f"the manifest has an unusable grid or dynamics ({'; '.join(wrong)})")
     faults += tower_faults(chosen, towers)
     for tower in () if faults else apart(chosen, towers):

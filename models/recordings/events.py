@@ -63,16 +63,14 @@ def load_data(
     """Read the first `limit` recordings of a split, files in plain string order.
 
     The path is a folder or zip in the released layout; a folder of ``.csv``, ``.npz`` and ``.npy``
-    recordings, flat (it stands for any split) or with ``train/`` and ``test/``; one such file; or the name
-    of a fetched data set. `bin_s` is the width of a time bin in seconds, by default `default_bin_s`; the
-    released layout and ``.npy`` files have bins already, see `require_events`. `taxels` and `classes` are
-    those of the network; without `taxels` the highest taxel with an event decides. Labels are `UNLABELLED`
-    where nothing states them. A file without events is as long as the median of the others. `groups` are
-    columns of a table of recordings or fields of file names, by default all columns but file and label. In
-    the released layout every recording has a label, all have the same taxels, and there are no counts.
+    recordings, flat (for any split) or with ``train/`` and ``test/``; one such file; or the name of a fetched
+    data set. `bin_s` is the width of a bin in seconds, by default `default_bin_s`; the released layout and
+    ``.npy`` files have bins already. `taxels` and `classes` are the network's; without `taxels` the highest
+    with an event decides. Labels are `UNLABELLED` where nothing states them. A file without events is as long
+    as the median of the others. `groups` are columns of a table of recordings or fields of file names, by
+    default all columns but file and label.
 
-    DataError if a recording cannot be used; OptionError if `bin_s` or `limit` cannot, or if `bin_s` is given
-    for what has bins already.
+    DataError if a recording cannot be used; OptionError if `bin_s` or `limit` cannot, or bins are there.
     """
     _require_options(bin_s, limit)
     place = _place_of(path)
@@ -99,8 +97,7 @@ def load_data(
             size += read[-1].grid.size
             evtouch.require_memory(source, size)
     events, steps = _stack(read, source)
-    notes += [*_silent_notes(read, source), *_unit_notes(read)]
-    notes += _taxel_notes(source, events) if taxels is None else []
+    notes += [*_silent_notes(read, source), *_unit_notes(read), *_taxel_notes(source, events, taxels)]
     return evtouch.Recordings(
         events=events,
         labels=np.array([each.label for each in read], dtype=np.int64),
@@ -342,10 +339,10 @@ def other_sensor(recordings: evtouch.Recordings) -> str | None:
     return f"{recordings.source}: has events of taxels 0..{last} only, the network has {recordings.taxels}"
 
 
-def _taxel_notes(source: str, events: EventArray) -> list[str]:
-    """A note where taxels seem to count from 1: the first is silent, and no other."""
+def _taxel_notes(source: str, events: EventArray, taxels: int | None) -> list[str]:
+    """A note where nobody says how many `taxels` there are and they seem to count from 1: only the first is silent."""
     alive = np.asarray(events.any(axis=(0, 2, 3)), np.bool_)
-    if len(alive) < 4 or alive[0] or not alive[1:].all():
+    if taxels is not None or len(alive) < 4 or alive[0] or not alive[1:].all():
         return []
     return [
         f"{source}: no event at taxel 0, some at each of 1..{len(alive) - 1}: if these count from 1, count from 0"

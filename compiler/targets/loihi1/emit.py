@@ -121,9 +121,8 @@ def emit(
     order = [chunk for chunks in cores for chunk in chunks]
     layer = np.concatenate([np.full(chunk.size, chunk.population) for chunk in order])
     numbers = np.concatenate([np.arange(chunk.first, chunk.last) for chunk in order])
-    compartment = np.lexsort((numbers, layer))  # of all neurons, population after population
     sizes = np.cumsum([population.size for population in network.populations])
-    compartment_id = np.split(compartment, sizes[:-1])
+    compartment_id = np.split(np.lexsort((numbers, layer)), sizes[:-1])
 
     def column(name: str) -> AnyArray:
         """A field of the populations, of each compartment."""
