@@ -53,6 +53,7 @@ from spikeloom.compiler.archive import (
     entry_faults,
     npy_bytes,
     read_npy,
+    require_none,
     stored_members,
     write_archive,
     zip_bytes,
@@ -234,8 +235,8 @@ def read_own(content: bytes, weights: str | None) -> Checkpoint:
     """Check a file of our own format, and take one set of weights from its members."""
     manifest, arrays = _signed_content(stored_members(content))
     kinds = ENTRIES | {name: kind for name, kind in MORE.items() if name in manifest}
-    if faults := entry_faults(manifest, kinds) or constant_faults(manifest["beta"], manifest["theta"]):
-        raise FileFault("; ".join(faults))
+    require_none(entry_faults(manifest, kinds) or constant_faults(manifest["beta"], manifest["theta"]))
+    faults: list[str] = []
     sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
     weights = sets[0] if weights is None else weights
     if weights not in sets:
@@ -264,8 +265,7 @@ def read_own(content: bytes, weights: str | None) -> Checkpoint:
         )
     if edges.size and edges.max() >= manifest["taxels"]:
         faults.append(f"the graph joins taxels outside 0..{manifest['taxels'] - 1}")
-    if faults:
-        raise FileFault("; ".join(faults))
+    require_none(faults)
     checkpoint = Checkpoint(
         **layers_of(chosen),
         beta=float(manifest["beta"]),
