@@ -43,5 +43,5 @@ class Counters:
         return Clocks(channels=self.parts, steps=-(-self.steps // self.parts), length=length)
 
     def trained(self, record: Mapping[str, Any]) -> Self:
-        """The same with how it was made."""
+        """A copy with the record of how it was trained."""
         return replace(self, training=record)

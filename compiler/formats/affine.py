@@ -50,7 +50,7 @@ def picked(value: A, rows: IntArray, shape: tuple[int, ...]) -> A:
 
 
 def picked_of_all(parts: Sequence[Affine], rows: IntArray) -> Affine:
-    """The same of several values one after the other, with a constant zero in front; `rows` has the result's shape."""
+    """Elements of several values one after the other, after a constant zero; `rows` has the shape of the result."""
     flat = rows.ravel()
     if len(parts) == 1 and flat.size and flat.min() >= 1:
         return picked(parts[0], flat - 1, rows.shape)
@@ -174,7 +174,7 @@ def convolution(
 
 
 def block_diagonal(matrix: Sparse, copies: int) -> Sparse:
-    """The same matrix for each of so many parts of a value; ModelError if it would be too large."""
+    """Block-diagonal matrix of so many copies of one; ModelError if it would be too large."""
     _require_few(copies * matrix.nnz)
     return (
         matrix

@@ -54,7 +54,7 @@ class Part:
         return array
 
     def integers(self, key: str) -> IntArray:
-        """The same as int64; ModelError if it holds others than whole numbers of 32 bits."""
+        """An entry as int64, of its own shape; ModelError if it holds anything but whole numbers of 32 bits."""
         array = self.numbers(key)
         wrong = array[(array != np.rint(array)) | (np.abs(array) >= 2**31)]
         if wrong.size:

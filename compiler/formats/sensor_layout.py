@@ -9,7 +9,7 @@ from spikeloom.compiler.ir import Input
 from spikeloom.compiler.types import IntArray
 
 POLARITIES = 2
-"""Of a sensor's events: up and down."""
+"""Polarities of a sensor's events: up and down."""
 
 _ORDER = "channel = taxel * polarities + polarity"
 

@@ -114,7 +114,7 @@ class Calibration:
         return np.asarray(np.sum(counts, axis=0, dtype=np.int64))
 
     def after(self, layer: Layer) -> Calibration:
-        """The same where the populations to come receive what the next `layer` sends."""
+        """A copy in which the populations to come receive what the next `layer` sends."""
         bits = np.empty((*self.events.shape[:2], -(-layer.size // 8)), np.uint8)
 
         def part(rows: slice) -> None:

@@ -28,7 +28,7 @@ PRICE_UNIT = "pJ"
 POWER_UNIT = "mW"
 TIME_UNIT = "ns"
 PICOSECONDS = 1000
-"""In a TIME_UNIT; finer latencies are rounded."""
+"""Picoseconds in a TIME_UNIT; latencies are rounded to whole ones."""
 
 EVENTS = (
     *(
@@ -46,7 +46,7 @@ FLOOR = "floor"
 """Power of a chip that events come on top of; a table without it has it in its prices."""
 
 CROSSBAR_EVENTS = ("synaptic_event", FLOOR)
-"""The same for crossbars: a synaptic event is a set crossing point that a spike on its axon meets."""
+"""What an energy table of crossbars may price; a synaptic event is a spike that meets a set crossing point."""
 
 LINK_BUFFER = "link_buffer"
 

@@ -47,7 +47,7 @@ LEARNING_RATE = 1e-3
 """At the start; it falls to zero along half a cosine."""
 
 GENTLE_RATE = 3e-4
-"""The same for a network that learns to decide as in floats, which recurrence may drive far off."""
+"""Learning rate of a network that learns to decide as in floats, which recurrence may drive far off."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

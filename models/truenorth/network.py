@@ -45,7 +45,7 @@ GAIN = 2.7
 convolution), thresholds being 1: membranes that only add reach them every ten to twenty steps."""
 
 LEAST_THRESHOLD = 8
-"""In a threshold of fewer whole numbers no weight and no drift has room."""
+"""Smallest threshold: a smaller one leaves no room for weights and drifts in whole numbers."""
 
 SPREADS = {2: 1.53, 3: 0.8, 4: 0.42}
 """Distance of two levels, in mean magnitudes of a neuron's weights, which rounds a normal distribution best [1]_.

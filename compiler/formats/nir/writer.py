@@ -30,7 +30,7 @@ from spikeloom.compiler.targets.loihi1.storage.weight_storage import FORGETS
 from spikeloom.compiler.types import FloatArray
 
 VERSION = "1.0.8"
-"""Of the layout."""
+"""Version of the layout that is written."""
 
 DENSE_LIMIT = 2**28
 """Weights of a matrix: NIR writes zeros out."""

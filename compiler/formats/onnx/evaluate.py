@@ -141,7 +141,7 @@ def _operator(node: Node, table: Table) -> Any:
 
 
 Matrix = Callable[[Node, Table, Sequence[Any], int], Sparse]
-"""Of an operator, from the operand of that place, flat in C order; who asks for it adds the biases of Conv and Gemm."""
+"""Matrix of an operator, from the operand of that place, flat in C order; without the bias of Conv and Gemm."""
 
 
 def _contract(

@@ -21,7 +21,7 @@ from spikeloom.compiler.formats.names import named, printable
 from spikeloom.compiler.types import AnyArray
 
 PRODUCER = "spikeloom"
-"""Of files that are written here, from netlists."""
+"""Producer of the files that are written here, from netlists."""
 
 OPSETS = range(9, 27)
 """Versions of the operator set whose operators are known here."""

@@ -35,7 +35,7 @@ class Forgotten:
 
     @property
     def text(self) -> str:
-        """Both in a line."""
+        """Steps and what they leave, in a line."""
         left = [f"{self.restless:,} neurons may fire without input"] * (self.restless > 0)
         left += [f"{self.unsettled:,} others keep up to {self.residue:.2%} of θ"] * (self.unsettled > 0)
         return f"{self.steps} blank steps after each recording clear {'all but: ' + '; '.join(left) if left else 'it'}"

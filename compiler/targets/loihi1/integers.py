@@ -29,7 +29,7 @@ MANTISSA = np.int16
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IntegerPopulation:
-    """The same neurons in the chip's registers; units as in :class:`netlist.Netlist`."""
+    """Neurons of a population in the chip's registers; units as in :class:`netlist.Netlist`."""
 
     name: str  # Unique in the network
     beta: float  # Of the float model, as theta and alpha

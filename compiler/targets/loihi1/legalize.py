@@ -26,7 +26,7 @@ REMEDIES = {
 
 
 WEIGHT_BITS = 9
-"""Of a signed mantissa."""
+"""Width of a signed mantissa."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -231,7 +231,7 @@ LAYOUT = (_place, _emit, _legalize)
 PASSES = (*FLOATS, _quantize, *INTEGERS, *LAYOUT)
 
 After = Callable[[str, Compilation], object] | None
-"""As of :func:`pipeline.run`."""
+"""Callback of :func:`pipeline.run`: gets the name of each pass and its work."""
 
 
 def start(source: Network | IntegerNetwork, options: Options, target: Target) -> Compilation:

@@ -77,7 +77,7 @@ def _fill(needs: Needs, population: int) -> list[Chunk]:
 
 
 def _worst(needs: Needs, population: int) -> tuple[Violation, ...]:
-    """For each limit that single neurons of a population break: the one that breaks it most."""
+    """Of each limit that single neurons of a population break, the violation by the neuron that breaks it most."""
     worst: dict[str, tuple[int, int]] = {}
     for neuron in range(needs.network.populations[population].size):
         for rule, used in needs.excess(

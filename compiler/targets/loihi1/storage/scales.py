@@ -113,7 +113,7 @@ def rounded(
 def with_spike_errors(
     layer: Rounded, post: int, calibration: Calibration | None, parts: int | None = None
 ) -> Rounded:
-    """The same with what the calibration says of it, or its first `parts`, given what the layers before it send."""
+    """A layer with its spike errors on the calibration, or its first `parts`, given what the layers before it send."""
     if calibration is None:
         return layer
     ready = integer_layer(layer.population, layer.projections, loops=False)

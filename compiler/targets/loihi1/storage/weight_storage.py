@@ -123,7 +123,7 @@ def loads(population: IntegerPopulation, projections: tuple[IntegerProjection, .
 
 
 def fullest(population: IntegerPopulation, up: AnyArray, down: AnyArray) -> FloatArray:
-    """The same from the largest positive and negative sum of a step, (neurons,) in weight units."""
+    """What :func:`loads` gives, from the largest positive and negative sum of a step, (neurons,) in weight units."""
     filled: FloatArray = np.maximum(up, down).astype(np.float64)
     if population.decay_u == FORGETS:
         return filled
