@@ -24,7 +24,7 @@ from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.models.training.counters import Plan, counters_of, fit, run_counters
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.backends import machine_of
-from spikeloom.runtime.machines.capabilities import LONGEST, require_stoppable
+from spikeloom.runtime.machines.capabilities import LONGEST, Stoppable
 from spikeloom.runtime.machines.loihi1 import engine, kernel
 from spikeloom.runtime.machines.loihi1.costs import cost, estimate
 from spikeloom.runtime.machines.loihi1.trace import Counts
@@ -115,9 +115,9 @@ def test_recordings_of_different_length_end_on_their_own(place, monkeypatch):
     monkeypatch.chdir(place)
     netlist, data = read_netlist("net.loom"), load_data("data", "test")
     lengths = np.array([60, 1, 7, 24, 33, 2, 50, 59, 60, 60, 3, 40])
-    ran = require_stoppable(machine_of(netlist)).cumulative(data.events, lengths)
+    ran = Stoppable.required(machine_of(netlist)).cumulative(data.events, lengths)
     at = exits.standing(ran.votes, lengths)
-    sure = exits.proven(ran.votes, at, exits.most_votes(require_stoppable(machine_of(netlist)), STEPS))
+    sure = exits.proven(ran.votes, at, exits.most_votes(Stoppable.required(machine_of(netlist)), STEPS))
     ends = exits.exits(sure, at)
     assert np.all(ends < lengths)
     for i, length in enumerate(lengths):
@@ -135,7 +135,7 @@ def test_held_out_recordings_calibrate_by_their_decisions(as_json, report, place
     monkeypatch.chdir(place)
     seen = load_data("data", "train")
     lengths = np.full(len(seen), STEPS)
-    votes = require_stoppable(machine_of(read_netlist("net.loom"))).cumulative(seen.events, lengths).votes
+    votes = Stoppable.required(machine_of(read_netlist("net.loom"))).cumulative(seen.events, lengths).votes
     held, races = (exits.turning_points(race(votes, lengths)) for race in (exits.standing, exits.races))
     factors = [rule["factor"] for rule in as_json(*ALL, "--held-out")["rules"][1:]]
     assert factors == [exits.calibrate(held, allowed).factor for allowed in (0.0, 0.005, 0.01, 0.02, 0.05)]
@@ -237,12 +237,12 @@ def test_how_often_an_output_neuron_can_spike():
         Neuron(threshold=150, decay_u=2047),  # the current adds up to twice the weight
         Neuron(threshold=1, bias=-101, bias_exponent=6),
     )
-    assert require_stoppable(machine_of(netlist)).least_intervals.tolist() == [1, 2, 2, 4, 0, 3, 1, 0]
-    most = exits.most_votes(require_stoppable(machine_of(netlist)), 5)[[0, 1, 3, 4]]
+    assert Stoppable.required(machine_of(netlist)).least_intervals.tolist() == [1, 2, 2, 4, 0, 3, 1, 0]
+    most = exits.most_votes(Stoppable.required(machine_of(netlist)), 5)[[0, 1, 3, 4]]
     assert most.tolist() == [[0, 1, 2, 3, 4, 5], [0, 1, 1, 2, 2, 3], [0, 1, 1, 1, 1, 2], [0] * 6]
     slow = two_classes(Neuron(threshold=2**17 - 1, decay_v=0), Neuron(threshold=1))
     quiet = replace(slow, bias_mantissa=read_only([0, 0]), synapse_weight=read_only([2, 2]))
-    assert require_stoppable(machine_of(quiet)).least_intervals.tolist() == [
+    assert Stoppable.required(machine_of(quiet)).least_intervals.tolist() == [
         LONGEST,
         1,
     ]  # looked at only so far
@@ -259,7 +259,7 @@ def test_no_output_neuron_spikes_more_often(data):
     except NumericRangeError:
         return
     voters = np.flatnonzero(netlist.readout_class >= 0)
-    machine = require_stoppable(machine_of(netlist))
+    machine = Stoppable.required(machine_of(netlist))
     length = events.shape[1]
     for voter, interval, steady in zip(voters, machine.least_intervals, machine.steady, strict=True):
         times = np.flatnonzero(spikes[:, voter])
@@ -278,7 +278,7 @@ def test_a_vote_that_never_ceases_is_a_proof():
     training, seen = (synthetic_split(split, limit=48) for split in ("train", "test"))
     data = run_counters(training, Plan())
     made = counters_of(data, fit(data, 6), training, 6)
-    machine = require_stoppable(machine_of(compile_network(counting_network(made)).netlist))
+    machine = Stoppable.required(machine_of(compile_network(counting_network(made)).netlist))
     steps = of_length(seen, made.clocks.length)
     ran = machine.cumulative(steps.events, steps.step_counts)
     at = exits.standing(ran.votes, steps.step_counts)
@@ -289,4 +289,4 @@ def test_a_vote_that_never_ceases_is_a_proof():
     assert_array_equal(at.leader[np.arange(48), ends], at.decision)
     assert np.all(ends < exits.exits(exits.proven(ran.votes, at, most), at))
     netlist = large_netlist(10, proved=True)
-    assert not require_stoppable(machine_of(netlist)).steady.any()
+    assert not Stoppable.required(machine_of(netlist)).steady.any()

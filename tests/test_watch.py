@@ -26,7 +26,7 @@ from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.commands.exchange import watch
 from spikeloom.runtime.machines.backends import machine_of
-from spikeloom.runtime.machines.capabilities import require_stoppable
+from spikeloom.runtime.machines.capabilities import Stoppable
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.stream import Step, Stream
 from spikeloom.runtime.machines.votes import class_counts
@@ -300,12 +300,12 @@ def test_a_grasp_ends_as_soon_as_it_is_sure(lively_file, lines, factor):
         given = () if factor is None else (factor,)
         found = objects(lively_file, lines(as_lines(events, seed)), "--bins", 40, "--until-sure", *given)
         votes = (
-            require_stoppable(machine_of(LIVELY))
+            Stoppable.required(machine_of(LIVELY))
             .cumulative(events.reshape(1, 20, 1, 40), np.array([40]))
             .votes
         )
         at = exits.standing(votes, np.array([40]))
-        sure = exits.proven(votes, at, exits.most_votes(require_stoppable(machine_of(LIVELY)), 40))
+        sure = exits.proven(votes, at, exits.most_votes(Stoppable.required(machine_of(LIVELY)), 40))
         end = int(exits.exits(sure, at, np.inf if factor is None else factor)[0])
         early = end + 3 < 39  # the read-out lags three steps
         bins = end + 4 if early else 40

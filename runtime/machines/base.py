@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -199,6 +199,16 @@ class Machine(ABC):
 
     details: ClassVar[tuple[str, ...]]
     """How deep a price can go, the usual one first."""
+
+    @classmethod
+    def required(cls, machine: "Machine", path: str = "netlist", command: str = "this command") -> Self:
+        """The same machine, if it offers what this class does; else an OptionError, which names file and command."""
+        if not isinstance(machine, cls):
+            title = machine.target.title
+            raise OptionError(
+                f"{path}: is for {title}, which {command} does not take; give one for another chip"
+            )
+        return machine
 
     @cached_property
     def target(self) -> Target:

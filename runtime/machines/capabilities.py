@@ -7,7 +7,6 @@ from typing import Self
 
 import numpy as np
 
-from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.targets.netlist_file import Netlist
@@ -187,38 +186,3 @@ class Explainable(Comparable):
 
 LONGEST = 4096
 """Steps after which :attr:`Stoppable.least_intervals` looks no further: a spike may follow then."""
-
-
-def require_explainable(
-    machine: Machine, path: str = "netlist", command: str = "this command"
-) -> Explainable:
-    """The same machine, if its differences can be explained; else an OptionError, which names file and command."""
-    if not isinstance(machine, Explainable):
-        raise _lacking(machine, path, command)
-    return machine
-
-
-def require_comparable(machine: Machine, path: str = "netlist", command: str = "this command") -> Comparable:
-    """The same machine, if a float model can be compared with it; else an OptionError, which names file and command."""
-    if not isinstance(machine, Comparable):
-        raise _lacking(machine, path, command)
-    return machine
-
-
-def require_stoppable(machine: Machine, path: str = "netlist", command: str = "this command") -> Stoppable:
-    """The same machine, if recordings can be stopped on it; else an OptionError, which names file and command."""
-    if not isinstance(machine, Stoppable):
-        raise _lacking(machine, path, command)
-    return machine
-
-
-def require_threaded(machine: Machine, path: str = "netlist", command: str = "this command") -> Threaded:
-    """The same machine, if recordings can run side by side on it; else an OptionError, which names file and command."""
-    if not isinstance(machine, Threaded):
-        raise _lacking(machine, path, command)
-    return machine
-
-
-def _lacking(machine: Machine, path: str, command: str) -> OptionError:
-    title = machine.target.title
-    return OptionError(f"{path}: is for {title}, which {command} does not take; give one for another chip")

@@ -14,7 +14,7 @@ from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
 from spikeloom.runtime.machines.backends import machine_for
-from spikeloom.runtime.machines.capabilities import require_explainable
+from spikeloom.runtime.machines.capabilities import Explainable
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.check import ExplainRequest
 
@@ -35,7 +35,7 @@ def run(request: ExplainRequest) -> Outcome:
     """Run the command; differences are its subject, not a failure."""
     if request.top < 1:
         raise OptionError(f"--top {request.top}: at least 1 root can be shown; give a positive number")
-    machine = require_explainable(machine_for(request.netlist), request.netlist, "explain")
+    machine = Explainable.required(machine_for(request.netlist), request.netlist, "explain")
     netlist = machine.netlist
     loaded = load_network(request.checkpoint, request, netlist)
     require_match(netlist, loaded.network)

@@ -7,7 +7,7 @@ from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
-from spikeloom.runtime.machines.capabilities import Stoppable, require_stoppable
+from spikeloom.runtime.machines.capabilities import Stoppable
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
@@ -33,7 +33,7 @@ def run(request: AnytimeRequest) -> Outcome:
     """Run the command."""
     require_place(request.output, "-o", request)
     allowed = _allowed(request)
-    machine = require_stoppable(machine_for(request.netlist), request.netlist, "anytime")
+    machine = Stoppable.required(machine_for(request.netlist), request.netlist, "anytime")
     data = load_recordings(request.data, request, machine.netlist)
     machine.require_sensor(data.events)
     points = _races(request, machine)

@@ -106,13 +106,13 @@ def _step_seconds(request: WatchRequest, netlist: Netlist) -> Decimal:
 
 def _ending(request: WatchRequest, machine: Machine) -> Callable[[int, IntArray], bool] | None:
     """Says whether a grasp is decided before its end, where that is wanted."""
-    from spikeloom.runtime.machines.capabilities import require_stoppable
+    from spikeloom.runtime.machines.capabilities import Stoppable
     from spikeloom.runtime.studies.anytime import exits
 
     if request.until_sure is None or request.bins is None:
         return None
     return exits.live(
-        require_stoppable(machine, request.netlist, "--until-sure"), request.bins, request.until_sure
+        Stoppable.required(machine, request.netlist, "--until-sure"), request.bins, request.until_sure
     )
 
 

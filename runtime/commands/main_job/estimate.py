@@ -9,7 +9,7 @@ from spikeloom.models.training.counters import BITS
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.base import Machine, Price, Run
-from spikeloom.runtime.machines.capabilities import require_comparable
+from spikeloom.runtime.machines.capabilities import Comparable
 from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section
@@ -71,7 +71,7 @@ def sections(found: Compared) -> list[Section]:
 
 def _neurobench(request: EstimateRequest, machine: Machine) -> NeuroBench:
     """Metrics of the same recordings."""
-    network = require_comparable(machine, request.netlist, "--neurobench")
+    network = Comparable.required(machine, request.netlist, "--neurobench")
     return neurobench.measure(network, load_recordings(request.data, request, machine.netlist))
 
 

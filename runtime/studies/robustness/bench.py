@@ -16,7 +16,7 @@ from spikeloom.runtime.inputs.checkpoint import load_graph
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
-from spikeloom.runtime.machines.capabilities import require_threaded
+from spikeloom.runtime.machines.capabilities import Threaded
 from spikeloom.runtime.requests.check import StressRequest
 from spikeloom.runtime.studies.robustness.pair import Events, Inputs, Pair
 from spikeloom.runtime.studies.robustness.proofs.entries import channels_of
@@ -86,7 +86,7 @@ def in_a_row(events: Events, lengths: IntArray, order: IntArray) -> Events:
 
 def bench_of(request: StressRequest) -> tuple[Bench, LoadedNetwork, str]:
     """Everything that is stressed, the float network, and a hash of the recordings."""
-    netlist = require_threaded(machine_for(request.netlist), request.netlist, "stress").netlist
+    netlist = Threaded.required(machine_for(request.netlist), request.netlist, "stress").netlist
     loaded = load_network(request.checkpoint, request, netlist)
     require_match(netlist, loaded.network)
     loaded.require_same(request.netlist, netlist, request.run)

@@ -17,7 +17,7 @@ from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.targets.compartments import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.machines.backends import machine_of
-from spikeloom.runtime.machines.capabilities import Damageable, Memory, Threaded, require_threaded
+from spikeloom.runtime.machines.capabilities import Damageable, Memory, Threaded
 from spikeloom.runtime.machines.votes import readout_counts
 
 Events = EventArray
@@ -46,7 +46,7 @@ class Pair:
     @cached_property
     def chip(self) -> Threaded:
         """The netlist, ready to run."""
-        return require_threaded(machine_of(self.netlist))
+        return Threaded.required(machine_of(self.netlist))
 
     @cached_property
     def memory(self) -> Memory | None:
