@@ -25,6 +25,7 @@ turn 64 comparisons into one word. LLVM makes of them what the machine has.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -162,96 +163,85 @@ def _lanes(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(one, nothing, _all(_STATES, 0))
 
 
+def _loop(builder: Any, values: Any, goes_on: Function, body: Function) -> Any:
+    """Emit a loop: as long as it `goes_on` with the values, `body` makes the next ones of them; returns the last."""
+    before = builder.block
+    head, inside, done = map(builder.append_basic_block, ("head", "body", "done"))
+    builder.branch(head)
+    builder.position_at_end(head)
+    phis = [builder.phi(value.type) for value in values]
+    for phi, value in zip(phis, values, strict=True):
+        phi.add_incoming(value, before)
+    builder.cbranch(goes_on(phis), inside, done)
+    builder.position_at_end(inside)
+    for phi, value in zip(phis, body(phis), strict=True):
+        phi.add_incoming(value, builder.block)
+    builder.branch(head)
+    builder.position_at_end(done)
+    return phis
+
+
+def _add_row(
+    builder: Any, tables: Any, row: Any, total: Any, arrived: Any, *, marks: bool
+) -> tuple[Any, Any]:
+    """Add the weights of a row to the sums and, if wanted, mark who is reached."""
+    total = builder.add(total, _row(builder, tables, row))
+    return total, builder.or_(arrived, _element(builder, tables["reached"], row)) if marks else arrived
+
+
 def _sum_rows(
     builder: Any, tables: Any, active: Any, at: Any, block: Any, *, marks: bool
 ) -> tuple[Any, Any]:
     """Emit the loop over a block's links and, within, over active sources; returns sums and who was reached."""
-    before = builder.block
-    names = ("links", "link", "sources", "source", "link.end", "done")
-    links, link, sources, source, link_end, done = map(builder.append_basic_block, names)
     begin, end = (_element(builder, tables["first"], builder.add(block, _number(i))) for i in (0, 1))
-    builder.branch(links)
 
-    builder.position_at_end(links)
-    e = builder.phi(_WORD)
-    total = builder.phi(_SUMS)
-    arrived = builder.phi(_WORD)
-    for phi, value in ((e, begin), (total, _all(_SUMS, 0)), (arrived, _number(0))):
-        phi.add_incoming(value, before)
-    builder.cbranch(builder.icmp_signed("<", e, end), link, done)
+    def of_link(values: Any) -> Any:
+        e, total, arrived = values
+        linked = _element(builder, tables["linked"], e)
+        word = _element(builder, active, builder.add(at, _element(builder, tables["word"], e)))
+        first_row = _element(builder, tables["row"], e)
 
-    builder.position_at_end(link)
-    linked = _element(builder, tables["linked"], e)
-    word = _element(builder, active, builder.add(at, _element(builder, tables["word"], e)))
-    first_row = _element(builder, tables["row"], e)
-    both = builder.and_(word, linked)
-    builder.branch(sources)
+        def of_source(values: Any) -> Any:
+            left, total, arrived = values
+            lowest = builder.and_(left, builder.neg(left))
+            rank = builder.ctpop(builder.and_(linked, builder.sub(lowest, _number(1))))
+            row = builder.add(first_row, rank)
+            return builder.xor(left, lowest), *_add_row(builder, tables, row, total, arrived, marks=marks)
 
-    builder.position_at_end(sources)
-    left = builder.phi(_WORD)
-    part = builder.phi(_SUMS)
-    marked = builder.phi(_WORD)
-    for phi, value in ((left, both), (part, total), (marked, arrived)):
-        phi.add_incoming(value, link)
-    builder.cbranch(builder.icmp_unsigned("!=", left, _number(0)), source, link_end)
+        def any_left(values: Any) -> Any:
+            return builder.icmp_unsigned("!=", values[0], _number(0))
 
-    builder.position_at_end(source)
-    lowest = builder.and_(left, builder.neg(left))
-    rank = builder.ctpop(builder.and_(linked, builder.sub(lowest, _number(1))))
-    row = builder.add(first_row, rank)
-    part.add_incoming(builder.add(part, _row(builder, tables, row)), source)
-    left.add_incoming(builder.xor(left, lowest), source)
-    marked.add_incoming(
-        builder.or_(marked, _element(builder, tables["reached"], row)) if marks else marked, source
-    )
-    builder.branch(sources)
+        _, *sums = _loop(builder, (builder.and_(word, linked), total, arrived), any_left, of_source)
+        return builder.add(e, _number(1)), *sums
 
-    builder.position_at_end(link_end)
-    for phi, value in ((e, builder.add(e, _number(1))), (total, part), (arrived, marked)):
-        phi.add_incoming(value, link_end)
-    builder.branch(links)
+    def within(values: Any) -> Any:
+        return builder.icmp_signed("<", values[0], end)
 
-    builder.position_at_end(done)
+    _, total, arrived = _loop(builder, (begin, _all(_SUMS, 0), _number(0)), within, of_link)
     return total, arrived
-
-
-def _each_listed(builder: Any, sources: Any, bounds: Any, values: Any, add: Function) -> Any:
-    """Emit a loop over listed sources, four at a time, then one; `add` emits what each does to the values."""
-    k = bounds[0]
-    for stride in (UNROLLED, 1):
-        before = builder.block
-        head, body, done = map(builder.append_basic_block, ("head", "body", "done"))
-        builder.branch(head)
-        builder.position_at_end(head)
-        phis = [builder.phi(value.type) for value in (k, *values)]
-        for phi, value in zip(phis, (k, *values), strict=True):
-            phi.add_incoming(value, before)
-        k, *values = phis
-        builder.cbranch(builder.icmp_signed("<=", builder.add(k, _number(stride)), bounds[1]), body, done)
-        builder.position_at_end(body)
-        added = values
-        for i in range(stride):
-            added = add(builder.sext(_element(builder, sources, builder.add(k, _number(i))), _WORD), added)
-        for phi, value in zip(phis, (builder.add(k, _number(stride)), *added), strict=True):
-            phi.add_incoming(value, body)
-        builder.branch(head)
-        builder.position_at_end(done)
-    return values
 
 
 def _sum_listed(
     builder: Any, tables: Any, sources: Any, bounds: Any, block: Any, *, marks: bool
 ) -> tuple[Any, Any]:
-    """Emit the same for a block that every source reaches, on listed sources."""
+    """Emit the same for a block that every source reaches: listed sources, four at a time, then one."""
     base = _element(builder, tables["row"], _element(builder, tables["first"], block))
 
-    def add(source: Any, values: Any) -> Any:
-        row = builder.add(base, source)
-        total, arrived = values
-        total = builder.add(total, _row(builder, tables, row))
-        return total, builder.or_(arrived, _element(builder, tables["reached"], row)) if marks else arrived
+    def add(stride: int, values: Any) -> Any:
+        k, total, arrived = values
+        for i in range(stride):
+            source = builder.sext(_element(builder, sources, builder.add(k, _number(i))), _WORD)
+            row = builder.add(base, source)
+            total, arrived = _add_row(builder, tables, row, total, arrived, marks=marks)
+        return builder.add(k, _number(stride)), total, arrived
 
-    total, arrived = _each_listed(builder, sources, bounds, (_all(_SUMS, 0), _number(0)), add)
+    def within(stride: int, values: Any) -> Any:
+        return builder.icmp_signed("<=", builder.add(values[0], _number(stride)), bounds[1])
+
+    values = bounds[0], _all(_SUMS, 0), _number(0)
+    for stride in (UNROLLED, 1):
+        values = _loop(builder, values, partial(within, stride), partial(add, stride))
+    _, total, arrived = values
     return total, arrived
 
 
