@@ -31,7 +31,6 @@ def main(arguments: argparse.Namespace) -> Outcome:
         raise OptionError(f"{arguments.netlist}: no hardware description of {machine.target.title} is known")
     choice = SplitChoice(split=arguments.split, limit=arguments.limit)
     data = load_recordings(arguments.data, choice, machine.netlist)
-    machine.require_sensor(data.events)
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(arguments.work or temporary)
         folder.mkdir(parents=True, exist_ok=True)

@@ -71,7 +71,7 @@ def test_simulators_are_held_against_their_specifications(made, monkeypatch):
     monkeypatch.setattr(simulator, "simulate", wrong)
     assert machine.check(events, lengths=lengths) == 3
     with pytest.raises(DataError, match=r"9 input channels found, the netlist has \d+"):
-        machine.require_sensor(np.zeros((1, 3, 3, 12), np.uint8))
+        machine.run(np.zeros((1, 3, 3, 12), np.uint8))
 
 
 @pytest.mark.parametrize("name", ["loihi1", "truenorth"])

@@ -88,7 +88,7 @@ def test_a_neuron_is_there_once_for_each_axon_that_it_reaches():
     assert set(count["fc2"]) == {1}
     assert set(count["fc1"]) == set(count["conv1"]) == {4}
     assert netlist.n_cores == 2 + 2 + 2
-    assert len(find_twins(netlist, 32).first_neuron) == 100 + 120 + 300
+    assert len(find_twins(netlist).first_neuron) == 100 + 120 + 300
 
 
 def test_networks_beyond_the_chip():

@@ -20,9 +20,10 @@ from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.tallies import Begin, FloatTally, ModelTally, Part
 from spikeloom.runtime.equivalence.verdict import Verdict
 from spikeloom.runtime.machines.backends import machine_of
-from spikeloom.runtime.machines.base import ENGINES, Machine
+from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.machines.capabilities import Comparable
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
+from spikeloom.runtime.requests.main_job import ENGINES
 
 
 def verify(
@@ -69,7 +70,7 @@ def verify(
     machine = machine_of(netlist)
     floats = source if original is None and isinstance(source, Network) else original
     begin = progress or (lambda _part, _done: None)
-    _require_fit(machine, source, floats, data, spec_samples)
+    _require_fit(machine, source, floats, spec_samples)
     lowered, reference = _tallies(machine, source, floats, len(data), begin)
     engines = _compare_engines(machine, data, min(spec_samples, len(data)), engine_name, begin)
     votes, saturated = _run(
@@ -102,10 +103,8 @@ def _tallies(
     )
 
 
-def _require_fit(
-    machine: Machine, source: Any, floats: Network | None, data: Recordings, spec_samples: int
-) -> None:
-    """Refuse networks or recordings of another size, and a specification that would run on nothing."""
+def _require_fit(machine: Machine, source: Any, floats: Network | None, spec_samples: int) -> None:
+    """Refuse networks of another size, and a specification that would run on nothing."""
     if spec_samples < 1:
         raise DataError(
             f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number"
@@ -113,7 +112,6 @@ def _require_fit(
     if isinstance(machine, Comparable):
         require_match(machine.netlist, source)
         require_match(machine.netlist, source if floats is None else floats)
-    machine.require_sensor(data.events)
 
 
 def _compare_engines(

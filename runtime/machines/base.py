@@ -23,6 +23,7 @@ from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import Block, Outcome, Section
 from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.requests.main_job import ENGINES
 
 Done = Callable[[int], object] | None
 """Called with the number of recordings done."""
@@ -34,9 +35,6 @@ PART = 16
 
 HELD = 1 << 25
 """Entries (recording, step, neuron) of these, unless one recording has more."""
-
-ENGINES = ("spikeloom", "onnx")
-"""What can be held against a chip's specification: our simulator, or another program beside it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -163,12 +161,11 @@ def differences(slow: Any, fast: Any) -> int:
 
 
 def require_channels(netlist: Netlist, channels: int) -> None:
-    """Raise DataError unless recordings of so many input channels fit the network."""
+    """Raise DataError unless recordings of so many input channels, clocks among them, fit the network."""
     if channels != netlist.n_inputs:
-        ticking = netlist.clocks.channels
-        clocks = f", {ticking} of them clocks (spikeloom.compiler.dynamics.with_clocks)" if ticking else ""
+        clocks = netlist.clocks.channels
         raise DataError(
-            f"recordings: {channels} input channels found, the netlist has {netlist.n_inputs}{clocks}; "
+            f"recordings: {channels - clocks} input channels found, the netlist has {netlist.n_inputs - clocks}; "
             "use recordings of the sensor that the network was compiled for"
         )
 
@@ -386,16 +383,6 @@ class Machine(ABC):
     def forgetting(self, channels: EventArray) -> Forgetting | None:  # noqa: ARG002
         """How soon the chip forgets what it was before a step of a recording (channels, steps); None: not known."""
         return None
-
-    def require_sensor(self, events: EventArray) -> None:
-        """Refuse recordings with another number of input channels: a DataError."""
-        channels = events.shape[1] * events.shape[2]
-        due = self.netlist.taxels * self.netlist.polarities
-        if channels != due:
-            raise DataError(
-                f"recordings: {channels} input channels found, the netlist has {due}; use recordings of the "
-                "sensor that the network was compiled for"
-            )
 
     def batch(self, steps: int) -> int:  # noqa: ARG002
         """Recordings of so many data steps whose price is worked out at a time where memory is short."""

@@ -43,7 +43,6 @@ def run(request: ExplainRequest) -> Outcome:
     if request.limit is None and request.sample is None:
         request = replace(request, limit=LIMIT)
     data = load_recordings(request.data, request, netlist)
-    machine.require_sensor(data.events)
     chosen = (
         range(len(data)) if request.sample is None else [find_recording(data, request.sample, "--sample")]
     )

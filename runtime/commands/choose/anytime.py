@@ -35,7 +35,6 @@ def run(request: AnytimeRequest) -> Outcome:
     allowed = _allowed(request)
     machine = Stoppable.required(machine_for(request.netlist), request.netlist, "anytime")
     data = load_recordings(request.data, request, machine.netlist)
-    machine.require_sensor(data.events)
     points = _races(request, machine)
     progress("running")
     ran = machine.cumulative(data.events, data.step_counts)
@@ -76,7 +75,6 @@ def _races(request: AnytimeRequest, machine: Stoppable) -> FloatArray | None:
     training = load_recordings(
         request.calibrate, replace(request, split="train", limit=None), machine.netlist
     )
-    machine.require_sensor(training.events)
     progress("calibrating")
     lengths = training.step_counts
     race = exits.standing if request.held_out else exits.races

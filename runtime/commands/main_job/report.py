@@ -53,7 +53,6 @@ def run(request: ReportRequest) -> Outcome:
         require_match(netlist, reference.loaded.network)
     reference.loaded.require_same(request.netlist, netlist, request.run)
     data = load_recordings(request.data, request, netlist, labels_for="report", joined=False)
-    machine.require_sensor(data.events)
     report = _report(request, machine, reference.network, reference.loaded, data, battery)
     made = report.provenance
     title = f"{made.netlist.file} on {made.data.file}"

@@ -43,7 +43,7 @@ def prepare(netlist: CrossbarNetlist, *, careful: bool = False) -> Engine:
     """
     bits = load_target(netlist.target).limit("neuron.membrane_bits")
     low, high = signed_range(bits)
-    twins, steady, cap = _steady_first(netlist, find_twins(netlist, kernel.HALF), low, high, careful=careful)
+    twins, steady, cap = _steady_first(netlist, find_twins(netlist), low, high, careful=careful)
     first = twins.first_neuron
     axons = len(twins.first_axon)
     feeds, clocks, wires = netlist.aims()

@@ -18,15 +18,13 @@ from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 Int32 = npt.NDArray[np.int32]
 
 PARAMETERS = (
-    *(
-        "leak",
-        "leak_reversal",
-        "threshold",
-        "reset_mode",
-        "reset",
-        "negative_threshold",
-        "negative_saturates",
-    ),
+    "leak",
+    "leak_reversal",
+    "threshold",
+    "reset_mode",
+    "reset",
+    "negative_threshold",
+    "negative_saturates",
 )
 LEAK, REVERSAL, THRESHOLD, RESET_MODE, RESET, NEGATIVE, SATURATES, AXON, DELAY, VOTES_FROM = range(10)
 """Columns of the parameters of a neuron: those of the netlist, the axon that its spikes reach (-1 for none),

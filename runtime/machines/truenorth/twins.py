@@ -14,20 +14,10 @@ import numpy as np
 
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.runtime.machines.truenorth.kernel import HALF, PARAMETERS
 
 _FEED, _CLOCK, _WIRE, _ITSELF = range(4)
-_REGISTERS = (
-    *(
-        "leak",
-        "leak_reversal",
-        "threshold",
-        "reset_mode",
-        "reset",
-        "negative_threshold",
-        "negative_saturates",
-    ),
-    *("initial", "readout_first"),
-)
+_REGISTERS = (*PARAMETERS, "initial", "readout_first")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,13 +37,13 @@ class Twins:
     synapse_halves: IntArray
 
 
-def find_twins(netlist: CrossbarNetlist, half: int) -> Twins:
-    """Kinds of a network that breaks no rule; positive sums are shifted by `half` bits."""
+def find_twins(netlist: CrossbarNetlist) -> Twins:
+    """Kinds of a network that breaks no rule."""
     neuron = netlist.neuron_of_synapse()
     axon = netlist.axon_of_synapse()
     aims = netlist.aims()
     weight = netlist.weight[neuron, netlist.axon_type[axon]]
-    halves = np.where(weight > 0, weight << half, -weight)
+    halves = np.where(weight > 0, weight << HALF, -weight)
     single = np.bincount(np.concatenate(aims), minlength=netlist.n_axons) == 1
     sources = _sources(netlist, aims, single)
     registers = _registers(netlist, single[aims[_WIRE]])
