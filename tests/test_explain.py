@@ -125,9 +125,9 @@ def stored_as(network, thresholds, exponents=(0,)):
 def explained(network, integer, events, compensated=(), **options):
     """Explain what an intact machine does with one recording."""
     deviations = LoihiDeviations(network=network, integer=integer, compensated=compensated)
-    return explain(
-        network, deviations, events, run_integer(integer, events[None], membranes=True), **options
-    )
+    nobody = [np.zeros(population.size, np.bool_) for population in network.populations]
+    known = {"absent": nobody, "unread": nobody, "pruned": False} | options
+    return explain(network, deviations, events, run_integer(integer, events[None], membranes=True), **known)
 
 
 def test_equal_spikes_have_no_diagnosis():

@@ -19,7 +19,6 @@ from spikeloom.runtime.equivalence.verdict import (
     ModelSpikes,
     Verdict,
     in_a_sentence,
-    levels_of,
     mcnemar,
     parse_requirements,
     spike_agreement,
@@ -77,9 +76,9 @@ def test_levels_of_a_verdict():
         (lowered(0), 1, 1),
         (lowered(0) | {"membranes_saturated": 1}, 1, 0),
     ):
-        levels = {level.name: level.share for level in levels_of(verdict(**changes))}
+        levels = {level.name: level.share for level in verdict(**changes).levels}
         assert levels == {"EN": 1.0, "E0": e0, "E1": e1, "E2": 0.8, "E3": 0.5}
-    text = levels_of(verdict())[4].text
+    text = verdict().levels[4].text
     assert "right on float only 1, on chip only 1 (exact McNemar p = 1); class votes moved: 8 of 13" in text
     silent, disjoint = layer(0, 0, 0), layer(5, 5, 10)
     assert (spike_agreement(silent), spike_agreement(disjoint)) == (1.0, 0.0)

@@ -8,7 +8,8 @@ import numpy as np
 from spikeloom.compiler.interpret import channels_last, cut
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.targets.compartments import MEMBRANE_SHIFT
-from spikeloom.compiler.types import BoolArray, EventArray, IntArray
+from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.breakdowns import Breakdown, breakdowns
 from spikeloom.runtime.equivalence.reference import (
     LADDER,
@@ -31,12 +32,10 @@ Begin = Callable[[str, int], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Part:
-    """Some recordings, and what the chip did on them; `lengths` are their data steps."""
+    """Some recordings, the `rows` of all, and what the chip did on them."""
 
     rows: slice
-    events: EventArray
-    lengths: IntArray
-    files: tuple[str, ...]
+    data: Recordings
     run: Run
 
 
@@ -53,11 +52,13 @@ class ModelTally:
     def add(self, part: Part) -> None:
         """Count some recordings."""
         self._begin("lowered model", part.rows.start)
-        expected = self._model.spikes(part.events)
+        expected = self._model.spikes(part.data.events)
         for name, first in self._model.first.items():
             spikes = expected[name]
-            self._spikes[name] += int(cut(spikes, part.lengths).sum())
-            self._different[name] += self._machine.differing(part.run, name, spikes, first, part.lengths)
+            self._spikes[name] += int(cut(spikes, part.data.step_counts).sum())
+            self._different[name] += self._machine.differing(
+                part.run, name, spikes, first, part.data.step_counts
+            )
 
     @property
     def layers(self) -> dict[str, ModelSpikes]:
@@ -81,7 +82,7 @@ class FloatTally:
     def add(self, part: Part) -> None:
         """Run the model on some recordings."""
         self._begin("float32 reference", part.rows.start)
-        reference = [cut(spikes, part.lengths) for spikes in self._reference(part.events)]
+        reference = [cut(spikes, part.data.step_counts) for spikes in self._reference(part.data.events)]
         voting = reference[self._readout.population]
         self.votes[part.rows] = readout_counts(self._readout, self.votes.shape[1], voting)
         if self.spikes is not None:
@@ -111,7 +112,7 @@ class SpikeTally:
     def add(self, part: Part, reference: Layers) -> None:
         """Count some recordings."""
         first = part.rows.start
-        channels = channels_last(part.events, self._machine.netlist.clocks)
+        channels = channels_last(part.data.events, self._machine.netlist.clocks)
         wanted = self._compared(reference)
         chip = self._compared([part.run.spikes[name] for name in self._names])
         self._different[LADDER[-1]] += _differences(wanted, chip)
@@ -122,7 +123,7 @@ class SpikeTally:
             lower = chip
             if simulation is not None:
                 lower = self._compared(
-                    [cut(spikes, part.lengths) for spikes in simulation.run(channels).spikes]
+                    [cut(spikes, part.data.step_counts) for spikes in simulation.run(channels).spikes]
                 )
             self._different[stage] += _differences(wanted, lower)
             if stage == LADDER[0] and self.first_divergence is None:
@@ -181,13 +182,13 @@ class SpikeTally:
         machine = self._machine
         layer = machine.integer.populations[index]
         neuron = int(self._neurons[index][entry])
-        recording = part.events[sample : sample + 1, ..., : step + 1]
+        recording = part.data.events[sample : sample + 1, ..., : step + 1]
         register = int(machine.run(recording, membranes=True).membranes[layer.name][0, step, neuron])
         scale = float(layer.scale[neuron])
         on_chip = not machine.absent[index][neuron]  # a neuron that the chip leaves out stays at zero
         taxel, feature = taxel_and_feature(self._network, index, neuron)
         return Divergence(
-            file=part.files[sample],
+            file=part.data.files[sample],
             step=step,
             layer=layer.name,
             neuron=neuron,

@@ -201,7 +201,13 @@ class Verdict(Shown):
     @property
     def levels(self) -> tuple[Level, ...]:
         """What was reached on each level."""
-        return levels_of(self)
+        return (
+            Level(name="EN", share=float(self.netlist.holds), text=self.netlist.text),
+            _engine_level(self),
+            _model_level(self),
+            _spike_level(self),
+            _decision_level(self),
+        )
 
     @property
     def missed(self) -> tuple[str, ...]:
@@ -254,17 +260,6 @@ def mcnemar(labels: IntArray, first: IntArray, second: IntArray) -> tuple[int, i
     k = min(only_first, only_second)
     tail = sum(math.comb(n, i) for i in range(k + 1)) / 2**n
     return only_first, only_second, min(1.0, 2 * tail)
-
-
-def levels_of(verdict: Verdict) -> tuple[Level, ...]:
-    """Summarise a verdict on all levels."""
-    return (
-        Level(name="EN", share=float(verdict.netlist.holds), text=verdict.netlist.text),
-        _engine_level(verdict),
-        _model_level(verdict),
-        _spike_level(verdict),
-        _decision_level(verdict),
-    )
 
 
 def _engine_level(verdict: Verdict) -> Level:

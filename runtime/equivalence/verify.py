@@ -136,20 +136,13 @@ def _run(
     saturated: int | None = None
     for rows in machine.parts(len(data), data.steps):
         begin("chip", rows.start)
-        lengths = None if data.lengths is None else data.lengths[rows]
-        run = machine.run(data.events[rows], lengths=lengths, spikes=True)
+        some = data.part(rows)
+        run = machine.run(some.events, lengths=some.lengths, spikes=True)
         votes[rows] = run.votes
         if run.saturated is not None:
             saturated = (saturated or 0) + int(run.saturated.sum())
-        part = Part(
-            rows=rows,
-            events=data.events[rows],
-            lengths=data.step_counts[rows],
-            files=data.files[rows],
-            run=run,
-        )
         for tally in tallies:
-            tally.add(part)
+            tally.add(Part(rows=rows, data=some, run=run))
     return votes, saturated
 
 

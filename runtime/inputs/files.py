@@ -1,10 +1,12 @@
 """Files that a user names: shipped checkpoints, places to write, what can be inspected."""
 
+from __future__ import annotations
+
 import zipfile
 from collections.abc import Callable, Iterable
 from importlib import resources
 from pathlib import Path
-from typing import Protocol, cast
+from typing import TYPE_CHECKING
 
 from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import OptionError
@@ -14,15 +16,11 @@ from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name
 from spikeloom.runtime.report.drawing import PICTURES, Drawing
 from spikeloom.runtime.requests.fields import Request
 
+if TYPE_CHECKING:
+    from spikeloom.runtime.requests.check import CertifyRequest, StressRequest
+    from spikeloom.runtime.requests.training import TrainRequest
+
 _RECORDINGS = "recordings are shown by spikeloom data describe"
-
-
-class Pictured(Protocol):
-    """A request that may ask for a picture."""
-
-    @property
-    def picture(self) -> str | None:
-        """File to draw it to."""
 
 
 PRETRAINED = "pretrained:"
@@ -95,7 +93,9 @@ def require_place(
         raise OptionError(f"{option} {path}: has to end in {' or '.join(allowed)}; give another name")
 
 
-def require_picture(request: Pictured, outputs: Iterable[str | Path | None]) -> None:
+def require_picture(
+    request: CertifyRequest | StressRequest | TrainRequest, outputs: Iterable[str | Path | None]
+) -> None:
     """Refuse a ``--picture`` that could not be written, of another kind than is drawn, or that is one of the `outputs`.
 
     Raises OptionError.
@@ -103,7 +103,7 @@ def require_picture(request: Pictured, outputs: Iterable[str | Path | None]) -> 
     path = request.picture
     if path is None:
         return
-    require_place(path, "--picture", cast(Request, request), PICTURES)
+    require_place(path, "--picture", request, PICTURES)
     if Path(path).absolute() in [Path(output).absolute() for output in outputs if output is not None]:
         raise OptionError(f"--picture {path}: is also the -o file; give another name")
 

@@ -130,6 +130,15 @@ class SplitChoice(Request):
 
 
 @dataclass(frozen=True, kw_only=True)
+class WindowChoice(SplitChoice):
+    """Which part of them."""
+
+    window: str = option(
+        "first part of every recording, as in 50%%", default="100%", metavar="PERCENT", group="recordings"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class RecordingsChoice(SplitChoice):
     """Which recordings."""
 

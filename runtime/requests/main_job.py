@@ -16,7 +16,7 @@ from spikeloom.runtime.requests.choices import (
     NetlistChoice,
     NetworkChoice,
     RecordingsChoice,
-    SplitChoice,
+    WindowChoice,
 )
 from spikeloom.runtime.requests.fields import option
 
@@ -100,23 +100,17 @@ class InspectRequest(CheckpointChoice):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunRequest(NetlistChoice, RecordingsChoice):
+class RunRequest(NetlistChoice, RecordingsChoice, WindowChoice):
     """Run a netlist exactly as the chip would."""
 
-    window: str = option(
-        "first part of every recording, as in 50%%", default="100%", metavar="PERCENT", group="recordings"
-    )
     spikes: str | None = option("write the spikes of every layer, aligned with the data", metavar="OUT.npz")
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerifyRequest(ComparisonChoice, SplitChoice):
+class VerifyRequest(ComparisonChoice, WindowChoice):
     """Compare chip and float model, spike for spike."""
 
     data: str | Recordings | None = option(DATA_HELP, metavar="PATH", group="recordings")
-    window: str = option(
-        "first part of every recording, as in 50%%", default="100%", metavar="PERCENT", group="recordings"
-    )
     original: str | None = option(
         "float model for E2 and E3 (default: the weights of --checkpoint)", metavar="CKPT"
     )
@@ -134,12 +128,9 @@ class VerifyRequest(ComparisonChoice, SplitChoice):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EstimateRequest(NetlistChoice, RecordingsChoice):
+class EstimateRequest(NetlistChoice, RecordingsChoice, WindowChoice):
     """Synaptic operations, energy and time of an inference."""
 
-    window: str = option(
-        "first part of every recording, as in 50%%", default="100%", metavar="PERCENT", group="recordings"
-    )
     detail: str = option(
         "counts: events, energy, simple time model; cycle: the time of every message too",
         default="counts",

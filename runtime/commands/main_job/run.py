@@ -70,8 +70,8 @@ def _runs(what: str, machine: Machine, data: Recordings, *, spikes: bool = False
     count = Progress(len(data))
     for rows in machine.parts(len(data), data.steps):
         count(rows.start, what)
-        lengths = None if data.lengths is None else data.lengths[rows]
-        yield machine.run(data.events[rows], lengths=lengths, spikes=spikes)
+        part = data.part(rows)
+        yield machine.run(part.events, lengths=part.lengths, spikes=spikes)
 
 
 def _write_spikes(path: str, machine: Machine, data: Recordings) -> None:

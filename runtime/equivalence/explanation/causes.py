@@ -48,9 +48,9 @@ def explain(
     events: BoolArray,
     observed: Activity,
     *,
-    absent: Sequence[BoolArray] | None = None,
-    unread: Sequence[BoolArray] | None = None,
-    pruned: bool = False,
+    absent: Sequence[BoolArray],
+    unread: Sequence[BoolArray],
+    pruned: bool,
 ) -> results.Explanation:
     """Find the roots of all differences between float64 model and chip on one recording, and their causes.
 
@@ -59,20 +59,18 @@ def explain(
     population, of which the `unread` reach no neuron and are not compared; they were `pruned` on evidence,
     or cannot fire with their rounded weights.
     """
-    none = [np.zeros(population.size, np.bool_) for population in network.populations]
     both = _Sides(
         network=network,
         deviations=deviations,
         events=events,
         model=run_float(network, events[None], membranes=True),
         chip=observed,
-        absent=absent or none,
+        absent=absent,
         pruned=pruned,
     )
     layers = range(len(network.populations))
     differs = [
-        (both.truth(post) != both.fired(post)) & ~mute
-        for post, mute in zip(layers, unread or none, strict=True)
+        (both.truth(post) != both.fired(post)) & ~mute for post, mute in zip(layers, unread, strict=True)
     ]
     resets = [both.together(post) & deviations.forgets(post) for post in layers]
     roots = find_roots(differs, resets, deviations.sources)

@@ -8,7 +8,7 @@ from spikeloom.compiler import __version__
 from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.interpret import channels_last
-from spikeloom.compiler.storage import Storage
+from spikeloom.compiler.storage import Fixed, Storage
 from spikeloom.compiler.targets.loihi1 import integers
 from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.netlist import write_netlist
@@ -139,19 +139,11 @@ def _lower_integers(path: str, request: CompileRequest) -> Lowered:
         **({"cores_for": cores_for} if cores_for else {}),
         **({"chips": request.chips} if request.chips != 1 else {}),
     }
-    options = Options(
-        keep_all=request.keep_all,
-        cores_for=cores_for,
-        free_running=request.free_running,
-        chips=request.chips,
-        provenance=origin,
-    )
-    done = compile_network(read.network, options)
-    netlist = done.netlist
+    done = compile_network(read.network, replace(_options(request, Fixed()), provenance=origin))
     return Lowered(
-        netlist=netlist,
+        netlist=done.netlist,
         model=_model(done),
-        write=lambda output: write_netlist(netlist, output),
+        write=lambda output: write_netlist(done.netlist, output),
         report=lambda sha256: _laid_out(request.output, sha256, read.facts),
     )
 
