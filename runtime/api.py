@@ -10,9 +10,9 @@ import os
 import shutil
 import tempfile
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets import DEFAULT_TARGET
@@ -130,20 +130,8 @@ def compile(
         from spikeloom.runtime.inputs.compilation import options_of
 
         given |= options_of(storage, given)
-    folder = tempfile.mkdtemp(prefix="spikeloom-")
-    path = Path(folder) / "netlist.loom"
-    from spikeloom.runtime.commands.main_job import compile as command
-
-    try:
-        seen = {"calibrate": recordings_of({"data": calibrate}, "train")}
-        request = checked(CompileRequest, given | seen | {"checkpoint": source, "output": str(path)})
-        facts: Shown = command.run(request).result
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-    made = Compiled(path, source, NetworkChoice.of(vars(request)), facts)
-    weakref.finalize(made, shutil.rmtree, folder, ignore_errors=True)
-    return made
+    seen = {"calibrate": recordings_of({"data": calibrate}, "train")}
+    return _compiled(given | seen | {"checkpoint": source})
 
 
 @documented(NetworkChoice)
@@ -345,6 +333,23 @@ def chart(
 
     result: Chart = command.run(checked(ChartRequest, given)).result
     return result
+
+
+def _compiled(given: Mapping[str, Any]) -> Compiled:
+    """Compile into a folder that goes with the compiled network."""
+    from spikeloom.runtime.commands.main_job import compile as command
+
+    folder = tempfile.mkdtemp(prefix="spikeloom-")
+    path = Path(folder) / "netlist.loom"
+    try:
+        request = checked(CompileRequest, {**given, "output": str(path)})
+        facts: Shown = command.run(request).result
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    made = Compiled(path, request.checkpoint, NetworkChoice.of(vars(request)), facts)
+    weakref.finalize(made, shutil.rmtree, folder, ignore_errors=True)
+    return made
 
 
 def _place(data: Source, bin: float | None) -> dict[str, object]:

@@ -136,7 +136,7 @@ def test_what_is_known_again_is_so_after_any_past(seed):
 
 
 def study_of(netlist, given, **options):
-    return certify(machine_of(netlist), recorded(given), jobs=1, **options)
+    return certify(machine_of(netlist), recorded(given), jobs=1, **{"shift": 25, "most": 16} | options)
 
 
 def decided(netlist, given):
@@ -206,7 +206,7 @@ def test_counters_bear_exactly_so_many_events(plan):
     machine = machine_of(compile_network(counting_network(made)).netlist)
     tally, exact = tally_of(machine), set()
     for one, found in zip(
-        given[:5], certify(machine, data.part(slice(5)), jobs=1, most=2).certificates, strict=True
+        given[:5], certify(machine, data.part(slice(5)), jobs=1, shift=25, most=2).certificates, strict=True
     ):
         channels, cells = channels_of(one[None], machine.netlist)[0], cells_of(one, machine.netlist)
         votes, broken = machine.votes(channels[None])[0], 3
@@ -228,7 +228,7 @@ def test_counters_bear_exactly_so_many_events(plan):
     assert {1, 2} <= exact
     assert (
         share_robust_to_one_event(machine, data.part(slice(5)))
-        == certify(machine, data.part(slice(5)), jobs=1).certified(1) / 5
+        == certify(machine, data.part(slice(5)), jobs=1, shift=25, most=16).certified(1) / 5
     )
 
 

@@ -177,21 +177,31 @@ class Verdict(Shown):
         )
 
     @property
-    def accuracy(self) -> Mapping[str, float]:
-        """Shares of recordings that each side, ``float`` and ``chip``, gets right."""
+    def right(self) -> Mapping[str, int]:
+        """Recordings that each side, ``float`` and ``chip``, gets right."""
         sides = {"float": self.float_predictions, "chip": self.chip_predictions}
         return {
-            side: float(np.mean(decided == self.labels))
+            side: int(np.count_nonzero(decided == self.labels))
             for side, decided in sides.items()
             if decided is not None
         }
 
     @property
-    def decision_agreement(self) -> float | None:
-        """Share of recordings in which float model and chip decide alike."""
+    def accuracy(self) -> Mapping[str, float]:
+        """Shares of these."""
+        return {side: count / self.samples for side, count in self.right.items()}
+
+    @property
+    def equal(self) -> int | None:
+        """Recordings in which float model and chip decide alike."""
         if self.float_predictions is None:
             return None
-        return float(np.mean(self.float_predictions == self.chip_predictions))
+        return int(np.count_nonzero(self.float_predictions == self.chip_predictions))
+
+    @property
+    def decision_agreement(self) -> float | None:
+        """Share of these."""
+        return None if self.equal is None else self.equal / self.samples
 
     @property
     def votes_moved(self) -> int | None:
@@ -229,12 +239,11 @@ def in_a_sentence(verdict: Verdict) -> str:
     """What it comes to, for a reader of nothing else."""
     if verdict.missed:
         return f"Do not use this netlist: {'; '.join(verdict.missed)}."
-    right = {side: round(share * verdict.samples) for side, share in verdict.accuracy.items()}
-    if verdict.decision_agreement is None:
+    right = verdict.right
+    if verdict.equal is None:
         same = "the chip has every spike of its model"
         return f"The netlist is its network; {same} and is right on {right['chip']} of {verdict.samples} recordings."
-    equal = round(verdict.decision_agreement * verdict.samples)
-    alike = f"decides as the float model on {equal} of {verdict.samples} recordings"
+    alike = f"decides as the float model on {verdict.equal} of {verdict.samples} recordings"
     sides = f"is right on {right['chip']}, the float model on {right['float']}"
     return f"The netlist is its checkpoint, rounded; the chip {alike} and {sides}."
 
@@ -310,10 +319,9 @@ def _decision_level(verdict: Verdict) -> Level:
     agreement = verdict.decision_agreement
     if agreement is None or verdict.float_predictions is None or verdict.float_counts is None:
         return Level(name="E3", share=None, text="not applicable: there is no float model")
-    equal = round(agreement * verdict.samples)
     only_float, only_chip, p = mcnemar(verdict.labels, verdict.float_predictions, verdict.chip_predictions)
     text = (
-        f"{equal} of {verdict.samples} decisions equal; right on float only {only_float}, on chip only "
+        f"{verdict.equal} of {verdict.samples} decisions equal; right on float only {only_float}, on chip only "
         f"{only_chip} (exact McNemar p = {p:.3g}); class votes moved: {verdict.votes_moved:,} "
         f"of {verdict.float_counts.sum():,}"
     )
@@ -397,12 +405,8 @@ def _ladder_table(verdict: Verdict) -> Table:
 
 
 def _lines(verdict: Verdict) -> list[str]:
-    right = {
-        side: percent(round(share * verdict.samples), verdict.samples)
-        for side, share in verdict.accuracy.items()
-    }
     lines = [
-        *(f"{side + ' accuracy:':<17}{share}" for side, share in right.items()),
+        *(f"{side + ' accuracy:':<17}{percent(n, verdict.samples)}" for side, n in verdict.right.items()),
         *(f"{level.name}  {level.text}" for level in verdict.levels),
         *(f"missed: {line}" for line in verdict.missed),
         *(f"breakdown: {breakdown.text}" for breakdown in verdict.breakdowns),

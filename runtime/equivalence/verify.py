@@ -42,12 +42,10 @@ def verify(
 
     Parameters
     ----------
-    netlist : Netlist
-        For any chip.
+    netlist, data : Netlist, Recordings
+        For any chip; recordings in steps of the network.
     source : Network, NativeNetwork or Counters
         What the netlist was compiled from, or another network of the same architecture.
-    data : Recordings
-        In steps of the network.
     original : Network, optional
         The float model of E2 and E3; by default `source`, where that is one.
     spec_samples : int
@@ -56,10 +54,8 @@ def verify(
         One of ``ENGINES``, which runs beside our engine on all recordings.
     required : mapping, optional
         Shares that levels have to reach, see :mod:`equivalence.verdict`; EN always.
-    check : NetlistCheck, optional
-        What is known of EN.
-    progress : callable, optional
-        See :data:`tallies.Begin`.
+    check, progress : NetlistCheck, callable, optional
+        What is known of EN; see :data:`tallies.Begin`.
 
     Raises
     ------

@@ -2,28 +2,8 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
 
-from spikeloom.models.recordings.evtouch import Recordings
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExportSource:
-    """What a format is written from; options that were not given are None.
-
-    source, output: file of the network, and the one to be written.
-    recordings: reads recordings for a netlist, where a format has a use for them.
-    recording: which of them.
-    form: which form of the format.
-    dt: seconds of a step.
-    """
-
-    source: str
-    output: str
-    recordings: Callable[[Any], Recordings] | None = None
-    recording: int | None = None
-    form: str | None = None
-    dt: float | None = None
+from spikeloom.runtime.requests.exchange import ExportRequest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +40,7 @@ class Format:
 
     name: str
     title: str
-    write: Callable[[ExportSource], Export]
+    write: Callable[[ExportRequest], Export]
     options: tuple[str, ...] = ()
     whole: bool = False
     ending: str = ""

@@ -94,11 +94,10 @@ def _cards(report: Report) -> dict[str, tuple[str, str]]:
     verdict = report.verify
     price = report.price
     cards = {}
-    for side, share in verdict.accuracy.items():
-        value, _, note = percent(round(share * verdict.samples), verdict.samples).partition(" (")
+    for side, right in verdict.right.items():
+        value, _, note = percent(right, verdict.samples).partition(" (")
         cards[f"{side} accuracy"] = value, note.removesuffix(")")
-    equal = round((verdict.decision_agreement or 0) * verdict.samples)
-    cards["decisions equal"] = f"{equal} of {verdict.samples}", "chip and float model"
+    cards["decisions equal"] = f"{verdict.equal} of {verdict.samples}", "chip and float model"
     exact = f"every spike, membrane and count of {verdict.spec_samples} recordings"
     cards["specification = engine"] = "yes" if verdict.spec_equals_engine else "NO", exact
     energy = {name: float(each.mean()) for name, each in price.dynamic_j.items()}

@@ -6,17 +6,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from spikeloom.compiler.files import write_atomically
-from spikeloom.compiler.targets.netlist_file import Netlist
-from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.files import require_netlist, require_place
-from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.inputs.repeat import refuse
 from spikeloom.runtime.machines.backends import export_formats
-from spikeloom.runtime.machines.exports import ExportSource
 from spikeloom.runtime.report.encode import INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 from spikeloom.runtime.report.shown import Shown
-from spikeloom.runtime.requests.choices import SplitChoice
 from spikeloom.runtime.requests.exchange import ExportRequest
 
 FORMATS = {each.name: each for each in export_formats()}
@@ -58,21 +53,7 @@ def run(request: ExportRequest) -> Outcome:
     require_place(request.output, "-o", request, [FORMATS[request.to].ending or request.to])
     require_netlist(request.source)
 
-    def read(netlist: Netlist) -> Recordings:
-        assert request.data is not None, "recordings are read where they are given"
-        return load_recordings(
-            request.data, SplitChoice(split=request.split or "test", bin=request.bin), netlist
-        )
-
-    content = ExportSource(
-        source=request.source,
-        output=request.output,
-        recordings=None if request.data is None else read,
-        recording=request.recording,
-        form=request.form,
-        dt=request.dt,
-    )
-    export = FORMATS[request.to].write(content)
+    export = FORMATS[request.to].write(request)
     digest = hashlib.sha256()
     size = 0
     with write_atomically(request.output) as file:

@@ -14,8 +14,9 @@ from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.models.recordings.evtouch import BIN_S
 from spikeloom.runtime.inputs.recordings import origin_of
-from spikeloom.runtime.machines.exports import Export, ExportSource, Facts, Format
+from spikeloom.runtime.machines.exports import Export, Facts, Format
 from spikeloom.runtime.report.encode import OPTIONAL
+from spikeloom.runtime.requests.exchange import ExportRequest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +46,7 @@ class NirFacts(Facts):
     convention: str
 
 
-def _sanafe(request: ExportSource) -> Export:
+def _sanafe(request: ExportRequest) -> Export:
     netlist = read_netlist(request.source)
     target = load_target(netlist.target)
     places = sanafe.cores(netlist, target)
@@ -70,7 +71,7 @@ def _sanafe(request: ExportSource) -> Export:
     return Export(content=content, facts=facts, lines=tuple(lines))
 
 
-def _onnx(request: ExportSource) -> Export:
+def _onnx(request: ExportRequest) -> Export:
     netlist = read_netlist(request.source)
     form = request.form or "scan"
     content, *ports = onnx.export(netlist, form)
@@ -86,7 +87,7 @@ def _onnx(request: ExportSource) -> Export:
     return Export(content=[content], facts=facts, form=form, lines=lines)
 
 
-def _nir(request: ExportSource) -> Export:
+def _nir(request: ExportRequest) -> Export:
     netlist = read_netlist(request.source)
     width = origin_of(netlist.provenance).get("bin_s")
     dt = (width or BIN_S) * netlist.bins if request.dt is None else request.dt

@@ -5,7 +5,10 @@ from dataclasses import dataclass
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import ranc
-from spikeloom.runtime.machines.exports import Export, ExportSource, Facts, Format
+from spikeloom.runtime.inputs.recordings import load_recordings
+from spikeloom.runtime.machines.exports import Export, Facts, Format
+from spikeloom.runtime.requests.choices import SplitChoice
+from spikeloom.runtime.requests.exchange import ExportRequest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -15,13 +18,14 @@ class RancFacts(Facts):
     ticks: int | None
 
 
-def _ranc(request: ExportSource) -> Export:
+def _ranc(request: ExportRequest) -> Export:
     from spikeloom.runtime.machines.truenorth.machine import load  # numba, so only here
 
     netlist = load(request.source).netlist
     events = None
-    if request.recordings is not None:
-        data = request.recordings(netlist)
+    if request.data is not None:
+        choice = SplitChoice(split=request.split or "test", bin=request.bin)
+        data = load_recordings(request.data, choice, netlist)
         number = request.recording or 0
         if not 0 <= number < len(data.files):
             raise OptionError(f"--recording {number}: --data has recordings 0 to {len(data.files) - 1}")

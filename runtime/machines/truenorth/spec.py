@@ -134,6 +134,22 @@ def neuron_tick(neuron: Neuron, positive: int, negative: int, bits: int) -> tupl
     return spiked, left or neuron.membrane != v
 
 
+def neurons_at_rest(netlist: CrossbarNetlist) -> list[Neuron]:
+    """All neurons, before the first tick."""
+    *registers, _ = Neuron.__dataclass_fields__
+    columns = [getattr(netlist, name).tolist() for name in (*registers, "initial")]
+    return [Neuron(*values) for values in zip(*columns, strict=True)]
+
+
+def crossing_points(netlist: CrossbarNetlist) -> list[list[tuple[int, int]]]:
+    """Of each axon, the neurons that it reaches, with the weights."""
+    points: list[list[tuple[int, int]]] = [[] for _ in range(netlist.n_axons)]
+    crossing = np.stack([netlist.axon_of_synapse(), netlist.neuron_of_synapse()], axis=1)
+    for axon, neuron in crossing.tolist():
+        points[axon].append((neuron, int(netlist.weight[neuron, netlist.axon_type[axon]])))
+    return points
+
+
 def injected(netlist: CrossbarNetlist, events: EventArray) -> defaultdict[int, list[int]]:
     """Axons that input events and clocks reach in each tick of a recording (n_inputs, T), once for each of them."""
     due: defaultdict[int, list[int]] = defaultdict(list)
@@ -170,16 +186,8 @@ def simulate(netlist: CrossbarNetlist, events: EventArray) -> Trace:
     bits = load_target(netlist.target).limit("neuron.membrane_bits")
     steps = events.shape[1]
     ticks = netlist.ticks(steps)
-    *registers, _ = Neuron.__dataclass_fields__
-    columns = [getattr(netlist, name).tolist() for name in (*registers, "initial")]
-    neurons = [Neuron(*values) for values in zip(*columns, strict=True)]
-
-    # the crossing points of each axon, as pairs of neuron and weight
-    points: list[list[tuple[int, int]]] = [[] for _ in range(netlist.n_axons)]
-    crossing = np.stack([netlist.axon_of_synapse(), netlist.neuron_of_synapse()], axis=1)
-    for axon, neuron in crossing.tolist():
-        points[axon].append((neuron, int(netlist.weight[neuron, netlist.axon_type[axon]])))
-
+    neurons = neurons_at_rest(netlist)
+    points = crossing_points(netlist)
     # what leads to the axons: from outside by tick, from neurons by their wires
     due = injected(netlist, events)
     wires: list[list[tuple[int, int]]] = [[] for _ in neurons]

@@ -13,7 +13,6 @@ import numpy as np
 
 from spikeloom.compiler.arrays import frozen
 from spikeloom.compiler.checkpoint import Checkpoint, Dense
-from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.compartments import (
     ONE_STEP_SUM_MAX,
@@ -168,12 +167,8 @@ def without_hops(
     fewer[list(hops)] = 0
     integer = compilation.integer
     network = expand(replace(checkpoint, hops=fewer), convolution.propagation)
-    planes = [p for p in integer.projections if p.post == 0]
-    form = Form(
-        bits=planes[0].bits,
-        exponents=tuple(sorted({p.exponent for p in planes})),
-        threshold=np.maximum(integer.populations[0].threshold, 1),
-    )
+    form = integer.forms[0]
+    form = replace(form, threshold=np.maximum(form.threshold, 1))
     layer = rounded(layer_of(network, 0), form)
     if layer is None or layer.reached > ONE_STEP_SUM_MAX:
         return None

@@ -26,19 +26,14 @@ from spikeloom.runtime.studies.robustness.proofs.entries import (
 from spikeloom.runtime.studies.robustness.results import PHASES, Certificate, Certificates, Decided
 from spikeloom.runtime.studies.robustness.threads import in_threads
 
-SHIFT = 25
-"""Bins that a recording is shifted by at most."""
-
-MOST = 16
-"""Changed events up to which a proof is looked for."""
-
 
 def certify(
-    machine: Machine, data: Recordings, *, shift: int = SHIFT, most: int = MOST, jobs: int | None = None
+    machine: Machine, data: Recordings, *, shift: int, most: int, jobs: int | None = None
 ) -> Certificates:
     """Certificates of recordings in their own bins; `jobs` of them at a time, one a core by default.
 
-    Raises DataError for another sensor, NumericRangeError where a register overflows.
+    A recording is shifted by at most `shift` bins, a proof is looked for up to `most` changed events. Raises
+    DataError for another sensor, NumericRangeError where a register overflows.
     """
     tally = tally_of(machine)
     recordings = zip(data.events, data.step_counts.tolist(), data.labels.tolist(), data.files, strict=True)
@@ -66,7 +61,7 @@ def certificate(
     *,
     shift: int,
     most: int,
-    tally: Tally | None = None,
+    tally: Tally | None,
 ) -> Certificate:
     """What is known of one recording (taxels, polarities, bins); `tally` is that of a counting network."""
     singles = _flip_each(machine, events, most, tally)

@@ -364,22 +364,25 @@ def added(there: BoolArray) -> BoolArray:
 @exhaustive(TAXEL)
 def dead(events: Events) -> Iterator[Case]:
     """A taxel sends nothing."""
-    for taxel in range(len(events)):
-        yield (taxel,), set_taxels(events, np.array([taxel]), 0)
+    yield from _each_set(events, 1, 0)
 
 
 @exhaustive(TAXEL)
 def stuck(events: Events) -> Iterator[Case]:
     """A taxel sends both polarities in every bin."""
-    for taxel in range(len(events)):
-        yield (taxel,), set_taxels(events, np.array([taxel]), 1)
+    yield from _each_set(events, 1, 1)
 
 
 @exhaustive(TAXELS)
 def two_dead(events: Events) -> Iterator[Case]:
     """Two taxels send nothing."""
-    for taxels in combinations(range(len(events)), 2):
-        yield taxels, set_taxels(events, np.array(taxels), 0)
+    yield from _each_set(events, 2, 0)
+
+
+def _each_set(events: Events, count: int, value: int) -> Iterator[Case]:
+    """So many taxels at a time, dead or stuck."""
+    for taxels in combinations(range(len(events)), count):
+        yield taxels, set_taxels(events, np.array(taxels), value)
 
 
 @exhaustive(BINS)

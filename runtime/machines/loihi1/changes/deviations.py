@@ -121,10 +121,9 @@ class LoihiDeviations(Deviations):
             for stage in (self.network, self.integer)
         )
         real *= scale[:, None]
-        stored_as = [p for p in self.integer.projections if p.post == post]
-        bits = min(p.bits for p in stored_as)
-        exponents = tuple(sorted({p.exponent for p in stored_as}))
-        clipped = np.abs(real) > reach(bits, exponents) * step_units(bits, exponents) * SLACK
+        form = self.integer.forms[post]
+        largest = reach(form.bits, form.exponents) * step_units(form.bits, form.exponents)
+        clipped = np.abs(real) > largest * SLACK
         return np.stack([stored, real, np.where(clipped, real, stored)]) * (1 << MEMBRANE_SHIFT)
 
     def _variants(self, post: int, rows: IntArray) -> list[Variant]:
@@ -169,13 +168,12 @@ class LoihiDeviations(Deviations):
     def _finer_weights(self, post: int, *, clipped: bool, held: bool) -> str:
         """More bits, then more planes, then more scales."""
         layer = self.integer.populations[post].name
-        stored = [projection for projection in self.integer.projections if projection.post == post]
-        bits = max(projection.bits for projection in stored)
-        planes = len({projection.exponent for projection in stored})
+        form = self.integer.forms[post]
+        planes = len(form.exponents)
         why = "the range cuts off its largest weights" if clipped else "its weights are too coarse"
         if not held:
             why = "no input can make it fire with its rounded weights"
-        wider = "--weight-bits 8 or " if bits < 8 else ""
+        wider = "--weight-bits 8 or " if form.bits < 8 else ""
         if planes < 3:
             return f"{why}: compile {layer} with {wider}--planes {planes + 1}{BOUND if planes > 1 else ''}"
         return f"{why}: compile {layer} with {wider}--scale-groups 8{BOUND}"
