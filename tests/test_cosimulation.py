@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +22,22 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.targets.loihi1.netlist import write_netlist
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron
 from spikeloom.compiler.targets.truenorth.netlist import RESET_NONE, write_crossbars
-from spikeloom.runtime.machines.truenorth import cosimulation
 from spikeloom.runtime.machines.truenorth.machine import TrueNorth
 
 SCRIPT = Path(__file__).parent.parent / "benchmarks" / "cosimulate.py"
 OURS = Path(__file__).with_name("rtl")
 STEPS = 6
+
+
+def script():
+    """What the script defines."""
+    found = spec_from_file_location("cosimulate", SCRIPT)
+    module = sys.modules["cosimulate"] = module_from_spec(found)
+    found.loader.exec_module(module)
+    return module
+
+
+cosimulation = script()
 
 
 @pytest.fixture(params=["ours", "RANC"])
