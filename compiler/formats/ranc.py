@@ -176,7 +176,7 @@ def export(given: CrossbarNetlist, events: EventArray | None = None) -> Iterator
     netlist = terms.netlist
     mesh = mesh_of(given)
     chip = load_target(given.target)
-    voters = np.flatnonzero(netlist.readout_class >= 0)
+    voters = netlist.voters
     config = {
         "exact_ticks": terms.ticks,
         "num_neurons": chip.limit("core.neurons"),

@@ -61,6 +61,11 @@ class Netlist:
         """Number of input channels."""
         return self.taxels * self.polarities + self.clocks.channels
 
+    @property
+    def voters(self) -> IntArray:
+        """Neurons that vote, as they are counted in ``readout_class``; shape (voters,)."""
+        return np.flatnonzero(self.readout_class >= 0)
+
 
 class AxonNetlist(Netlist):
     """One whose cores have input axons, and these a list of synapses each."""

@@ -10,7 +10,7 @@ from spikeloom.compiler.types import BoolArray, IntArray
 
 def class_counts(netlist: Netlist, spikes: IntArray) -> IntArray:
     """Votes per class from spike counts per compartment (samples, compartments); shape (samples, classes)."""
-    voters = np.flatnonzero(netlist.readout_class >= 0)
+    voters = netlist.voters
     counts = np.zeros((len(spikes), netlist.classes), np.int64)
     np.add.at(counts.T, netlist.readout_class[voters], spikes[:, voters].T)
     return counts

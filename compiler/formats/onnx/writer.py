@@ -160,7 +160,7 @@ def _layer(netlist: Netlist, index: int, name: str, sources: dict[int, IntArray]
     _, current, highest, stored = (bound[ids] for bound in reached)
     lost_u = netlist.decay_u[ids] + 1
     lost_v = netlist.decay_v[ids]
-    bias = netlist.bias_mantissa[ids] << netlist.bias_exponent[ids]
+    bias = netlist.bias[ids]
     clipped = np.minimum(stored, MEMBRANE_MAX)
     widest = max(
         int((clipped * (DECAY_ONE - lost_v)).max()),
@@ -285,7 +285,7 @@ def _integrate(graph: Nodes, netlist: Netlist, layer: Layer, spikes: list[str], 
         lasting = _decayed(graph, layer, f"{name}.current", netlist.decay_u[ids] + 1, f"{name}/lasting")
         inflow = graph.add("Add", [lasting, inflow], f"{name}/current") if inflow else lasting
         graph.add("Mul", [inflow, window], f"{name}.current_next")
-    biases = netlist.bias_mantissa[ids] << netlist.bias_exponent[ids]
+    biases = netlist.bias[ids]
     if biases.any():
         bias = graph.constant(f"{name}/bias", one_each(biases, kind))
         inflow = graph.add("Add", [inflow, bias], f"{name}/inflow") if inflow else bias

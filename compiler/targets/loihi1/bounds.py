@@ -113,8 +113,7 @@ def reach(netlist: Netlist) -> Reach:
     """Bounds of the registers of each compartment, whatever the input."""
     bounds = one_step_bounds(netlist)
     up, down = (np.floor(largest_current(sums, netlist.decay_u)) for sums in bounds)
-    bias = netlist.bias_mantissa << netlist.bias_exponent
-    highest, lowest = extreme_membranes(netlist.threshold, bias, netlist.decay_v, up, down)
+    highest, lowest = extreme_membranes(netlist.threshold, netlist.bias, netlist.decay_v, up, down)
     sinking = np.floor(np.minimum(lowest, MEMBRANE_MAX + 1))  # beyond its register counts as just beyond
     return Reach(
         sums=np.maximum(*bounds) << MEMBRANE_SHIFT,

@@ -54,7 +54,7 @@ def forgotten(netlist: Netlist) -> Forgotten:
     reached = reach(netlist)
     threshold = netlist.threshold << MEMBRANE_SHIFT
     most = np.minimum(reached.current, CURRENT_MAX)
-    bias = netlist.bias_mantissa << netlist.bias_exponent
+    bias = netlist.bias
     current = np.stack([-most, most])
     ends = np.minimum(reached.stored, MEMBRANE_MAX)
     membrane = np.stack([-ends, threshold])

@@ -97,7 +97,7 @@ def lift(netlist: Netlist) -> IntegerNetwork:
     """
     populations = tuple(_population(netlist, index) for index in range(len(netlist.layers)))
     projections = _projections(netlist)
-    voting = np.unique(netlist.layer[netlist.readout_class >= 0])
+    voting = np.unique(netlist.layer[netlist.voters])
     if len(voting) != 1:
         raise FormatError(f"{len(voting)} layers vote for classes, one is allowed; compile it again")
     return IntegerNetwork(

@@ -34,6 +34,7 @@ import numpy as np
 from spikeloom.compiler.archive import Kind
 from spikeloom.compiler.dynamics import MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.targets.loihi1.registers import (
+    DECAY_ONE,
     in_units,
 )
 from spikeloom.compiler.targets.netlist_file import (
@@ -158,6 +159,21 @@ class Netlist(AxonNetlist):
     def begins(self) -> IntArray:
         """Chip step of a recording from which each layer integrates, before 0 where all always do; (layers,)."""
         return np.array([-self.blank or layer.depth for layer in self.layers])
+
+    @property
+    def keep_u(self) -> IntArray:
+        """What a step keeps of each current, in 1/4096; shape (compartments,)."""
+        return DECAY_ONE - 1 - self.decay_u
+
+    @property
+    def keep_v(self) -> IntArray:
+        """What a step keeps of each membrane, in 1/4096; shape (compartments,)."""
+        return DECAY_ONE - self.decay_v
+
+    @property
+    def bias(self) -> IntArray:
+        """``mantissa * 2**exponent``, membrane units; shape (compartments,)."""
+        return self.bias_mantissa << self.bias_exponent
 
     def compartments_of(self, layer: int) -> IntArray:
         """Compartment ids of a layer, ordered by neuron; shape (compartments of the layer,)."""

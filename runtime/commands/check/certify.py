@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
-from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import require_least
-from spikeloom.compiler.files import sha256_of
 from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
-from spikeloom.runtime.inputs.recordings import load_recordings, name_of
+from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.encode import write_json
@@ -42,17 +39,7 @@ def run(request: CertifyRequest) -> Outcome:
     singles = int(data.step_counts.sum()) * data.taxels * data.events.shape[2]
     tell(f"trying {singles:,} single events of {number(len(data), 'recording')}, then every other change")
     certificates = certify(machine, data, shift=request.shift, most=request.most, jobs=request.jobs)
-    result = replace(
-        certificates,
-        provenance=Provenance(
-            spikeloom=__version__,
-            netlist=Path(request.netlist).name,
-            netlist_sha256=sha256_of(request.netlist),
-            data=name_of(request.data),
-            data_sha256=data.sha256,
-            split=request.split,
-        ),
-    )
+    result = replace(certificates, provenance=Provenance.of(request, data.sha256))
     write_picture(request.picture, lambda: taxel_map(result))
     write_json(request.output, result)
     return Outcome(result, sections)

@@ -30,7 +30,7 @@ def _in_range(netlist: Netlist) -> bool:
     """Whether no input whatever brings a sum, a membrane or a product that the kernel cannot hold."""
     reached = reach(netlist)
     lasts = netlist.decay_u + 1 != 2**DECAY_BITS
-    product = reached.stored * (2**DECAY_BITS - netlist.decay_v)
+    product = reached.stored * netlist.keep_v
     return bool(
         np.all(reached.sums <= SUM_MAX << MEMBRANE_SHIFT)
         and np.all(reached.current <= CURRENT_MAX)
@@ -102,7 +102,7 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
     bias = np.zeros(size, np.int32)
     threshold = np.full(size, NEVER, np.int32)
     compartment = np.full(size, -1)
-    bias[seats.position] = netlist.bias_mantissa << netlist.bias_exponent
+    bias[seats.position] = netlist.bias
     threshold[seats.position] = netlist.threshold << MEMBRANE_SHIFT
     compartment[seats.position] = np.arange(netlist.n_compartments)
     return Blocks(
@@ -144,10 +144,9 @@ class _Seats(NamedTuple):
 def _seats(netlist: Netlist) -> _Seats:
     """Seat compartments by depth, layer and neuron; a layer begins a block, and so does another decay within it."""
     depth = np.array([layer.depth for layer in netlist.layers])
-    keep = 2**DECAY_BITS - netlist.decay_v
-    keep_u = 2**DECAY_BITS - 1 - netlist.decay_u
-    order = np.lexsort((netlist.neuron, keep_u, keep, netlist.layer, depth[netlist.layer]))
-    groups = np.stack([netlist.layer, keep, keep_u])[:, order]
+    decays = netlist.keep_v, netlist.keep_u
+    order = np.lexsort((netlist.neuron, *reversed(decays), netlist.layer, depth[netlist.layer]))
+    groups = np.stack([netlist.layer, *decays])[:, order]
     begins = np.flatnonzero(np.append(True, np.any(np.diff(groups) != 0, axis=0))[: len(order)])
     sizes = np.diff(np.append(begins, len(order)))
     blocks = -(-sizes // LANES)

@@ -21,7 +21,6 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.registers import (
     ACCUMULATOR_MAX,
     CURRENT_MAX,
-    DECAY_BITS,
     MEMBRANE_MAX,
     MEMBRANE_SHIFT,
 )
@@ -80,10 +79,10 @@ def tables_of(netlist: Netlist) -> Tables:
         sum_of=(2 * netlist.synapse_compartment()[order] + (weight < 0)).astype(np.uint32),
         magnitude=np.abs(weight).astype(np.uint16),
         begin=netlist.begins[netlist.layer].astype(np.int32),
-        keep_u=(2**DECAY_BITS - 1 - netlist.decay_u).astype(np.int32),
-        keep_v=(2**DECAY_BITS - netlist.decay_v).astype(np.int32),
+        keep_u=netlist.keep_u.astype(np.int32),
+        keep_v=netlist.keep_v.astype(np.int32),
         threshold=(netlist.threshold << MEMBRANE_SHIFT).astype(np.int32),
-        bias=(netlist.bias_mantissa << netlist.bias_exponent).astype(np.int32),
+        bias=netlist.bias.astype(np.int32),
     )
 
 

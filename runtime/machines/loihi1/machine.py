@@ -151,7 +151,7 @@ class Loihi(Damageable, Explainable, Stoppable):
     @property
     def read_out_lag(self) -> int:
         """The depth of the latest layer that votes."""
-        voting = np.unique(self.netlist.layer[self.netlist.readout_class >= 0])
+        voting = np.unique(self.netlist.layer[self.netlist.voters])
         return max(int(self.netlist.layers[layer].depth) for layer in voting.tolist())
 
     def in_a_row(self, events: EventArray, lengths: IntArray | None) -> IntArray | None:

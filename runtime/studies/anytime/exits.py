@@ -79,15 +79,14 @@ def most_votes(machine: Stoppable, steps: int) -> IntArray:
     left = np.arange(steps + 1)
     each = np.where(interval[:, None] > 0, -(-left // np.maximum(interval, 1)[:, None]), 0)
     most = np.zeros((netlist.classes, steps + 1), np.int64)
-    np.add.at(most, netlist.readout_class[netlist.readout_class >= 0], each)
+    np.add.at(most, netlist.readout_class[netlist.voters], each)
     return most
 
 
 def steady_classes(machine: Stoppable) -> BoolArray:
     """Classes that get a vote in every step after their first one; shape (classes,)."""
     classes = machine.netlist.classes
-    readout = machine.netlist.readout_class
-    votes = readout[readout >= 0]
+    votes = machine.netlist.readout_class[machine.netlist.voters]
     counts = [np.bincount(each, minlength=classes) for each in (votes, votes[machine.steady])]
     return np.asarray((counts[0] == 1) & (counts[1] == 1))
 

@@ -78,7 +78,7 @@ def effects(netlist: Netlist, spikes: IntArray) -> FloatArray:
     sent = spikes * met[netlist.n_inputs :]
     whole = np.bincount(netlist.layer, sent, len(netlist.layers))
     share: FloatArray = sent / np.maximum(whole, 1e-300)[netlist.layer]
-    share[netlist.readout_class >= 0] = np.inf
+    share[netlist.voters] = np.inf
     return share
 
 

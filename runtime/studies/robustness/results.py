@@ -2,9 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
 
+from spikeloom.compiler import __version__
+from spikeloom.compiler.files import sha256_of
+from spikeloom.runtime.inputs.recordings import name_of
 from spikeloom.runtime.report.encode import OPTIONAL, key
 from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.requests.check import CertifyRequest, StressRequest
 from spikeloom.runtime.studies.robustness.definition import Level
 
 
@@ -85,6 +91,19 @@ class Provenance:
     data: str
     data_sha256: str
     split: str
+
+    @classmethod
+    def of(cls, request: CertifyRequest | StressRequest, data_sha256: str, **more: Any) -> Self:
+        """That of a request on recordings with this hash; `more` are the fields of a subclass."""
+        return cls(
+            spikeloom=__version__,
+            netlist=Path(request.netlist).name,
+            netlist_sha256=sha256_of(request.netlist),
+            data=name_of(request.data),
+            data_sha256=data_sha256,
+            split=request.split,
+            **more,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,11 +7,8 @@ from pathlib import Path
 import numpy as np
 from joblib import delayed
 
-from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.files import sha256_of
 from spikeloom.runtime.equivalence.breakdowns import undecided
-from spikeloom.runtime.inputs.recordings import name_of
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.requests.check import StressRequest
 from spikeloom.runtime.studies.robustness.bench import Bench, bench_of, by_length, whole
@@ -61,17 +58,13 @@ def stress(request: StressRequest, names: Sequence[str], requirements: Sequence[
         not_applicable={name: reason for name, reason in reasons.items() if reason is not None},
         required=tuple(map(str, requirements)),
         missed=unmet(requirements, curves),
-        provenance=ComparedProvenance(
-            spikeloom=__version__,
-            netlist_sha256=sha256_of(request.netlist),
-            checkpoint_sha256=loaded.sha256,
-            **loaded.read_as,
-            graph=loaded.graph,
-            data_sha256=data,
-            netlist=Path(request.netlist).name,
+        provenance=ComparedProvenance.of(
+            request,
+            data,
             checkpoint=Path(str(request.checkpoint)).name,
-            data=name_of(request.data),
-            split=request.split,
+            checkpoint_sha256=loaded.sha256,
+            graph=loaded.graph,
+            **loaded.read_as,
         ),
     )
 

@@ -33,7 +33,6 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.registers import (
     ACCUMULATOR_MAX,
     CURRENT_MAX,
-    DECAY_BITS,
     MEMBRANE_MAX,
     MEMBRANE_SHIFT,
 )
@@ -110,10 +109,10 @@ def chip_of(netlist: Netlist) -> Chip:
     pairs = place[netlist.synapse_compartment()], source[netlist.axon_of_synapse()]
     weight = sparse.csr_array((netlist.effective_weight(), pairs), shape=(places, netlist.n_inputs + places))
     columns = {
-        "keep_u": (2**DECAY_BITS - 1 - netlist.decay_u, 0),
-        "keep_v": (2**DECAY_BITS - netlist.decay_v, 0),
+        "keep_u": (netlist.keep_u, 0),
+        "keep_v": (netlist.keep_v, 0),
         "threshold": (netlist.threshold << MEMBRANE_SHIFT, NEVER),
-        "bias": (netlist.bias_mantissa << netlist.bias_exponent, 0),
+        "bias": (netlist.bias, 0),
         "lowest": (-np.minimum(reach(netlist).stored, MEMBRANE_MAX), 0),
         "label": (netlist.readout_class, -1),
     }

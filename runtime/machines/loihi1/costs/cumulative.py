@@ -20,11 +20,11 @@ from spikeloom.runtime.machines.loihi1.trace import Charges, side_by_side
 
 def least_intervals(netlist: Netlist) -> IntArray:
     """See :attr:`Stoppable.least_intervals`; in the order of compartments."""
-    voters = np.flatnonzero(netlist.readout_class >= 0)
+    voters = netlist.voters
     current = np.floor(largest_current(one_step_bounds(netlist)[0][voters], netlist.decay_u[voters]))
-    gain = current.astype(np.int64) + (netlist.bias_mantissa << netlist.bias_exponent)[voters]
+    gain = current.astype(np.int64) + netlist.bias[voters]
     threshold = netlist.threshold[voters] << MEMBRANE_SHIFT
-    keep = 2**DECAY_BITS - netlist.decay_v[voters]
+    keep = netlist.keep_v[voters]
     membrane = np.zeros_like(gain)
     interval = np.zeros_like(gain)
     open_ = np.ones(len(gain), np.bool_)
@@ -42,7 +42,7 @@ def least_intervals(netlist: Netlist) -> IntArray:
 
 def steady(netlist: Netlist) -> BoolArray:
     """See :attr:`Stoppable.steady`: what nothing lowers, and its own spike alone lifts over the threshold."""
-    voters = np.flatnonzero(netlist.readout_class >= 0)
+    voters = netlist.voters
     sender = netlist.axon_source[netlist.axon_of_synapse()] - netlist.n_inputs
     receiver = netlist.synapse_compartment()
     itself = np.bincount(
@@ -68,7 +68,7 @@ def run(
     updates[:, -1] = 1
     amounts = Charges(sources=sources, updates=updates)
     polls = np.zeros((netlist.n_inputs + netlist.n_compartments, netlist.classes), np.int64)
-    voters = np.flatnonzero(netlist.readout_class >= 0)
+    voters = netlist.voters
     polls[netlist.n_inputs + voters, netlist.readout_class[voters]] = 1
     polled = Charges(sources=polls, updates=np.zeros((netlist.n_compartments, netlist.classes), np.int64))
     parts = [polled, amounts, *map(timing.charges, latencies.values())]
