@@ -151,7 +151,8 @@ class Watch:
         if self._is_open():
             self._decide()
         self.stream.reset()
-        self.origin, self.decided = None, False
+        self.origin = None
+        self.decided = False
 
     def _decide(self, *, early: bool = False) -> None:
         """Run the steps by which the read-out lags, unless they change nothing, and show the decision."""

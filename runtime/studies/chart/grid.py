@@ -48,28 +48,31 @@ def parse_grid(text: str, target: Target) -> Grid:
 
     An OptionError names the value that cannot be understood, and what is allowed.
     """
-    axis, found = "", dict[str, dict[Any, None]]()
+    axis = ""
+    values_of: dict[str, dict[Any, None]] = {}
     for word in re.split("[,/]", text):
         name, equals, value = (part.strip() for part in word.rpartition("="))
         if equals:
-            if name not in AXES or name in found:
+            if name not in AXES or name in values_of:
                 raise OptionError(
                     f"--grid {name}: give each of {', '.join(AXES)} once, as in bits=2-6,8,planes=1-2"
                 )
-            axis, found[name] = name, {}
+            axis = name
+            values_of[name] = {}
         if not axis:
             raise OptionError(f"--grid {value}: belongs to no axis; begin with one, as in bits=2-6,8")
         reader, allowed = _readers(target)[axis]
         values = reader(value)
         if not values:
             raise OptionError(f"--grid {axis}={value}: allowed are {allowed}")
-        found[axis] |= dict.fromkeys(values)
-    return Grid(**{name: tuple(values) for name, values in found.items()})
+        values_of[axis] |= dict.fromkeys(values)
+    return Grid(**{name: tuple(values) for name, values in values_of.items()})
 
 
 def _readers(target: Target) -> dict[str, tuple[Callable[[str], Sequence[Any]], str]]:
     """What reads the values of each axis, with nothing for a value that is not allowed; and what is."""
-    widths, slots = sorted(target.choices["synapse.weight_bits"]), target.limit("core.threshold_slots")
+    widths = sorted(target.choices["synapse.weight_bits"])
+    slots = target.limit("core.threshold_slots")
     listed = ", ".join(map(str, widths))
     return {
         "bits": (
@@ -92,9 +95,11 @@ def _numbers(words: str, allowed: Collection[int], step: int = 1) -> list[int]:
     ends = re.fullmatch(r"([0-9]{1,3})%?(?:-([0-9]{1,3})%?(?::([0-9]{1,3})%?)?)?", words, re.ASCII)
     if ends is None:
         return []
-    first, last, every = int(ends[1]), int(ends[2] or ends[1]), int(ends[3] or step)
-    found = [*range(first, last, every), last] if first <= last and every else []
-    return list(dict.fromkeys(found)) if set(found) <= set(allowed) else []
+    first = int(ends[1])
+    last = int(ends[2] or ends[1])
+    every = int(ends[3] or step)
+    numbers = [*range(first, last, every), last] if first <= last and every else []
+    return list(dict.fromkeys(numbers)) if set(numbers) <= set(allowed) else []
 
 
 def _widths(words: str, allowed: Collection[int]) -> list[tuple[int, ...]]:

@@ -190,7 +190,8 @@ def require_suited(networks: Sequence[NetworkFile], splits: Mapping[str, Recordi
                 f"{network.path}: has {network.taxels} taxels and {network.classes} classes, {first.path} has "
                 f"{first.taxels} and {first.classes}; chart networks of one data set at a time"
             )
-        width, own = splits["test"].seconds, network.training.get("bin_s")
+        width = splits["test"].seconds
+        own = network.training.get("bin_s")
         if own not in (None, width):
             raise ModelError(
                 f"{network.path}: was trained on bins of {own:g} s, {first.path} reads bins of {width:g} s; chart "
@@ -206,7 +207,8 @@ def require_suited(networks: Sequence[NetworkFile], splits: Mapping[str, Recordi
 def require_grid(networks: Sequence[NetworkFile], grid: Grid, target: Target) -> None:
     """Refuse widths and layouts by layer that do not suit a network's layers."""
     for network in networks:
-        path, layers = network.path, network.layers
+        path = network.path
+        layers = network.layers
         for bits in grid.bits if network.forms is None else ():
             if len(bits) not in (1, len(layers)):
                 raise OptionError(

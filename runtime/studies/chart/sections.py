@@ -37,14 +37,14 @@ def sections(chart: Chart) -> list[Section]:
     figure = Figure(
         "chart", partial(picture, chart), "Test accuracy over energy and time of a mean inference."
     )
-    by, points = chart.chosen_by, chart.points
+    points = chart.points
     return [
         Section("Which one to deploy", _choice(chart)),
         Section("Accuracy against cost", [figure, *_fronts(chart)]),
         Section(
             "Every point",
             [
-                _table(points, by, f"{len(points)} points", 0),
+                _table(points, chart.chosen_by, f"{len(points)} points", 0),
                 Details("Commands of every point", _commands(points)),
                 Text("\n".join(_refused(chart))),
             ],
@@ -61,7 +61,9 @@ def printed(chart: Chart, folder: str) -> list[Section]:
 
 def _choice(chart: Chart) -> list[Block]:
     """The point to deploy and its commands."""
-    data, pick, point = chart.data, chart.budget, chart.chosen
+    data = chart.data
+    pick = chart.budget
+    point = chart.chosen
     lines = [
         f"{number(len(chart.points), 'point')} of {number(len(chart.networks), 'network')} on {data.test} test and "
         f"{data.train} training recordings; chosen on the training split, test figures are reported beside"

@@ -97,7 +97,9 @@ def _layout_options(layout: str) -> JsonObject:
 
 def commands(work: Measurement, layout: str, window: int) -> tuple[str, ...]:
     """What to type for the netlist of a network, and for its decisions and costs on a part of every recording."""
-    network, storage, data = work.network, work.storage, work.data
+    network = work.network
+    storage = work.storage
+    data = work.data
     parts = [network.name, *storage.label().split(), *([] if layout == FEWEST else [layout])]
     file = "-".join(parts).replace(":", "").replace("+", "-") + ".loom"
     calibrated = {"calibrate": data.path, "bin": data.bin_s}
@@ -137,7 +139,8 @@ def _loaded(network: NetworkFile) -> LoadedNetwork:
 @lru_cache(maxsize=8)
 def _decided(network: NetworkFile, data: Data, windows: tuple[int, ...]) -> dict[int, dict[str, IntArray]]:
     """Decisions of the float32 model by window and split."""
-    loaded, splits = _loaded(network), _in_steps(data, network)
+    loaded = _loaded(network)
+    splits = _in_steps(data, network)
 
     def decisions(part: Recordings) -> IntArray:
         return vote(votes_so_far(loaded.network, part)[:, -1])
@@ -172,11 +175,11 @@ def _share(decisions: IntArray, wanted: IntArray) -> Share:
 
 def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
     """Write the netlist of a layout and measure it."""
-    asked = _compile_request(work, layout)
+    request = _compile_request(work, layout)
     placing = Options(
-        cores_for=parse_cores(asked.cores_for),
+        cores_for=parse_cores(request.cores_for),
         provenance=provenance(
-            asked, _loaded(work.network), calibrated=_in_steps(work.data, work.network)["train"]
+            request, _loaded(work.network), calibrated=_in_steps(work.data, work.network)["train"]
         ),
     )
     try:
@@ -186,7 +189,8 @@ def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
     file = work.files[layout]
     file.parent.mkdir(parents=True, exist_ok=True)
     sha256 = write_netlist(netlist, file)
-    machine, splits = machine_of(netlist), _in_steps(work.data, work.network)
+    machine = machine_of(netlist)
+    splits = _in_steps(work.data, work.network)
     figures = {
         window: {
             split: _figures(machine, _part(work.network, splits[split], window), work.data.bin_s, decisions)
@@ -205,13 +209,13 @@ def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
 
 def _rounded(work: Measurement, loaded: LoadedNetwork) -> Compilation:
     """A network in its storage; how it is laid out is yet to be said."""
-    asked = _compile_request(work, FEWEST)
+    request = _compile_request(work, FEWEST)
     options = Options(
-        storage=storage_of(asked, work.network.forms),
-        prune_unused=asked.prune_unused,
+        storage=storage_of(request, work.network.forms),
+        prune_unused=request.prune_unused,
         training_events=_part(work.network, _in_steps(work.data, work.network)["train"], WHOLE).events,
     )
-    return to_integers(loaded.network, options, load_target(asked.target))
+    return to_integers(loaded.network, options, load_target(request.target))
 
 
 def _compile_request(work: Measurement, layout: str) -> CompileRequest:
