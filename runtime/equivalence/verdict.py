@@ -188,7 +188,7 @@ class Verdict(Shown):
 
     @property
     def accuracy(self) -> Mapping[str, float]:
-        """Shares of these."""
+        """Share of recordings that each side gets right."""
         return {side: count / self.samples for side, count in self.right.items()}
 
     @property
@@ -200,7 +200,7 @@ class Verdict(Shown):
 
     @property
     def decision_agreement(self) -> float | None:
-        """Share of these."""
+        """Share of recordings in which they do."""
         return None if self.equal is None else self.equal / self.samples
 
     @property
