@@ -44,7 +44,7 @@ class Charges:
 
 def side_by_side(parts: Sequence[Charges]) -> Charges:
     """Several charges as one: the sums of each after those before it."""
-    sources, updates = ([getattr(part, name) for part in parts] for name in Charges.__slots__)
+    sources, updates = ([getattr(part, name) for part in parts] for name in ("sources", "updates"))
     return Charges(sources=np.concatenate(sources, axis=1), updates=np.concatenate(updates, axis=1))
 
 
