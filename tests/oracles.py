@@ -48,8 +48,3 @@ def refused(error, words, call, *given, **options):
     for word in words.split("|"):
         assert word in message
     return message
-
-
-def comparable(netlist, layer):
-    """Neurons of a layer whose spikes can be compared: all but those left out because their spikes reach no neuron."""
-    return np.setdiff1d(np.arange(netlist.layers[layer].neurons), netlist.layers[layer].unread)

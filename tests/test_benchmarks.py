@@ -2,16 +2,11 @@
 
 import importlib
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from random_netlists import MEMORYLESS, SIMULATORS, large_netlist, ungated
-
-from spikeloom.compiler.arrays import read_only
-from spikeloom.runtime.machines.loihi1.engine import simulate
-from spikeloom.runtime.machines.loihi1.trace import aligned
+from random_netlists import SIMULATORS
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -36,51 +31,6 @@ def busy(workload):
     events = np.random.default_rng(5).random((6, 12, 78)) < 0.13
     layers = workload.build_chain(events)
     return events, layers, workload.place_chain(layers, taxels=39)
-
-
-def channels_first(events):
-    return np.ascontiguousarray(events.transpose(0, 2, 1)).view(np.uint8)
-
-
-def test_our_spikes_are_those_of_the_reference(workload, busy):
-    events, _, netlist = busy
-    trace = simulate(netlist, channels_first(events), threads=1, spikes=True)
-    for layer, expected in enumerate(workload.reference(workload.chain_of(netlist), events)):
-        assert expected.any()
-        assert np.array_equal(aligned(netlist, trace.spikes, layer), expected)
-
-
-def test_our_spikes_without_windows_are_those_of_the_pipelined_reference(workload, busy):
-    events, _, netlist = busy
-    events = np.concatenate([events, np.zeros_like(events[:, :4])], axis=1)
-    trace = simulate(ungated(netlist), channels_first(events), threads=1, spikes=True)
-    for layer, expected in enumerate(workload.reference(workload.chain_of(netlist), events, delay=1)):
-        assert np.array_equal(trace.spikes[:, :, netlist.compartments_of(layer)], expected)
-
-
-def test_matrices_of_any_wiring_give_our_spikes(workload):
-    netlist = ungated(large_netlist(3, proved=True))
-    netlist = replace(netlist, decay_u=read_only(np.full(netlist.n_compartments, MEMORYLESS)))
-    events = np.random.default_rng(4).random((1, netlist.n_inputs, 30)) < 0.3
-    expected = simulate(netlist, events.view(np.uint8), threads=1, spikes=True).spikes[0]
-    stages = workload.stages_of(netlist)
-    ids = [netlist.compartments_of(layer) for layer in range(len(stages))]
-    assert any(layer in stage.weights for layer, stage in enumerate(stages))
-    membranes, fired = (
-        [np.zeros(len(each), np.int64) for each in ids],
-        [np.zeros(len(each), int) for each in ids],
-    )
-    for step in range(30):
-        sources = {-1: events[0, :, step], **dict(enumerate(fired))}
-        fired = []
-        for stage, membrane in zip(stages, membranes, strict=True):
-            kept = np.sign(membrane) * (np.abs(membrane) * (4096 - stage.decay) // 4096)
-            given = sum(weight @ sources[source] for source, weight in stage.weights.items())
-            membrane[:] = kept + 64 * given + stage.bias
-            fired.append(membrane > stage.threshold)
-            membrane[fired[-1]] = 0
-        assert all(np.array_equal(each, expected[step, own]) for each, own in zip(fired, ids, strict=True))
-    assert expected.any()
 
 
 @pytest.mark.parametrize("run", SIMULATORS)

@@ -208,19 +208,6 @@ def test_short_words_for_help_and_version(capsys, words, shown):
     assert shown in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "meant"),
-    [
-        (["verfy"], "verify"),
-        (["estimate", "x.loom", "--lable"], "--table"),
-        (["run", "--dta", "x"], "--data"),
-    ],
-)
-def test_a_misspelt_word_is_answered_with_the_near_one(capsys, words, meant):
-    assert cli.main(words) == 2
-    assert f"did you mean {meant}?" in capsys.readouterr().err
-
-
 HEAVY = "torch tqdm numba scipy.stats matplotlib onnx onnxruntime networkx h5py jinja2"
 """Packages that take a tenth of a second and more to load."""
 

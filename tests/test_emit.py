@@ -14,7 +14,7 @@ from random_netlists import Axon, Neuron, build
 
 from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError, OptionError
-from spikeloom.compiler.ir import INPUT, fan_in
+from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.storage import Exact, Packing
@@ -64,26 +64,6 @@ def test_the_netlist_holds_exactly_the_network(network, target):
     for post in range(len(network.populations)):
         for pre, weight in nets.dense_weights(network, post).items():
             np.testing.assert_array_equal(dense[pre, post], weight)
-
-
-@given(nets.integer_networks(), nets.tight_targets())
-def test_layers_are_those_of_the_network(network, target):
-    parts = nets.legal_partition(network, target)
-    netlist = nets.seated(network, parts, target, {"seed": 1})
-    for index, population in enumerate(network.populations):
-        ids = netlist.compartments_of(index)
-        assert netlist.neuron[ids].tolist() == list(range(population.size))
-        layer = netlist.layers[index]
-        into = [p for p in network.projections if p.post == index]
-        assert (layer.name, layer.neurons) == (population.name, population.size)
-        assert layer.synapses == fan_in(network, index).sum()
-        assert layer.max_fan_in == fan_in(network, index).max()
-        assert layer.weight_bits == max(p.bits for p in into)
-    assert (netlist.taxels, netlist.polarities) == (network.input.taxels, network.input.polarities)
-    assert (netlist.classes, netlist.provenance, netlist.target) == (network.classes, {"seed": 1}, "loihi1")
-    assert all(
-        not getattr(netlist, name).flags.writeable for name in ("neuron", "axon_source", "synapse_weight")
-    )
 
 
 def test_lists_are_sparse_where_that_saves_visits():

@@ -96,17 +96,6 @@ def test_large_networks_reach_every_regime():
     assert saturations > 0
 
 
-def test_threads_and_batches_do_not_matter():
-    netlist = large_netlist(7, proved=True)
-    prepared = engine.prepare(netlist)
-    events = random_batch(8, netlist.n_inputs)
-    one = engine.simulate(prepared, events, **KEPT, threads=1)
-    assert_equal(one, engine.simulate(netlist, events.astype(np.bool_), **KEPT, threads=3))
-    for index in range(len(events)):  # each alone, so nothing leaks from one into the next
-        alone = engine.simulate(prepared, events[index : index + 1], **KEPT)
-        assert_equal(recording_of(one, index), recording_of(alone, 0))
-
-
 def test_only_what_is_asked_for_is_kept():
     netlist = large_netlist(7, proved=True)
     events = random_batch(8, netlist.n_inputs)
@@ -276,11 +265,13 @@ def test_the_random_pipelines_reach_every_way_of_storage():
     assert whole.tolist() == [0, 64]
 
 
-def test_recordings_of_any_length_together():
+@pytest.mark.parametrize("stepwise", [False, True])
+def test_recordings_of_any_length_together_on_several_threads(stepwise):
     netlist = pipeline(3, inputs=20, sizes=SHAPES[3], density=0.5)
     events = (np.random.default_rng(4).random((9, 20, 16)) < 0.2).astype(np.uint8)
     lengths = np.array([16, 0, 1, 5, 16, 3, 2, 15, 8])
-    together = engine.simulate(netlist, events, lengths=lengths, **KEPT)
+    prepared = engine.prepare(netlist, stepwise=stepwise)
+    together = engine.simulate(prepared, events, lengths=lengths, threads=3, **KEPT)
     for index, length in enumerate(lengths):
         expected = spec.simulate(netlist, events[index, :, :length])
         found = recording_of(together, index)
@@ -389,22 +380,3 @@ def test_scattered_synapses_take_the_other_kernel():
     assert isinstance(
         lay_out_blocks(build([Neuron() for _ in range(1000)], axons, n_inputs=6000, depths=[0])), str
     )
-
-
-@pytest.mark.parametrize("layer", [0, 1, 2])
-def test_layers_without_neurons_are_charged_nothing(layer):
-    netlist = build(
-        [Neuron(layer=layer, bias=10), Neuron(layer=layer)],
-        [Axon(source=0, targets=((0, 50),))] if layer == 0 else [],
-        n_inputs=1,
-        depths=[0, 1, 2],
-    )
-    charges = Charges(sources=np.array([[1], [10], [20]]), updates=np.array([[300], [400]]))
-    events = np.ones((1, 1, 6), np.uint8)
-    traces = [
-        engine.simulate(engine.prepare(netlist, stepwise=stepwise), events, threads=1, charges=charges)
-        for stepwise in (False, True)
-    ]
-    assert isinstance(lay_out_blocks(netlist), Blocks)
-    assert traces[1].charged.sum() == 6 + 10 * traces[1].counts.spikes[0, 0] + 6 * 300
-    np.testing.assert_array_equal(traces[0].charged, traces[1].charged)

@@ -330,7 +330,3 @@ def test_the_first_recording_that_differs_and_its_first_roots(report):
     assert whole == report("--top", "1000", "--sample", "0")
     assert whole == report("--top", "1000", "--sample", "sample_0_label_0.npy")
     assert report("--top", "2")["top"] == whole["top"][:2]
-
-
-def test_the_netlist_of_a_checkpoint_has_no_faults(report):
-    assert not report()["faults"]

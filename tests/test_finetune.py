@@ -94,24 +94,10 @@ def test_storage_that_no_chip_has_is_refused(change):
     refused(ModelError, "node n1 (LIF): has no usable storage", made_nir.lowered, graph)
 
 
-def test_what_cannot_be_fine_tuned(tmp_path):
-    made, counters, timed = map(specimen, ("recurrent", "counters", "timed"))
-    words = ("finetune", made.network, *made.reading, "--data", made.data)
-    assert "no checkpoint, it is written back as .nir" in refusal(*words, "-o", tmp_path / "x.pt")
-    assert "--scale-groups 4: is for --weight-bits" in refusal(
-        *words, "--scale-groups", "4", "-o", tmp_path / "x.nir"
-    )
-    assert "has 39 taxels" in refusal(*words[:-1], "synthetic", "-o", tmp_path / "x.nir")
-    assert "no gradient" in refusal(
-        "finetune", counters.network, "--data", counters.data, "-o", tmp_path / "x.nir"
-    )
-    assert "written back as .pt" in refusal(
-        "finetune", timed.network, "--data", timed.data, "-o", tmp_path / "x.nir"
-    )
-    assert not list(tmp_path.glob("x.*"))
+def test_classes_without_recordings_are_warned_of(tmp_path):
+    made = specimen("recurrent")
     few = np.zeros((CLASSES, TAXELS, 2, 15), np.uint8)
     recordings_folder(tmp_path / "few", train=few, test=few, classes=2)
-    _, _, told = run(
-        *words[:-1], tmp_path / "few", "--weight-bits", "4", "--epochs", "1", "-o", tmp_path / "x.nir"
-    )
+    words = ("finetune", made.network, *made.reading, "--data", tmp_path / "few", "--weight-bits", "4")
+    _, _, told = run(*words, "--epochs", "1", "-o", tmp_path / "x.nir")
     assert f"few: their classes are 0..1, the network's 0..{CLASSES - 1}" in told

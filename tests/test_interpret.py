@@ -6,7 +6,7 @@ import networkx as nx
 import numpy as np
 import pytest
 import random_networks as nets
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from oracles import refused
@@ -102,17 +102,6 @@ def test_a_run_is_the_step_by_step_loop(networks, run, slowly, data):
         for post in range(len(network.populations)):
             np.testing.assert_array_equal(activity.spikes[post][sample], spikes[post])
             np.testing.assert_array_equal(activity.membranes[post][sample], membranes[post])
-
-
-@settings(max_examples=5)
-@given(st.data())
-def test_a_recording_runs_the_same_alone_and_in_another_batch(data):
-    network = data.draw(nets.integer_networks())
-    events = data.draw(nets.recordings_for(network.input.size, samples=20, most=4))
-    together = run_integer(network, events).spikes
-    for sample in range(len(events)):
-        alone = run_integer(network, events[sample : sample + 1]).spikes
-        assert all(np.array_equal(a[0], b[sample]) for a, b in zip(alone, together, strict=True))
 
 
 def test_a_membrane_that_dies_away_is_flushed():
@@ -226,13 +215,6 @@ def with_projection(network, index, **changes):
     projections = list(network.projections)
     projections[index] = replace(projections[index], **changes)
     return replace(network, projections=tuple(projections))
-
-
-@pytest.mark.parametrize(
-    ("make", "verify"), [(nets.chain, invariants.verify), (nets.integer_chain, integers.verify)]
-)
-def test_a_sound_network_passes(make, verify):
-    verify(make([[2, 4, 6], [8, 10, 12]], [[2, 0], [0, 2]]))
 
 
 def test_a_recurrent_population_is_no_deeper_for_it():

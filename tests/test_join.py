@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from commands import as_json, refusal
-from made_files import checkpoint_bytes, released, state_dict, weights
+from made_files import checkpoint_bytes
 from numpy.testing import assert_array_equal
 from oracles import refused
 from test_checkpoint import rebuilt
 from timed_networks import GRAPH, TIMING, events_of, written
-from zoo import specimen, stored, tuned
+from zoo import stored, tuned
 
 from spikeloom.compiler.checkpoint import SHARED, towers_of
 from spikeloom.compiler.dynamics import PLAIN, Clocks, Dynamics
@@ -230,21 +229,3 @@ def test_graphs_and_storage_must_agree(tmp_path):
     for other, what in ((another, "graph"), (tuned(one, 1), "storage")):
         with pytest.raises(ModelError, match=rf"differ from a in {what} \(b\);"):
             join([one, other], ["a", "b"])
-
-
-def test_what_cannot_be_joined_says_so(data, tmp_path):
-    one, made, old = f"{data}/timed1.pt", specimen("joined"), tmp_path / "old.t7"
-    torch.save(released(state_dict(weights())), old)
-    for words, reason in (
-        (f"join {one} -o {tmp_path}/x.pt", f"{one} is one network already; give two or more"),
-        (f"join {one} {one} -o {one}", f"-o {one}: is an input of this command"),
-        (f"join {one} {made.netlist} -o {tmp_path}/x.pt", f"{made.netlist}: "),
-        (
-            f"join {one} {data}/timed.pt --weights best -o {tmp_path}/x.pt",
-            "--weights best: the file holds last",
-        ),
-        (f"join {one} {old} -o {tmp_path}/x.pt", f"{old}: does not say its graph and constants"),
-        (f"finetune {made.network} --data {made.data} --weight-bits 4 -o {tmp_path}/x.pt", "has 3 towers"),
-    ):
-        assert reason in refusal(*words.split())
-    assert not (tmp_path / "x.pt").exists()

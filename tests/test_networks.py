@@ -12,8 +12,6 @@ from hypothesis import strategies as st
 from made_files import events as made_events
 from made_files import small_checkpoint
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import probed
-from scipy import sparse
 from test_dynamics import surrogate_spike
 
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
@@ -351,23 +349,6 @@ def test_spikes_and_membranes_are_those_of_plain_torch(tmp_path, system, padding
             assert membranes[layer].dtype == dtype
             assert_allclose(membranes[layer][sample], membrane, rtol=tolerance, atol=tolerance)
     assert all(0 < spikes[layer].mean() < 1 for layer in ("conv1", "fc1"))
-
-
-@pytest.mark.parametrize("system", NEW)
-def test_expansion_equals_probing_the_layer(tmp_path, system):
-    """The general way: any affine stage, here plain torch code, by its responses to unit vectors."""
-    network = network_of(system)
-    checkpoint = saved(tmp_path, network)
-    first = plain_first(system, {name: tensor.double() for name, tensor in state_of(network).items()})
-    weight, bias = probed(
-        lambda batch: np.stack([first(torch.tensor(row).view(39, 2)).numpy() for row in batch]), 78
-    )
-    expanded = expand(checkpoint, seen_by(system))
-    assert expanded.populations[0].name == "conv1"
-    assert_allclose(expanded.projections[0].weight.toarray(), weight, atol=1e-12)
-    assert_allclose(expanded.populations[0].bias, bias, atol=1e-12)
-    assert isinstance(expanded.projections[0].weight, sparse.csr_array)
-    assert expanded.projections[0].weight.nnz == np.count_nonzero(weight)
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.runtime.machines.loihi1 import engine
 
 FILES = Path(__file__).parent / "nir"
+"""Networks written by the package that each is named after, and what that package made of a recording."""
 
 
 READ = {

@@ -274,21 +274,6 @@ def test_the_optimum_of_small_cases(cores, mesh, seed, kind):
     assert set(placement.tiles) <= set(range(width * height))
 
 
-def test_of_equal_layouts_the_one_with_more_east_west_hops_is_taken():
-    """Two cores on tiles for one: side by side, not one above the other."""
-    placement = place(np.array([[0.0, 1.0], [0.0, 0.0]]), nets.small_target(mesh_tile_cores=1))
-    assert abs(placement.tiles[0] - placement.tiles[1]) == 1
-
-
-def test_a_slightly_better_layout_is_not_given_up_for_cheaper_hops():
-    """On a mesh of two rows the heavier pair sits side by side even if that costs more vertical hops."""
-    traffic = np.zeros((3, 3))
-    traffic[0, 1], traffic[0, 2], traffic[1, 2] = 1.0, 1.0 + 1e-6, 1.0 + 2e-6
-    placement = place(traffic, nets.small_target(mesh_tile_cores=1, mesh_width=2, mesh_height=2))
-    # one pair is two hops apart: the lightest
-    assert placement.spike_hops == pytest.approx(3 + 3e-6 + 1.0, rel=1e-12)
-
-
 @pytest.mark.parametrize(("kind", "cores"), [("random", 12), ("star", 12), ("layered", 64)])
 def test_many_cores_are_placed_well(cores, kind):
     rng = np.random.default_rng(1)

@@ -20,11 +20,10 @@ from random_networks import (
     ring,
 )
 
-from spikeloom.compiler import invariants
 from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.interpret import channels_last, run_float
-from spikeloom.compiler.ir import INPUT, depths, fan_in
+from spikeloom.compiler.ir import fan_in
 from spikeloom.compiler.passes.expand import expand, hop_powers, synapses
 from spikeloom.compiler.passes.prune import disconnect, either, never_fires
 from spikeloom.compiler.pipeline import run
@@ -73,9 +72,6 @@ def test_the_table_of_passes_in_the_docs():
     docs = (Path(__file__).parents[1] / "docs" / "compile.md").read_text("utf-8")
     for step in PASSES:
         assert f"| {step.name} | {step.does} | {step.keeps} |" in docs
-
-
-NOWHERE = Placement(tiles=(-1,), spike_hops=0)
 
 
 @pytest.mark.parametrize(
@@ -187,23 +183,6 @@ def test_structure_does_not_depend_on_the_weights():
     zeroed = dataclasses.replace(checkpoint.dense[0], weight=np.zeros_like(checkpoint.dense[0].weight))
     network = expand(dataclasses.replace(checkpoint, dense=(zeroed, *checkpoint.dense[1:])), ring(5))
     assert fan_in(network, 1).tolist() == [15] * 6
-
-
-def test_a_checkpoint_becomes_a_chain_of_populations():
-    network = expand(random_checkpoint(taxels=39, features=64, sizes=(128, 256, 36)), adjacency_of("manual"))
-    invariants.verify(network)
-    assert [(p.name, p.size) for p in network.populations] == [
-        ("conv1", 2496),
-        ("fc1", 128),
-        ("fc2", 256),
-        ("fc3", 36),
-    ]
-    assert [(p.pre, p.post) for p in network.projections] == [(INPUT, 0), (0, 1), (1, 2), (2, 3)]
-    assert depths(network) == (0, 1, 2, 3)
-    assert [int(fan_in(network, post).sum()) for post in range(4)] == [97_920, 319_488, 32_768, 9_216]
-    assert [int(fan_in(network, post).max()) for post in range(4)] == [60, 2496, 128, 256]
-    assert network.readout.population == 3
-    assert network.readout.label.tolist() == list(range(36))
 
 
 @given(float_networks(), st.data())

@@ -318,11 +318,6 @@ def test_a_proof_means_that_saturation_changes_nothing(data):
         assert np.abs(membranes).max() <= 2**23 - 1
 
 
-def mantissas(weight, scale, bits):
-    """Weights rounded to one plane of a width."""
-    return registers.round_steps(weight, scale, bits, (0,)) * registers.weight_step(bits)
-
-
 def test_registers_have_their_published_widths():
     assert (registers.ACCUMULATOR_MAX, registers.CURRENT_MAX, registers.MEMBRANE_MAX) == (
         2097151,
@@ -343,17 +338,6 @@ def test_registers_have_their_published_widths():
 @given(st.integers(-(2**24), 2**24), st.integers(0, 4096))
 def test_decay_rounds_the_exact_product_toward_zero(x, lost):
     assert decayed(x, lost) == int(Fraction(x * (4096 - lost), 4096))  # int of a fraction truncates
-
-
-@given(st.sampled_from(nets.BITS), st.lists(st.floats(-3, 3), min_size=1, max_size=5), st.floats(0.1, 300))
-def test_weights_are_the_nearest_of_their_grid_and_symmetric(bits, weights, scale):
-    step, weight = registers.weight_step(bits), np.array(weights)
-    mantissa = mantissas(weight, scale, bits)
-    grid = np.arange(-(256 - step), 256, step)
-    assert set(mantissa.tolist()) <= set(grid.tolist())
-    assert np.array_equal(mantissas(-weight, scale, bits), -mantissa)
-    nearest = np.abs(grid[:, None] - weight * scale).min(axis=0)
-    np.testing.assert_allclose(np.abs(mantissa - weight * scale), nearest, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("bias", [4095.5 * 128, -4095.5 * 128, 1e9])

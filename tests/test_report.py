@@ -38,7 +38,7 @@ from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.report import drawing, html
 from spikeloom.runtime.report.encode import OPTIONAL, decode, encode, key
 from spikeloom.runtime.report.sections import Code, Details, Facts, Figure, Section, Table, Text, terminal
-from spikeloom.runtime.studies.chart.sections import page, picture, printed, series_of
+from spikeloom.runtime.studies.chart.sections import page, picture, printed
 
 REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data", "-o", "out.html")
 HEADINGS = [
@@ -519,9 +519,6 @@ def test_numbers_of_numpy_are_plain_and_what_has_no_form_is_refused():
     refused(TypeError, "", encode, object())
 
 
-PARTS = ["Which one to deploy", "Accuracy against cost", "Every point", "Provenance"]
-
-
 @pytest.fixture
 def chart():
     return made_chart("energy=100uJ", "accuracy=80")
@@ -543,10 +540,6 @@ def test_a_choice_that_others_surpass_on_test_says_so(chart):
 
 
 # -- pictures ----------------------------------------------------------------------------------------------------------
-def test_colours_are_for_networks_where_there_are_several_else_for_storage(chart):
-    assert series_of(chart.points) == "network"
-    assert series_of(chart.points[:6]) == "storage"
-    assert series_of(chart.points[4:6]) == "window"
 
 
 def test_every_point_is_a_mark_that_tells_its_figures_and_commands(chart):
@@ -561,16 +554,6 @@ def test_every_point_is_a_mark_that_tells_its_figures_and_commands(chart):
 
 
 # -- page --------------------------------------------------------------------------------------------------------------
-def test_the_page_needs_nothing_else_and_holds_every_command(chart):
-    text = page(chart)
-    assert not re.findall(r'(?:src|href)="(?!#)', text)
-    assert not re.search(r"url\((?!#)|@import", text)
-    assert "a <b>" not in text
-    assert re.findall("<h2>(.*?)</h2>", text) == PARTS
-    for point in chart.points:
-        for command in point.commands:
-            assert command.replace("<", "&lt;").replace(">", "&gt;").replace("'", "&#39;") in text
-    assert page(made_chart("energy=100uJ", "accuracy=80")) == text
 
 
 def test_a_chart_in_a_narrow_window_and_a_dark_scheme(chart, tmp_path):

@@ -17,7 +17,7 @@ from made_files import (
     weights,
 )
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import comparable, load_weights, refused
+from oracles import load_weights, refused
 from test_checkpoint import rebuilt
 
 import spikeloom.models.training.train
@@ -26,7 +26,7 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.storage import Fixed, Given, Packing
+from spikeloom.compiler.storage import Fixed, Packing
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.options import Options
@@ -36,8 +36,7 @@ from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_fo
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.networks import Architecture, SpikingNet
-from spikeloom.models.networks.quantised import QuantisedNet, quantised_spikes
-from spikeloom.models.recordings.events import load_data
+from spikeloom.models.networks.quantised import QuantisedNet
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.training.evaluate import evaluate
@@ -47,8 +46,6 @@ from spikeloom.models.training.record import training_record
 from spikeloom.models.training.robust import disturb
 from spikeloom.models.training.train import Epoch, state_files, train, train_both, validation_split
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.studies.training.plan import both_splits
 
 GRAPH = build_graph("manual")
@@ -293,15 +290,6 @@ def test_the_model_computes_what_the_compiled_network_computes(tmp_path, bits, s
     assert sum(int(spikes.sum()) for spikes in expected) > 0
 
 
-def test_batches_do_not_mix(tmp_path):
-    checkpoint, adjacency = small_checkpoint(tmp_path)
-    data = drawn(checkpoint, 0, samples=5)
-    model = QuantisedNet(expand(checkpoint, adjacency), tuned_forms(checkpoint, adjacency, data.events, 4))
-    together = model(time_first(data.events))
-    alone = torch.cat([model(time_first(data.events[i : i + 1])) for i in range(5)])
-    assert torch.equal(together, alone)
-
-
 def test_gradients_are_those_of_the_rounded_float_model(tmp_path):
     """At 8 bits and with scales this fine the straight-through gradient is the float model's, to a few parts in 100."""
     checkpoint, adjacency = small_checkpoint(tmp_path)
@@ -430,37 +418,6 @@ def test_forms_that_cannot_be_used(tmp_path, change):
     save_checkpoint(path, {"last": weights()}, **made_files.graph_facts(graph), **constants, forms=forms)
     path.write_bytes(rebuilt(path.read_bytes(), lambda manifest, _: change(manifest["forms"])))
     refused(ModelError, f"{path}: the manifest has no usable forms", read_checkpoint, path)
-
-
-@pytest.mark.slow
-@pytest.mark.recordings
-def test_the_model_is_the_chip_on_every_recording(tmp_path, objects_zip, containers_zip):
-    adjacency = normalised_adjacency(build_graph("manual").edges, 39)
-    for name, place in (("objects", objects_zip), ("containers", containers_zip)):
-        output = tmp_path / f"{name}.pt"
-        words = [
-            "finetune",
-            f"pretrained:{name}",
-            "--data",
-            str(place),
-            "--weight-bits",
-            "4",
-            "--epochs",
-            "2",
-        ]
-        assert main([*words, "-o", str(output)]) == 0
-        checkpoint = read_checkpoint(output)
-        netlist = compile_network(
-            expand(checkpoint, adjacency), Options(storage=Given(checkpoint.forms))
-        ).netlist
-        for split in ("train", "test"):
-            data = load_data(place, split)
-            model = quantised_spikes(expand(checkpoint, adjacency), data.events)
-            trace = engine.simulate(netlist, data.events.reshape(len(data), -1, data.steps), spikes=True)
-            for index, layer in enumerate(netlist.layers):
-                kept = comparable(netlist, index)  # the chip leaves out what nobody hears
-                ours = aligned(netlist, trace.spikes, index)[..., kept]
-                np.testing.assert_array_equal(ours, model[layer.name][..., kept])
 
 
 def test_a_class_without_training_recordings_is_said(tmp_path, capsys):

@@ -155,10 +155,6 @@ def test_what_the_chip_cannot_hold_is_refused(tmp_path):
     write_counters(tmp_path / "c.pt", random_counters(0, most=127))
     code, _, err = run("compile", tmp_path / "c.pt", "--target", "truenorth", "-o", tmp_path / "c.loom")
     assert (code, "c.pt: weights of up to" in err) == (2, True)
-    code, _, err = run(
-        "train", "--data", "synthetic", "--system", "counters", "--weight-bits", "9", "-o", "x.pt"
-    )
-    assert (code, "--weight-bits 9: allowed are 2 to 8" in err) == (2, True)
 
 
 def test_rounded_weights_keep_the_sums():

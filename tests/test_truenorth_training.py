@@ -2,13 +2,11 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from commands import as_json, refusal
-from made_files import CLASSES, TAXELS, own_file
 from oracles import refused
 from random_crossbars import random_network
 from zoo import STEPS, specimen
@@ -245,49 +243,14 @@ def test_from_recordings_to_the_chip(tmp_path, monkeypatch):
 
 @pytest.fixture
 def native(tmp_path, monkeypatch):
-    """A network of the zoo, its netlist and recordings, another network, and one of floats."""
+    """A network of the zoo, its netlist and recordings."""
     made = specimen("native")
     for name in ("net.pt", "net.loom", "data"):
         (tmp_path / name).symlink_to(made.folder / name)
     monkeypatch.chdir(tmp_path)
-    written(
-        "two.pt",
-        {which: random_network(seed, taxels=TAXELS, classes=CLASSES) for which, seed in WHICH.items()},
-    )
-    own_file(Path("own.pt"))
 
 
-WHICH = {"last": 4, "best": 5}
-SYNTHETIC = TRAIN.replace("--data data", "--data synthetic")
 VERIFY = "verify net.loom --data data --checkpoint"
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (f"{SYNTHETIC} --recipe timed -o z.pt", "--recipe timed: "),
-        ("train --data synthetic --graph manual --copies 2 -o z.pt", "--copies 2: is for"),
-        ("compile net.pt -o z.loom", "--target loihi1: net.pt was trained for IBM TrueNorth"),
-        ("compile net.pt --target truenorth --planes 2 -o z.loom", "--planes 2: is not for"),
-        ("inspect net.pt --beta 0.3", "--beta 0.3: net.pt is a network for TrueNorth and says that itself"),
-        (f"{VERIFY} net.pt --min-agreement 1", "--min-agreement 1.0: the network is whole numbers"),
-        (f"{VERIFY} two.pt", "--checkpoint two.pt: net.loom was compiled from another file"),
-        (
-            "verify two.loom --data data --checkpoint two.pt",
-            "--weights last: two.loom was compiled from best",
-        ),
-        ("join net.pt own.pt -o z.pt", "net.pt: is a network trained for TrueNorth, not yet compiled; only"),
-        (
-            "compile own.pt --target truenorth -o z.loom",
-            "fc3, all 4 neurons: keep 0.2 of their membranes a step",
-        ),
-    ],
-)
-@pytest.mark.usefixtures("native")
-def test_mistakes(words, said):
-    as_json("compile", "two.pt", "--weights", "best", "--target", "truenorth", "-o", "two.loom")
-    assert said in refusal(*words.split())
-    assert not list(Path().glob("z.*"))
 
 
 @pytest.mark.usefixtures("native")
