@@ -1,6 +1,7 @@
 """Small checkpoints and recordings on disk, for the tests that go through files and the command line."""
 
 import io
+import json
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -10,10 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from spikeloom.compiler.archive import ZIP_DATE
+from spikeloom.compiler.archive import ZIP_DATE, read_npy
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
+from spikeloom.compiler.formats.own_checkpoint import content_digest, save_checkpoint
 from spikeloom.models.graphs import Graph, normalised_adjacency
 from spikeloom.models.recordings.evtouch import Recordings
 
@@ -156,3 +157,17 @@ def csv_folder(folder: Path, *, taxels: int = TAXELS, samples: int = 8, classes:
             "\n".join(["time_s,taxel,polarity", *lines])
         )
     return folder
+
+
+def rebuilt(
+    content: bytes, change: object, *, sign: bool = True, compression: int = zipfile.ZIP_STORED
+) -> bytes:
+    """Our own format with changed members; signed anew unless told otherwise."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    manifest = json.loads(members["manifest.json"])
+    change(manifest, members)
+    if sign:
+        arrays = {n.removesuffix(".npy"): read_npy(m) for n, m in members.items() if n.endswith(".npy")}
+        manifest["sha256"] = content_digest(manifest, arrays)
+    return zipped(members | {"manifest.json": json.dumps(manifest)}, compression)

@@ -6,9 +6,11 @@ import numpy as np
 from hypothesis import strategies as st
 from random_netlists import assert_equal
 
+from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.dynamics import clocks_over
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron
+from spikeloom.compiler.targets.truenorth.counting import LARGEST
 from spikeloom.compiler.targets.truenorth.native import (
     UNIT,
     NativeNetwork,
@@ -185,3 +187,38 @@ def defined_spikes(network, events) -> dict[str, np.ndarray]:
                 held = 0 if spikes[t, n] else max(held, -int(stage.floor[n]))
         found[stage.name] = before = spikes
     return found
+
+
+def random_counters(
+    seed, *, taxels=3, parts=1, classes=3, thresholds=(1, 3), most=LARGEST, steps=20, ramp=12
+):
+    """Some counters of a sensor, whose sums of the data never reach the threshold."""
+    rng = np.random.default_rng(seed)
+    kinds = [
+        (channel, part, k) for k in thresholds for part in range(parts) for channel in range(2 * taxels)
+    ]
+    counter = np.array(kinds)[rng.random(len(kinds)) < 0.8][::-1]
+    weight = rng.integers(-most, most + 1, (classes, len(counter))) * (
+        rng.random((classes, len(counter))) < 0.7
+    )
+    slope = int(rng.integers(1, 9))
+    highest = int(weight.clip(min=0).sum(axis=1).max())
+    sizes = {"taxels": taxels, "polarities": 2, "classes": classes, "bins": 1, "steps": steps}
+    threshold = highest + slope * steps + 0.5
+    return Counters(
+        **sizes,
+        parts=parts,
+        ramp=ramp,
+        counter=counter,
+        weight=weight,
+        slope=float(slope),
+        threshold=threshold,
+    )
+
+
+def counter_events(seed, counters, rate=0.3):
+    """A recording (taxels, polarities, steps) that is silent in the ramp."""
+    shape = counters.taxels, counters.polarities, counters.clocks.length
+    events = (np.random.default_rng(seed).random(shape) < rate).astype(np.uint8)
+    events[..., counters.steps :] = 0
+    return events

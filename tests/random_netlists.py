@@ -226,3 +226,19 @@ def assert_equal(left: Trace, right: Trace) -> None:
     for field in fields(left.counts):
         pair = (getattr(trace.counts, field.name) for trace in (left, right))
         np.testing.assert_array_equal(*pair, err_msg=field.name, strict=True)
+
+
+def six_steps():
+    """Two inputs, h0 and h1 one tile north of them, o one tile east of these; what SANA-FE 2.2.9 was run on."""
+    neurons = [Neuron(threshold=80), Neuron(threshold=80), Neuron(threshold=80, core=1, layer=1)]
+    axons = [
+        Axon(source=0, targets=((0, 60), (1, -30))),
+        Axon(source=1, targets=((0, 50), (1, 90))),
+        Axon(source=2, core=1, targets=((0, 100),)),
+        Axon(source=3, core=1, targets=((0, 70),)),
+    ]
+    netlist = build(neurons, axons, n_inputs=2, depths=[0, 1])
+    netlist = replace(netlist, core_tile=read_only([8, 9]), format_index_bits=read_only([0]))
+    # an event acts in the step after the one in which its channel fires there
+    events = np.array([[0, 1, 1, 0, 1, 0], [0, 1, 0, 0, 1, 1]], np.uint8)
+    return netlist, events, by_engine(ungated(netlist), events)

@@ -12,14 +12,14 @@ import made_files as made
 import numpy as np
 import pytest
 import torch
-from made_files import checkpoint_bytes, state_dict, torch_bytes, zipped
+from made_files import checkpoint_bytes, rebuilt, state_dict, torch_bytes, zipped
 from oracles import refused
 
-from spikeloom.compiler.archive import npy_bytes, read_npy
+from spikeloom.compiler.archive import npy_bytes
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import SIZE_LIMIT
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.own_checkpoint import content_digest, save_checkpoint
+from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
 from spikeloom.models.graphs import Graph
 
 TAXELS, FEATURES, HOPS, SIZES, CLASSES = 6, 4, 3, (5, 7), 3
@@ -61,20 +61,6 @@ def own(**changes: object) -> bytes:
     options = {"beta": 0.25, "theta": 0.75, "training": {"seed": 4}} | changes
     sets = options.pop("weights", {"last": weights(), "best": weights(2)})
     return checkpoint_bytes(sets, options.pop("graph", ring()), **options)
-
-
-def rebuilt(
-    content: bytes, change: object, *, sign: bool = True, compression: int = zipfile.ZIP_STORED
-) -> bytes:
-    """Our own format with changed members; signed anew unless told otherwise."""
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    manifest = json.loads(members["manifest.json"])
-    change(manifest, members)
-    if sign:
-        arrays = {n.removesuffix(".npy"): read_npy(m) for n, m in members.items() if n.endswith(".npy")}
-        manifest["sha256"] = content_digest(manifest, arrays)
-    return zipped(members | {"manifest.json": json.dumps(manifest)}, compression)
 
 
 @pytest.mark.parametrize("new", [True, False], ids=["zip", "pre-1.6"])

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from commands import as_json, run
 from numpy.testing import assert_array_equal
+from oracles import assert_as_specified, check_costs
 from random_crossbars import recording_of
 from random_netlists import assert_equal, by_engine, by_steps
-from test_cost import check as check_costs
-from test_onnx_engine import assert_as_specified
 from zoo import CROSSBARS, FLOAT, LAYERED, MAKERS, over, specified, specimen
 
 import spikeloom

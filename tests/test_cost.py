@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from made_files import events, recorded, small_checkpoint
+from oracles import brute_force, check_costs
 from random_netlists import Axon, Neuron, build
 from random_networks import LOIHI, compiled, integer_chain
 
@@ -14,72 +15,12 @@ from spikeloom.compiler.targets.base import EnergyTable, Quantity
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.runtime.machines.backends import machine_of
-from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.studies import neurobench
-
-DAVIES = {"synaptic_operation": 23.6, "neuron_idle": 52, "neuron_active": 81, "packet": 1.7}
-DAVIES |= {"hop_east_west": 3, "hop_north_south": 4}
-SANAFE = {"synaptic_operation_dense": 35.5, "synaptic_operation_sparse": 33.6, "neuron_idle": 51.2}
-SANAFE |= {"neuron_active": 72.8, "spike": 69.3, "packet": 111, "hop_east_west": 3, "hop_north_south": 4.2}
-PICOJOULES = {"davies2018": DAVIES, "sanafe": SANAFE}
-
-
-def brute_force(netlist, recording, trace=None):
-    """Amounts per layer as plain lists, by visiting every synapse for every spike of the specification's run."""
-    trace = trace or spec.simulate(netlist, recording)
-    steps = recording.shape[1]
-    layers = range(len(netlist.layers))
-    found = {name: [0] * len(layers) for name in (*cost.EVENTS, "zeros")}
-    core_of_axon, core_of = netlist.core_of_axon(), netlist.core_of_compartment()
-    for t in range(steps + netlist.max_depth):
-        channels = np.flatnonzero(recording[:, t]) if t < steps else []
-        fired = np.flatnonzero(trace.spikes[t])
-        for compartment in fired:
-            found["spike"][netlist.layer[compartment]] += 1
-        for source in [*channels, *(fired + netlist.n_inputs)]:
-            for axon in np.flatnonzero(netlist.axon_source == source):
-                core = core_of_axon[axon]
-                form = "sparse" if netlist.format_index_bits[netlist.axon_format[axon]] else "dense"
-                for synapse in range(netlist.axon_synapses[axon], netlist.axon_synapses[axon + 1]):
-                    into = netlist.layer[netlist.core_compartments[core] + netlist.synapse_target[synapse]]
-                    found[f"synaptic_operation_{form}"][into] += 1
-                    found["zeros"][into] += int(netlist.synapse_weight[synapse] == 0)
-                if source >= netlist.n_inputs:
-                    sender = source - netlist.n_inputs
-                    here, there = (divmod(int(netlist.core_tile[c]), 8) for c in (core_of[sender], core))
-                    found["packet"][netlist.layer[sender]] += 1
-                    found["hop_east_west"][netlist.layer[sender]] += abs(here[1] - there[1])
-                    found["hop_north_south"][netlist.layer[sender]] += abs(here[0] - there[0])
-    of_both_forms = found["synaptic_operation_dense"], found["synaptic_operation_sparse"]
-    found["synaptic_operation"] = np.sum(of_both_forms, axis=0).tolist()
-    for layer in layers:
-        found["neuron_active"][layer] = int(trace.counts.updates[layer])
-        held = int(np.count_nonzero(netlist.layer == layer))
-        found["neuron_idle"][layer] = held * (steps + netlist.max_depth) - int(trace.counts.updates[layer])
-    return found
-
-
-def check(netlist, recordings, traces=None):
-    """Hold the counts and energies of a batch against the brute force; returns the costs."""
-    trace = engine.simulate(netlist, recordings)
-    costs = cost.price(cost.prepare(netlist, LOIHI), trace.counts, recordings.shape[2] + netlist.max_depth)
-    for sample, recording in enumerate(recordings):
-        expected = brute_force(netlist, recording, traces and traces[sample])
-        for name in cost.EVENTS:
-            assert costs.events[name][sample].tolist() == expected[name], name
-        assert costs.zeros[sample].tolist() == expected["zeros"]
-        for table, prices in PICOJOULES.items():
-            for layer in range(len(netlist.layers)):
-                by_hand = sum(amount * expected[name][layer] for name, amount in prices.items()) * 1e-12
-                assert costs.energy[table][sample, layer] == pytest.approx(by_hand, rel=1e-12)
-    assert set(costs.energy) == set(PICOJOULES)
-    assert costs.unpriced == {}
-    assert costs.steps == recordings.shape[2] + netlist.max_depth
-    return costs
 
 
 def counted_by_hand():
@@ -100,7 +41,7 @@ def test_counted_by_hand():
     recording = np.zeros((1, 2, 5), np.uint8)
     recording[0, 0, [0, 2]] = 1  # the first neuron fires in steps 0 and 2
     recording[0, 1, [1, 2, 3]] = 1  # synapses of weight zero are visited all the same
-    costs = check(netlist, recording)
+    costs = check_costs(netlist, recording)
     assert costs.steps == 6
     assert costs.events["spike"].tolist() == [[2, 0]]
     assert costs.events["synaptic_operation_sparse"].tolist() == [[2 + 3, 2 * 3]]
@@ -123,7 +64,7 @@ def test_counted_by_hand():
     ]
     np.testing.assert_allclose(pico, expected, rtol=1e-12)
     dense = dataclasses.replace(netlist, format_index_bits=np.zeros_like(netlist.format_index_bits))
-    assert check(dense, recording).events["synaptic_operation_dense"].tolist() == [[5, 6]]
+    assert check_costs(dense, recording).events["synaptic_operation_dense"].tolist() == [[5, 6]]
 
 
 def table(name, **prices):

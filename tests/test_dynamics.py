@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import load_weights, refused
+from oracles import load_weights, refused, surrogate_spike
 from timed_networks import GRAPH, SMALL, TIMING, louder, written
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, clocks_over
@@ -28,25 +28,6 @@ from spikeloom.runtime.cli import main
 
 ADJACENCY = normalised_adjacency(GRAPH.edges, 39)
 SIGMOID = Surrogate(shape=FAST_SIGMOID, width=0.25, reset=False)
-
-
-def surrogate_spike(surrogate):
-    class Spike(torch.autograd.Function):
-        @staticmethod
-        def forward(ctx, membrane, theta):
-            ctx.save_for_backward(membrane)
-            ctx.theta = theta
-            return membrane.gt(theta).to(membrane.dtype)
-
-        @staticmethod
-        def backward(ctx, gradient):
-            (membrane,) = ctx.saved_tensors
-            distance = (membrane - ctx.theta).abs()
-            if surrogate.shape == FAST_SIGMOID:
-                return gradient / (1 + distance / surrogate.width) ** 2, None
-            return gradient * (distance < surrogate.width), None
-
-    return Spike.apply
 
 
 def neurons_step_by_step(drive, bias, alpha, beta, theta, surrogate):

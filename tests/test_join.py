@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import as_json, refusal
-from made_files import checkpoint_bytes
+from made_files import checkpoint_bytes, rebuilt
 from numpy.testing import assert_array_equal
 from oracles import refused
-from test_checkpoint import rebuilt
 from timed_networks import GRAPH, TIMING, events_of, written
 from zoo import stored, tuned
 

@@ -6,10 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from commands import as_json
-from made_files import CLASSES, TAXELS, own_file, weights
+from made_files import CLASSES, TAXELS, own_file, rebuilt, weights
 from numpy.testing import assert_array_equal
 from oracles import refused
-from test_checkpoint import rebuilt
 
 from spikeloom.compiler.dynamics import NO_CLOCKS
 from spikeloom.compiler.errors import ModelError

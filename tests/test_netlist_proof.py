@@ -11,8 +11,8 @@ from commands import as_json, run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_files import TAXELS, csv_folder, events, own_file, small_checkpoint, state_dict, weights
+from random_crossbars import random_counters
 from random_networks import chain, random_checkpoint, ring
-from test_truenorth_counting import random_counters
 from timed_networks import events_of, written
 
 from spikeloom.compiler.arrays import read_only

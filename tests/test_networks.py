@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from made_files import events as made_events
 from made_files import small_checkpoint
 from numpy.testing import assert_allclose, assert_array_equal
-from test_dynamics import surrogate_spike
+from oracles import surrogate_spike
 
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint

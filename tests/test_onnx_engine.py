@@ -10,9 +10,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from onnx.reference import ReferenceEvaluator
-from oracles import refused
-from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
-from test_timing import six_steps
+from oracles import assert_as_specified, by_scan, refused
+from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings, six_steps
 from zoo import specimen
 
 from spikeloom.compiler.arrays import read_only
@@ -22,53 +21,7 @@ from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.formats.onnx.writer import digits, plan
 from spikeloom.compiler.targets.loihi1.bounds import reach
 from spikeloom.compiler.targets.loihi1.registers import ACCUMULATOR_MAX, CURRENT_MAX
-from spikeloom.runtime.machines.loihi1 import engine, onnx_engine, spec
-
-
-def by_scan(netlist, events, **options):
-    return onnx_engine.simulate(onnx_engine.prepare(netlist), events, **options)
-
-
-def by_name(session, given):
-    names = [port.name for port in session.get_outputs()]
-    return dict(zip(names, session.run(names, given), strict=True))
-
-
-def by_steps(netlist, events):
-    """Spikes, membranes after the reset and votes of recordings in the form ``step``."""
-    session = onnx_engine.open_session(onnx_writer.export(netlist, "step")[0])
-    samples, _, length = events.shape
-    given = {
-        port.name: np.zeros(
-            [samples if size == "batch" else size for size in port.shape], port.type[len("tensor(") : -1]
-        )
-        for port in session.get_inputs()
-    }
-    given["length"][...] = length
-    steps = np.pad(events, ((0, 0), (0, 0), (0, netlist.max_depth))).transpose(2, 0, 1)
-    spikes = np.zeros((samples, len(steps), netlist.n_compartments), np.bool_)
-    membranes = spikes.astype(np.int64)
-    for step, now in enumerate(steps):
-        found = by_name(session, given | {"events": now})
-        given |= {
-            name.removesuffix("_next"): array for name, array in found.items() if name.endswith("_next")
-        }
-        for layer in plan(netlist):
-            spikes[:, step, layer.ids] = given[f"{layer.name}.spikes"]
-            membranes[:, step, layer.ids] = given[f"{layer.name}.membrane"]
-    return spikes, membranes, given.get("votes", np.zeros((samples, netlist.classes)))
-
-
-def assert_as_specified(netlist, events, expected=None):
-    """Both forms do what the specification does on one recording."""
-    expected = expected or spec.simulate(netlist, events)
-    spikes, membranes, votes = by_steps(netlist, events[None])
-    np.testing.assert_array_equal(spikes[0], expected.spikes)
-    np.testing.assert_array_equal(membranes[0], np.where(expected.spikes, 0, expected.membranes))
-    spikes, counts = by_scan(netlist, events[None])
-    np.testing.assert_array_equal(spikes[0], expected.spikes)
-    due = [expected.counts.spikes[netlist.readout_class == label].sum() for label in range(netlist.classes)]
-    assert counts[0].tolist() == votes[0].tolist() == due
+from spikeloom.runtime.machines.loihi1 import engine, onnx_engine
 
 
 @given(st.data())

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import timing_oracle
 from commands import as_json
-from random_netlists import Axon, Neuron, build
-from test_timing import LOIHI, six_steps
+from random_netlists import Axon, Neuron, build, six_steps
+from random_networks import LOIHI
 
 from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.formats import sanafe

@@ -11,9 +11,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from made_files import CLASSES, TAXELS, events, recorded, recordings_folder
 from numpy.testing import assert_array_equal
+from random_crossbars import counter_events, random_counters
 from random_netlists import large_netlist, lively, netlists, recordings, voting
 from random_networks import random_checkpoint, ring
-from test_truenorth_counting import random_counters, random_events
 
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.formats.counters import counting_network
@@ -287,7 +287,7 @@ def test_verdicts_are_those_of_plain_runs(bins, clocks):
 def test_a_chip_that_knows_no_short_cut_runs_every_change():
     counters = random_counters(1, taxels=2, classes=3)
     netlist = compile_crossbars(counters).netlist
-    given = np.stack([random_events(seed, counters) for seed in (5, 6)])
+    given = np.stack([counter_events(seed, counters) for seed in (5, 6)])
     for one, found in zip(given, study_of(netlist, given, shift=1).certificates, strict=True):
         cells, alter = cells_of(one, netlist), 0
         for channel, step in cells.cells.tolist():

@@ -7,15 +7,15 @@ import pytest
 import timing_oracle
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_netlists import Axon, Neuron, build, by_engine, large_netlist, netlists, recordings, ungated
+from random_netlists import Axon, Neuron, build, by_engine, large_netlist, netlists, recordings, six_steps
+from random_networks import LOIHI
 
 from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.formats import sanafe
-from spikeloom.compiler.targets.base import LATENCIES, Quantity, load_target
+from spikeloom.compiler.targets.base import LATENCIES, Quantity
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost, timing
 
-LOIHI = load_target("loihi1")
 (SANAFE,) = LOIHI.time
 PICO = 1000
 
@@ -67,22 +67,6 @@ def assert_as_defined(netlist, trace, events, *, times=SANAFE):
     np.testing.assert_array_equal(detailed.receiving, column("receiving", 1))
     np.testing.assert_array_equal(detailed.peak_load, column("peak_load", 1))
     return wanted
-
-
-def six_steps():
-    """Two inputs, h0 and h1 one tile north of them, o one tile east of these; what SANA-FE 2.2.9 was run on."""
-    neurons = [Neuron(threshold=80), Neuron(threshold=80), Neuron(threshold=80, core=1, layer=1)]
-    axons = [
-        Axon(source=0, targets=((0, 60), (1, -30))),
-        Axon(source=1, targets=((0, 50), (1, 90))),
-        Axon(source=2, core=1, targets=((0, 100),)),
-        Axon(source=3, core=1, targets=((0, 70),)),
-    ]
-    netlist = build(neurons, axons, n_inputs=2, depths=[0, 1])
-    netlist = replace(netlist, core_tile=read_only([8, 9]), format_index_bits=read_only([0]))
-    # an event acts in the step after the one in which its channel fires there
-    events = np.array([[0, 1, 1, 0, 1, 0], [0, 1, 0, 0, 1, 1]], np.uint8)
-    return netlist, events, by_engine(ungated(netlist), events)
 
 
 DETAILED = [1058.8, 1068.7, 1039.7, 1058.8, 1068.7, 1078.4]

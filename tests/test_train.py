@@ -10,6 +10,7 @@ from made_files import (
     TAXELS,
     checkpoint_bytes,
     csv_folder,
+    rebuilt,
     recorded,
     recordings_folder,
     ring,
@@ -18,7 +19,6 @@ from made_files import (
 )
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import load_weights, refused
-from test_checkpoint import rebuilt
 
 import spikeloom.models.training.train
 from spikeloom.compiler.errors import DataError, ModelError, OptionError

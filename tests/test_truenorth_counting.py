@@ -9,9 +9,9 @@ from commands import as_json, run
 from hypothesis import given
 from hypothesis import strategies as st
 from made_files import recordings_folder
-from random_crossbars import CHIP, both, with_limit
+from random_crossbars import CHIP, both, counter_events, random_counters, with_limit
 
-from spikeloom.compiler.counters import BLOCK, Counters
+from spikeloom.compiler.counters import BLOCK
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.formats.counters import counting_network, write_counters
@@ -23,41 +23,6 @@ from spikeloom.compiler.targets.truenorth.passes import compile_crossbars
 from spikeloom.models.training.counters import round_weights
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.votes import class_counts
-
-
-def random_counters(
-    seed, *, taxels=3, parts=1, classes=3, thresholds=(1, 3), most=LARGEST, steps=20, ramp=12
-):
-    """Some counters of a sensor, whose sums of the data never reach the threshold."""
-    rng = np.random.default_rng(seed)
-    kinds = [
-        (channel, part, k) for k in thresholds for part in range(parts) for channel in range(2 * taxels)
-    ]
-    counter = np.array(kinds)[rng.random(len(kinds)) < 0.8][::-1]
-    weight = rng.integers(-most, most + 1, (classes, len(counter))) * (
-        rng.random((classes, len(counter))) < 0.7
-    )
-    slope = int(rng.integers(1, 9))
-    highest = int(weight.clip(min=0).sum(axis=1).max())
-    sizes = {"taxels": taxels, "polarities": 2, "classes": classes, "bins": 1, "steps": steps}
-    threshold = highest + slope * steps + 0.5
-    return Counters(
-        **sizes,
-        parts=parts,
-        ramp=ramp,
-        counter=counter,
-        weight=weight,
-        slope=float(slope),
-        threshold=threshold,
-    )
-
-
-def random_events(seed, counters, rate=0.3):
-    """A recording (taxels, polarities, steps) that is silent in the ramp."""
-    shape = counters.taxels, counters.polarities, counters.clocks.length
-    events = (np.random.default_rng(seed).random(shape) < rate).astype(np.uint8)
-    events[..., counters.steps :] = 0
-    return events
 
 
 def assert_exact(counters, events, chip=CHIP):
@@ -87,13 +52,13 @@ def assert_exact(counters, events, chip=CHIP):
 )
 def test_every_spike_is_the_models_and_the_votes_are_the_files(seed, parts, classes, most, rate):
     counters = random_counters(seed, parts=parts, classes=classes, most=most)
-    assert_exact(counters, random_events(seed, counters, rate))
+    assert_exact(counters, counter_events(seed, counters, rate))
 
 
 @pytest.mark.parametrize("most", [1, 7, 11, LARGEST])
 def test_both_chips_have_the_same_whole_numbers_and_votes(most):
     counters = random_counters(most, taxels=6, classes=8, most=most, ramp=60)
-    events = np.stack([random_events(seed, counters) for seed in range(6)])
+    events = np.stack([counter_events(seed, counters) for seed in range(6)])
     made = compile_network(counting_network(counters)), compile_crossbars(counters)
     np.testing.assert_array_equal(*(machine_of(each.netlist).run(events).votes for each in made))
     scales = [population.scale for population in made[0].integer.populations]
@@ -108,7 +73,7 @@ def test_sums_of_several_cores_come_together():
     groups = len(planned(counters, CHIP).groups)
     assert 2 * groups * 12 == np.count_nonzero(netlist.layer == netlist.layers.index("sums")) > 24
     assert netlist.n_cores < groups + 4, "counters use what sums and votes leave"
-    assert assert_exact(counters, random_events(2, counters)).max() > 0
+    assert assert_exact(counters, counter_events(2, counters)).max() > 0
 
 
 def test_counters_spike_again_as_on_other_chips():
