@@ -5,6 +5,7 @@ import json
 import tempfile
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import content_digest, save_checkpoint
 from spikeloom.models.graphs import Graph, normalised_adjacency
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.recordings.release import write_released
 
 TAXELS, FEATURES, CLASSES, STEPS = 6, 5, 4, 24
 
@@ -125,7 +128,12 @@ def events(
     seed: int = 0, *, samples: int = 6, taxels: int = TAXELS, steps: int = STEPS, rate: float = 0.2
 ) -> np.ndarray:
     """Random recordings, (samples, taxels, 2, steps) uint8."""
-    return (np.random.default_rng(seed).random((samples, taxels, 2, steps)) < rate).astype(np.uint8)
+    return sparse_events(seed, samples, taxels, 2, steps, rate=rate)
+
+
+def sparse_events(seed: int | np.random.Generator, *shape: int, rate: float) -> np.ndarray:
+    """Random events of any shape, uint8; a generator in the place of a seed is drawn from."""
+    return (np.random.default_rng(seed).random(shape) < rate).astype(np.uint8)
 
 
 def recordings_folder(
@@ -137,6 +145,14 @@ def recordings_folder(
         for i, recording in enumerate(made if made is not None else events(2)):
             np.save(folder / split / f"sample_{i}_label_{i % classes}.npy", recording.astype(np.float32))
     return folder
+
+
+def grasps_folder(folder: Path, **kind) -> list[Recordings]:
+    """Write made grasps in the released layout, a seed for each split; keywords as of `synthetic_grasps`."""
+    seeds = {"train": 1, "test": 2}
+    grasps = [replace(synthetic_grasps(seed=seed, **kind), split=split) for split, seed in seeds.items()]
+    write_released(folder, grasps)
+    return grasps
 
 
 def recorded(events: np.ndarray, labels: np.ndarray | None = None, split: str = "train") -> Recordings:

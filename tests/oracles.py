@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_array_equal
 from random_networks import LOIHI, dense_weights
 
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
@@ -23,19 +24,17 @@ def assert_same_network(found, expected):
     assert found.input == expected.input
     assert found.classes == expected.classes
     assert found.readout.population == expected.readout.population
-    np.testing.assert_array_equal(found.readout.label, expected.readout.label)
+    assert_array_equal(found.readout.label, expected.readout.label)
     for ours, theirs in zip(found.populations, expected.populations, strict=True):
         for name in ("beta", "theta", "decay_u", "decay_v"):
             assert getattr(ours, name) == getattr(theirs, name), name
         for name in ("threshold", "bias_mantissa", "bias_exponent"):
-            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), err_msg=name)
+            assert_array_equal(getattr(ours, name), getattr(theirs, name), err_msg=name)
     for post in range(len(expected.populations)):
         ours, theirs = dense_weights(found, post), dense_weights(expected, post)
         for pre in set(ours) | set(theirs):
             nothing = np.zeros(1, np.int64)
-            np.testing.assert_array_equal(
-                *np.broadcast_arrays(ours.get(pre, nothing), theirs.get(pre, nothing))
-            )
+            assert_array_equal(*np.broadcast_arrays(ours.get(pre, nothing), theirs.get(pre, nothing)))
 
 
 def load_weights(network, weights):
@@ -182,9 +181,9 @@ def assert_as_specified(netlist, events, expected=None):
     """Both forms do what the specification does on one recording."""
     expected = expected or spec.simulate(netlist, events)
     spikes, membranes, votes = by_steps(netlist, events[None])
-    np.testing.assert_array_equal(spikes[0], expected.spikes)
-    np.testing.assert_array_equal(membranes[0], np.where(expected.spikes, 0, expected.membranes))
+    assert_array_equal(spikes[0], expected.spikes)
+    assert_array_equal(membranes[0], np.where(expected.spikes, 0, expected.membranes))
     spikes, counts = by_scan(netlist, events[None])
-    np.testing.assert_array_equal(spikes[0], expected.spikes)
+    assert_array_equal(spikes[0], expected.spikes)
     due = [expected.counts.spikes[netlist.readout_class == label].sum() for label in range(netlist.classes)]
     assert counts[0].tolist() == votes[0].tolist() == due

@@ -4,6 +4,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 from hypothesis import strategies as st
+from made_files import sparse_events
 from random_netlists import assert_equal
 
 from spikeloom.compiler.counters import Counters
@@ -110,7 +111,7 @@ def crossbars(draw, neurons=NEURONS, *, channels=3):
 def events(seed: int, channels: int, steps: int, *, samples: int | None = None):
     """Recordings of a third of all events."""
     shape = (channels, steps) if samples is None else (samples, channels, steps)
-    return (np.random.default_rng(seed).random(shape) < 1 / 3).astype(np.uint8)
+    return sparse_events(seed, *shape, rate=1 / 3)
 
 
 def recording_of(batch: Trace, sample: int = 0) -> Trace:
@@ -167,7 +168,7 @@ def random_network(
 
 def random_events(seed, network, *, samples=2, steps=12):
     shape = (samples, network.taxels, network.polarities, steps)
-    return (np.random.default_rng(seed).random(shape) < 0.4).astype(np.uint8)
+    return sparse_events(seed, *shape, rate=0.4)
 
 
 def defined_spikes(network, events) -> dict[str, np.ndarray]:
@@ -219,6 +220,6 @@ def random_counters(
 def counter_events(seed, counters, rate=0.3):
     """A recording (taxels, polarities, steps) that is silent in the ramp."""
     shape = counters.taxels, counters.polarities, counters.clocks.length
-    events = (np.random.default_rng(seed).random(shape) < rate).astype(np.uint8)
+    events = sparse_events(seed, *shape, rate=rate)
     events[..., counters.steps :] = 0
     return events

@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 
 from spikeloom.compiler.arrays import read_only, read_only_float
 from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
@@ -222,10 +223,10 @@ SIMULATORS = [spec.simulate, by_engine, by_steps]
 def assert_equal(left: Trace, right: Trace) -> None:
     """Every spike, membrane and count of two traces is the same, of whatever chip."""
     for name in (name for name in KEPT if hasattr(right, name)):
-        np.testing.assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name, strict=True)
+        assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name, strict=True)
     for field in fields(left.counts):
         pair = (getattr(trace.counts, field.name) for trace in (left, right))
-        np.testing.assert_array_equal(*pair, err_msg=field.name, strict=True)
+        assert_array_equal(*pair, err_msg=field.name, strict=True)
 
 
 def six_steps():

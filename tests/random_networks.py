@@ -7,6 +7,7 @@ import math
 import numpy as np
 from hypothesis import assume
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 from scipy import sparse
 
 from spikeloom.compiler.checkpoint import Checkpoint, Dense
@@ -389,4 +390,4 @@ def assert_same_layers(*runs):
     """Spikes, layer by layer, are the same in every run."""
     for layers in zip(*runs, strict=True):
         for other in layers[1:]:
-            np.testing.assert_array_equal(other, layers[0])
+            assert_array_equal(other, layers[0])

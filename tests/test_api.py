@@ -87,8 +87,7 @@ def test_modules_come_in_as_they_are(data, tmp_path, monkeypatch):
 
 
 def test_what_does_not_suit_is_refused(data, net):
-    with pytest.raises(TypeError, match="wieght_bits"):
-        api.compile("pretrained:grasps", wieght_bits="4")
+    refused(TypeError, "wieght_bits", api.compile, "pretrained:grasps", wieght_bits="4")
     assert len(net.run(data.test, limit=2).files) == 2
     refused(DataError, "has 39 taxels, the network has 6", net.run, api.recordings("synthetic").test)
     refused(OptionError, "data |: ndarray found, allowed: text", net.run, data.test.events)

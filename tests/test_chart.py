@@ -261,8 +261,14 @@ def test_the_point_that_fits_all_budgets(points, budgets, number, fitting):
 def test_the_nearest_point_of_budgets_that_nothing_fits(points, budgets, number):
     found = study.pick(points, parse_budgets(budgets), BY)
     assert (found.fits, found.fitting, found.point) == (False, 0, number)
-    with pytest.raises(OptionError, match=r"--budget time=1ms: .*no time table"):
-        study.pick(points, parse_budgets(["time=1ms"]), replace(BY, time=None))
+    refused(
+        OptionError,
+        "--budget time=1ms: |no time table",
+        study.pick,
+        points,
+        parse_budgets(["time=1ms"]),
+        replace(BY, time=None),
+    )
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from made_files import checkpoint_bytes, rebuilt, state_dict, torch_bytes, zipped
+from numpy.testing import assert_array_equal
 from oracles import refused
 
 from spikeloom.compiler.archive import npy_bytes
@@ -72,12 +73,12 @@ def test_every_released_layout_gives_the_same_weights(tmp_path, old, new):
     assert (read.layout, read.runs, read.training) == ("state_dict", 1, None)
     assert (read.taxels, read.classes, read.hops.shape) == (TAXELS, CLASSES, (HOPS + 1, FEATURES, 2))
     for k in range(HOPS + 1):
-        np.testing.assert_array_equal(read.hops[k], state[f"conv1.lins.{k}.weight"])
-    np.testing.assert_array_equal(read.conv_bias, state["conv1.bias"])
+        assert_array_equal(read.hops[k], state[f"conv1.lins.{k}.weight"])
+    assert_array_equal(read.conv_bias, state["conv1.bias"])
     assert [dense.name for dense in read.dense] == ["fc1", "fc2", "fc3"]
     for dense in read.dense:
-        np.testing.assert_array_equal(dense.weight, state[f"{dense.name}.weight"])
-        np.testing.assert_array_equal(dense.bias, state[f"{dense.name}.bias"])
+        assert_array_equal(dense.weight, state[f"{dense.name}.weight"])
+        assert_array_equal(dense.bias, state[f"{dense.name}.bias"])
     arrays = [read.hops, read.conv_bias, *(a for dense in read.dense for a in (dense.weight, dense.bias))]
     assert all(a.dtype == np.float32 and a.flags.c_contiguous and not a.flags.writeable for a in arrays)
     assert (read.graph, read.edges) == (None, None)
@@ -93,7 +94,7 @@ def test_run_selects_a_state_dict_and_its_figures(tmp_path):
     path = write(tmp_path / "x.t7", released(tensors(0), tensors(1), **figures))
     read = read_checkpoint(path, run=1)
     assert (read.layout, read.runs) == ("released", 2)
-    np.testing.assert_array_equal(read.conv_bias, tensors(1)["conv1.bias"])
+    assert_array_equal(read.conv_bias, tensors(1)["conv1.bias"])
     assert read.training == {
         "runs": 2,
         "weights": "last epoch",
@@ -111,7 +112,7 @@ def test_half_and_double_precision_become_float32(tmp_path):
             tmp_path / "x.t7", torch_bytes({key: value.to(kind) for key, value in tensors().items()})
         )
         expected = tensors()["fc2.weight"].to(kind).to(torch.float32)
-        np.testing.assert_array_equal(read_checkpoint(path).dense[1].weight, expected)
+        assert_array_equal(read_checkpoint(path).dense[1].weight, expected)
 
 
 def test_constants_come_from_the_user_or_are_reported_as_assumed(tmp_path):
@@ -217,15 +218,15 @@ def test_own_format_round_trip(tmp_path):
     for which, seed in (("last", 1), ("best", 2)):
         read = read_checkpoint(path, weights=which)
         expected = weights(seed)
-        np.testing.assert_array_equal(read.hops, expected["conv1.hops"])
-        np.testing.assert_array_equal(read.conv_bias, expected["conv1.bias"])
+        assert_array_equal(read.hops, expected["conv1.hops"])
+        assert_array_equal(read.conv_bias, expected["conv1.bias"])
         assert [dense.name for dense in read.dense] == ["fc1", "fc2"]
         for dense in read.dense:
-            np.testing.assert_array_equal(dense.weight, expected[f"{dense.name}.weight"])
-            np.testing.assert_array_equal(dense.bias, expected[f"{dense.name}.bias"])
+            assert_array_equal(dense.weight, expected[f"{dense.name}.weight"])
+            assert_array_equal(dense.bias, expected[f"{dense.name}.bias"])
     assert (read.beta, read.theta, read.assumed) == (0.25, 0.75, ())
     assert (read.layout, read.runs, read.graph, read.training) == ("spikeloom", 1, "ring", {"seed": 4})
-    np.testing.assert_array_equal(read.edges, ring().edges)
+    assert_array_equal(read.edges, ring().edges)
     assert (read.taxels, read.classes) == (TAXELS, CLASSES)
     assert read.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     assert read_checkpoint(path, beta=0.5).beta == 0.5
@@ -243,7 +244,7 @@ def test_own_format_needs_neither_torch_nor_pickle(tmp_path):
         manifest = json.loads(archive.read("manifest.json"))
         array = np.lib.format.read_array(io.BytesIO(archive.read("best/fc2.bias.npy")), allow_pickle=False)
     assert manifest["weights"] == ["last", "best"]
-    np.testing.assert_array_equal(array, weights(2)["fc2.bias"])
+    assert_array_equal(array, weights(2)["fc2.bias"])
 
 
 def test_more_than_nine_dense_stages(tmp_path):

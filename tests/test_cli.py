@@ -113,7 +113,7 @@ def test_spikes_are_written_aligned_with_the_data(as_json, tmp_path, place):
         for name, spikes in zip(SIZES, expected, strict=True):
             assert archive[name].dtype == np.bool_
             assert archive[name].shape == (6, STEPS, SIZES[name])
-            np.testing.assert_array_equal(archive[name], spikes)
+            assert_array_equal(archive[name], spikes)
             assert spikes.any()
         assert archive["fc3"].sum(axis=1).tolist() == report["counts"]
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from made_files import recordings_folder
+from made_files import recordings_folder, sparse_events
 from random_crossbars import IN_RANCS_TERMS, crossbars, events
 from random_netlists import lively
 
@@ -79,7 +79,7 @@ def chain():
 @pytest.fixture
 def place(tmp_path):
     write_crossbars(chain(), tmp_path / "net.loom")
-    recordings = (np.random.default_rng(0).random((2, 1, 2, STEPS)) < 0.6).astype(np.uint8)
+    recordings = sparse_events(0, 2, 1, 2, STEPS, rate=0.6)
     recordings_folder(tmp_path / "data", train=recordings, test=recordings, classes=2)
     return tmp_path
 

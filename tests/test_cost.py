@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from made_files import events, recorded, small_checkpoint
+from numpy.testing import assert_allclose, assert_array_equal
 from oracles import brute_force, check_costs
 from random_netlists import Axon, Neuron, build
 from random_networks import LOIHI, compiled, integer_chain
@@ -62,7 +63,7 @@ def test_counted_by_hand():
             6 * 33.6 + 2 * 51.2 + 10 * 72.8,
         ],
     ]
-    np.testing.assert_allclose(pico, expected, rtol=1e-12)
+    assert_allclose(pico, expected, rtol=1e-12)
     dense = dataclasses.replace(netlist, format_index_bits=np.zeros_like(netlist.format_index_bits))
     assert check_costs(dense, recording).events["synaptic_operation_dense"].tolist() == [[5, 6]]
 
@@ -122,14 +123,14 @@ def test_every_lacking_price_is_named():
 def test_what_did_not_happen_needs_no_price():
     costs, _ = priced_by(table("idle", neuron_idle=50.0), silent=True)
     # 3 compartments in 6 steps
-    np.testing.assert_allclose(costs.energy["idle"].sum(axis=1), [18 * 50e-12] * 2)
+    assert_allclose(costs.energy["idle"].sum(axis=1), [18 * 50e-12] * 2)
 
 
 def test_one_price_for_both_forms_of_a_list():
     both = {name: price for name, price in FULL.items() if not name.startswith("synaptic")}
     costs, _ = priced_by(table("one", **both, synaptic_operation=7.0), table("two", **FULL))
     extra = (costs.energy["one"] - costs.energy["two"]).sum(axis=1)
-    np.testing.assert_allclose(extra, [6e-12 * (1 + 3)] * 2)
+    assert_allclose(extra, [6e-12 * (1 + 3)] * 2)
 
 
 def test_report_has_means_and_extremes_over_recordings(tmp_path):
@@ -146,7 +147,7 @@ def test_report_has_means_and_extremes_over_recordings(tmp_path):
     expected = np.mean(
         [np.add(s["synaptic_operation_dense"], s["synaptic_operation_sparse"]) for s in samples], axis=0
     )
-    np.testing.assert_allclose(layers, expected)
+    assert_allclose(layers, expected)
     updates = [sum(s["neuron_active"]) for s in samples]
     assert report["max"]["neuron_updates"] == max(updates)
     accesses = netlist.n_compartments * (recordings.shape[2] + 3)
@@ -182,11 +183,9 @@ def test_all_details_have_the_same_spikes_and_events(small, found):
     plain = engine.simulate(netlist, recordings, lengths=LENGTHS)
     for trace, priced in found.values():
         for field in dataclasses.fields(trace.counts):
-            np.testing.assert_array_equal(
-                getattr(trace.counts, field.name), getattr(plain.counts, field.name)
-            )
+            assert_array_equal(getattr(trace.counts, field.name), getattr(plain.counts, field.name))
         for name, energy in found["counts"][1].costs.energy.items():
-            np.testing.assert_array_equal(priced.costs.energy[name], energy)
+            assert_array_equal(priced.costs.energy[name], energy)
 
 
 def test_a_batch_is_its_recordings_one_by_one(small, found):
@@ -197,7 +196,7 @@ def test_a_batch_is_its_recordings_one_by_one(small, found):
             whole, part = (getattr(cost, model)["sanafe"] for cost in (found["cycle"][1], alone))
             steps = length + netlist.max_depth
             for name in ("duration_ns", "critical_core", "receiving"):
-                np.testing.assert_array_equal(getattr(whole, name)[index, :steps], getattr(part, name)[0])
+                assert_array_equal(getattr(whole, name)[index, :steps], getattr(part, name)[0])
             assert not whole.duration_ns[index, steps:].any()
             assert np.all(whole.critical_core[index, steps:] == -1)
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import as_json, refusal, run
-from made_files import recorded, recordings_folder
+from made_files import recorded, recordings_folder, sparse_events
 from numpy.testing import assert_array_equal
 from oracles import refused
 
@@ -46,7 +46,7 @@ def made(seed=0, samples=30, rate=0.3):
     rng = np.random.default_rng(seed)
     labels = np.arange(samples) % CLASSES
     often = np.random.default_rng(9).random((CLASSES, TAXELS, 2, 4)).repeat(STEPS // 4, axis=3)
-    events = (rng.random((samples, TAXELS, 2, STEPS)) < 2 * rate * often[labels]).astype(np.uint8)
+    events = sparse_events(rng, samples, TAXELS, 2, STEPS, rate=2 * rate * often[labels])
     return recorded(events, labels)
 
 

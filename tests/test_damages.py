@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from made_files import ring
+from made_files import ring, sparse_events
 from numpy.testing import assert_allclose, assert_array_equal
 from random_networks import chain, compiled, integer_chain, random_checkpoint
 from timed_networks import written
@@ -53,7 +53,7 @@ def drawn(seed=0):
 
 
 def inputs(memory, seed=0, samples=5, steps=24):
-    return (drawn(seed).random((samples, memory.netlist.n_inputs, steps)) < 0.3).astype(np.uint8)
+    return sparse_events(drawn(seed), samples, memory.netlist.n_inputs, steps, rate=0.3)
 
 
 def weights(stage):

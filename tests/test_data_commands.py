@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import requests
+from numpy.testing import assert_array_equal
 from oracles import refused
 
 from spikeloom.compiler.errors import DataError, OptionError
@@ -99,7 +100,7 @@ def test_convert_to_joined_bins(own, split):
     fine, coarse = (load_data(own / f"{name}.zip", split).events for name in ("fine", "coarse"))
     assert (fine.shape[3], coarse.shape[3], report["steps"]) == (36, 4, 4)
     for bin_ in range(4):
-        np.testing.assert_array_equal(coarse[..., bin_], fine[..., 10 * bin_ : 10 * bin_ + 10].any(axis=3))
+        assert_array_equal(coarse[..., bin_], fine[..., 10 * bin_ : 10 * bin_ + 10].any(axis=3))
     assert coarse.any()
 
 

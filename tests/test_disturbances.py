@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_files import sparse_events
 from numpy.testing import assert_array_equal
 
 from spikeloom.models.graphs import NEUTOUCH
@@ -18,7 +19,7 @@ def recordings(draw, *, least=1):
     """Recordings (samples, taxels, 2, steps)."""
     shape = [draw(st.integers(1, 3)), draw(st.integers(2, 7)), 2, draw(st.integers(least, 30))]
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    return (rng.random(shape) < draw(st.sampled_from([0.0, 0.1, 0.5, 1.0]))).astype(np.uint8)
+    return sparse_events(rng, *shape, rate=draw(st.sampled_from([0.0, 0.1, 0.5, 1.0])))
 
 
 SEEDS = st.integers(0, 2**32 - 1)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from made_files import STEPS, events, recorded, small_checkpoint, weights
+from numpy.testing import assert_allclose, assert_array_equal
 from random_netlists import Neuron, build
 from scipy import stats
 
@@ -142,12 +143,12 @@ def test_each_rung_adds_one_deviation(small):
         assert decayed.theta == weighed.theta == plain.theta == 0.5
         assert shifted.theta == 0.5
         scale = netlist.scale[ids[0]]
-        np.testing.assert_array_equal(weighed.bias, plain.bias)
+        assert_array_equal(weighed.bias, plain.bias)
         register = netlist.bias_mantissa[ids] * 2.0 ** netlist.bias_exponent[ids]
-        np.testing.assert_allclose(shifted.bias, register / (64 * scale), rtol=1e-15)
-        np.testing.assert_allclose(shifted.bias, plain.bias, atol=0.51 / (64 * scale) * 2**7)
+        assert_allclose(shifted.bias, register / (64 * scale), rtol=1e-15)
+        assert_allclose(shifted.bias, plain.bias, atol=0.51 / (64 * scale) * 2**7)
         exact, rounded = (n.projections[index].weight.toarray() for n in (network, scaled))
-        np.testing.assert_array_equal(beta.projections[index].weight.toarray(), exact)
+        assert_array_equal(beta.projections[index].weight.toarray(), exact)
         step = 2.0 ** (9 - 4) * 2.0 ** int(netlist.format_exponent.max())
         assert 0 < np.abs(rounded - exact).max() <= step / scale
 
@@ -219,7 +220,7 @@ def test_the_ladder_carries_thresholds_that_differ(small):
     network, recordings = expand(checkpoint, adjacency), channels_last(events(2))
     rungs = [run_float(rung, recordings).spikes[0] for rung in realised(network, lift(changed))]
     plain = [run_float(rung, recordings).spikes[0] for rung in realised(network, lift(netlist))]
-    np.testing.assert_array_equal(rungs[1], plain[1])
+    assert_array_equal(rungs[1], plain[1])
     moved = (rungs[2] != plain[2]).any(axis=(0, 1))
     assert moved.any()
     assert not moved[2:].any()

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from made_files import events, zipped
+from numpy.testing import assert_array_equal
 from oracles import refused
 
 from spikeloom.compiler.archive import npy_bytes as npy
@@ -224,7 +225,7 @@ def test_whole_steps_and_one_at_least():
     for percent, steps in ((1, 1), (10, 1), (19, 1), (20, 2), (25, 2), (50, 5), (99, 9)):
         found = first_part(whole, percent)
         assert found.lengths is None
-        np.testing.assert_array_equal(found.events, whole.events[..., :steps])
+        assert_array_equal(found.events, whole.events[..., :steps])
         assert (found.files, found.labels.tolist()) == (whole.files, whole.labels.tolist())
     assert first_part(whole, 100) is whole
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from commands import as_json, refusal, run
-from made_files import CLASSES, recordings_folder
+from made_files import CLASSES, recordings_folder, sparse_events
 from made_modules import TAXELS
 from oracles import refused
 from scipy import sparse
@@ -26,7 +26,7 @@ def biased_currents(folder):
     nodes = [made_nir.affine(rng, 8, 2 * TAXELS, 1.5), made_nir.cuba(8, r=2.0, weight=2.0)]
     nodes += [made_nir.affine(rng, CLASSES, 8, 2.0), made_nir.cuba(CLASSES, r=2.0, weight=2.0)]
     nir.write(folder / "net.nir", made_nir.chain(*nodes))
-    train, test = ((rng.random((count, TAXELS, 2, 15)) < 0.2).astype(np.uint8) for count in (8, 4))
+    train, test = (sparse_events(rng, count, TAXELS, 2, 15, rate=0.2) for count in (8, 4))
     recordings_folder(folder / "data", train=train, test=test, classes=CLASSES)
     return Specimen(folder, folder / "net.nir", ("--dt", "0.02"), ())
 
@@ -66,7 +66,7 @@ def test_gradients_run_through_own_spikes_and_currents(surrogate):
     shape = {"input": Input(taxels=2, polarities=2), "readout": Readout(population=0, label=np.arange(size))}
     network = Network(populations=(neurons,), projections=into, classes=size, **shape)
     model = QuantisedNet(network, [Form(bits=8, exponents=(0, 7), threshold=np.full(size, 4000))], surrogate)
-    events = time_first((rng.random((3, 2, 2, 25)) < 0.4).astype(np.uint8))
+    events = time_first(sparse_events(rng, 3, 2, 2, 25, rate=0.4))
     wanted = torch.tensor(rng.normal(size=(3, size)), dtype=torch.float32)
     (model(events) * wanted).sum().backward()
     given, own, bias = (torch.tensor(each).float().requires_grad_() for each in (*weights, neurons.bias))

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
+from oracles import refused
 from random_netlists import SIMULATORS, Axon, Neuron, build, by_engine, netlists, recordings
 
 from spikeloom.compiler.errors import OptionError
@@ -40,8 +41,7 @@ def test_what_blank_steps_leave():
         found = forgotten(one(**registers))
         assert (found.restless, found.unsettled, found.residue > 0) == (restless, unsettled, unsettled > 0)
     for registers in ({"decay_v": 0}, {"decay_v": 1, "threshold": 100_000}):
-        with pytest.raises(OptionError, match="do not decay, or not in 4096 blank steps"):
-            forgotten(one(**registers))
+        refused(OptionError, "do not decay, or not in 4096 blank steps", forgotten, one(**registers))
 
 
 @given(data=st.data())

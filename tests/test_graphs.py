@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from oracles import refused
 
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
@@ -97,7 +98,7 @@ def test_normalisation_agrees_with_its_formula(edges, spare):
     for source, target in edges:
         if into[source]:
             expected[target, source] += 1 / np.sqrt(into[source] * into[target])
-    np.testing.assert_allclose(result, expected, rtol=1e-14, atol=0)
+    assert_allclose(result, expected, rtol=1e-14, atol=0)
     assert result.dtype == np.float64
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from made_files import sparse_events
 from numpy.testing import assert_array_equal
 from oracles import refused
 from random_networks import chain, small_target
@@ -28,7 +29,7 @@ def unlike(seed=3, samples=72):
     hidden = rng.normal(0, 0.12, (24, 10)) * np.geomspace(0.3, 8, 24)[:, None]
     hidden[0, 0] = 90
     network = chain(hidden, rng.normal(0, 0.35, (5, 24)))
-    return network, (rng.random((samples, 10, 1, 40)) < 0.3).astype(np.uint8)
+    return network, sparse_events(rng, samples, 10, 1, 40, rate=0.3)
 
 
 def decisions(spikes):

@@ -8,6 +8,7 @@ import pytest
 import random_networks as nets
 from hypothesis import given
 from hypothesis import strategies as st
+from made_files import sparse_events
 from numpy.testing import assert_array_equal
 from oracles import refused
 from scipy import sparse
@@ -100,8 +101,8 @@ def test_a_run_is_the_step_by_step_loop(networks, run, slowly, data):
     for sample in range(len(events)):
         spikes, membranes = slowly(network, events[sample])
         for post in range(len(network.populations)):
-            np.testing.assert_array_equal(activity.spikes[post][sample], spikes[post])
-            np.testing.assert_array_equal(activity.membranes[post][sample], membranes[post])
+            assert_array_equal(activity.spikes[post][sample], spikes[post])
+            assert_array_equal(activity.membranes[post][sample], membranes[post])
 
 
 def test_a_membrane_that_dies_away_is_flushed():
@@ -132,7 +133,7 @@ def lively(weights=3, seed=0, sizes=(8, 6, 5, 4)):
 
 
 def random_inputs(channels, seed=0, samples=4, steps=30, rate=0.3):
-    return (np.random.default_rng(seed).random((samples, channels, steps)) < rate).astype(np.uint8)
+    return sparse_events(seed, samples, channels, steps, rate=rate)
 
 
 def as_they_are(events):

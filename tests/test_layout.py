@@ -8,6 +8,7 @@ import pytest
 import random_networks as nets
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
+from made_files import sparse_events
 from oracles import refused
 
 from spikeloom.compiler.errors import CapacityError, NumericRangeError, OptionError
@@ -112,7 +113,7 @@ def netlist():
 
 @pytest.fixture(scope="module")
 def recordings():
-    return (np.random.default_rng(5).random((3, 6, 40)) < 0.5).astype(np.uint8)
+    return sparse_events(5, 3, 6, 40, rate=0.5)
 
 
 def test_a_network_takes_as_few_chips_as_hold_it(netlist, tmp_path):

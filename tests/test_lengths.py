@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from commands import as_json
-from made_files import CLASSES, TAXELS, own_file, rebuilt, weights
+from made_files import CLASSES, TAXELS, grasps_folder, own_file, rebuilt, weights
 from numpy.testing import assert_array_equal
 from oracles import refused
 
@@ -19,8 +19,6 @@ from spikeloom.compiler.targets.loihi1.netlist import netlist_bytes, read_netlis
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import BIN_S
-from spikeloom.models.recordings.grasps import synthetic_grasps
-from spikeloom.models.recordings.release import write_released
 from spikeloom.models.training.evaluate import evaluate
 from spikeloom.models.training.train import train, validation_split
 from spikeloom.runtime.cli import main
@@ -147,11 +145,7 @@ def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bins")
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.chdir(folder)
-        splits = [
-            replace(synthetic_grasps(per_class=2, steps=20, seed=seed, classes=("ring", "box")), split=split)
-            for split, seed in (("train", 1), ("test", 2))
-        ]
-        write_released(folder / "fine", splits)
+        grasps_folder(folder / "fine", per_class=2, steps=20, classes=("ring", "box"))
         words = (
             ("data", "convert", "fine", "--join", str(BINS), "-o", "long"),
             ("train", "--data", "fine", "--join", str(BINS), *TRAINED, "-o", "x.pt"),

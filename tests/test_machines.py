@@ -6,6 +6,7 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from oracles import refused
 from zoo import specimen
 
@@ -35,12 +36,12 @@ def test_runs_and_prices_are_the_simulators(made):
     counts = SIMULATORS[made.folder.name].simulate(netlist, channels, lengths=LENGTHS).counts
     done = machine.run(events, lengths=LENGTHS, spikes=True)
     votes = counts.votes if netlist.target == "truenorth" else counts.spikes
-    np.testing.assert_array_equal(done.votes, class_counts(netlist, votes))
-    np.testing.assert_array_equal(done.decisions, done.votes.argmax(axis=1))
+    assert_array_equal(done.votes, class_counts(netlist, votes))
+    assert_array_equal(done.decisions, done.votes.argmax(axis=1))
     assert tuple(done.spikes) == machine.layers
     for detail in machine.details:
         again, price = machine.price(events, lengths=LENGTHS, bin_s=0.02, detail=detail)
-        np.testing.assert_array_equal(again.votes, done.votes)
+        assert_array_equal(again.votes, done.votes)
         each = [price.synaptic_operations, *price.energy_j.values(), *price.time_s.values()]
         assert {np.shape(values) for values in each} == {(4,)}
         assert set(price.energy_j) == {table.name for table in machine.target.energy}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from made_files import recorded
+from made_files import recorded, sparse_events
 from made_modules import CLASSES, NETS, TAXELS, AllSteps, OneStep, example_of, mlp, seeded
 from oracles import refused
 from torch import nn
@@ -20,7 +20,7 @@ STEPS = 12
 
 def events_of(network, samples=3):
     shape = (samples, network.input.taxels, network.input.polarities, STEPS)
-    return (np.random.default_rng(5).random(shape) < 0.4).astype(np.uint8)
+    return sparse_events(5, *shape, rate=0.4)
 
 
 def as_input(name, events, step):

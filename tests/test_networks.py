@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from made_files import events as made_events
-from made_files import small_checkpoint
+from made_files import small_checkpoint, sparse_events
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import surrogate_spike
 
@@ -168,7 +168,7 @@ def network_of(
 
 
 def events_of(seed, samples=3, steps=25, rate=0.15):
-    return (np.random.default_rng(seed).random((samples, 39, 2, steps)) < rate).astype(np.uint8)
+    return sparse_events(seed, samples, 39, 2, steps, rate=rate)
 
 
 def saved(tmp_path, network, *, padding="none", weights=None, **more):

@@ -9,6 +9,8 @@ from commands import as_json
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from made_files import sparse_events
+from numpy.testing import assert_array_equal
 from onnx.reference import ReferenceEvaluator
 from oracles import assert_as_specified, by_scan, refused
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings, six_steps
@@ -38,10 +40,10 @@ def test_random_networks_are_the_specification(data):
 
 def test_a_large_network_is_the_engine():
     netlist = large_netlist(3, proved=True)
-    events = (np.random.default_rng(4).random((5, netlist.n_inputs, 30)) < 0.05).astype(np.uint8)
+    events = sparse_events(4, 5, netlist.n_inputs, 30, rate=0.05)
     lengths = np.array([30, 12, 30, 0, 12])
     expected = engine.simulate(netlist, events, lengths=lengths, spikes=True)
-    np.testing.assert_array_equal(by_scan(netlist, events, lengths=lengths)[0], expected.spikes)
+    assert_array_equal(by_scan(netlist, events, lengths=lengths)[0], expected.spikes)
 
 
 def three_neurons():
@@ -78,9 +80,7 @@ def test_verify_finds_an_engine_that_strays(monkeypatch):
 def test_digits_add_up_to_the_weights(weight, shift):
     found = digits(weight << shift)
     assert all(digit.dtype == np.int8 for digit, _ in found)
-    np.testing.assert_array_equal(
-        sum(digit.astype(np.int64) * factor for digit, factor in found), weight << shift
-    )
+    assert_array_equal(sum(digit.astype(np.int64) * factor for digit, factor in found), weight << shift)
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_the_reference_of_the_format_computes_the_same(tmp_path):
     )
     model = ReferenceEvaluator(content)
     found = dict(zip(model.output_names, model.run(None, {"events": given.transpose(2, 0, 1)}), strict=True))
-    np.testing.assert_array_equal(found["layer0.spikes"].transpose(1, 0, 2), expected[:, :12, :2])
-    np.testing.assert_array_equal(found["layer1.spikes"].transpose(1, 0, 2), expected[:, 1:13, 2:])
+    assert_array_equal(found["layer0.spikes"].transpose(1, 0, 2), expected[:, :12, :2])
+    assert_array_equal(found["layer1.spikes"].transpose(1, 0, 2), expected[:, 1:13, 2:])
     assert found["votes"].tolist() == [[0, int(sample[:, 2].sum())] for sample in expected]
     assert found["class"].tolist() == [int(sample[:, 2].any()) for sample in expected]

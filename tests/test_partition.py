@@ -5,6 +5,7 @@ import pytest
 import random_networks as nets
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from oracles import refused
 
 from spikeloom.compiler.errors import CapacityError
@@ -301,4 +302,4 @@ def test_traffic_is_a_packet_per_listening_axon(network, compartments, seed):
             compartment = source - netlist.n_inputs
             rate = rates[netlist.layer[compartment]][netlist.neuron[compartment]]
             expected[core_of_compartment[compartment], core_of_axon[axon]] += rate
-    np.testing.assert_allclose(core_traffic(network, parts, rates), expected, rtol=1e-12)
+    assert_allclose(core_traffic(network, parts, rates), expected, rtol=1e-12)

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from made_files import events, recorded, small_checkpoint
+from numpy.testing import assert_allclose, assert_array_equal
 from oracles import probed, refused
 from random_networks import (
     assert_same_layers,
@@ -161,7 +162,7 @@ def test_the_expanded_convolution_is_the_probed_one(adjacency, n_hops, features,
     hops = np.random.default_rng(seed).normal(size=(n_hops, features, channels))
     expanded = convolution(adjacency, hops)
     weight, bias = probed(factored(adjacency, hops), len(adjacency) * channels)
-    np.testing.assert_allclose(expanded.toarray(), weight, rtol=0, atol=1e-12)
+    assert_allclose(expanded.toarray(), weight, rtol=0, atol=1e-12)
     assert not bias.any()
 
 
@@ -207,7 +208,7 @@ def test_leaving_out_moves_no_spike_that_is_left(network, data):
     for post, ids in enumerate(kept):
         assert len(ids) >= 1
         assert not whole[post][..., silent[post]].any()
-        np.testing.assert_array_equal(rest[post], whole[post][..., ids])
+        assert_array_equal(rest[post], whole[post][..., ids])
     voting = network.readout.population
     assert len(kept[voting]) == network.populations[voting].size
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import as_json, run
+from oracles import refused
 
 from spikeloom.compiler.counters import BLOCK
 from spikeloom.compiler.errors import OptionError
@@ -91,5 +92,4 @@ def test_the_option(monkeypatch, tmp_path):
     request = EstimateRequest(
         netlist="net.loom", data=synthetic_split("test", limit=12), against_processor=True
     )
-    with pytest.raises(OptionError, match="needs the training split"):
-        estimate.run(request)
+    refused(OptionError, "needs the training split", estimate.run, request)

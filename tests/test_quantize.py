@@ -9,6 +9,7 @@ import pytest
 import random_networks as nets
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 
 from spikeloom.compiler.interpret import run_float
 from spikeloom.compiler.ir import Form
@@ -118,9 +119,7 @@ def test_a_layer_of_zeros_with_biases_spikes_by_them():
     network = nets.chain(np.zeros((3, 2)), biases=[[0.6, 0.45, 0.3]])
     events = np.ones((1, 20, 2), bool)
     integer, _ = choose_storage(network, nets.LOIHI)
-    np.testing.assert_array_equal(
-        run_integer(integer, events).spikes[0], run_float(network, events).spikes[0]
-    )
+    assert_array_equal(run_integer(integer, events).spikes[0], run_float(network, events).spikes[0])
 
 
 @pytest.mark.parametrize("weight", [100.0, 300.0, 4000.0])

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from made_files import zipped
+from numpy.testing import assert_array_equal
 from random_networks import compiled, integer_chain, integer_networks
 
 from spikeloom.compiler import archive
@@ -99,7 +100,7 @@ def test_every_netlist_comes_back_whole(tmp_path_factory, network):
 def test_numpy_alone_reads_the_file(path, netlist):
     with np.load(path, allow_pickle=False) as members:
         assert set(members.files) == {"manifest", "sha256", *ARRAYS}
-        np.testing.assert_array_equal(members["synapse_weight"], netlist.synapse_weight)
+        assert_array_equal(members["synapse_weight"], netlist.synapse_weight)
         kinds = {name: members[name].dtype.str for name in ("synapse_weight", "readout_class", "threshold")}
         assert kinds == {"synapse_weight": "<i2", "readout_class": "|i1", "threshold": "<i4"}
         manifest = json.loads(str(members["manifest"]))

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
+from oracles import refused
 from random_netlists import SIMULATORS, Axon, Neuron, build
 
 from spikeloom.compiler.errors import DataError, NumericRangeError
@@ -100,7 +102,7 @@ def test_layers_integrate_in_their_window_only(simulate):
     trace = simulate(netlist, np.zeros((1, 3), np.uint8))
     assert trace.spikes.shape == trace.membranes.shape == (8, 3)
     assert [spikes(trace, c) for c in range(3)] == [[0, 1, 2], [2, 3, 4], [5, 6, 7]]
-    np.testing.assert_array_equal(trace.membranes, trace.spikes)
+    assert_array_equal(trace.membranes, trace.spikes)
     for layer in range(3):
         assert aligned(netlist, trace.spikes, layer).tolist() == [[True], [True], [True]]
         assert aligned(netlist, trace.spikes[None], layer).shape == (1, 3, 1)
@@ -150,5 +152,10 @@ def test_overflows(simulate, netlist, channels, found):
 
 
 def test_wrong_number_of_channels(simulate):
-    with pytest.raises(DataError, match="2 input channels found, the netlist has 1"):
-        simulate(single(Neuron()), np.zeros((2, 3), np.uint8))
+    refused(
+        DataError,
+        "2 input channels found, the netlist has 1",
+        simulate,
+        single(Neuron()),
+        np.zeros((2, 3), np.uint8),
+    )

@@ -9,7 +9,7 @@ import pytest
 from commands import as_json, run
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from made_files import CLASSES, TAXELS, events, recorded, recordings_folder
+from made_files import CLASSES, TAXELS, events, recorded, recordings_folder, sparse_events
 from numpy.testing import assert_array_equal
 from random_crossbars import counter_events, random_counters
 from random_netlists import large_netlist, lively, netlists, recordings, voting
@@ -79,7 +79,7 @@ def test_changed_runs_are_whole_runs_on_networks_of_any_kind(data):
 
 def test_a_change_ends_where_the_chip_is_in_the_state_that_it_would_be_in_anyway():
     netlist = lively()
-    channels = (np.random.default_rng(0).random((20, 40)) < 0.2).astype(np.uint8)
+    channels = sparse_events(0, 20, 40, rate=0.2)
     cells = every_cell(channels)[::7]
     found = assert_as_by_running(machine_of(netlist), channels, single(cells))
     changed = np.repeat(channels[None], len(cells), axis=0)
@@ -110,7 +110,7 @@ def test_what_is_known_again_is_so_after_any_past(seed):
     rng = np.random.default_rng(seed)
     netlist = lively() if seed == 0 else small_netlist(seed)
     inputs, steps = netlist.n_inputs, 40
-    channels = (rng.random((inputs, steps)) < 0.1).astype(np.uint8)
+    channels = sparse_events(rng, inputs, steps, rate=0.1)
     machine = machine_of(netlist)
     known = machine.forgetting(channels)
     (spikes,), (membranes,) = kept(netlist, channels[None])
@@ -199,7 +199,7 @@ def test_no_attack_breaks_what_is_proven(seed):
 def test_counters_bear_exactly_so_many_events(plan):
     rng, labels = np.random.default_rng(3), np.arange(24) % 3
     often = np.random.default_rng(4).random((3, 2, 2, 1))
-    given = (rng.random((24, 2, 2, 16)) < 0.6 * often[labels]).astype(np.uint8)
+    given = sparse_events(rng, 24, 2, 2, 16, rate=0.6 * often[labels])
     data = recorded(given, labels)
     seen = run_counters(data, plan)
     made = counters_of(seen, fit(seen, 3), data, 3)

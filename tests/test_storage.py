@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from random_networks import BITS, LOIHI, chain, float_networks, moved, recordings_for
 
 from spikeloom.compiler.ir import Form
@@ -71,7 +72,7 @@ def test_planes_hold_every_step_and_the_coarser_only_what_the_finer_do_not_reach
     )
     planes = split_planes(steps, bits, exponents)
     total = sum(plane * 2 ** (e - exponents[0]) for plane, e in zip(planes, exponents, strict=True))
-    np.testing.assert_array_equal(total, steps * weight_step(bits))
+    assert_array_equal(total, steps * weight_step(bits))
     for k, plane in enumerate(planes):
         assert not np.any(plane % weight_step(bits))
         assert np.abs(plane).max() <= 256 - weight_step(bits)
@@ -96,7 +97,7 @@ def test_a_rounded_population_is_the_nearest_of_its_grid(network, storage, data)
         )
         form = Form(bits=bits, exponents=exponents, threshold=threshold)
         integer, planes = round_population(population, incoming, form)
-        np.testing.assert_allclose(integer.realised_theta, population.theta, rtol=1e-15)
+        assert_allclose(integer.realised_theta, population.theta, rtol=1e-15)
         step, limit = weight_step(bits) * 2.0 ** exponents[0], reach(bits, exponents)
         for projection in incoming:
             stored = sum(p.effective().toarray() for p in planes if p.pre == projection.pre)
@@ -107,7 +108,7 @@ def test_a_rounded_population_is_the_nearest_of_its_grid(network, storage, data)
         for plane in planes:
             dense = plane.effective().toarray()
             by_hand += [np.maximum(dense, 0).sum(axis=1), np.maximum(-dense, 0).sum(axis=1)]
-        np.testing.assert_array_equal(one_sided(planes, population.size), by_hand)
+        assert_array_equal(one_sided(planes, population.size), by_hand)
 
 
 def test_planes_are_stored_where_they_are_used():
@@ -169,7 +170,7 @@ def test_every_recipe_gives_a_proven_legal_network(network, bits, planes, groups
         assert len(np.unique(population.threshold)) == choice.groups <= groups
         assert 1 <= choice.planes <= planes
         assert choice.scale <= choice.finest_scale
-        np.testing.assert_allclose(population.realised_theta, model.theta, rtol=1e-15)
+        assert_allclose(population.realised_theta, model.theta, rtol=1e-15)
         # a bias is off by half a unit of its register at most
         unit = 2.0**population.bias_exponent / (64 * population.scale)
         error = population.bias / (64 * population.scale) - model.bias
@@ -211,7 +212,7 @@ def test_each_error_is_made_up_for_as_well_as_the_inputs_to_come_can():
         error = left[:, j] - expected[:, j]
         left[:, rest] += np.outer(error, np.linalg.solve(damped[np.ix_(rest, rest)], damped[rest, j]))
     found = _round_in_turn(weight[:, order], _share(together[np.ix_(order, order)]))
-    np.testing.assert_array_equal(found, expected[:, order])
+    assert_array_equal(found, expected[:, order])
     assert np.any(expected != np.rint(weight))
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_files import recorded
+from made_files import recorded, sparse_events
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import refused
 from random_networks import LOIHI, chain, integer_chain, integer_population, small_target, stored
@@ -174,7 +174,7 @@ def drawn(seed, *, hidden=12, gain=1.0, alpha=0.0):
 
 def events_of_five(seed, samples=6, steps=50):
     """Recordings (samples, taxels, polarities, steps) of five taxels."""
-    return (np.random.default_rng(seed).random((samples, 5, 2, steps)) < 0.3).astype(np.uint8)
+    return sparse_events(seed, samples, 5, 2, steps, rate=0.3)
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.5])

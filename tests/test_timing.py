@@ -7,6 +7,8 @@ import pytest
 import timing_oracle
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_files import sparse_events
+from numpy.testing import assert_allclose, assert_array_equal
 from random_netlists import Axon, Neuron, build, by_engine, large_netlist, netlists, recordings, six_steps
 from random_networks import LOIHI
 
@@ -47,25 +49,25 @@ def assert_as_defined(netlist, trace, events, *, times=SANAFE):
     def column(name, scale=PICO):
         return np.array([[getattr(step, name) for step in wanted]]) / scale
 
-    np.testing.assert_array_equal(simple.duration_ns, column("simple"))
+    assert_array_equal(simple.duration_ns, column("simple"))
     cores = netlist.n_cores
     for name in ("generation", "processing"):
         total = [sum(getattr(step, name)[core] for step in wanted) / PICO for core in range(cores)]
-        np.testing.assert_array_equal(getattr(simple, f"{name}_ns"), [total])
+        assert_array_equal(getattr(simple, f"{name}_ns"), [total])
     loads = [step.generation + step.processing for step in wanted]
     critical = [load.index(max(load)) for load in loads]
-    np.testing.assert_array_equal(simple.critical_core, [[core % cores for core in critical]])
-    np.testing.assert_array_equal(simple.receiving, [[core >= cores for core in critical]])
+    assert_array_equal(simple.critical_core, [[core % cores for core in critical]])
+    assert_array_equal(simple.receiving, [[core >= cores for core in critical]])
     for name, field in (
         ("detailed", "duration"),
         ("sent", "sent"),
         ("processed", "processed"),
         ("blocked", "blocked"),
     ):
-        np.testing.assert_array_equal(getattr(detailed, f"{field}_ns"), column(name), err_msg=name)
-    np.testing.assert_array_equal(detailed.critical_core, column("critical_core", 1))
-    np.testing.assert_array_equal(detailed.receiving, column("receiving", 1))
-    np.testing.assert_array_equal(detailed.peak_load, column("peak_load", 1))
+        assert_array_equal(getattr(detailed, f"{field}_ns"), column(name), err_msg=name)
+    assert_array_equal(detailed.critical_core, column("critical_core", 1))
+    assert_array_equal(detailed.receiving, column("receiving", 1))
+    assert_array_equal(detailed.peak_load, column("peak_load", 1))
     return wanted
 
 
@@ -139,7 +141,7 @@ def test_kernels_and_definition_agree_on_a_crowded_mesh(link_buffer):
     netlist = replace(large_netlist(1, proved=True), core_tile=read_only([0, 0, 3, 17, 30]))
     rng = np.random.default_rng(2)
     spikes = rng.random((3, netlist.n_compartments)) < 0.3
-    events = (rng.random((netlist.n_inputs, 3)) < 0.5).astype(np.uint8)
+    events = sparse_events(rng, netlist.n_inputs, 3, rate=0.5)
     trace = forced(netlist, spikes, spikes | (rng.random(spikes.shape) < 0.5))
     wanted = assert_as_defined(netlist, trace, events, times=table(link_buffer))
     assert (max(step.blocked for step in wanted) > 0) == (link_buffer < 16)
@@ -202,7 +204,7 @@ def test_parts_and_cores_add_up_to_the_estimate():
     netlist = replace(large_netlist(3, proved=True), core_tile=read_only([0, 0, 3, 17, 30]))
     form = np.arange(len(netlist.format_index_bits)) % 2 * 10
     netlist = replace(netlist, format_index_bits=read_only(form))
-    events = (np.random.default_rng(4).random((3, netlist.n_inputs, 12)) < 0.3).astype(np.uint8)
+    events = sparse_events(4, 3, netlist.n_inputs, 12, rate=0.3)
     lengths = np.array([12, 5, 0])
     trace = engine.simulate(netlist, events, lengths=lengths, spikes=True, updated=True)
     estimate = cost.price(cost.prepare(netlist, LOIHI), trace.counts, lengths + netlist.max_depth)
@@ -210,12 +212,12 @@ def test_parts_and_cores_add_up_to_the_estimate():
     amounts = cost.price(cost.prepare(netlist, LOIHI, "core"), counts, lengths + netlist.max_depth).events
     assert all(amount.shape == (3, netlist.n_cores) for amount in amounts.values())
     for event, amount in amounts.items():
-        np.testing.assert_allclose(amount.sum(axis=1), estimate.events[event].sum(axis=1), err_msg=event)
+        assert_allclose(amount.sum(axis=1), estimate.events[event].sum(axis=1), err_msg=event)
         assert amount.any(), event
     for priced in LOIHI.energy:
         for found in (amounts, estimate.events):
             whole = sum(joules.sum(axis=1) for joules in cost.by_part(LOIHI, found)[priced.name].values())
-            np.testing.assert_allclose(whole, estimate.energy[priced.name].sum(axis=1), rtol=1e-12)
+            assert_allclose(whole, estimate.energy[priced.name].sum(axis=1), rtol=1e-12)
 
 
 def test_amounts_of_a_core_are_its_own():

@@ -15,10 +15,12 @@ from made_files import (
     recordings_folder,
     ring,
     small_checkpoint,
+    sparse_events,
     weights,
 )
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import load_weights, refused
+from zoo import tuned
 
 import spikeloom.models.training.train
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
@@ -196,8 +198,9 @@ def test_a_killed_training_resumes_to_the_same_weights(tmp_path, robust):
     training, test, state = grasps(0), grasps(1), tmp_path / "x.state"
     options = {"epochs": 4, "seed": 2, "keep_epoch": 2, "recipe": replace(RELEASED, robust=robust)}
     whole = train(training, test, ADJACENCY, SMALL, **options)
-    with pytest.raises(KilledError):
-        train(training, test, ADJACENCY, SMALL, **options, state=state, after_epoch=killed)
+    refused(
+        KilledError, "", train, training, test, ADJACENCY, SMALL, **options, state=state, after_epoch=killed
+    )
     resumed = train(training, test, ADJACENCY, SMALL, **options, state=state, resume=True)
     plain = train(training, test, ADJACENCY, SMALL, epochs=4, seed=2, keep_epoch=2)
     assert same(plain.last, whole.last) == (robust == 0)
@@ -267,7 +270,7 @@ def drawn(checkpoint, seed, *, samples=12, steps=20):
     rng = np.random.default_rng(seed)
     labels = rng.integers(0, checkpoint.classes, samples)
     rate = 0.05 + 0.3 * (labels[:, None, None, None] / max(1, checkpoint.classes - 1))
-    events = (rng.random((samples, checkpoint.taxels, 2, steps)) < rate).astype(np.uint8)
+    events = sparse_events(rng, samples, checkpoint.taxels, 2, steps, rate=rate)
     return recorded(events, labels)
 
 
@@ -286,7 +289,7 @@ def test_the_model_computes_what_the_compiled_network_computes(tmp_path, bits, s
     found = model.spikes_of(time_first(data.events))
     expected = run_integer(integer, channels_last(data.events)).spikes
     for ours, theirs in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(ours.detach().bool().numpy().transpose(1, 0, 2), theirs)
+        assert_array_equal(ours.detach().bool().numpy().transpose(1, 0, 2), theirs)
     assert sum(int(spikes.sum()) for spikes in expected) > 0
 
 
@@ -334,7 +337,7 @@ def test_weights_that_would_overflow_are_shrunk(tmp_path):
 
 def test_what_is_lost_and_comes_has_its_chance():
     rng = np.random.default_rng(0)
-    events = (rng.random((200, 20, 2, 50)) < rng.uniform(0.05, 0.4, (200, 1, 1, 1))).astype(np.uint8)
+    events = sparse_events(rng, 200, 20, 2, 50, rate=rng.uniform(0.05, 0.4, (200, 1, 1, 1)))
     found = disturb(events, 0.2, np.random.default_rng(1))
     alive = found.any(axis=(2, 3))
     assert alive.mean() == pytest.approx(0.8, abs=0.02)
@@ -360,7 +363,7 @@ def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
     rest = finetune(network, train, test, LOIHI, resume=True, **options)
     assert rest.history == whole.history
     for name, array in whole.net.tensors().items():
-        np.testing.assert_array_equal(rest.net.tensors()[name], array)
+        assert_array_equal(rest.net.tensors()[name], array)
     moved = replace(checkpoint, conv_bias=checkpoint.conv_bias + 1)  # as other epochs of the same file are
     for other, what in ((moved, "network"), (replace(checkpoint, beta=0.6), "beta")):
         words = f"belongs to a training with other {what}"
@@ -409,9 +412,8 @@ def test_a_loss_that_is_no_number(tmp_path, monkeypatch, loss, name, found):
     ],
 )
 def test_forms_that_cannot_be_used(tmp_path, change):
-    checkpoint, adjacency = small_checkpoint(tmp_path)
-    data = drawn(checkpoint, 0)
-    forms = tuned_forms(checkpoint, adjacency, data.events, 4)
+    checkpoint, _ = small_checkpoint(tmp_path)
+    forms = tuned(checkpoint).forms
     path = tmp_path / "tuned.pt"
     graph = ring(checkpoint.taxels)
     constants = {"beta": 0.2, "theta": 0.5, "training": {}}

@@ -9,20 +9,19 @@ import sys
 import time
 from collections import Counter
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 import swept
 from commands import RUNTIME, as_json, refusal, run
+from made_files import grasps_folder
 from oracles import refused
 from swept import Square, begun, points, square
 
 from spikeloom.compiler.errors import DataError, OptionError, UnfinishedError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.models.recordings.grasps import synthetic_grasps
-from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime import cli
 from spikeloom.runtime.studies.jobs import only_one, sweep
 from spikeloom.runtime.studies.training import seeds as trainings
@@ -35,11 +34,7 @@ WORDS = ("train", "--data", "data", "--graph", "manual", "--features", "4")
 def data(tmp_path, monkeypatch) -> Path:
     """A small data set in the released layout; the working folder is where it is."""
     monkeypatch.chdir(tmp_path)
-    splits = (("train", 1), ("test", 2))
-    grasps = [
-        replace(synthetic_grasps(per_class=3, steps=12, seed=seed), split=split) for split, seed in splits
-    ]
-    write_released(tmp_path / "data", grasps)
+    grasps_folder(tmp_path / "data", per_class=3, steps=12)
     return tmp_path
 
 
@@ -309,15 +304,19 @@ def test_what_a_measurement_raises_arrives_and_results_are_kept(tmp_path, jobs):
     assert raised.value.__notes__[1].endswith(
         f"of 4 measurements of this stage are kept in {tmp_path / 'x.store'}"
     )
-    with pytest.raises(ZeroDivisionError, match="a defect"):
-        swept_here(tmp_path, points(tmp_path / "log", 5, trouble={4: "defect"}), jobs=jobs)
+    refused(
+        ZeroDivisionError,
+        "a defect",
+        swept_here,
+        tmp_path,
+        points(tmp_path / "log", 5, trouble={4: "defect"}),
+        jobs=jobs,
+    )
 
 
 def test_an_interrupt_keeps_all(tmp_path):
-    with pytest.raises(
-        KeyboardInterrupt,
-        match=r"2 of 3 measurements of this stage are kept in .*; go on with the same command",
-    ):
+    said = r"2 of 3 measurements of this stage are kept in .*; go on with the same command"
+    with pytest.raises(KeyboardInterrupt, match=said):  # a note
         swept_here(tmp_path, points(tmp_path / "log", 3, trouble={2: "interrupt"}), jobs=1)
 
 

@@ -9,6 +9,8 @@ from commands import as_json, run
 from hypothesis import given
 from hypothesis import strategies as st
 from made_files import recordings_folder
+from numpy.testing import assert_array_equal
+from oracles import refused
 from random_crossbars import CHIP, both, counter_events, random_counters, with_limit
 
 from spikeloom.compiler.counters import BLOCK
@@ -34,12 +36,12 @@ def assert_exact(counters, events, chip=CHIP):
     for name, first in plan.first.items():
         chosen = np.flatnonzero(netlist.layer == netlist.layers.index(name))
         on_chip = trace.spikes[first : first + steps][:, chosen]
-        np.testing.assert_array_equal(on_chip, model[name][:, netlist.neuron[chosen]], name)
+        assert_array_equal(on_chip, model[name][:, netlist.neuron[chosen]], name)
     votes = class_counts(netlist, trace.counts.votes[None])[0]
-    np.testing.assert_array_equal(votes, model["votes"].sum(axis=0))
+    assert_array_equal(votes, model["votes"].sum(axis=0))
     network = counting_network(counters)
     spikes = float_simulation(network).run(channels_last(events[None], counters.clocks)).spikes
-    np.testing.assert_array_equal(votes, spikes[-1][0].sum(axis=0))
+    assert_array_equal(votes, spikes[-1][0].sum(axis=0))
     return votes
 
 
@@ -60,11 +62,11 @@ def test_both_chips_have_the_same_whole_numbers_and_votes(most):
     counters = random_counters(most, taxels=6, classes=8, most=most, ramp=60)
     events = np.stack([counter_events(seed, counters) for seed in range(6)])
     made = compile_network(counting_network(counters)), compile_crossbars(counters)
-    np.testing.assert_array_equal(*(machine_of(each.netlist).run(events).votes for each in made))
+    assert_array_equal(*(machine_of(each.netlist).run(events).votes for each in made))
     scales = [population.scale for population in made[0].integer.populations]
     for projection, held in zip(made[0].network.projections, made[0].integer.projections, strict=True):
         whole = projection.weight.toarray() * scales[projection.post][:, None]
-        np.testing.assert_array_equal(held.effective().toarray(), whole)
+        assert_array_equal(held.effective().toarray(), whole)
 
 
 def test_sums_of_several_cores_come_together():
@@ -113,10 +115,14 @@ def test_what_the_chip_cannot_hold_is_refused(tmp_path):
     ):
         compile_crossbars(counters)
     counters = random_counters(0)
-    with pytest.raises(ModelError, match=r"a ramp of 0\.5 a step"):
-        compile_crossbars(replace(counters, slope=0.5))
-    with pytest.raises(CapacityError, match=r"chip: 2 used, 1 allowed .*--weight-bits"):
-        compile_crossbars(counters, target=with_limit("chip.cores", 1))
+    refused(ModelError, "a ramp of 0.5 a step", compile_crossbars, replace(counters, slope=0.5))
+    refused(
+        CapacityError,
+        "chip: 2 used, 1 allowed |--weight-bits",
+        compile_crossbars,
+        counters,
+        target=with_limit("chip.cores", 1),
+    )
     write_counters(tmp_path / "c.pt", random_counters(0, most=127))
     code, _, err = run("compile", tmp_path / "c.pt", "--target", "truenorth", "-o", tmp_path / "c.loom")
     assert (code, "c.pt: weights of up to" in err) == (2, True)

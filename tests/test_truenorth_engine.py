@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_files import sparse_events
 from random_crossbars import CHIP, alone, both, crossbars, events, recording_of, relays, with_limit
 from random_netlists import assert_equal
 from random_networks import chain
@@ -137,7 +138,7 @@ def large():
 
 
 def test_full_cores_and_many_ticks():
-    netlist, recording = large(), (np.random.default_rng(1).random((78, 60)) < 0.05).astype(np.uint8)
+    netlist, recording = large(), sparse_events(1, 78, 60, rate=0.05)
     assert faults(netlist, CHIP) == ()
     assert 1000 < both(netlist, recording).counts.spikes.sum() < 2500 * 60
 

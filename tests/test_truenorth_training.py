@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 from commands import as_json, refusal
+from made_files import grasps_folder, sparse_events
+from numpy.testing import assert_allclose, assert_array_equal
 from oracles import refused
 from random_crossbars import random_network
 from zoo import STEPS, specimen
@@ -18,8 +20,6 @@ from spikeloom.compiler.targets.truenorth.native import faults
 from spikeloom.compiler.targets.truenorth.native_file import PARTS, is_trained, read_trained, write_trained
 from spikeloom.compiler.targets.truenorth.netlist import read_crossbars, write_crossbars
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, Surrogate
-from spikeloom.models.recordings.grasps import synthetic_grasps
-from spikeloom.models.recordings.release import write_released
 from spikeloom.models.systems import propagation_of
 from spikeloom.models.truenorth import network as truenorth
 from spikeloom.models.truenorth.kind import CROSSBARS
@@ -83,7 +83,7 @@ def network(seed=0, sizes=SIZES):
 
 
 def test_what_is_trained_is_what_is_exported():
-    net, events = network(), (np.random.default_rng(2).random((3, 6, 2, 9)) < 0.3).astype(np.uint8)
+    net, events = network(), sparse_events(2, 3, 6, 2, 9, rate=0.3)
     with torch.no_grad():
         net.biases[1] += 0.3
         net.hops *= 2
@@ -91,10 +91,10 @@ def test_what_is_trained_is_what_is_exported():
     assert faults(found) == []
     votes = truenorth.run_network(found, events)["fc3"].sum(axis=1).reshape(3, -1, 3).mean(axis=1) / 9
     rates = net(torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32)))
-    np.testing.assert_allclose(rates.detach().numpy(), votes, rtol=1e-6)
+    assert_allclose(rates.detach().numpy(), votes, rtol=1e-6)
     for layer in net.rounded():
         for whole in (layer.weight / 32, layer.leak, layer.threshold, layer.floor):
-            np.testing.assert_array_equal(whole.detach().numpy(), np.round(whole.detach().numpy()))
+            assert_array_equal(whole.detach().numpy(), np.round(whole.detach().numpy()))
     rates.sum().backward()
     assert all(
         parameter.grad is not None and parameter.grad.abs().sum() > 0 for parameter in net.parameters()
@@ -121,7 +121,7 @@ def test_equal_votes_stay_equal():
         rates = net(events, lengths).detach().numpy()
         for one, other in ((0, 1), (0, 2), (1, 2)):
             difference = np.sign(counts[:, one] - counts[:, other])
-            np.testing.assert_array_equal(difference, np.sign(rates[:, one] - rates[:, other]))
+            assert_array_equal(difference, np.sign(rates[:, one] - rates[:, other]))
             equal += np.count_nonzero((difference == 0) & (counts[:, one] > 0))
     assert equal > 10
 
@@ -135,16 +135,28 @@ def test_groups_fill_the_axons_of_a_core():
         taxels=39, classes=20, hops=3, features=15, copies=2, clocks=clocks_over(8, 325)
     )
     assert (found.groups, found.hidden) == (5, (120, 120))
-    with pytest.raises(OptionError, match=r"--copies 4: 78 input channels with 4 axons each, .* has 256"):
-        truenorth.size_network(
-            taxels=39, classes=20, hops=3, features=16, copies=4, clocks=clocks_over(5, 325)
-        )
-    with pytest.raises(
-        OptionError, match=r"--features 16: .* 39 taxels and 60 clocks to cores of 85 inputs"
-    ):
-        truenorth.size_network(
-            taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(60, 325)
-        )
+    refused(
+        OptionError,
+        "--copies 4: 78 input channels with 4 axons each, | has 256",
+        truenorth.size_network,
+        taxels=39,
+        classes=20,
+        hops=3,
+        features=16,
+        copies=4,
+        clocks=clocks_over(5, 325),
+    )
+    refused(
+        OptionError,
+        "--features 16: | 39 taxels and 60 clocks to cores of 85 inputs",
+        truenorth.size_network,
+        taxels=39,
+        classes=20,
+        hops=3,
+        features=16,
+        copies=3,
+        clocks=clocks_over(60, 325),
+    )
 
 
 def written(path, networks=None):
@@ -169,7 +181,7 @@ def test_round_trip(tmp_path):
         )
         for one, other in zip(found.network.stages, made.stages, strict=True):
             for part in PARTS:
-                np.testing.assert_array_equal(getattr(one, part), getattr(other, part))
+                assert_array_equal(getattr(one, part), getattr(other, part))
     assert read_trained(path).weights == "last"
     refused(ModelError, "--weights clean: the file holds last, best", read_trained, path, weights="clean")
 
@@ -213,11 +225,7 @@ TRAIN = "train --system tactilesgnet-truenorth --data data --graph manual --feat
 
 def test_from_recordings_to_the_chip(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    seeds = (("train", 1), ("test", 2))
-    grasps = [
-        replace(synthetic_grasps(per_class=2, steps=12, seed=seed), split=split) for split, seed in seeds
-    ]
-    write_released(tmp_path / "data", grasps)
+    grasps = grasps_folder(tmp_path / "data", per_class=2, steps=12)
     (run,) = as_json(*f"{TRAIN} -o x.pt".split())["runs"]
     assert run["command"].endswith(
         "--system tactilesgnet-truenorth --graph manual --features 2 --epochs 1 --seed 0"

@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from made_files import sparse_events
+from numpy.testing import assert_array_equal
 from oracles import refused
 from random_netlists import Axon, Neuron, build, lively, netlists, recordings, voting
 
@@ -94,7 +96,7 @@ def as_lines(events: np.ndarray, seed: int = 0, *, low: int = 0, inside: int = 0
 
 def random_events(seed: int, length: int = 40) -> np.ndarray:
     """A recording (10, 2, length) whose last bin is not empty."""
-    events = (np.random.default_rng(seed).random((10, 2, length)) < 0.1).astype(np.uint8)
+    events = sparse_events(seed, 10, 2, length, rate=0.1)
     events[3, 1, -1] = 1
     return events
 
@@ -320,7 +322,7 @@ def test_a_grasp_ends_as_soon_as_it_is_sure(lively_file, lines, factor):
 
 
 def events_of(netlist: Netlist, seed: int, length: int = 30) -> np.ndarray:
-    return (np.random.default_rng(seed).random((netlist.n_inputs, length)) < 0.15).astype(np.uint8)
+    return sparse_events(seed, netlist.n_inputs, length, rate=0.15)
 
 
 def play(stream: Stream, events: np.ndarray) -> list[Step]:
@@ -338,10 +340,10 @@ def assert_is_run(netlist: Netlist, steps: list[Step], events: np.ndarray) -> No
         expected = np.zeros_like(found)
         ids = netlist.compartments_of(layer)
         expected[:, netlist.neuron[ids]] = trace.spikes[0][:, ids]
-        np.testing.assert_array_equal(found, expected, strict=True)
+        assert_array_equal(found, expected, strict=True)
     so_far = np.cumsum(trace.spikes[0], axis=0)
     votes = class_counts(netlist, so_far)
-    np.testing.assert_array_equal(
+    assert_array_equal(
         np.array([s.counts for s in steps], np.int64).reshape(votes.shape), votes, strict=True
     )
     assert [step.decision for step in steps] == votes.argmax(axis=1).tolist()

@@ -2,9 +2,8 @@
 
 from dataclasses import replace
 
-import made_files
-import numpy as np
 import torch
+from made_files import graph_facts, sparse_events
 
 from spikeloom.compiler.dynamics import Clocks, Dynamics
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
@@ -43,10 +42,10 @@ def written(path, system="tactilesgnet", dynamics=TIMING, seed=1, **sizes):
         "grid": grid,
     }
     sets = {"last": network.export_weights()}
-    save_checkpoint(path, sets, **made_files.graph_facts(GRAPH), dynamics=dynamics, **constants)
+    save_checkpoint(path, sets, **graph_facts(GRAPH), dynamics=dynamics, **constants)
     return network, seen
 
 
 def events_of(seed, samples=4, steps=15, rate=0.15):
     """Recordings (samples, taxels, polarities, steps)."""
-    return (np.random.default_rng(seed).random((samples, 39, 2, steps)) < rate).astype(np.uint8)
+    return sparse_events(seed, samples, 39, 2, steps, rate=rate)

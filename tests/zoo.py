@@ -17,7 +17,7 @@ import made_nir
 import nir
 import numpy as np
 import pytest
-from made_files import CLASSES, recordings_folder
+from made_files import CLASSES, recordings_folder, sparse_events
 from made_modules import TAXELS
 from random_crossbars import random_network as native_network
 from timed_networks import GRAPH, TIMING, written
@@ -245,7 +245,7 @@ def specimen(name: str) -> Specimen:
     data = folder / "data"
     rng = np.random.default_rng(7)
     steps = 3 * STEPS - 1 if name == "binned" else STEPS
-    train, test = ((rng.random((samples, taxels, 2, steps)) < 0.2).astype(np.uint8) for samples in (8, 4))
+    train, test = (sparse_events(rng, samples, taxels, 2, steps, rate=0.2) for samples in (8, 4))
     recordings_folder(data, train=train, test=test, classes=3 if name == "onnx" else CLASSES)
     calibrated = ["--calibrate", str(data)] if name in FLOAT and "tuned" not in name else []
     made = Specimen(folder, folder / file, tuple(reading.split()), (*compiling.split(), *calibrated))
