@@ -1,17 +1,16 @@
 """Layouts: cores asked for, and networks on several chips."""
 
-import contextlib
 import dataclasses
 
 import numpy as np
 import pytest
 import random_networks as nets
-from hypothesis import Phase, assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from made_files import sparse_events
 from oracles import refused
 
-from spikeloom.compiler.errors import CapacityError, NumericRangeError, OptionError
+from spikeloom.compiler.errors import CapacityError, OptionError
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
@@ -19,18 +18,10 @@ from spikeloom.compiler.targets.loihi1.layout.partition import core_bound, parti
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count, chip_of_core, place_on_chips, share
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, require_legal
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist, write_netlist
-from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import page, timing
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
-from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.report.encode import encode
-
-WITHOUT_SHRINKING = tuple(phase for phase in Phase if phase is not Phase.shrink)
-
-
-def netlist_of(network, layout, target=nets.LOIHI):
-    return emit(network, layout.cores, layout.placement.tiles, target, {})
 
 
 def test_a_layer_gets_more_cores_than_asked_for_if_even_parts_do_not_fit():
@@ -66,30 +57,6 @@ def test_every_partition_is_legal_and_holds_every_neuron_once(network, target, d
     require_legal(nets.seated(network, parts, target), target)
     assert partition(network, target, cores_for=asked) == parts
     assert partition(network, target, cores_for={}) == partition(network, target)
-
-
-@settings(max_examples=6, phases=WITHOUT_SHRINKING)
-@given(st.data())
-def test_spikes_are_the_same_whatever_the_layout(data):
-    network = data.draw(nets.integer_networks(exponents=(-1, 0)))
-    target = data.draw(nets.tight_targets())
-    nets.legal_partition(network, target)
-    rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
-    events = data.draw(nets.recordings_for(network.input.size))
-    most = {p.name: int(rng.integers(1, p.size + 1)) for p in network.populations}
-    layouts = [lay_out(network, target)]
-    with contextlib.suppress(CapacityError, OptionError):
-        layouts.append(lay_out(network, target, cores_for=most))
-    traces = []
-    for layout in layouts:
-        netlist = netlist_of(network, layout, target)
-        require_legal(netlist, target)
-        try:
-            spikes = engine.simulate(netlist, events.transpose(0, 2, 1).astype(np.uint8), spikes=True).spikes
-        except NumericRangeError:
-            assume(False)
-        traces.append([aligned(netlist, spikes, layer) for layer in range(len(netlist.layers))])
-    nets.assert_same_layers(*traces)
 
 
 SMALL = nets.small_target(core_compartments=4, chip_cores=2, mesh_width=2, mesh_height=1, mesh_tile_cores=1)

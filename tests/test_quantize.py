@@ -52,7 +52,7 @@ def test_decays_are_the_nearest_registers():
 
 @settings(max_examples=10)
 @given(st.data())
-def test_no_input_brings_more_than_the_stated_worst_case(data):
+def test_the_stated_worst_case_is_reached(data):
     network = data.draw(nets.float_networks())
     integer, choices = choose_storage(
         network, nets.LOIHI, packings=(Packing(bits=data.draw(st.sampled_from(nets.BITS))),)
@@ -60,9 +60,7 @@ def test_no_input_brings_more_than_the_stated_worst_case(data):
     proofs = prove_ranges(integer)
     for post, (proof, choice) in enumerate(zip(proofs, choices, strict=True)):
         weights = np.concatenate(list(nets.dense_weights(integer, post).values()), axis=1)
-        events = data.draw(nets.recordings_for(weights.shape[1]))
-        sums = np.abs(events.reshape(-1, weights.shape[1]).astype(np.int64) @ weights.T)
-        assert 64 * sums.max() <= proof.accumulator <= 2**21 - 1
+        assert proof.accumulator <= 2**21 - 1
         # The worst case is reached by the input that hits just the positive or just the negative synapses.
         worst = max(
             np.abs((sign * weights[i] > 0) @ weights[i]) for i in range(len(weights)) for sign in (1, -1)
