@@ -11,26 +11,21 @@ and differences are bootstrapped over recordings. Parts that were measured befor
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from made import made as made_by
-from nested import DRAWS, ROUNDS, spread, tried, whole
+from nested import DRAWS, ROUNDS, measured_parts, parted, spread, tried, whole, write
 
-from spikeloom.compiler.files import write_atomically
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.counters import (
-    FOLDS,
     Counted,
     Fitted,
     Plan,
     counters_of,
     fit_rules,
     run_counters,
-    split_folds,
 )
 from spikeloom.runtime.studies.counting import decisions_of
 
@@ -97,8 +92,6 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=32 if name == "ramp" else 1)
     arguments = parser.parse_args()
     data, training = whole(arguments.recordings)
-    store = arguments.output.with_suffix(".parts.json")
-    done: Json = json.loads(store.read_text()) if store.exists() else {}
     plan = Plan(
         thresholds=tuple(map(int, arguments.thresholds.split(","))),
         parts=arguments.parts,
@@ -108,15 +101,8 @@ def main() -> None:
         strengths=STRENGTHS,
     )
     of_window = {window: run_counters(data, replace(plan, window=window)) for window in WINDOWS}
-    split = {"split": np.arange(len(data)) >= training}
-    for number in range(ROUNDS):
-        fold = split_folds(data.labels, FOLDS, np.random.default_rng(1000 + number))
-        split |= {f"{number}.{each}": fold == each for each in range(FOLDS)}
-    for name, held in split.items():
-        if name not in done:
-            done[name] = measured(data, of_window, np.flatnonzero(~held), np.flatnonzero(held))
-            store.write_text(json.dumps(done))
-            print(name, flush=True)
+    split = parted(data, training)
+    done = measured_parts(split, arguments.output, lambda rows, held: measured(data, of_window, rows, held))
     draws = np.random.default_rng(0).integers(0, len(data), (DRAWS, len(data)))
     share = {point: np.zeros(len(data)) for point in done["split"]}
     for name, held in split.items():
@@ -138,15 +124,9 @@ def main() -> None:
         print(
             f"{point:18} {mean:.2f} ({low:.2f} … {high:.2f})   test {sum(own['right'])} of {len(own['right'])}"
         )
-    halves = data.part(slice(training)), data.part(slice(training, None))
-    found: Json = made_by(*halves) | {
-        "data": Path(arguments.recordings).name,
-        "recordings": len(data),
-        "test_samples": len(data) - training,
-    }
-    found |= {"plan": {name: getattr(arguments, name) for name in OPTIONS}, "points": points}
-    with write_atomically(arguments.output) as file:
-        file.write(json.dumps(found, indent=1).encode() + b"\n")
+    plan_words = {name: getattr(arguments, name) for name in OPTIONS}
+    found: Json = {"test_samples": len(data) - training, "plan": plan_words, "points": points}
+    write(arguments.output, arguments.recordings, data, training, found)
 
 
 if __name__ == "__main__":

@@ -24,14 +24,19 @@ AXES = {
 """What lies along the bottom of the charts with two logarithmic axes, and its label."""
 
 
+def save(figure: Any, stem: str) -> None:
+    """Write STEM.svg and STEM.png; the same figures give the same files."""
+    with mpl.rc_context({"svg.hashsalt": "spikeloom"}):
+        figure.savefig(Path(f"{stem}.svg"), metadata={"Date": None})
+    figure.savefig(Path(f"{stem}.png"), dpi=120)
+    plt.close(figure)
+
+
 def _finish(figure: Any, panel: Any, stem: str) -> None:
     panel.grid(which="major", color="#ddd", lw=0.6)
     panel.set_axisbelow(True)
     panel.spines[["top", "right"]].set_visible(False)
-    with mpl.rc_context({"svg.hashsalt": "spikeloom"}):  # the same figures give the same file
-        figure.savefig(Path(f"{stem}.svg"), metadata={"Date": None})
-    figure.savefig(Path(f"{stem}.png"), dpi=120)
-    plt.close(figure)
+    save(figure, stem)
 
 
 def draw(result: dict[str, Any], stem: str) -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -77,6 +77,37 @@ def whole(path: str) -> tuple[Recordings, int]:
         split="both",
     )
     return both, len(training)
+
+
+def parted(data: Recordings, training: int) -> dict[str, np.ndarray]:
+    """Which recordings are held out: those released as test split, and each fifth in five rounds."""
+    held = {"split": np.arange(len(data)) >= training}
+    for number in range(ROUNDS):
+        fold = split_folds(data.labels, FOLDS, np.random.default_rng(1000 + number))
+        held |= {f"{number}.{each}": fold == each for each in range(FOLDS)}
+    return held
+
+
+def measured_parts(
+    split: Mapping[str, np.ndarray], output: Path, measure: Callable[[np.ndarray, np.ndarray], Json]
+) -> Json:
+    """What is found for each part, kept beside the output; parts that were measured before are not again."""
+    store = output.with_suffix(".parts.json")
+    done: Json = json.loads(store.read_text()) if store.exists() else {}
+    for name, held in split.items():
+        if name not in done:
+            done[name] = measure(np.flatnonzero(~held), np.flatnonzero(held))
+            store.write_text(json.dumps(done))
+            print(name, flush=True)
+    return done
+
+
+def write(output: Path, source: str, data: Recordings, training: int, found: Json) -> None:
+    """Store what was found, and on what."""
+    halves = data.part(slice(training)), data.part(slice(training, None))
+    whole = made_by(*halves) | {"data": Path(source).name, "recordings": len(data)} | found
+    with write_atomically(output) as file:
+        file.write(json.dumps(whole, indent=1).encode() + b"\n")
 
 
 def price(data: Counted, classes: int) -> int:
@@ -230,8 +261,6 @@ def main() -> None:
     parser.add_argument("--ramp", type=int, default=32, help="steps of the read-out; twice for levels")
     arguments = parser.parse_args()
     data, training = whole(arguments.recordings)
-    store = arguments.output.with_suffix(".parts.json")
-    done: Json = json.loads(store.read_text()) if store.exists() else {}
     plans = [
         Plan(
             bins=bins,
@@ -245,29 +274,15 @@ def main() -> None:
         for bins, parts, events in SMALL + LARGE
     ]
     all_counted = {name_of(plan): run_counters(data, plan) for plan in plans}
-    split = {"split": np.arange(len(data)) >= training}
-    for number in range(ROUNDS):
-        fold = split_folds(data.labels, FOLDS, np.random.default_rng(1000 + number))
-        split |= {f"{number}.{each}": fold == each for each in range(FOLDS)}
-    for name, held in split.items():
-        if name not in done:
-            done[name] = measured(
-                data, all_counted, np.flatnonzero(~held), np.flatnonzero(held), arguments.again
-            )
-            store.write_text(json.dumps(done))
-        rights = {system: sum(each["right"]) for system, each in done[name]["systems"].items()}
-        print(name, f"of {held.sum()}:", rights, flush=True)
+    split = parted(data, training)
+    done = measured_parts(
+        split,
+        arguments.output,
+        lambda rows, held: measured(data, all_counted, rows, held, arguments.again),
+    )
     nested = [name for name in split if name != "split"]
-    halves = data.part(slice(training)), data.part(slice(training, None))
-    found: Json = made_by(*halves) | {
-        "data": Path(arguments.recordings).name,
-        "recordings": len(data),
-        "rounds": ROUNDS,
-        "folds": FOLDS,
-    }
-    found |= {
-        "nested": summary([done[name] for name in nested], [split[name] for name in nested], len(data))
-    }
+    found: Json = {"rounds": ROUNDS, "folds": FOLDS}
+    found["nested"] = summary([done[name] for name in nested], [split[name] for name in nested], len(data))
     own = done["split"]
     found["split"] = {
         kind: {
@@ -277,8 +292,7 @@ def main() -> None:
         }
         for kind in ("systems", "rules")
     }
-    with write_atomically(arguments.output) as file:
-        file.write(json.dumps(found, indent=1).encode() + b"\n")
+    write(arguments.output, arguments.recordings, data, training, found)
     for name, each in found["nested"]["systems"].items():
         mean, low, high = (100 * value for value in each["accuracy"])
         test = found["split"]["systems"][name]

@@ -10,9 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-
-mpl.use("Agg")
+from growth_chart import save
 from matplotlib import pyplot as plt
 
 OURS, RIVAL = "#1b7f5c", "#5b6b7c"
@@ -61,10 +59,7 @@ def draw(result: dict[str, Any], stem: str) -> None:
         panel.set_xlabel("CPU ms per recording, one thread: median, least to largest", fontsize=9)
         panel.set_title(f"{name}: {operations / 1e6:.1f} M synaptic operations", fontsize=10)
         panel.spines[["top", "right"]].set_visible(False)
-    with mpl.rc_context({"svg.hashsalt": "spikeloom"}):  # the same figures give the same file
-        figure.savefig(Path(f"{stem}.svg"), metadata={"Date": None})
-    figure.savefig(Path(f"{stem}.png"), dpi=120)
-    plt.close(figure)
+    save(figure, stem)
 
 
 if __name__ == "__main__":
