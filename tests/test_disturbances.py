@@ -168,17 +168,6 @@ def test_recordings_that_were_given_stay_as_they_are(name, events, seed):
         assert_array_equal(events, before)
 
 
-def test_shape_order_and_names():
-    grasps = synthetic_grasps(per_class=2, steps=30, seed=5, classes=("ring", "box", "edge"))
-    assert grasps.events.shape == (6, 39, 2, 30)
-    assert grasps.events.dtype == np.uint8
-    assert grasps.events.flags.c_contiguous
-    assert set(np.unique(grasps.events).tolist()) == {0, 1}
-    assert grasps.labels.tolist() == [0, 1, 2, 0, 1, 2]
-    assert grasps.files == tuple(f"sample_{i}_label_{i % 3}.npy" for i in range(6))
-    assert (grasps.split, grasps.source) == ("synthetic", "synthetic grasps, seed 5")
-
-
 def test_a_seed_gives_the_same_bytes_everywhere():
     events = synthetic_grasps(per_class=2, steps=40, seed=7).events
     assert hashlib.sha256(events.tobytes()).hexdigest() == (
