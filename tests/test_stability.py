@@ -77,23 +77,6 @@ def test_changed_runs_are_whole_runs_on_networks_of_any_kind(data):
     assert_as_by_running(machine, channels, joined([cells[each] for each in several]))
 
 
-def test_a_change_ends_where_the_chip_is_in_the_state_that_it_would_be_in_anyway():
-    netlist = lively()
-    channels = sparse_events(0, 20, 40, rate=0.2)
-    cells = every_cell(channels)[::7]
-    found = assert_as_by_running(machine_of(netlist), channels, single(cells))
-    changed = np.repeat(channels[None], len(cells), axis=0)
-    changed[np.arange(len(cells)), cells[:, 0], cells[:, 1]] ^= 1
-    (spikes,), (membranes,) = kept(netlist, channels[None])
-    other_spikes, other_membranes = kept(netlist, changed)
-    differ = np.any((other_spikes != spikes) | (other_membranes != membranes), axis=2)
-    last = differ.shape[1] - differ[:, ::-1].argmax(axis=1)
-    assert np.all(np.where(differ.any(axis=1), last, 0) <= found.end)
-    assert len(np.unique(found.end - cells[:, 1])) > 3
-    # a register that differs has its say in the next step, or is currents and membranes that a reset hides
-    assert np.mean(last[differ.any(axis=1)] + 2 >= found.end[differ.any(axis=1)]) > 0.5
-
-
 def test_where_a_register_may_overflow_every_change_is_run():
     netlist = replace(voting(large_netlist(3, proved=False)), taxels=20)
     assert overflows(netlist)
