@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays
 from made_files import sparse_events
 from numpy.testing import assert_array_equal
 from onnx.reference import ReferenceEvaluator
-from oracles import assert_as_specified, by_scan, refused
+from oracles import assert_as_specified, by_scan, by_steps, refused
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings, six_steps
 from zoo import specimen
 
@@ -22,7 +22,10 @@ from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.formats.onnx.writer import digits, plan
 from spikeloom.compiler.targets.loihi1.bounds import reach
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.loihi1.registers import ACCUMULATOR_MAX, CURRENT_MAX
+from spikeloom.models.recordings.events import load_data
+from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine
 
 
@@ -69,6 +72,33 @@ def test_verify_finds_an_engine_that_strays(monkeypatch):
     report = as_json(*words, "--engine", "onnx", codes=(1,))
     assert not report["spec_equals_engine"]
     assert report["engine_different"] == 2
+
+
+PART = 48
+SETS = {"objects_zip": ("objects", (576, 144)), "containers_zip": ("containers", (240, 60))}
+
+
+@pytest.mark.slow
+@pytest.mark.recordings
+@pytest.mark.parametrize("bits", [8, 4])
+@pytest.mark.parametrize("fixture", SETS)
+def test_all_recordings(fixture, bits, request, tmp_path):
+    name, sizes = SETS[fixture]
+    archive = request.getfixturevalue(fixture)
+    for split, size in zip(("train", "test"), sizes, strict=True):
+        events = load_data(archive, split).events
+        assert len(events) == size
+        words = ["compile", f"pretrained:{name}", "--calibrate", archive, "--weight-bits", bits]
+        assert cli.main([*map(str, words), "-o", str(tmp_path / "n.loom")]) == 0
+        netlist = read_netlist(tmp_path / "n.loom")
+        total = 0
+        for start in range(0, size, PART):
+            part = events[start : start + PART].reshape(-1, netlist.n_inputs, events.shape[3])
+            expected = engine.simulate(netlist, part, spikes=True).spikes
+            total += int(np.count_nonzero(expected))
+            for run in (by_steps, by_scan):
+                assert np.array_equal(run(netlist, part)[0], expected), run
+        assert total > 1_000_000
 
 
 @given(
