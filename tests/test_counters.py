@@ -228,23 +228,26 @@ def test_folds_share_out_every_class():
 
 def test_commands_take_a_counting_network(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    words = "train --data synthetic --system counters --join 5 --window 50 --parts 2 -o c.pt"
+    recordings_folder(
+        tmp_path / "data", train=made(samples=90).events, test=made(seed=1).events, classes=CLASSES
+    )
+    words = "train --data data --system counters --join 5 --window 50 --parts 2 -o c.pt"
     record = as_json(*words.split())["record"]
-    assert record["test_correct"] > 100
+    assert record["test_correct"] > 15
     shown = as_json("inspect", "c.pt")["training"]
     assert (shown["plan"]["bins"], shown["strength"]) == (5, record["strength"])
-    assert "whatever its own length" in run("compile", "c.pt", "--calibrate", "synthetic", "-o", "c.loom")[1]
-    found = as_json("verify", "c.loom", "--checkpoint", "c.pt", "--data", "synthetic")
+    assert "whatever its own length" in run("compile", "c.pt", "--calibrate", "data", "-o", "c.loom")[1]
+    found = as_json("verify", "c.loom", "--checkpoint", "c.pt", "--data", "data")
     share = record["test_correct"] / record["test_samples"]
     assert found["accuracy"] == {"float": share, "chip": share}
-    few = ["c.loom", "--checkpoint", "c.pt", "--data", "synthetic", "--limit", "3"]
-    decided = as_json("run", "c.loom", "--data", "synthetic", "--limit", "3")
+    few = ["c.loom", "--checkpoint", "c.pt", "--data", "data", "--limit", "3"]
+    decided = as_json("run", "c.loom", "--data", "data", "--limit", "3")
     page = as_json("report", *few, "-o", "c.html")
     assert page["decisions"]["chip"] == decided["predictions"]
     assert page["recording"]["votes"]["chip"] == decided["counts"][0]
-    words = "chart c.pt --data synthetic --grid bits=8,window=50%/100% --jobs 1 -o ch"
+    words = "chart c.pt --data data --grid bits=8,window=50%/100% --jobs 1 -o ch"
     points = as_json(*words.split())["points"]
-    half = as_json("run", "c.loom", "--data", "synthetic", "--window", "50")
+    half = as_json("run", "c.loom", "--data", "data", "--window", "50")
     right = sum(map(int.__eq__, half["predictions"], half["labels"]))
     assert [point["test"]["correct"] for point in points] == [right, record["test_correct"]]
 

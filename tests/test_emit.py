@@ -15,7 +15,7 @@ from random_netlists import Axon, Neuron, build
 
 from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError, OptionError
-from spikeloom.compiler.ir import INPUT
+from spikeloom.compiler.ir import INPUT, fan_in
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.storage import Exact, Packing
@@ -106,6 +106,10 @@ def test_emit_and_back(network, compartments):
     found = lift(netlist)
     verify(found)  # a projection without synapses is kept
     assert_same_network(found, network)
+    for index, layer in enumerate(netlist.layers):
+        into = fan_in(network, index)
+        assert (layer.synapses, layer.max_fan_in) == (into.sum(), into.max())
+        assert layer.weight_bits == max(p.bits for p in network.projections if p.post == index)
     for ours, theirs in zip(found.populations, network.populations, strict=True):
         assert ours.name == theirs.name
         assert_array_equal(ours.scale, theirs.scale)
