@@ -48,15 +48,15 @@ SHIPPED = {  # Row: network with its options, recordings, options of `compile`
     "grasps": ("pretrained:grasps", "synthetic", ""),
 }
 NETWORKS = ("objects", "objects-200ms", "objects-truenorth", "containers", "containers-truenorth", "grasps")
-PROCESSOR = {
+PROCESSOR = {  # Networks with options of `compile`
     OBJECTS: {
-        "TactileSGNet": f"{MANUAL} --graph manual",
-        "200 ms": "pretrained:objects-200ms",
+        "TactileSGNet": f"{MANUAL} --graph manual --weight-bits 8",
+        "200 ms": "pretrained:objects-200ms --weight-bits 8",
         "counters": "pretrained:objects-counters",
     },
     CONTAINERS: {
-        "TactileSGNet": "pretrained:containers",
-        "200 ms": "containers-200ms.pt",
+        "TactileSGNet": "pretrained:containers --weight-bits 8",
+        "200 ms": "containers-200ms.pt --weight-bits 8",
         "counters": "pretrained:containers-counters",
     },
 }
