@@ -181,10 +181,10 @@ def test_tables_that_are_not_there_or_wrong(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("joules", "said"), [(1e-9, "static power dominates"), (1e9, "events take 1e+09 J")]
+    ("joules", "said"), [(1e-9, "static power dominates"), (1e9, "dynamic energy is 1e+09 J")]
 )
 def test_which_power_dominates_is_said_once(joules, said):
-    """Static power is not called the larger where events take more."""
+    """Static power is not called the larger where dynamic energy is more."""
     made = specimen("timed")
     outcome = made.machine.price(made.events, lengths=LENGTHS, bin_s=0.02)[1].outcome
     mean = replace(

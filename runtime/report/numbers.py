@@ -38,8 +38,8 @@ def dominant(static_j: Iterable[float], dynamic_j: Iterable[float]) -> str:
     high = max(dynamic_j)
     static = f"{si(least, 'J')} to {si(most, 'J')}"
     if least <= high:
-        return f"at the sensor's pace events take {si(high, 'J')}, static power {static}"
-    more = f"{static}, {least / high:,.0f} times what events take or more"
+        return f"at the sensor's pace dynamic energy is {si(high, 'J')}, static {static}"
+    more = f"{static}, {least / high:,.0f} times the dynamic energy or more"
     return f"at the sensor's pace static power dominates: {more}"
 
 

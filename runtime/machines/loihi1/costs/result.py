@@ -138,6 +138,7 @@ class CostReport:
     samples: int
     chip_steps: int
     detail: str
+    prices: Mapping[str, str]  # of each energy table, in words
     per_inference: Amounts
     min: Amounts
     max: Amounts
@@ -164,6 +165,7 @@ def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: flo
         samples=len(costs.zeros),
         chip_steps=costs.steps,
         detail="cycle" if found.detailed else "counts",
+        prices={table.name: table.title for table in target.energy},
         per_inference=whole(np.mean),
         min=whole(np.min),
         max=whole(np.max),

@@ -86,10 +86,18 @@ def core_table(report: CostReport) -> Table:
 def _lines(report: CostReport) -> list[str]:
     pace = report.pace
     ends = report.energy_range_j
-    lines = []
+    lines = [f"prices, {name}: {title}" for name, title in report.prices.items()]
     if ends is not None:
         low, high = (f"{si(ends[end].energy_j, 'J')} ({ends[end].table})" for end in ("low", "high"))
         lines.append(f"sources differ: a mean inference takes a dynamic energy of {low} to {high}")
+    if report.energy_by_part_j:
+        neurons = ", ".join(
+            f"{100 * each['soma'] / (sum(each.values()) or 1):.0f} % ({name})"
+            for name, each in report.energy_by_part_j.items()
+        )
+        lines.append(
+            f"soma, mostly the update of every neuron in every step, takes {neurons} of it; events take the rest"
+        )
     real_time = ", ".join(f"{si(value, 'W')} ({name})" for name, value in pace.real_time_w.items())
     lines.append(f"dynamic power at the sensor's pace, {1000 * pace.bin_s:g} ms a step: {real_time}")
     lines += [
