@@ -1,113 +1,139 @@
 """Accuracy against energy of all systems, support vector machines marked: the figure that README leads with.
 
-    python benchmarks/systems.py DATA OUT.json 'NAME=NETWORK[@TARGET]' …
-    python benchmarks/systems.py --draw OUT.png OBJECTS.json CONTAINERS.json
+    python benchmarks/systems.py
 
-Counters of longer bins are trained by `spikeloom train --data Ev-Objects.zip --system counters --ramp 16` with
-`--join 5 --parts 2 --thresholds 1,4,16` (100 ms) and `--join 10 --thresholds 1,2,4,8,16` (200 ms); the joined network
-by the commands of `docs/training.md`.
-
-Each network is compiled with --calibrate DATA and decides and prices the test split once. The lines are the machines of
-`benchmarks/results/features-*.json`, which `python benchmarks/features.py` made: the linear and the radial one that are
-best by cross-validation on the training split.
+Draws ``results/systems.png`` from stored results alone, and chooses nothing: the shipped networks of TactileSGNet at 8
+bits, the joined ones at their last epoch (five of them, mean), what ``spikeloom smallest`` wrote, and as lines the
+linear and the radial support vector machine that are best by cross-validation on the training split.
+The picture holds the digest of what it was drawn from; the tests compare.
 """
 
 from __future__ import annotations
 
-import argparse
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
-import numpy as np
-from made import made
 
-import spikeloom
 from spikeloom.runtime.report.numbers import wilson
 
 RESULTS = Path(__file__).parent / "results"
-WORDS = {"linear": "linear", "rbf": "RBF"}
+PICTURE = RESULTS / "systems.png"
+SOURCES = (
+    "shipped.json",
+    "joined-containers-100ms.json",
+    *(f"smallest-{each}.json" for each in ("objects", "objects-budget", "containers")),
+    *(f"features-{each}.json" for each in ("objects", "containers")),
+)
+SHIPPED = {
+    "Objects": {"objects": "20 ms", "objects-200ms": "200 ms"},
+    "Containers": {"containers": "20 ms"},
+}
+"""Rows of the shipped networks, with their bins."""
+
+CHOSEN = {
+    "Objects": {"objects": "smallest", "objects-budget": "smallest, under 8 µJ"},
+    "Containers": {"containers": "smallest --levels 5"},
+}
+JOINED = "100 ms, five joined"
 STYLES = {"TactileSGNet": ("o", "#1b6ca8"), "counters": ("s", "#c1440e")}
 """Marker and colour of a system."""
 
 SVM = {"linear": ("linear SVM, no chip", "--"), "rbf": ("RBF SVM, no chip", ":")}
-TICKS = (1, 3, 10, 30, 100, 300)
+TICKS = (3, 10, 30, 100, 300)
 
 
-def measured(name: str, network: str, data: Any) -> dict[str, Any]:
-    """Decisions and dynamic energy of one network on the chip."""
-    path, _, target = network.partition("@")
-    options = {"target": target} if target else {"calibrate": None if "counters" in name else data.train}
-    netlist = spikeloom.compile(path, **options)
-    found = netlist.run(data.test)
-    correct = round(found.accuracy * found.samples)
-    costs = netlist.estimate(data.test).details
-    about = {"name": name, "network": Path(path).name, "correct": correct, "samples": found.samples}
-    amounts = {"operations": costs.per_inference.synaptic_operations, "cores": len(costs.cores)}
-    return about | amounts | {"energy_j": dict(costs.per_inference.energy_j)}
+def stored(name: str) -> Any:
+    return json.loads((RESULTS / name).read_text("utf-8"))
 
 
-def draw(place: str, files: list[str]) -> None:
-    """One panel for each data set, small labels beside each mark."""
-    figure, panels = plt.subplots(
-        len(files), figsize=(5.2, 3.2 * len(files)), layout="constrained", squeeze=False
-    )
-    for axes, file in zip(panels[:, 0], files, strict=True):
-        found = json.loads(Path(file).read_text())
-        title = found["data"].removesuffix(".zip").removeprefix("Ev-")
-        machines = json.loads((RESULTS / f"features-{title.lower()}.json").read_text())
-        best = {
-            kernel: max(
-                (m for m in machines["machines"] if m["kernel"] == kernel),
-                key=lambda m: m["cross_validation"],
+def sources() -> str:
+    """Digest of what the picture is drawn from."""
+    return hashlib.sha256(b"".join((RESULTS / name).read_bytes() for name in SOURCES)).hexdigest()
+
+
+def point(
+    system: str, label: str, correct: float, interval: tuple[float, float], energy_j: Any
+) -> dict[str, Any]:
+    """A network: share of test recordings with its interval, and energies by both tables."""
+    energies = [1e6 * energy_j[table] for table in ("davies2018", "sanafe")]
+    return {"system": system, "label": label, "share": correct, "interval": interval, "energies": energies}
+
+
+def points(data: str) -> list[dict[str, Any]]:
+    """Of one set of recordings."""
+    found = []
+    figures = stored("shipped.json")["figures"]
+    for name, label in SHIPPED[data].items():
+        one = figures[name]
+        samples = one["test_samples"]
+        found.append(
+            point(
+                "TactileSGNet", label, one["chip"] / samples, wilson(one["chip"], samples), one["energy_j"]
             )
-            for kernel in SVM
+        )
+    if data == "Containers":
+        joined = stored("joined-containers-100ms.json")["last"]["5"]
+        chip, networks = joined["mean"]["chip"], joined["networks"]
+        energy_j = {
+            table: sum(each["energy_j"][table] for each in networks) / len(networks)
+            for table in networks[0]["energy_j"]
         }
-        for kernel, one in best.items():
-            words, line = SVM[kernel]
-            share = 100 * one["correct"] / machines["test_samples"]
-            axes.axhline(share, color="0.45", ls=line, lw=1)
-            above = one["correct"] == max(each["correct"] for each in best.values())
-            aside = {"xytext": (0, 2 if above else -2), "va": "bottom" if above else "top", "ha": "center"}
-            axes.annotate(words, (80, share), textcoords="offset points", fontsize=8, color="0.35", **aside)
-        for each in found["networks"]:
-            name, _, label = each["name"].partition(", ")
-            marker, colour = STYLES[name]
-            energies = 1e6 * np.array(list(each["energy_j"].values()))
-            share = 100 * each["correct"] / each["samples"]
-            low, high = (100 * bound for bound in wilson(each["correct"], each["samples"]))
+        low, high = (end / 60 for end in chip["interval"])
+        found.append(point("TactileSGNet", JOINED, chip["mean"] / 60, (low, high), energy_j))
+    for name, label in CHOSEN[data].items():
+        checked = stored(f"smallest-{name}.json")["checked"]
+        right = checked["right"]
+        interval = (right["low"], right["high"])
+        found.append(point("counters", label, right["accuracy"], interval, checked["costs"]["energy_j"]))
+    return found
+
+
+def lines(axes: Any, data: str) -> None:
+    """The support vector machine of each kernel that is best by cross-validation."""
+    machines = stored(f"features-{data.lower()}.json")
+    best = {
+        kernel: max(
+            (each for each in machines["machines"] if each["kernel"] == kernel),
+            key=lambda each: each["cross_validation"],
+        )
+        for kernel in SVM
+    }
+    for kernel, one in best.items():
+        words, line = SVM[kernel]
+        share = 100 * one["correct"] / machines["test_samples"]
+        axes.axhline(share, color="0.45", ls=line, lw=1)
+        above = one["correct"] == max(each["correct"] for each in best.values())
+        aside = {"xytext": (0, 2 if above else -2), "va": "bottom" if above else "top", "ha": "right"}
+        axes.annotate(words, (850, share), textcoords="offset points", fontsize=8, color="0.35", **aside)
+
+
+def draw() -> None:
+    """One panel for each set of recordings, small labels beside each mark."""
+    figure, panels = plt.subplots(2, figsize=(5.2, 6.4), layout="constrained")
+    for axes, data in zip(panels, SHIPPED, strict=True):
+        lines(axes, data)
+        for each in points(data):
+            marker, colour = STYLES[each["system"]]
+            energies, share = each["energies"], 100 * each["share"]
+            low, high = (100 * bound for bound in each["interval"])
             span = [[share - low], [high - share]]
             axes.errorbar(energies[0], share, span, color=colour, marker=marker, ms=5, lw=0.8)
-            axes.plot(energies, [share] * len(energies), color=colour, lw=2.5, alpha=0.35)
+            axes.plot(energies, [share] * 2, color=colour, lw=2.5, alpha=0.35)
             beside = {"xytext": (4, -11), "textcoords": "offset points", "fontsize": 8, "color": colour}
-            axes.annotate(label.replace(", ", "\n"), (energies[0], share), va="top", **beside)
+            axes.annotate(each["label"].replace(", ", "\n"), (energies[0], share), va="top", **beside)
         axes.set_xscale("log")
-        axes.set(title=title, xlim=(1, 600), xticks=TICKS, xticklabels=TICKS)
+        axes.set(title=data, xlim=(2, 900), xticks=TICKS, xticklabels=TICKS)
         axes.minorticks_off()
         axes.grid(alpha=0.25)
-    panels[-1, 0].set_xlabel("dynamic energy a decision (µJ); bar: the other price table")
-    figure.supylabel("test accuracy (%)", fontsize=10)
+    panels[-1].set_xlabel("dynamic energy a decision (µJ): Davies; bar to SANA-FE")
+    figure.supylabel("test accuracy (%), chip", fontsize=10)
     handles = [plt.Line2D([], [], color=c, marker=m, ls="", label=name) for name, (m, c) in STYLES.items()]
-    panels[0, 0].legend(handles=handles, fontsize=8, loc="lower left")
-    figure.savefig(place, dpi=130)
-
-
-def main() -> None:
-    """Measure, or draw."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--draw", metavar="OUT.png")
-    parser.add_argument("files", nargs="+")
-    arguments = parser.parse_args()
-    if arguments.draw:
-        draw(arguments.draw, arguments.files)
-        return
-    source, output, *networks = arguments.files
-    data = spikeloom.recordings(source)
-    rows = [measured(*each.split("=", 1), data) for each in networks]
-    found = made(data.train, data.test) | {"data": Path(source).name, "networks": rows}
-    Path(output).write_text(json.dumps(found, indent=1) + "\n")
+    panels[0].legend(handles=handles, fontsize=8, loc="lower left")
+    figure.savefig(PICTURE, dpi=130, metadata={"Description": f"drawn from {sources()}"})
 
 
 if __name__ == "__main__":
-    main()
+    draw()

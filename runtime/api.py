@@ -106,7 +106,7 @@ def compile(
     dt: float | None = None,
     convention: str | None = None,
 ) -> Compiled:
-    """Lower a network to a netlist that obeys every limit of its chip.
+    """Compile a network to a netlist within the limits of its chip.
 
     Parameters
     ----------
@@ -287,7 +287,7 @@ def smallest(
     edges: str | None = None,
     directed: bool = False,
 ) -> Smallest:
-    """Find the cheapest network that does the job, among counting networks and networks that are trained; write it.
+    """Choose the cheapest of many networks that is about as accurate as the best, and write it.
 
     Raises
     ------

@@ -24,17 +24,17 @@ if TYPE_CHECKING:
 GROUPS: dict[str, dict[str, str]] = {
     "main job": {
         "demo": "the main job on a shipped checkpoint and synthetic grasps; needs no files and no internet",
-        "compile": "lower a checkpoint to a netlist that obeys every limit of the chip",
-        "inspect": "show a netlist (layers, scales, cores, fill of every limit) or a checkpoint",
-        "run": "run a netlist exactly as the chip would",
+        "compile": "compile a trained network to a netlist within the limits of the chip",
+        "inspect": "show a netlist (layers, scales, cores, use of each limit) or a checkpoint",
+        "run": "run a netlist in the integer arithmetic of the chip",
         "verify": "compare chip and float model, spike for spike",
         "estimate": "synaptic operations, energy and time of an inference",
         "report": "one self-contained page: verdict, accuracy, cores, taxels, spikes, energy, time, provenance",
     },
     "choose": {
-        "smallest": "the cheapest network that does the job: many are tried, one is chosen, compiled and verified",
+        "smallest": "the cheapest of many networks that is about as accurate as the best, compiled and verified",
         "chart": "accuracy against energy, time and size for a grid of configurations, and which one to deploy",
-        "lean": "what of a network its recordings do not need, and a netlist without it",
+        "lean": "which neurons, taxels and hops its recordings do not need, and a netlist without them",
         "anytime": "how early decisions could be taken, and what that saves",
     },
     "check": {
@@ -43,8 +43,8 @@ GROUPS: dict[str, dict[str, str]] = {
         "certify": "which decisions no small change of a recording alters: proven, not sampled",
     },
     "training": {
-        "train": "train networks by the released recipe; last, best and clean epoch reported",
-        "finetune": "train a network further on the very integers of the chip, down to ternary weights",
+        "train": "train networks, and report the last, best and clean epoch",
+        "finetune": "train a network further with the chip's integers, down to ternary weights",
         "join": "put several trained networks side by side in one, whose votes add up",
     },
     "exchange": {

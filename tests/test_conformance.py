@@ -68,7 +68,7 @@ data:
     unlabelled
 estimate:
     chip_steps cores detail energy_by_part_j energy_range_j layers max min not_modelled not_priced pace
-    per_inference samples static time
+    per_inference prices samples static time
 estimate, crossbars:
     cores cores_of_chip energy layers max min not_priced pace per_inference samples static_w
 explain:

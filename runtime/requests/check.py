@@ -17,7 +17,7 @@ class ExplainRequest(ComparisonChoice, RecordingsChoice):
     """Why chip and float model differ on one recording: roots, their causes, and what removes them."""
 
     sample: str | None = option(
-        "recording to explain, by name or from 0 (default: the first that differs)",
+        "recording to explain, by name or by number from 0 (default: the first that differs)",
         metavar="NAME|N",
         flags=("--sample", "--recording"),
     )
@@ -47,7 +47,7 @@ class CertifyRequest(NetlistChoice, RecordingsChoice):
     """Which decisions no small change of a recording alters: proven, not sampled."""
 
     shift: int = option("largest shift to try", default=25, metavar="BINS")
-    most: int = option("largest number of changed events to look for a proof of", default=16, metavar="N")
+    most: int = option("largest number of changed events to look for a proof for", default=16, metavar="N")
     jobs: int | None = option("recordings at a time (default: one a core)", metavar="N")
-    picture: str | None = option("draw how many decisions hang on each taxel", metavar="OUT.png|svg|pdf")
+    picture: str | None = option("draw how many decisions depend on each taxel", metavar="OUT.png|svg|pdf")
     output: str | None = option("write what --json prints", metavar="OUT.json", flags=("-o", "--output"))

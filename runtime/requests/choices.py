@@ -50,14 +50,12 @@ class CheckpointChoice(SensorChoice):
 
     run: int = option("which run of a released file", default=0, metavar="N", group="network")
     weights: str | None = option(
-        "epoch, where a checkpoint holds several (default: the first of these that it holds)",
+        "epoch, if a checkpoint holds several (default: the first of these that it holds)",
         choices=WEIGHTS,
         group="network",
     )
-    beta: float | None = option(
-        "membrane decay, where the file does not say (default: 0.2)", group="network"
-    )
-    theta: float | None = option("threshold, where the file does not say (default: 0.5)", group="network")
+    beta: float | None = option("membrane decay, if the file does not say (default: 0.2)", group="network")
+    theta: float | None = option("threshold, if the file does not say (default: 0.5)", group="network")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,24 +63,24 @@ class NetworkChoice(CheckpointChoice):
     """How a network of any format is read."""
 
     polarities: int | None = option(
-        "of an ONNX or NIR input, where its shape is flat", metavar="N", group="network"
+        "polarities of an ONNX or NIR input, if its shape is flat", metavar="N", group="network"
     )
     polarities_first: bool | None = option(
-        "whether they are the first axis, where the shape of an ONNX or NIR input does not say",
+        "whether polarities are the first axis, if the shape of an ONNX or NIR input does not say",
         group="network",
         constants={
             "--polarities-first": (
                 True,
-                "they are the first axis, where the shape of an ONNX or NIR input does not say",
+                "polarities are the first axis, if the shape of an ONNX or NIR input does not say",
             ),
             "--polarities-last": (
                 False,
-                "they are the last axis, where the shape of an ONNX or NIR input does not say",
+                "polarities are the last axis, if the shape of an ONNX or NIR input does not say",
             ),
         },
     )
     dt: float | None = option(
-        "time step that a NIR file is read in (default: its own)", metavar="SECONDS", group="network"
+        "time step at which a NIR file is read (default: its own)", metavar="SECONDS", group="network"
     )
     convention: str | None = option(
         f"a step keeps 1 - dt/tau (euler) or exp(-dt/tau) (exponential) of a state (default: {CONVENTIONS[0]})",
@@ -96,7 +94,7 @@ class ComparisonChoice(NetlistChoice, NetworkChoice):
     """Which compiled network, beside which float model."""
 
     checkpoint: str | Network = option(
-        "its float model", required=True, metavar=NETWORK_FILES, group="network"
+        "float model of the netlist", required=True, metavar=NETWORK_FILES, group="network"
     )
 
 

@@ -20,23 +20,26 @@ from spikeloom.runtime.requests.fields import option
 
 @dataclass(frozen=True, kw_only=True)
 class SmallestRequest(SensorChoice, ConditionChoice):
-    """The cheapest network that does the job: many are tried, one is chosen, compiled and verified."""
+    """The cheapest of many networks that is about as accurate as the best, compiled and verified."""
 
     target: str = option("chip", default=DEFAULT_TARGET)
     levels: int | None = option(
-        "so many classes in a row are levels of one thing, for counting networks (default: 1)", metavar="N"
+        "every N classes in a row are levels of one thing, for counting networks (default: 1)", metavar="N"
     )
     budget: tuple[str, ...] = option(
-        "energy=5uJ, time=5ms, operations=25000, cores=1, accuracy=88, certified=90; all of them hold",
+        "energy=5uJ, time=5ms, operations=25000, cores=1, accuracy=88, certified=90; all must hold",
         default=(),
         metavar="WHAT=LIMIT[,…]",
     )
     time: str | None = option(
-        "begin nothing new after so long, as in 30m; the same command goes on (default: 20m)", metavar="TIME"
+        "start nothing new after this time, as in 30m; the same command continues (default: 20m)",
+        metavar="TIME",
     )
-    store: str | None = option("what is measured (default: NET.sqlite, beside the netlist)", metavar="FILE")
+    store: str | None = option(
+        "file that keeps measurements (default: NET.sqlite, beside the netlist)", metavar="FILE"
+    )
     jobs: int | None = option("processes at a time (default: one a core)", metavar="N")
-    html: str | None = option("write a page, too", metavar="PAGE.html")
+    html: str | None = option("also write the result as a page", metavar="PAGE.html")
     output: str = option(
         "netlist; NET.pt is the network", required=True, metavar="NET.loom", flags=("-o", "--output")
     )
@@ -54,7 +57,7 @@ class ChartRequest(CheckpointChoice, DataChoice):
         metavar="AXIS=V,V,…",
     )
     budget: tuple[str, ...] = option(
-        "of the point to deploy: energy=0.1mJ, time=5ms or accuracy=88; may be repeated, all of them hold",
+        "limit for the point to deploy: energy=0.1mJ, time=5ms or accuracy=88; may be repeated, all must hold",
         default=(),
         metavar="WHAT=LIMIT",
     )
@@ -65,17 +68,17 @@ class ChartRequest(CheckpointChoice, DataChoice):
 
 @dataclass(frozen=True, kw_only=True)
 class LeanRequest(NetworkChoice, RecordingsChoice):
-    """What of a network its recordings do not need, and a netlist without it."""
+    """Which neurons, taxels and hops its recordings do not need, and a netlist without them."""
 
     checkpoint: str = option("trained network", positional=True, metavar=NETWORK_FILES)
     differ: float = option(
         "share of training decisions that the netlist may change", default=0.01, metavar="X"
     )
     output: str | None = option(
-        "write the netlist without what may go", metavar="OUT.loom", flags=("-o", "--output")
+        "write the netlist without what is not needed", metavar="OUT.loom", flags=("-o", "--output")
     )
     network: str | None = option(
-        "write the float network without dense neurons that may go", metavar="OUT.pt"
+        "write the float network without dense neurons that are not needed", metavar="OUT.pt"
     )
 
 
@@ -83,12 +86,14 @@ class LeanRequest(NetworkChoice, RecordingsChoice):
 class AnytimeRequest(NetlistChoice, RecordingsChoice):
     """How early decisions could be taken, and what that saves."""
 
-    calibrate: str | None = option("recordings whose train split says when a vote is sure", metavar="PATH")
+    calibrate: str | None = option(
+        "recordings whose training split sets when a vote is sure", metavar="PATH"
+    )
     held_out: bool = option(
-        "the network was not trained on --calibrate: its decisions count, not races for second place",
+        "the network was not trained on --calibrate: use its decisions, not races for second place",
         default=False,
     )
-    differ: float | None = option("share of them that may end otherwise (default: 0)", metavar="X")
+    differ: float | None = option("share of these that may end otherwise (default: 0)", metavar="X")
     output: str | None = option(
         "write the result with figures of every recording", metavar="OUT.json", flags=("-o", "--output")
     )

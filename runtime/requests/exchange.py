@@ -40,7 +40,7 @@ class WatchRequest(NetlistChoice):
     input: str = option("event lines; - is standard input", default="-", metavar="FILE")
     bin: str | None = option("bin of the recordings (default: the network's, else 0.02)", metavar="SECONDS")
     bins: int | None = option(
-        "steps of every grasp: shorter ones are filled up, longer ones cut; counters know theirs, read-out included",
+        "steps of every grasp: shorter ones are padded, longer ones cut; counters know theirs, read-out included",
         metavar="N",
     )
     origin: str = option(
@@ -49,7 +49,7 @@ class WatchRequest(NetlistChoice):
         choices=("zero", "first"),
     )
     speed: str = option(
-        "keep to the wall clock, or go on as soon as events allow it",
+        "keep the sensor's pace, or go on as soon as events allow",
         default="full",
         choices=("real", "full"),
     )
@@ -86,9 +86,9 @@ class DescribeRequest(Request):
 class ConvertRequest(DescribeRequest):
     """Write the released layout: SPLIT/sample_N_label_L.npy."""
 
-    join: int = option("make one bin of N, an event where one has any", default=1, metavar="N")
+    join: int = option("make one bin of N, with an event where any of them has one", default=1, metavar="N")
     output: str = option(
-        "new folder, or a zip; or a .csv of event lines, of one recording",
+        "new folder or zip, or a .csv of event lines for one recording",
         required=True,
         metavar="OUT",
         flags=("-o", "--output"),

@@ -33,7 +33,7 @@ ENGINES = ("spikeloom", "onnx")
 
 @dataclass(frozen=True, kw_only=True)
 class CompileRequest(NetworkChoice):
-    """Lower a checkpoint to a netlist that obeys every limit of the chip."""
+    """Compile a trained network to a netlist within the limits of the chip."""
 
     bin: float | None = option(BIN_HELP, metavar="S", group="recordings")
     checkpoint: str | Network = option(
@@ -44,7 +44,7 @@ class CompileRequest(NetworkChoice):
         "storage width, one or one a layer: 2 to 6 or 8 (default: 8)", metavar="N[,N]", group="storage"
     )
     planes: str | None = option(
-        "times a synapse is stored, 1 to 3 (default: 1)", metavar="N[,N]", group="storage"
+        "synapses that together hold a weight, 1 to 3 (default: 1)", metavar="N[,N]", group="storage"
     )
     scale_groups: str | None = option(
         "scales in a layer, 1 to 8 (default: 1)", metavar="N[,N]", group="storage"
@@ -58,15 +58,15 @@ class CompileRequest(NetworkChoice):
         "keep neurons that never fire or reach no neuron", default=False, group="storage"
     )
     prune_unused: bool = option(
-        "leave out neurons that never fired on the training split, too", default=False, group="storage"
+        "also leave out neurons that never fired on the training split", default=False, group="storage"
     )
     share_lists: bool = option(
-        "with --calibrate: round what a convolution repeats alike, for less memory",
+        "with --calibrate: round equal weights of a convolution alike, for less memory",
         default=False,
         group="storage",
     )
     calibrate: str | Recordings | None = option(
-        "recordings whose train split chooses storage and scales", metavar="PATH", group="storage"
+        "recordings whose training split chooses storage and scales", metavar="PATH", group="storage"
     )
     keep: float | None = option(
         f"share of equal decisions on held-out training recordings that storage has to keep (default: {KEEP:g})",
@@ -74,13 +74,13 @@ class CompileRequest(NetworkChoice):
         group="storage",
     )
     cores_for: str | None = option(
-        "at least N cores for a layer, which it shares with none, as in conv1=4,fc1=6",
+        "spread a layer over at least N cores of its own, as in conv1=4,fc1=6",
         metavar="LAYER=N[,…]",
         group="layout",
     )
     chips: int = option("use up to N chips", default=1, metavar="N", group="layout")
     free_running: bool = option(
-        "no host resets the chip: layers always integrate, blank steps after each recording clear them",
+        "for a chip that no host resets: layers always integrate, blank steps after each recording clear them",
         default=False,
         group="layout",
     )
@@ -94,14 +94,14 @@ class CompileRequest(NetworkChoice):
 
 @dataclass(frozen=True, kw_only=True)
 class InspectRequest(CheckpointChoice):
-    """Show a netlist (layers, scales, cores, fill of every limit) or a checkpoint."""
+    """Show a netlist (layers, scales, cores, use of each limit) or a checkpoint."""
 
     path: str = option("netlist or checkpoint", positional=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunRequest(NetlistChoice, RecordingsChoice, WindowChoice):
-    """Run a netlist exactly as the chip would."""
+    """Run a netlist in the integer arithmetic of the chip."""
 
     spikes: str | None = option("write the spikes of every layer, aligned with the data", metavar="OUT.npz")
 
@@ -121,10 +121,12 @@ class VerifyRequest(ComparisonChoice, WindowChoice):
         f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})", metavar="X"
     )
     require: str | None = option(
-        "levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
+        "levels to pass instead: E0 specification = engine, E2 share of spikes in each layer, E3 share of decisions",
         metavar="E0,E2=X,E3=X",
     )
-    spec_samples: int = option("recordings for spec = engine", default=3, metavar="N")
+    spec_samples: int = option(
+        "recordings on which specification and engine are compared", default=3, metavar="N"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,12 +140,12 @@ class EstimateRequest(NetlistChoice, RecordingsChoice, WindowChoice):
         group="depth and prices",
     )
     table: str | None = option(
-        "energy or time by this table alone, or by your own",
+        "use this table of prices or times alone, or your own file",
         metavar="NAME|FILE.toml",
         group="depth and prices",
     )
     against_processor: bool = option(
-        "train a linear rule for a small processor on the same recordings, and hold its costs beside these",
+        "train a linear rule for a small processor on the same recordings, and compare its costs",
         default=False,
     )
     neurobench: bool = option("NeuroBench's metrics of the network as the chip holds it", default=False)
@@ -154,8 +156,11 @@ class ReportRequest(ComparisonChoice, RecordingsChoice):
     """One self-contained page: verdict, accuracy, cores, taxels, spikes, energy, time, provenance."""
 
     recording: str | None = option(
-        "recording to draw, by name or from 0 (default: the first decided differently)", metavar="NAME|N"
+        "recording to draw, by name or by number from 0 (default: the first decided differently)",
+        metavar="NAME|N",
     )
     stress: str | None = option("show what stress -o wrote about this netlist", metavar="STRESS.json")
     output: str = option("page to write", required=True, metavar="OUT.html", flags=("-o", "--output"))
-    spec_samples: int = option("recordings for spec = engine", default=3, metavar="N")
+    spec_samples: int = option(
+        "recordings on which specification and engine are compared", default=3, metavar="N"
+    )

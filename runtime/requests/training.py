@@ -26,10 +26,12 @@ ALL_SYSTEMS = (*SYSTEMS, NATIVE, COUNTING)
 
 @dataclass(frozen=True, kw_only=True)
 class TrainRequest(SensorChoice, DataChoice):
-    """Train networks by the released recipe; last, best and clean epoch reported."""
+    """Train networks, and report the last, best and clean epoch."""
 
     join: int = option(
-        "bins of the recordings per step; it has an event where any of them has one", default=1, metavar="N"
+        "bins of the recordings per step; a step has an event where any of its bins has one",
+        default=1,
+        metavar="N",
     )
     system: str | None = option(
         f"{', '.join(ALL_SYSTEMS)} (default: {TACTILESGNET}; {', '.join((*GRAPH_SYSTEMS, NATIVE))} need a graph)",
@@ -37,7 +39,7 @@ class TrainRequest(SensorChoice, DataChoice):
         group="network",
     )
     padding: str | None = option(
-        "of a grid-cnn: none, with stride 2 (default), or same, whose neurons no single core holds",
+        "padding of a grid-cnn: none, with stride 2 (default), or same, which needs more neurons than a core holds",
         choices=tuple(PADDINGS),
     )
     recipe: str = option(
@@ -85,7 +87,7 @@ class TrainRequest(SensorChoice, DataChoice):
     decay_epochs: int | None = option(
         "divide the learning rate by 10 every N epochs, first after epoch N + 1 (default: 40)", metavar="N"
     )
-    seed: int = option("of initial weights and the order of recordings", default=0, metavar="N")
+    seed: int = option("seed of initial weights and of the order of recordings", default=0, metavar="N")
     seeds: int = option("train N seeds side by side", default=1, metavar="N")
     resume: bool = option("resume an interrupted training with the same options", default=False)
     keep: tuple[str, ...] = option(
@@ -112,7 +114,7 @@ class FinetuneRequest(NetworkChoice, DataChoice):
     scale_groups: int | None = option("scales per layer, at that width (default: 8)", metavar="N")
     robust: float | None = option("probability that an event is lost, and that a taxel is: 0.1", metavar="X")
     epochs: int = option("passes over the training recordings", default=40, metavar="N")
-    seed: int = option("of the order of recordings", default=0, metavar="N")
+    seed: int = option("seed of the order of recordings", default=0, metavar="N")
     resume: bool = option("resume an interrupted fine-tuning with the same options", default=False)
     output: str = option(
         "a checkpoint is written as a checkpoint, any other network as NIR with its netlist OUT.loom beside it",

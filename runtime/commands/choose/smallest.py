@@ -1,4 +1,4 @@
-"""The command ``smallest``: the cheapest network that does the job, chosen by cross-validation."""
+"""The command ``smallest``: of many networks the cheapest that is about as accurate as the best."""
 
 import re
 from dataclasses import replace

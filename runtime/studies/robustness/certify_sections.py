@@ -51,7 +51,7 @@ def sections(result: Certificates) -> Iterator[Section]:
     most = np.argsort(-sum(hanging.values()), kind="stable")
     taxels = [[str(taxel), *(str(each[taxel]) for each in hanging.values())] for taxel in most.tolist()]
     head = ["taxel", *PANELS.values()]
-    yield Section("Decisions that hang on a taxel", [Table(head, taxels, most=SHOWN)])
+    yield Section("Decisions that depend on a taxel", [Table(head, taxels, most=SHOWN)])
     phases = np.sum([each.phases for each in certificates], axis=0)
     if phases.any():
         cells = [f"{100 * each / phases.sum():.0f} %" for each in phases]
@@ -89,7 +89,7 @@ def _row(one: Certificate) -> list[str]:
 
 
 def hanging_on(result: Certificates) -> dict[str, IntArray]:
-    """Decisions that hang on each taxel: on its failure, and on any of its events."""
+    """Decisions that depend on each taxel: on its failure, and on any of its events."""
     kinds = {"dead": ("dead",), "stuck": ("stuck",), "event": ("removed", "added")}
     hanging = {name: np.zeros(result.taxels, np.int64) for name in kinds}
     for (name, of), one in product(kinds.items(), result.certificates):
@@ -107,7 +107,7 @@ def _places(taxels: int) -> FloatArray:
 
 @styled()
 def taxel_map(result: Certificates) -> Drawing:
-    """Taxels where they lie, coloured by how many decisions hang on each."""
+    """Taxels where they lie, coloured by how many decisions depend on each."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
