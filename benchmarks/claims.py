@@ -55,7 +55,7 @@ NUMBER = re.compile(
 COMPARED = re.compile(
     r"\b(?:better|worse|best|worst|lower|higher|highest|lowest|cheaper|cheapest|faster|fastest|slower|slowest|"
     r"most accurate|as well as|as good as|never|always|outperforms?|beats?|state of the art|"
-    r"shown to|without loss|guarantee[sd]?|every (?:limit|machine|chip|spike|decision|case|network|system))\b",
+    r"shown to be|without loss|guarantee[sd]?|every (?:limit|machine|chip|spike|decision|case|network|system))\b",
     re.IGNORECASE,
 )
 """What needs a result, a test or a definition."""
