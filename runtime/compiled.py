@@ -208,6 +208,7 @@ class Compiled:
         *,
         split: str = "test",
         limit: int | None = None,
+        groups: str | Sequence[str] | None = None,
         only: str | Sequence[str] | None = None,
         seeds: int = 5,
         require: str | Sequence[str] = (),

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import PurePath
 
 import numpy as np
@@ -66,6 +67,19 @@ def conditions(data: Recordings) -> dict[str, dict[str, BoolArray]]:
             names = [f"part {part + 1} of {PARTS}" for part in range(PARTS)]
         known[group] = {f"{group}={name}": place == index for index, name in enumerate(names)}
     return known
+
+
+def by_condition(data: Recordings) -> dict[str, BoolArray]:
+    """Recordings (samples,) of every condition of every group, by its name."""
+    return {name: held for parts in conditions(data).values() for name, held in parts.items()}
+
+
+def with_groups(data: Recordings, wanted: Sequence[str] | None) -> Recordings:
+    """Recordings with the `wanted` groups alone; all that they have, where None. DataError as of :func:`groups_of`."""
+    if wanted is None:
+        return data
+    rows = [{name: values[index] for name, values in data.groups.items()} for index in range(len(data))]
+    return replace(data, groups=groups_of(data.source, data.files, rows, wanted))
 
 
 def _numbers_first(value: str) -> tuple[bool, float, str]:

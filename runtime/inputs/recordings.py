@@ -11,6 +11,7 @@ from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings import events
+from spikeloom.models.recordings.conditions import with_groups
 from spikeloom.models.recordings.counts import number, show_counts
 from spikeloom.models.recordings.evtouch import (
     BIN_S,
@@ -50,12 +51,13 @@ def recordings(
     Raises DataError or OptionError if they cannot be used, or do not suit the network.
     """
     trained_bin = (trained or {}).get("bin_s")
+    wanted = None if groups is None else [name.strip() for name in groups.split(",")]
     if isinstance(path, Recordings):
         require_suited(path, classes=classes, taxels=taxels)
         _require_width(path, trained_bin)
         if limit is not None and limit < 1:
             raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
-        data = path.part(slice(limit))
+        data = with_groups(path.part(slice(limit)), wanted)
         return events.joined_bins(data if labels_for is None else events.need_labels(data, labels_for), bins)
     if path != SYNTHETIC:
         if trained_bin is not None and bin_s not in (None, trained_bin):
@@ -70,7 +72,7 @@ def recordings(
             limit=limit,
             classes=classes,
             taxels=taxels,
-            groups=None if groups is None else [name.strip() for name in groups.split(",")],
+            groups=wanted,
         )
         _require_width(data, trained_bin)
         _require_sensor(data, split, taxels)
@@ -79,7 +81,7 @@ def recordings(
             events.need_labels(data, labels_for)
     else:
         events.require_events(SYNTHETIC, bin_s)
-        data = synthetic_split(split, limit=limit)
+        data = with_groups(synthetic_split(split, limit=limit), wanted)
         require_suited(data, classes=classes, taxels=taxels)
     if classes is not None:
         _warn_of_others(data, trained or {}, classes, whole=limit is None)
@@ -181,6 +183,7 @@ def load_recordings(
         bin_s=request.bin,
         labels_for=labels_for,
         trained=origin_of(netlist.provenance),
+        groups=getattr(request, "groups", None),
     )
     return in_steps(data, netlist, window) if joined else data
 

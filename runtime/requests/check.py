@@ -8,6 +8,7 @@ from spikeloom.runtime.requests.choices import (
     ComparisonChoice,
     NetlistChoice,
     RecordingsChoice,
+    ShownConditionChoice,
 )
 from spikeloom.runtime.requests.fields import option
 
@@ -25,7 +26,7 @@ class ExplainRequest(ComparisonChoice, RecordingsChoice):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StressRequest(ComparisonChoice, RecordingsChoice):
+class StressRequest(ComparisonChoice, ShownConditionChoice, RecordingsChoice):
     """Where float network and chip break: a seeded battery of perturbations, with verdicts and reasons."""
 
     only: str | None = option("perturbations to measure (default: all)", metavar="NAME[,…]")

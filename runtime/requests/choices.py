@@ -106,13 +106,26 @@ class DataChoice(Request):
     bin: float | None = option(BIN_HELP, metavar="S", group="recordings")
 
 
+GROUPS_HELP = "columns of recordings.csv, or fields of file names as in speed3_force1"
+
+
 @dataclass(frozen=True, kw_only=True)
 class ConditionChoice(DataChoice):
     """Recordings made under several conditions."""
 
     groups: str | None = option(
-        "conditions to leave out in turn: columns of recordings.csv, or fields of file names as in speed3_force1 "
-        "(default: all columns)",
+        f"conditions to leave out in turn: {GROUPS_HELP} (default: all columns)",
+        metavar="NAME[,NAME]",
+        group="recordings",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShownConditionChoice(Request):
+    """Conditions of recordings that a trained network runs."""
+
+    groups: str | None = option(
+        f"conditions to show accuracies by: {GROUPS_HELP} (default: all columns)",
         metavar="NAME[,NAME]",
         group="recordings",
     )

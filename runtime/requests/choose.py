@@ -14,6 +14,7 @@ from spikeloom.runtime.requests.choices import (
     NetworkChoice,
     RecordingsChoice,
     SensorChoice,
+    ShownConditionChoice,
 )
 from spikeloom.runtime.requests.fields import option
 
@@ -46,7 +47,7 @@ class SmallestRequest(SensorChoice, ConditionChoice):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChartRequest(CheckpointChoice, DataChoice):
+class ChartRequest(CheckpointChoice, ShownConditionChoice, DataChoice):
     """Accuracy against energy, time and size for a grid of configurations, and which one to deploy."""
 
     checkpoints: tuple[str, ...] = option(

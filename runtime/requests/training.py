@@ -13,7 +13,13 @@ from spikeloom.compiler.targets.native import BASES, DEFAULT_COPIES
 from spikeloom.compiler.targets.native import SYSTEM as NATIVE
 from spikeloom.models.systems import PADDINGS
 from spikeloom.models.training.recipes import RECIPES, RELEASED
-from spikeloom.runtime.requests.choices import NETWORK_FILES, DataChoice, NetworkChoice, SensorChoice
+from spikeloom.runtime.requests.choices import (
+    GROUPS_HELP,
+    NETWORK_FILES,
+    DataChoice,
+    NetworkChoice,
+    SensorChoice,
+)
 from spikeloom.runtime.requests.fields import Request, option
 
 if TYPE_CHECKING:
@@ -28,6 +34,11 @@ ALL_SYSTEMS = (*SYSTEMS, NATIVE, COUNTING)
 class TrainRequest(SensorChoice, DataChoice):
     """Train networks, and report the last, best and clean epoch."""
 
+    groups: str | None = option(
+        f"train again without each condition and without parts at random: {GROUPS_HELP}",
+        metavar="NAME[,NAME]",
+        group="recordings",
+    )
     join: int = option(
         "bins of the recordings per step; a step has an event where any of its bins has one",
         default=1,

@@ -1,6 +1,6 @@
 """What ``train --system counters`` does: choose the strength of the rule, fit it, and read the test split once."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.models.training.counters import Plan, counters_of, fit, run_counters
+from spikeloom.models.training.folds import Fold
 from spikeloom.models.training.record import Held
 from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.console import progress
@@ -21,6 +22,7 @@ from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Section, Table, Text
 from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.studies.left_out import LeftOut, counters_left_out, left_out_blocks
 
 PART = 64
 """Recordings whose spikes are held at a time."""
@@ -55,6 +57,7 @@ class CountersReport(Shown):
     file: str
     sha256: str
     record: CountersRecord
+    left_out: LeftOut | None = field(default=None, metadata=OPTIONAL)
 
 
 def decisions_of(counters: Counters, data: Recordings) -> IntArray:
@@ -71,9 +74,14 @@ def decisions_of(counters: Counters, data: Recordings) -> IntArray:
 
 
 def train_counters(
-    plan: Plan, training: Recordings, test: Recordings, command: str, output: str
+    plan: Plan,
+    training: Recordings,
+    test: Recordings,
+    command: str,
+    output: str,
+    folds: Sequence[Fold] = (),
 ) -> CountersReport:
-    """Train a counting network, write it, and read the test split."""
+    """Train a counting network, write it, and read the test split; `folds` are conditions to leave out."""
     progress("cross-validation")
     classes = int(training.labels.max()) + 1
     data = run_counters(training, plan)
@@ -98,7 +106,11 @@ def train_counters(
     )
     known = {name: value for name, value in asdict(record).items() if value is not None}
     sha256 = write_counters(output, made.trained(known))
-    return CountersReport(file=Path(output).name, sha256=sha256, record=record)
+    left_out = None
+    if folds:
+        progress("leaving out conditions")
+        left_out = counters_left_out(data, classes, fitted.strength, record.validation, folds)
+    return CountersReport(file=Path(output).name, sha256=sha256, record=record, left_out=left_out)
 
 
 def counters_sections(report: CountersReport) -> Iterator[Section]:
@@ -111,6 +123,6 @@ def counters_sections(report: CountersReport) -> Iterator[Section]:
         f"test accuracy: {percent(made.test_correct, made.test_samples)}",
         f"written: {report.file}, sha256 {report.sha256}",
     ]
-    yield Section(
-        "Training", [Text(made.command), Table(["strength", "right when left out"], rows), *map(Text, lines)]
-    )
+    table = Table(["strength", "right when left out"], rows)
+    blocks = left_out_blocks(report.left_out)
+    yield Section("Training", [Text(made.command), table, *map(Text, lines), *blocks])

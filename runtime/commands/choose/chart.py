@@ -32,7 +32,7 @@ def run(request: ChartRequest) -> Outcome:
     """Run the command; exit code 1 if no point fits a budget."""
     from spikeloom.runtime.studies.chart.sections import printed, write_chart
     from spikeloom.runtime.studies.chart.study import STORE, chart
-    from spikeloom.runtime.studies.chart.work import read_splits
+    from spikeloom.runtime.studies.chart.work import groups_in, read_splits
 
     target = load_target(DEFAULT_TARGET)
     grid = Grid() if request.grid is None else parse_grid(request.grid, target)
@@ -49,12 +49,14 @@ def run(request: ChartRequest) -> Outcome:
             f"--table {request.table}: {target.title} has no such energy table; give {' or '.join(tables)}"
         )
     progress("reading the recordings")
-    splits = read_splits(request.data, request.bin, networks[0])
+    splits = read_splits(request.data, request.bin, networks[0], request.groups)
     data = data_of(request.data, splits["test"].seconds, splits["train"], splits["test"])
     require_suited(networks, splits, data.sha256)
     require_grid(networks, grid, target)
     folder.mkdir(exist_ok=True)
-    options = repeat.words(repeat.given(request, ("data", *repeat.NETWORK, "grid", "table", "bin")))
+    options = repeat.words(
+        repeat.given(request, ("data", *repeat.NETWORK, "grid", "table", "bin", "groups"))
+    )
     options += [word for budget in request.budget for word in ("--budget", budget)]
     command = repeat.command("chart", *request.checkpoints, *options, "-o", request.output)
     charted = chart(
@@ -67,6 +69,7 @@ def run(request: ChartRequest) -> Outcome:
         by=chosen_by(target, request.table),
         command=command,
         jobs=request.jobs,
+        groups=groups_in(splits, request.groups),
     )
     write_chart(folder, charted)
     return Outcome(charted, partial(printed, folder=str(folder)), 0 if charted.budget.fits else 1)

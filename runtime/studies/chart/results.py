@@ -25,6 +25,7 @@ class Figures(Share):
     equal: int
     costs: Costs = field(metadata=INLINE)
     steps: float
+    conditions: Mapping[str, Share] = field(default_factory=dict)  # Accuracy in each condition
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 from spikeloom.compiler.files import write_atomically
 from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.report import html
+from spikeloom.runtime.report.conditions import UNSEEN, worst_and_best
 from spikeloom.runtime.report.drawing import Drawing, sheet, styled
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.numbers import si
@@ -77,6 +78,11 @@ def _choice(chart: Chart) -> list[Block]:
         lines += [
             f"on the test split its interval lies below those of {better}, which the training split did not show"
         ]
+    accuracies = {name: each.accuracy for name, each in point.test.conditions.items()}
+    if accuracies:
+        lines.append(f"by condition of the test recordings: {worst_and_best(accuracies)}")
+    else:
+        lines.append(f"the recordings have no groups: {UNSEEN}")
     return [Text("\n".join(lines)), _table([point], chart.chosen_by, "The choice"), *_commands([point])]
 
 

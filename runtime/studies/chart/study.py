@@ -58,6 +58,7 @@ def chart(
     *,
     by: ChosenBy,
     command: str,
+    groups: work.Groups,
     jobs: int | None = None,
 ) -> Chart:
     """Measure a grid, as far as a folder does not hold it, and choose by a table of energy.
@@ -65,7 +66,7 @@ def chart(
     `command` repeats it; an OptionError says that the chip refuses all configurations.
     """
     works = [
-        work.measurement(network, storage, grid, data, target, folder)
+        work.measurement(network, storage, grid, data, target, folder, groups)
         for network in networks
         for storage in network.storages(grid)
     ]

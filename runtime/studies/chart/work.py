@@ -24,6 +24,7 @@ from spikeloom.compiler.targets.compartments import (
     write_netlist,
 )
 from spikeloom.compiler.types import IntArray, JsonObject
+from spikeloom.models.recordings.conditions import by_condition
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part
 from spikeloom.runtime.equivalence.reference import votes_so_far
@@ -44,6 +45,21 @@ from spikeloom.runtime.studies.search.results import Data, Share, share
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Groups:
+    """Names of groups as they were typed, and a hash of those of every recording."""
+
+    words: str | None
+    sha256: str
+
+
+def groups_in(splits: Mapping[str, Recordings], words: str | None) -> Groups:
+    """Those of recordings."""
+    return Groups(
+        words=words, sha256=content_key({name: dict(data.groups) for name, data in splits.items()})
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Measurement(Job):
     """A network in one storage, the file of its netlist by layout, and parts of each recording in per cent."""
 
@@ -52,6 +68,7 @@ class Measurement(Job):
     files: Mapping[str, Path]
     windows: tuple[int, ...]
     data: Data
+    groups: Groups
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,7 +84,13 @@ class Built:
 
 
 def measurement(
-    network: NetworkFile, storage: Storage, grid: Grid, data: Data, target: Target, folder: Path
+    network: NetworkFile,
+    storage: Storage,
+    grid: Grid,
+    data: Data,
+    target: Target,
+    folder: Path,
+    groups: Groups,
 ) -> Measurement:
     """Work whose key, and the names of its netlists in a folder, are of everything that decides the result."""
 
@@ -78,7 +101,7 @@ def measurement(
 
     windows = tuple(sorted(grid.window))
     return Measurement(
-        key=keyed("figures", layouts=grid.cores, windows=windows),
+        key=keyed("figures", layouts=grid.cores, windows=windows, groups=groups.sha256),
         label=f"{network.name} {storage.label()}",
         network=network,
         storage=storage,
@@ -87,6 +110,7 @@ def measurement(
         },
         windows=windows,
         data=data,
+        groups=groups,
     )
 
 
@@ -113,18 +137,20 @@ def commands(work: Measurement, layout: str, window: int) -> tuple[str, ...]:
     )
 
 
-def read_splits(path: str, bin_s: float | None, network: NetworkFile) -> dict[str, Recordings]:
+def read_splits(
+    path: str, bin_s: float | None, network: NetworkFile, groups: str | None = None
+) -> dict[str, Recordings]:
     """Training and test recordings by split, in bins."""
     shared: dict[str, Any] = {"classes": network.classes, "taxels": network.taxels, "labels_for": "chart"}
-    shared["trained"] = origin_of(network.training)
+    shared |= {"trained": origin_of(network.training), "groups": groups}
     require_splits(path)
     return {split: recordings(path, split, bin_s=bin_s, **shared) for split in SPLITS}
 
 
 @lru_cache(maxsize=2)
-def _in_steps(data: Data, network: NetworkFile) -> dict[str, Recordings]:
+def _in_steps(data: Data, network: NetworkFile, groups: Groups) -> dict[str, Recordings]:
     """The same in the steps of a network that joins bins."""
-    splits = read_splits(data.path, data.bin_s, network)
+    splits = read_splits(data.path, data.bin_s, network, groups.words)
     return {split: joined_bins(each, network.bins) for split, each in splits.items()}
 
 
@@ -137,10 +163,12 @@ def _loaded(network: NetworkFile) -> LoadedNetwork:
 
 
 @lru_cache(maxsize=8)
-def _decided(network: NetworkFile, data: Data, windows: tuple[int, ...]) -> dict[int, dict[str, IntArray]]:
+def _decided(
+    network: NetworkFile, data: Data, groups: Groups, windows: tuple[int, ...]
+) -> dict[int, dict[str, IntArray]]:
     """Decisions of the float32 model by window and split."""
     loaded = _loaded(network)
-    splits = _in_steps(data, network)
+    splits = _in_steps(data, network, groups)
 
     def decisions(part: Recordings) -> IntArray:
         return vote(votes_so_far(loaded.network, part)[:, -1])
@@ -179,7 +207,9 @@ def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
     placing = Options(
         cores_for=parse_cores(request.cores_for),
         provenance=provenance(
-            request, _loaded(work.network), calibrated=_in_steps(work.data, work.network)["train"]
+            request,
+            _loaded(work.network),
+            calibrated=_in_steps(work.data, work.network, work.groups)["train"],
         ),
     )
     try:
@@ -190,13 +220,13 @@ def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
     file.parent.mkdir(parents=True, exist_ok=True)
     sha256 = write_netlist(netlist, file)
     machine = machine_of(netlist)
-    splits = _in_steps(work.data, work.network)
+    splits = _in_steps(work.data, work.network, work.groups)
     figures = {
         window: {
             split: _figures(machine, _part(work.network, splits[split], window), work.data.bin_s, decisions)
             for split, decisions in each.items()
         }
-        for window, each in _decided(work.network, work.data, work.windows).items()
+        for window, each in _decided(work.network, work.data, work.groups, work.windows).items()
     }
     return Built(
         sha256=sha256,
@@ -213,7 +243,9 @@ def _rounded(work: Measurement, loaded: LoadedNetwork) -> Compilation:
     options = Options(
         storage=storage_of(request, work.network.forms),
         prune_unused=request.prune_unused,
-        training_events=_part(work.network, _in_steps(work.data, work.network)["train"], WHOLE).events,
+        training_events=_part(
+            work.network, _in_steps(work.data, work.network, work.groups)["train"], WHOLE
+        ).events,
     )
     return to_integers(loaded.network, options, load_target(request.target))
 
@@ -235,4 +267,7 @@ def _figures(machine: Machine, data: Recordings, bin_s: float, decided: IntArray
         equal=int(np.count_nonzero(decisions == decided)),
         costs=costs,
         steps=float(data.step_counts.mean()),
+        conditions={
+            name: _share(decisions[those], data.labels[those]) for name, those in by_condition(data).items()
+        },
     )

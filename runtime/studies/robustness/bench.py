@@ -1,14 +1,15 @@
 """What ``stress`` works on: netlist and float network, sensor and recordings, and inputs made of them."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.targets.compartments import Netlist
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.graphs import NEUTOUCH
+from spikeloom.models.recordings.conditions import by_condition
 from spikeloom.models.recordings.events import fitted, join_bins
 from spikeloom.models.sensors import read_layout
 from spikeloom.runtime.equivalence.reference import require_match
@@ -36,6 +37,8 @@ class Bench:
     labels: IntArray  # (recordings,) int64
     files: tuple[str, ...]
     lengths: IntArray  # (recordings,) int64; bins of each
+    # Recordings (recordings,) of each condition
+    conditions: Mapping[str, BoolArray] = field(default_factory=dict)
 
 
 def in_steps(events: Events, lengths: IntArray, netlist: Netlist) -> tuple[Events, IntArray]:
@@ -98,6 +101,7 @@ def bench_of(request: StressRequest) -> tuple[Bench, LoadedNetwork, str]:
         labels=data.labels,
         files=data.files,
         lengths=data.step_counts,
+        conditions=by_condition(data),
     )
     return bench, loaded, data.sha256
 

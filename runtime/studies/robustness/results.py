@@ -32,6 +32,14 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class InCondition:
+    """Clean recordings of a condition, and right decisions by side."""
+
+    recordings: int
+    right: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
     """Mean accuracy over seeds, its 95 % interval, and the accuracy of each seed."""
 
@@ -125,6 +133,7 @@ class Stress(Shown):
     classes: int
     seeds: int
     clean: Run
+    conditions: Mapping[str, InCondition] = field(default_factory=dict)
     perturbations: Mapping[str, Curve]
     not_applicable: Mapping[str, str]
     required: tuple[str, ...]

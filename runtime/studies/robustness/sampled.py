@@ -16,7 +16,7 @@ from spikeloom.runtime.studies.robustness.curves import Requirement, curve, unme
 from spikeloom.runtime.studies.robustness.definition import TAXELS, Level
 from spikeloom.runtime.studies.robustness.pair import SIDES, Inputs, Outcome, Pair, evaluate
 from spikeloom.runtime.studies.robustness.perturbations import SAMPLED
-from spikeloom.runtime.studies.robustness.results import ComparedProvenance, Run, Stress
+from spikeloom.runtime.studies.robustness.results import ComparedProvenance, InCondition, Run, Stress
 from spikeloom.runtime.studies.robustness.threads import in_threads
 
 
@@ -54,6 +54,7 @@ def stress(request: StressRequest, names: Sequence[str], requirements: Sequence[
         classes=classes,
         seeds=request.seeds,
         clean=undisturbed,
+        conditions=_in_conditions(bench, reference),
         perturbations=curves,
         not_applicable={name: reason for name, reason in reasons.items() if reason is not None},
         required=tuple(map(str, requirements)),
@@ -79,6 +80,18 @@ def clean(bench: Bench) -> tuple[Outcome, Run]:
     inputs = whole(bench.events, bench.pair.netlist, bench.lengths)
     outcome = evaluate(bench.pair, inputs)
     return outcome, _run(bench, outcome, None, inputs, outcome)
+
+
+def _in_conditions(bench: Bench, outcome: Outcome) -> dict[str, InCondition]:
+    """Right decisions by condition."""
+    right = {side: outcome.decisions(side) == bench.labels for side in SIDES}
+    return {
+        name: InCondition(
+            recordings=int(np.count_nonzero(those)),
+            right={side: int(np.count_nonzero(each[those])) for side, each in right.items()},
+        )
+        for name, those in bench.conditions.items()
+    }
 
 
 def measure(bench: Bench, name: str, level: Level, seed: int, reference: Outcome) -> Run:

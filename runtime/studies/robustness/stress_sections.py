@@ -9,6 +9,7 @@ import numpy as np
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.files import reading
 from spikeloom.models.recordings.counts import number
+from spikeloom.runtime.report.conditions import UNSEEN, worst_and_best
 from spikeloom.runtime.report.drawing import CHIP, FLOAT, GREY, WIDTH, Drawing, sheet, styled
 from spikeloom.runtime.report.encode import read_json
 from spikeloom.runtime.report.numbers import percent, wilson
@@ -67,10 +68,23 @@ def overview(result: Stress) -> list[Section]:
     drawn = [Figure("stress", partial(figure, result, title), caption, numbers)] if numbers else []
     skipped = [Text(f"{name}: not measured, {why}") for name, why in result.not_applicable.items()]
     return [
-        Section("Clean", [Text("\n".join(lines))]),
+        Section("Clean", [Text("\n".join(lines)), *_by_condition(result)]),
         Section("Verdicts", [verdicts(result), Text(KEY), *drawn]),
         Section("", skipped),
     ]
+
+
+def _by_condition(result: Stress) -> list[Text | Table]:
+    """Accuracies of clean recordings in each condition, the worst and the best of the chip named."""
+    if not result.conditions:
+        return [Text(f"the recordings have no groups: {UNSEEN}")]
+    rows = []
+    for name, each in result.conditions.items():
+        shares = [f"{100 * each.right[side] / each.recordings:.1f}" for side in SIDES]
+        rows.append([name, str(each.recordings), *shares])
+    chip = {name: each.right["chip"] / each.recordings for name, each in result.conditions.items()}
+    head = ["condition", "recordings", *(f"{side} %" for side in SIDES)]
+    return [Text(f"chip by condition: {worst_and_best(chip)}"), Table(head, rows, "Clean, by condition")]
 
 
 @styled()

@@ -13,8 +13,8 @@ import numpy as np
 
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.folds import Fold
 from spikeloom.runtime.studies.processor import Processor, processor
-from spikeloom.runtime.studies.smallest.folds import Fold
 from spikeloom.runtime.studies.smallest.space import Candidate
 
 LINEAR = "linear-svm"

@@ -24,6 +24,7 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.counters import FOLDS
+from spikeloom.models.training.folds import every, folds_of
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.jobs import sweep
 from spikeloom.runtime.studies.search.budgets import SHARES, Budget, excess
@@ -31,7 +32,6 @@ from spikeloom.runtime.studies.search.choice import NEAR, choose, front, is_wors
 from spikeloom.runtime.studies.search.results import chosen_by, titles_of
 from spikeloom.runtime.studies.smallest import work
 from spikeloom.runtime.studies.smallest.baselines import baselines
-from spikeloom.runtime.studies.smallest.folds import every, folds_of
 from spikeloom.runtime.studies.smallest.results import Checked, Choice, Family, Smallest, Tried
 from spikeloom.runtime.studies.smallest.space import EPOCHS, Candidate, variants
 from spikeloom.runtime.studies.smallest.work import RUNGS, Measured, Scene

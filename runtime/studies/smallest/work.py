@@ -29,6 +29,7 @@ from spikeloom.models.training.counters import (
     run_counters,
     split_folds,
 )
+from spikeloom.models.training.folds import Fold, every, folds_of
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.backends import backend_of, machine_of
 from spikeloom.runtime.machines.capabilities import Stoppable
@@ -42,7 +43,6 @@ from spikeloom.runtime.studies.search.measure import measure_netlist
 from spikeloom.runtime.studies.search.results import Data, NetlistCosts
 from spikeloom.runtime.studies.smallest import baselines
 from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF, RIDGE
-from spikeloom.runtime.studies.smallest.folds import Fold, every, folds_of
 from spikeloom.runtime.studies.smallest.space import EPOCHS, Candidate
 from spikeloom.runtime.studies.smallest.trained import Sensor, plan_of, without
 

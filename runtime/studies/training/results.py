@@ -3,7 +3,7 @@
 import statistics
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,9 +11,11 @@ from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.models.training.recipes import MSE
 from spikeloom.models.training.record import Reached, TrainingRecord
 from spikeloom.runtime.report.drawing import COLOURS, Drawing, sheet, styled
+from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.sections import Section, Table, Text
 from spikeloom.runtime.report.shown import Shown
+from spikeloom.runtime.studies.left_out import LeftOut, left_out_blocks
 
 TITLES = {"last": "last epoch", "best": "best epoch on test", "clean": "clean epoch, chosen on validation"}
 """What the epochs of ``WEIGHTS`` are called where people read of them."""
@@ -45,6 +47,7 @@ class TrainingReport(Shown):
 
     runs: Sequence[Finished]
     protocols: Mapping[str, Accuracies]
+    left_out: LeftOut | None = field(default=None, metadata=OPTIONAL)
 
 
 def summary(records: Sequence[TrainingRecord]) -> dict[str, Accuracies]:
@@ -83,7 +86,9 @@ def training_sections(result: TrainingReport) -> Iterable[Section]:
     files = ", ".join(run.file for run in result.runs)
     lines += textwrap.wrap(f"written: {files}", WIDTH, initial_indent="  ", subsequent_indent="    ")
     table = Table(["", "epoch", "correct", "accuracy", "95 % interval"], rows)
-    yield Section("Training", [Text(typed), table, Text("\n".join(lines))])
+    yield Section(
+        "Training", [Text(typed), table, Text("\n".join(lines)), *left_out_blocks(result.left_out)]
+    )
 
 
 @styled()

@@ -16,6 +16,7 @@ from spikeloom.runtime.inputs.recordings import require_bins
 from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.requests.training import TrainRequest
 from spikeloom.runtime.studies.counting import CountersReport, train_counters
+from spikeloom.runtime.studies.left_out import announce, condition_folds, networks_left_out
 from spikeloom.runtime.studies.training.plan import RECIPE, both_splits, plan_jobs, recipe_of, sensor_of
 from spikeloom.runtime.studies.training.results import TrainingReport, picture, summary
 from spikeloom.runtime.studies.training.seeds import train_seeds
@@ -49,15 +50,28 @@ def train_networks(request: TrainRequest) -> TrainingReport:
     graph, _ = sensor_of(request)
     percent = WHOLE if request.window is None else parse_window(request.window)
     training, test = (
-        first_part(each, percent) for each in both_splits(request.data, graph.n_taxels, request.bin)
+        first_part(each, percent)
+        for each in both_splits(request.data, graph.n_taxels, request.bin, request.groups)
     )
+    folds = []
+    if request.groups is not None:
+        folds = condition_folds(training, request.groups)
+        announce(request.groups, folds)
     if percent < WHOLE:
         tell(
             f"note: of every recording the first {percent} % train; give --window {percent}% to what runs the network"
         )
-    runs = train_seeds(plan_jobs(request, training, test), resume=request.resume)
+    jobs = plan_jobs(request, training, test)
+    runs = train_seeds(jobs, resume=request.resume)
     write_picture(request.picture, lambda: picture(runs))
-    return TrainingReport(runs=runs, protocols=summary(runs))
+    left_out = None
+    if folds:
+        first = jobs[0]
+        store = Path(f"{request.output}.folds.sqlite")
+        left_out = networks_left_out(
+            first.plan, training, folds, epochs=first.epochs, seed=first.seed, store=store
+        )
+    return TrainingReport(runs=runs, protocols=summary(runs), left_out=left_out)
 
 
 def train_counting(request: TrainRequest) -> CountersReport:
@@ -79,8 +93,12 @@ def train_counting(request: TrainRequest) -> CountersReport:
         typed += ["--join", str(request.join)]
     plan = _counting_plan(request.join, options)
     taxels = None if request.taxels is None else len(sensor_places(request.taxels))
-    training, test = both_splits(request.data, taxels, request.bin)
-    return train_counters(plan, training, test, repeat.command("train", *typed), request.output)
+    training, test = both_splits(request.data, taxels, request.bin, request.groups)
+    folds = []
+    if request.groups is not None:
+        folds = condition_folds(training, request.groups)
+        announce(request.groups, folds, parts=0)
+    return train_counters(plan, training, test, repeat.command("train", *typed), request.output, folds)
 
 
 def _counting_plan(bins: int, options: dict[str, Any]) -> Plan:
