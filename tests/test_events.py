@@ -136,7 +136,7 @@ def test_who_needs_labels_says_so(write):
     assert recordings.labels.tolist() == [1, UNLABELLED]
     assert message(need_labels, recordings, "training") == (
         "d: b.csv: no label, training needs one for every recording; "
-        "add a label column or name the file like grasp_7_label_3.csv"
+        "add a label column, name the file like grasp_7_label_3.csv, or list it with its label in recordings.csv"
     )
     recordings = load_data(write("d/b.csv", "0,0,1,1\n").parent)
     assert need_labels(recordings, "training") is recordings
@@ -218,7 +218,10 @@ def test_one_released_recording(tmp_path):
         assert recordings.labels.tolist() == [label]
         assert (counts.events, counts.duplicates, recordings.steps) == (grasps.events[3].sum(), 0, 40)
     said = refused(OptionError, "", load_data, tmp_path / "grasp.npy", bin_s=0.05)
-    assert said == "--bin 0.05: grasp.npy holds bins, not times; omit --bin"
+    assert said == (
+        "--bin 0.05: grasp.npy holds bins, of 0.02 s as nothing says it: write it to bins.npy; "
+        "give a multiple of that, or omit --bin"
+    )
     np.save(tmp_path / "bad.npy", np.full((3, 2, 4), 0.5))
     assert message(load_data, tmp_path / "bad.npy") == (
         "bad.npy: value 0.5 at taxel 0, polarity 0, step 0, allowed are 0 and 1; recordings are events, not pressures"
@@ -445,7 +448,10 @@ def test_a_table_above_the_splits(write):
     ("rows", "line"),
     [
         ("b_label_2.csv,3\n", "own: b_label_2.csv: label 2, and 3 in its table; fix one of them"),
-        ("a.csv,x\nc.csv,-1\n", "own: labels.csv: label '-1'; give numbers from 0, or names, in all rows"),
+        (
+            "a.csv,x\nc.csv,-1\n",
+            "own: labels.csv: row 3: label '-1'; give numbers from 0, or names, in all rows",
+        ),
         ("a.csv,1\na.csv,2\n", "own: labels.csv: row 3: a.csv stands there twice; keep one of the rows"),
         ("a.csv\n", "own: labels.csv: row 2: ['a.csv']; give a file, and a value in each column"),
     ],

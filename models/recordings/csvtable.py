@@ -3,23 +3,28 @@
 A line holds numbers between commas. The first line may name the columns, in any order; without names they
 stand in the order that the reader asks for. Blank lines, and what follows a ``#``, do not count.
 
-A table of recordings, ``recordings.csv`` or ``labels.csv`` beside them, has columns ``file`` and ``label``; others are
-groups, such as the speed and the force of a touch.
+A table of recordings, ``recordings.csv`` or ``labels.csv`` beside them, has columns ``file``, ``label`` and
+``duration_s``; others are groups, such as the speed and the force of a touch.
 """
 
 import csv
 import io
+import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import IO, Any
 
 import numpy as np
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.files import plain, read_whole, reading
+from spikeloom.compiler.files import plain, reading, require_size
 from spikeloom.compiler.types import FloatArray
+from spikeloom.models.recordings.classes import class_of
 from spikeloom.models.recordings.counts import number
+from spikeloom.models.recordings.evtouch import Members
 
 MAX_TABLE_BYTES = 256 << 20  # some 15 million events
 
@@ -27,6 +32,7 @@ TABLES = ("recordings.csv", "labels.csv")
 
 _FILE = ("file", "filename", "name", "recording")
 _LABEL = ("label", "class")
+DURATION = "duration_s"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,6 +41,7 @@ class Table:
 
     where: str  # The file, for messages
     columns: Mapping[str, FloatArray]  # Optional columns that the file does not have are absent
+    words: Sequence[str] = ()  # Cells of a column that may hold words, and does
     lines: Sequence[int]  # Line of each row
 
     def at(self, row: int) -> str:
@@ -48,18 +55,21 @@ def read_table(
     optional: tuple[str, ...] = (),
     *,
     where: str | None = None,
+    opener: Callable[[], IO[Any]] | None = None,
     empty: bool = False,
+    words: str = "",
 ) -> Table:
     """Read a CSV file with these columns, whose order counts where the file does not name them; `where` names the file.
 
-    The table has at least one row, unless it may be `empty` below its header; values may be infinite or NaN.
+    What the `opener` opens is read in its place. The table has at least one row, unless it may be `empty` below its
+    header; values may be infinite or NaN. The column `words` may hold words.
 
     DataError if the file cannot be read or is not such a table; the message names the line.
     """
     where = where or Path(path).name
     known = (*required, *optional)
     expected = ", ".join(required) + "".join(f"[, {name}]" for name in optional)
-    lines, rows = _rows(read_text(Path(path), where), known)
+    lines, rows = _rows(read_text(opener or partial(Path(path).open, "rb"), where), known)
     names = tuple(_cells(rows[0].lower())) if rows else ()
     if names and not any(map(_is_number, names)):
         if not (set(required) <= set(names) <= set(known) and len(set(names)) == len(names)):
@@ -83,17 +93,42 @@ def read_table(
     try:
         values = np.loadtxt(rows, delimiter=",", ndmin=2)
     except ValueError:
-        raise _fault(where, lines, rows, names) from None
+        if words not in names:
+            raise _fault(where, lines, rows, names) from None
+        return _with_words(where, lines, rows, names, words)
     if values.shape[1] != len(names):
         raise _fault(where, lines, rows, names)
     columns = {name: np.ascontiguousarray(values[:, index]) for index, name in enumerate(names)}
     return Table(where=where, columns=columns, lines=lines)
 
 
-def read_text(path: Path, where: str) -> str:
+def _with_words(
+    where: str, lines: Sequence[int], rows: Sequence[str], names: tuple[str, ...], words: str
+) -> Table:
+    """A table of which one column holds words."""
+    place = names.index(words)
+    cells = [_cells(row) for row in rows]
+    for line, row in zip(lines, cells, strict=True):
+        if len(row) != len(names):
+            raise _fault(where, [line], [",".join(row)], names)
+    taken = [row.pop(place) for row in cells]
+    others = names[:place] + names[place + 1 :]
+    numbers = [",".join(row) for row in cells]
+    try:
+        values = np.loadtxt(numbers, delimiter=",", ndmin=2)
+    except ValueError:
+        raise _fault(where, lines, numbers, others) from None
+    columns = {name: np.ascontiguousarray(values[:, index]) for index, name in enumerate(others)}
+    return Table(where=where, columns=columns, lines=lines, words=taken)
+
+
+def read_text(opener: Callable[[], IO[Any]], where: str) -> str:
     """A file of at most `MAX_TABLE_BYTES` as text, without a byte order mark; DataError if it cannot be read."""
     with reading(where, DataError, "save it as CSV in UTF-8"):
-        return read_whole(path, "table", MAX_TABLE_BYTES).decode("utf-8-sig")
+        with opener() as file:
+            content: bytes = file.read(MAX_TABLE_BYTES + 1)
+        require_size(len(content), "table", MAX_TABLE_BYTES)
+        return content.decode("utf-8-sig")
 
 
 def _rows(text: str, known: tuple[str, ...]) -> tuple[list[int], list[str]]:
@@ -140,72 +175,101 @@ def _is_number(cell: str) -> bool:
     return cell.isascii() and "_" not in cell
 
 
-def is_table(file: Path) -> bool:
+def is_table(name: str) -> bool:
     """Whether a file is such a table, by its name."""
-    return file.name.lower() in TABLES
+    return PurePosixPath(name).name.lower() in TABLES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """What a table says of a recording: its class, if it says so, and its groups."""
+    """What a table says of a recording: its class and its length in seconds, if it says so, and its groups."""
 
-    label: int | None
+    label: str | None
+    duration_s: float | None
     groups: dict[str, str]
 
 
-NOTHING = Row(label=None, groups={})
+NOTHING = Row(label=None, duration_s=None, groups={})
 
 
-def _read_rows(path: Path, where: str) -> dict[str, Row] | None:
-    """Rows by name of file of a table of recordings; None if it is another kind of table.
-
-    Classes that are no numbers are numbered in the order of their names.
-    """
-    rows = list(csv.reader(io.StringIO(read_text(path, where), newline="")))
+def _read_rows(opener: Callable[[], IO[Any]], where: str) -> dict[str, Row] | None:
+    """Rows by name of file of a table of recordings; None if it is another kind of table."""
+    rows = list(csv.reader(io.StringIO(read_text(opener, where), newline="")))
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     files = [index for index, name in enumerate(header) if name in _FILE]
-    classes = [index for index, name in enumerate(header) if name in _LABEL]
+    classes = [name for name in header if name in _LABEL]
     if len(files) != 1 or len(classes) > 1:
         return None
-    known: dict[str, dict[str, str]] = {}
+    known: dict[str, Row] = {}
     for line, cells in enumerate(rows[1:], 2):
         if not any(cell.strip() for cell in cells):
             continue
-        row = dict(zip(header, (cell.strip() for cell in cells), strict=False))
-        name = row.pop(header[files[0]])
+        here = f"{where}: row {line}"
+        groups = dict(zip(header, (cell.strip() for cell in cells), strict=False))
+        name = groups.pop(header[files[0]])
         if not name or len(cells) < len(header):
-            raise DataError(f"{where}: row {line}: {cells[:4]}; give a file, and a value in each column")
+            raise DataError(f"{here}: {cells[:4]}; give a file, and a value in each column")
+        row = Row(
+            label=_class(groups.pop(classes[0]), here) if classes else None,
+            duration_s=_seconds(groups.pop(DURATION, ""), here),
+            groups=groups,
+        )
         if known.setdefault(name, row) != row:
-            raise DataError(f"{where}: row {line}: {name} stands there twice; keep one of the rows")
-    number_of = _numbers([row[header[classes[0]]] for row in known.values()], where) if classes else {}
-    labels = {name: number_of[row.pop(header[classes[0]])] for name, row in known.items()} if classes else {}
-    return {name: Row(label=labels.get(name), groups=row) for name, row in known.items()}
+            raise DataError(f"{here}: {name} stands there twice; keep one of the rows")
+    return known
 
 
-def _numbers(classes: Sequence[str], where: str) -> dict[str, int]:
-    """Number of each class: what it is written as, or its place among the names."""
-    names = sorted(set(classes))
-    if all(name.isascii() and name.isdigit() and len(name) <= 6 for name in names):
-        return {name: int(name) for name in names}
-    if mixed := [name for name in names if not name or name.lstrip("-").replace(".", "").isdigit()]:
-        raise DataError(f"{where}: label {mixed[0]!r}; give numbers from 0, or names, in all rows")
-    return {name: index for index, name in enumerate(names)}
+def _class(text: str, where: str) -> str:
+    """A class; DataError if it is none."""
+    name = class_of(text)
+    if name is None:
+        raise DataError(f"{where}: label {text[:40]!r}; give numbers from 0, or names, in all rows")
+    return name
 
 
-def rows_beside(path: Path, files: list[Path], source: str) -> tuple[dict[Path, Row], list[str]]:
-    """Rows by file of tables in the folder `path` or beside `files`, and a note on each table."""
-    known: dict[Path, Row] = {}
+def _seconds(text: str, where: str) -> float | None:
+    """Length of a recording, if there is one; DataError if it is no length."""
+    if not text:
+        return None
+    seconds = float(text) if _is_number(text) else math.nan
+    if not (math.isfinite(seconds) and seconds > 0):
+        raise DataError(f"{where}: {DURATION} is {text[:40]!r}; give seconds above 0, or nothing")
+    return seconds
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Listed:
+    """What tables say: rows by recording, all classes that they know, and a note on each table."""
+
+    rows: Mapping[str, Row]
+    classes: frozenset[str]
+    notes: list[str]
+
+
+def rows_beside(members: Members, files: Sequence[str], source: str) -> Listed:
+    """Rows of tables at the top of a data set, or beside its `files`, which are named as `members` are."""
+    known: dict[str, Row] = {}
+    classes: set[str] = set()
     notes = []
-    folders = {} if path.is_file() else dict.fromkeys([path, *(file.parent for file in files)])
+    folders = dict.fromkeys([PurePosixPath(), *(PurePosixPath(file).parent for file in files)])
     for folder in folders:
-        for table in sorted(file for file in folder.iterdir() if is_table(file) and file.is_file()):
-            where = f"{source}: {table.relative_to(path).as_posix()}"
-            rows = _read_rows(table, where)
+        for table in sorted(
+            name for name in members if is_table(name) and PurePosixPath(name).parent == folder
+        ):
+            where = f"{source}: {table}"
+            rows = _read_rows(members[table], where)
             if rows is None:
                 notes.append(f"{where}: is not read; a table of recordings has columns file and label")
                 continue
-            inside = [file for file in files if file.is_relative_to(folder)]
-            names = {file: {file.name, file.relative_to(folder).as_posix()} & rows.keys() for file in inside}
-            known |= {file: rows[name] for file, same in names.items() for name in same}
-            notes.append(f"{where}: describes {sum(map(bool, names.values()))} of {len(files)} recordings")
-    return known, notes
+            inside = [file for file in files if PurePosixPath(file).is_relative_to(folder)]
+            found = {file: row for file in inside for row in _rows_of(rows, PurePosixPath(file), folder)}
+            known |= found
+            classes |= {row.label for row in rows.values() if row.label is not None}
+            notes.append(f"{where}: describes {len(found)} of {len(files)} recordings")
+    return Listed(rows=known, classes=frozenset(classes), notes=notes)
+
+
+def _rows_of(rows: Mapping[str, Row], file: PurePosixPath, folder: PurePosixPath) -> list[Row]:
+    """The row of a recording, by its name or its path from the table, if there is one."""
+    names = (file.name, file.relative_to(folder).as_posix())
+    return [rows[name] for name in names if name in rows][:1]

@@ -5,20 +5,29 @@ falling, one code per file. The label is the class of the whole recording: one c
 name such as ``grasp_7_label_3.csv``.
 """
 
+import io
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.types import EventArray, FloatArray, IntArray
 from spikeloom.models.graphs import MAX_TAXELS
+from spikeloom.models.recordings.classes import class_in_name, class_of
 from spikeloom.models.recordings.csvtable import read_table
-from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name, opened, parse_npy
+from spikeloom.models.recordings.evtouch import MAX_FILE_BYTES, Members, parse_npy, read_limited, unzipped
 
 MAX_LABEL = 999_999
+
+MAX_NPZ_BYTES = 4 * MAX_FILE_BYTES
+"""Of its file; each array is limited by itself."""
+
+Opener = Callable[[], IO[Any]]
 
 _REQUIRED = ("time_s", "taxel", "polarity")
 
@@ -31,26 +40,43 @@ class EventStream:
     time_s: FloatArray  # (events,) float64; seconds from the start of the recording, 0 or more, in any order
     taxel: IntArray  # (events,) int64; below `MAX_TAXELS`
     polarity: EventArray  # (events,) uint8; 1 for rising, 0 for falling
-    label: int  # Class of the recording, `UNLABELLED` where nothing says it
+    label: str | None  # Class of the recording, None where nothing says it
     at: Callable[[int], str]  # Place of an event by its index, for messages
 
 
 def read_stream(
-    path: str | os.PathLike[str], *, taxels: int | None = None, where: str | None = None
+    path: str | os.PathLike[str],
+    *,
+    taxels: int | None = None,
+    where: str | None = None,
+    opener: Opener | None = None,
 ) -> EventStream:
-    """Read a ``.csv`` or a ``.npz`` of one-dimensional arrays, whose ``label`` may be one number.
+    """Read a ``.csv`` or a ``.npz`` of one-dimensional arrays, whose ``label`` may be one number or name.
+
+    The `opener` opens what the path names, where that is in a zip.
 
     DataError if the file cannot be read, or holds an event that a sensor of so many `taxels` does not
     send; the message names the event.
     """
     path = Path(path)
     where = where or path.name
+    opener = opener or partial(path.open, "rb")
+    label: FloatArray | Sequence[str]
     if path.suffix.lower() == ".csv":
-        table = read_table(path, _REQUIRED, ("label",), where=where, empty=True)
+        table = read_table(
+            path, _REQUIRED, ("label",), where=where, opener=opener, empty=True, words="label"
+        )
         columns: Mapping[str, FloatArray] = table.columns
+        label = table.words or columns.get("label", NOTHING)
         at: Callable[[int], str] = table.at
     else:
-        columns, at = _read_npz(path, where)
+        arrays = unzipped(where, npz_file(where, opener))
+        columns = _columns(arrays, where)
+        label = label_array(arrays, where)
+
+        def at(row: int) -> str:
+            return f"{where}: event {row}"
+
     time_s = columns["time_s"]
     taxel = columns["taxel"]
     wrong = ~(np.isfinite(time_s) & (time_s >= 0))
@@ -73,7 +99,7 @@ def read_stream(
         time_s=time_s,
         taxel=taxel.astype(np.int64),
         polarity=_polarity(where, columns["polarity"], at),
-        label=_label(where, path.name, columns.get("label")),
+        label=class_in(where, path.name, label),
         at=at,
     )
 
@@ -93,45 +119,67 @@ def _polarity(where: str, values: FloatArray, at: Callable[[int], str]) -> Event
     return np.asarray(high.astype(np.uint8))
 
 
-def _label(where: str, name: str, column: FloatArray | None) -> int:
+NOTHING: FloatArray = np.zeros(0)
+"""No label."""
+
+
+def class_in(where: str, name: str, found: FloatArray | Sequence[str]) -> str | None:
     """Class of the recording, from its column or its name."""
-    named = label_in_name(name)
-    if column is None or not column.size:
+    named = class_in_name(name)
+    if not len(found):
         return named
-    first = float(column[0])
-    if not (0 <= first <= MAX_LABEL and first.is_integer()):
+    words = list(dict.fromkeys(each if isinstance(each, str) else f"{each:g}" for each in found))
+    if len(words) > 1:
         raise DataError(
-            f"{where}: label {first:g}, allowed are whole numbers 0..{MAX_LABEL}; number the classes"
-        )
-    other = column != first
-    if other.any():
-        raise DataError(
-            f"{where}: labels {first:g} and {column[other][0]:g} in one file, allowed is one; "
+            f"{where}: labels {words[0]} and {words[1]} in one file, allowed is one; "
             "write one file for each recording"
         )
-    if named not in (UNLABELLED, first):
-        raise DataError(f"{where}: label {first:g} in the file and {named} in its name; fix one of them")
-    return int(first)
+    label = class_of(words[0])
+    if label is None:
+        raise DataError(
+            f"{where}: label {words[0]}, allowed are whole numbers 0..{MAX_LABEL}; number the classes, or name them"
+        )
+    if named not in (None, label):
+        raise DataError(f"{where}: label {label} in the file and {named} in its name; fix one of them")
+    return label
 
 
-def _read_npz(path: Path, where: str) -> tuple[Mapping[str, FloatArray], Callable[[int], str]]:
-    """Columns of an npz."""
+def npz_file(where: str, opener: Opener) -> IO[bytes]:
+    """An npz in memory; DataError if it has more than `MAX_NPZ_BYTES`, or cannot be read."""
+    return io.BytesIO(read_limited(where, opener, MAX_NPZ_BYTES))
+
+
+def label_array(arrays: Members, where: str) -> FloatArray | Sequence[str]:
+    """The array ``label`` of an npz, of numbers or of words; empty where there is none."""
+    member = arrays.get("label.npy")
+    if member is None:
+        return NOTHING
+    values = parse_npy(f"{where}: label", member, "biufU").reshape(-1)
+    return [str(each) for each in values] if values.dtype.kind == "U" else values.astype(np.float64)
+
+
+def _columns(arrays: Members, where: str) -> dict[str, FloatArray]:
+    """Columns of an npz of events."""
     columns: dict[str, FloatArray] = {}
-    with opened(path) as members:
-        for name in (*_REQUIRED, "label"):
-            if member := members.get(f"{name}.npy"):
-                columns[name] = parse_npy(f"{where}: {name}", member).astype(np.float64)
-        if missing := [name for name in _REQUIRED if name not in columns]:
-            names = ", ".join(sorted(member.removesuffix(".npy") for member in members)) or "nothing"
-            raise DataError(
-                f"{where}: holds {names}, without {', '.join(missing)}; name the arrays {', '.join(_REQUIRED)}[, label]"
-            )
+    for name in _REQUIRED:
+        if member := arrays.get(f"{name}.npy"):
+            columns[name] = parse_npy(f"{where}: {name}", member).astype(np.float64)
+    if missing := [name for name in _REQUIRED if name not in columns]:
+        names = ", ".join(sorted(name.removesuffix(".npy") for name in arrays)) or "nothing"
+        raise DataError(
+            f"{where}: holds {names}, without {', '.join(missing)}; name the arrays {', '.join(_REQUIRED)}[, label], "
+            "or save one array (steps, taxels[, polarities])"
+        )
     shapes = {name: columns[name].shape for name in _REQUIRED}
     if len(set(shapes.values())) > 1 or columns["time_s"].ndim != 1:
         shown = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
         raise DataError(
             f"{where}: shapes {shown}, allowed is one number per event in each; save flat arrays"
         )
-    if "label" in columns:
-        columns["label"] = columns["label"].reshape(-1)
-    return columns, lambda row: f"{where}: event {row}"
+    return columns
+
+
+def is_events(arrays: Members) -> bool:
+    """Whether an npz holds events, or what was meant to be some: not one array beside label and width of a bin."""
+    names = {name.removesuffix(".npy") for name in arrays}
+    return bool(names & set(_REQUIRED)) or len(names - {"label", "bin_s"}) != 1

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 import numpy as np
@@ -19,12 +19,15 @@ import numpy as np
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.types import AnyArray, EventArray, IntArray
 from spikeloom.models.recordings import evtouch
+from spikeloom.models.recordings.arrays import Binned, bins_joined, one_width, read_binned
+from spikeloom.models.recordings.classes import numbered
 from spikeloom.models.recordings.conditions import groups_of
-from spikeloom.models.recordings.counts import GAP_S, EventCounts, number
-from spikeloom.models.recordings.csvtable import NOTHING, is_table, rows_beside
+from spikeloom.models.recordings.counts import GAP_S, EventCounts
+from spikeloom.models.recordings.csvtable import NOTHING, Row, is_table, rows_beside
 from spikeloom.models.recordings.eventfiles import EventStream, read_stream
 from spikeloom.models.recordings.evtouch import BIN_S
 from spikeloom.models.recordings.fetch import DATA_SETS, find_data
+from spikeloom.models.recordings.single import Single, silent_notes, taxel_notes, unit_notes, width_notes
 
 MAX_STEPS = 1_000_000
 
@@ -39,14 +42,18 @@ SEVERAL = 8
 _EDGE = 1e-9
 
 
-@dataclass(frozen=True, slots=True)
-class _Recording:
-    """One recording in bins, (taxels, 2, steps), and what messages call it."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Bins:
+    """Which width bins are to have: as asked for, else as a network was trained on, else as stated beside arrays."""
 
-    where: str
-    grid: EventArray
-    label: int
-    counts: EventCounts
+    asked: float | None
+    default: float | None
+    stated: float | None
+
+    @property
+    def of_events(self) -> float:
+        """Seconds of a bin that events are put into."""
+        return self.asked or self.default or self.stated or BIN_S
 
 
 def load_data(
@@ -54,23 +61,26 @@ def load_data(
     split: str = "test",
     *,
     bin_s: float | None = None,
-    default_bin_s: float = BIN_S,
+    default_bin_s: float | None = None,
     taxels: int | None = None,
     classes: int | None = None,
+    names: Sequence[str] | None = None,
     limit: int | None = None,
     groups: Sequence[str] | None = None,
 ) -> evtouch.Recordings:
     """Read the first `limit` recordings of a split, files in plain string order.
 
-    The path is a folder or zip in the released layout; a folder of ``.csv``, ``.npz`` and ``.npy``
-    recordings, flat (for any split) or with ``train/`` and ``test/``; one such file; or the name of a fetched
-    data set. `bin_s` is the width of a bin in seconds, by default `default_bin_s`; the released layout and
-    ``.npy`` files have bins already. `taxels` and `classes` are the network's; without `taxels` the highest
-    with an event decides. Labels are `UNLABELLED` where nothing states them. A file without events is as long
-    as the median of the others. `groups` are columns of a table of recordings or fields of file names, by
-    default all columns but file and label.
+    The path is a folder or zip in the released layout; a folder or zip of ``.csv``, ``.npz`` and ``.npy``
+    recordings, flat (it stands for any split) or with ``train/``, ``validation/`` and ``test/``; one such file; or
+    the name of a fetched data set. `bin_s` is the width of a time bin in seconds, by default `default_bin_s`, which a
+    network was trained on, or `BIN_S`; the bins of arrays are joined to it. `taxels` and `classes` are the network's,
+    as are the `names` of classes; without `taxels` the highest with an event decides. Labels are `UNLABELLED`
+    where nothing says them. An event file is as long as a table of recordings says, else until its last event; one
+    without events, or an array without steps, of which no table says it, is as long as the others in the median.
+    `groups` name columns of a table of recordings, or fields of file names; by default they are all columns that
+    the table has beside file, label and length. In the released layout all recordings have labels and the same taxels.
 
-    DataError if a recording cannot be used; OptionError if `bin_s` or `limit` cannot, or bins are there.
+    DataError if a recording cannot be used; OptionError if `bin_s` or `limit` cannot be.
     """
     _require_options(bin_s, limit)
     place = _place_of(path)
@@ -78,35 +88,42 @@ def load_data(
     with _data_set(place, split) as (members, splits):
         folder = _folder_of(split, splits, source)
         chosen = sorted(splits[folder].items())[:limit]
-        binned = all(name.lower().endswith(".npy") for name, _ in chosen)
-        stated = evtouch.parse_width(source, members, chosen[0][1]) if binned else None
-        width = (stated or BIN_S) if binned else bin_s or default_bin_s
-        if binned:
-            require_events(source, bin_s, width)
-        files = [(place.parent if place.is_file() else place) / member for _, member in chosen]
-        table, notes = rows_beside(place, files, source)
-        released = bool(folder) and binned
+        files = [member for _, member in chosen]
+        stated = evtouch.parse_width(source, members, files[0])
+        bins = _Bins(asked=bin_s, default=default_bin_s, stated=stated)
+        table = rows_beside(members, files, source)
+        released = bool(folder) and all(name.lower().endswith(".npy") for name, _ in chosen)
         size = 0
-        read: list[_Recording] = []
-        rows = [table.get(file, NOTHING) for file in files]
-        for file, (name, member), row in zip(files, chosen, rows, strict=True):
-            where = source if place == file else f"{source}: {Path(folder, name).as_posix()}"
-            read.append(_read(file, members[member], where, width, taxels, row.label))
+        read: list[Single] = []
+        rows = [table.rows.get(member, NOTHING) for member in files]
+        for (name, member), row in zip(chosen, rows, strict=True):
+            where = (
+                source
+                if place.is_file() and member == source
+                else f"{source}: {Path(folder, name).as_posix()}"
+            )
+            read.append(_read(member, members[member], where, bins, taxels, row))
             _require_alike(read[-1], read[0], released)
-            evtouch.require_class(where, read[-1].label, classes)
             size += read[-1].grid.size
             evtouch.require_memory(source, size)
+    labels, names = numbered([each.label for each in read], table.classes, names, source)
+    for each, label in zip(read, labels.tolist(), strict=True):
+        evtouch.require_class(each.where, label, classes)
+    width = one_width([each.bin_s for each in read], source)
     events, steps = _stack(read, source)
-    notes += [*_silent_notes(read, source), *_unit_notes(read), *_taxel_notes(source, events, taxels)]
+    notes = [*table.notes, *silent_notes(read, source), *unit_notes(read)]
+    notes += width_notes(read, [name for name, _ in chosen], source)
+    notes += taxel_notes(source, events) if taxels is None else []
     return evtouch.Recordings(
         events=events,
-        labels=np.array([each.label for each in read], dtype=np.int64),
+        labels=labels,
+        names=names,
         files=tuple(name for name, _ in chosen),
         split=split,
         source=source,
         lengths=None if steps.min() == steps.max() else steps,
-        counts=None if released else _sum_counts(read, steps, notes),
-        bin_s=stated if binned else width,
+        counts=None if released and not notes else _sum_counts(read, steps, notes),
+        bin_s=width,
         groups=groups_of(source, [name for name, _ in chosen], [row.groups for row in rows], groups),
     )
 
@@ -133,9 +150,9 @@ def _place_of(path: str | os.PathLike[str]) -> Path:
     return find_data(str(path)) if str(path) in DATA_SETS else Path(path)
 
 
-def _stack(read: Sequence[_Recording], source: str) -> tuple[EventArray, IntArray]:
+def _stack(read: Sequence[Single], source: str) -> tuple[EventArray, IntArray]:
     """Events of all recordings, filled up with silence, and the steps of each."""
-    steps = np.array([each.grid.shape[2] for each in read], np.int64)
+    steps = np.array([each.steps for each in read], np.int64)
     if not steps.any():
         raise DataError(f"{source}: no events in any recording; check how they were written")
     steps[steps == 0] = round(float(np.median(steps[steps > 0])))
@@ -147,18 +164,19 @@ def _stack(read: Sequence[_Recording], source: str) -> tuple[EventArray, IntArra
     return events, steps
 
 
-def _sum_counts(read: Sequence[_Recording], steps: IntArray, notes: Sequence[str]) -> EventCounts:
+def _sum_counts(read: Sequence[Single], steps: IntArray, notes: Sequence[str]) -> EventCounts:
     """Counts of all recordings together."""
     names = ("events", "out_of_order", "duplicates", "gaps")
     sums = {name: sum(getattr(each.counts, name) for each in read) for name in names}
     return EventCounts(**sums, shorter=int(np.count_nonzero(steps < steps.max())), notes=tuple(notes))
 
 
-def _require_alike(read: _Recording, first: _Recording, released: bool) -> None:
+def _require_alike(read: Single, first: Single, released: bool) -> None:
     """Refuse other polarities than the first recording has; in the released layout other taxels, and no label."""
-    if released and read.label == evtouch.UNLABELLED:
+    if released and read.label is None:
         raise DataError(
-            f"{read.where}: no label in the name, allowed is sample_N_label_L.npy; rename or remove it"
+            f"{read.where}: no label in the name, allowed is sample_N_label_L.npy; rename it, list it in "
+            "recordings.csv, or remove it"
         )
     same = slice(0 if released else 1, 2)
     if read.grid.shape[same] != first.grid.shape[same]:
@@ -174,6 +192,9 @@ def require_events(where: str, bin_s: float | None, width: float = BIN_S) -> Non
         raise OptionError(f"--bin {bin_s:g}: {where} holds bins, not times; omit --bin")
 
 
+SPLITS = ("train", "validation", "test")
+
+
 def data_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
     """Splits that a data set has; none if it is flat or one recording, DataError if there are no recordings."""
     with _data_set(_place_of(path)) as (_, splits):
@@ -187,7 +208,7 @@ def need_labels(recordings: evtouch.Recordings, what: str) -> evtouch.Recordings
         file = recordings.files[int(np.argmax(missing))]
         raise DataError(
             f"{recordings.source}: {file}: no label, {what} needs one for every recording; "
-            "add a label column or name the file like grasp_7_label_3.csv"
+            "add a label column, name the file like grasp_7_label_3.csv, or list it with its label in recordings.csv"
         )
     return recordings
 
@@ -292,7 +313,9 @@ def _data_set(
     source = path.name or str(path)
     if path.is_file():
         if path.suffix.lower() in evtouch.SUFFIXES:
-            yield {path.name: partial(path.open, "rb")}, {"": {path.name: path.name}}
+            files = [path, *(each / evtouch.WIDTH for each in path.absolute().parents[:2])]
+            beside = {file.name: partial(file.open, "rb") for file in reversed(files) if file.is_file()}
+            yield beside, {"": {path.name: path.name}}
             return
         with path.open("rb") as file:
             if file.read(2) != b"PK":
@@ -300,11 +323,12 @@ def _data_set(
                     f"{path}: not a recording; give a folder, a released zip, or a .csv, .npz or .npy file"
                 )
     with evtouch.opened(path) as members:
-        plain = {name: member for name, member in members.items() if not is_table(Path(name))}
-        splits = evtouch.splits_of(source, plain, {"train", "test", split})
-        flat = {name: name for name in plain if "/" not in name and not name.startswith(".")}
-        if not splits and flat and path.is_dir():
-            splits = {"": flat}
+        plain = {
+            name: member
+            for name, member in members.items()
+            if not is_table(name) and PurePosixPath(name).name != evtouch.WIDTH
+        }
+        splits = evtouch.splits_of(source, plain, {*SPLITS, split}) or _flat(plain)
         if not splits:
             raise DataError(
                 f"{source}: no recordings (train/ or test/ with .csv, .npz or sample_N_label_L.npy); "
@@ -313,18 +337,10 @@ def _data_set(
         yield members, splits
 
 
-def _unit_notes(read: Sequence[_Recording]) -> list[str]:
-    """One line for all recordings whose times look wrong."""
-    odd = [(each.where, note) for each in read for note in each.counts.notes]
-    others = f" (and {len(odd) - 1} more)" if len(odd) > 1 else ""
-    return [f"{place}{others}: {note}" for place, note in odd[:1]]
-
-
-def _silent_notes(read: Sequence[_Recording], source: str) -> list[str]:
-    """One line for all recordings without events."""
-    silent = sum(each.grid.shape[2] == 0 for each in read)
-    line = f"{source}: {number(silent, 'recording')} without events: taken as long as the others"
-    return [line] if silent else []
+def _flat(members: evtouch.Members) -> dict[str, dict[str, str]]:
+    """Recordings that are in no split."""
+    flat = {name: name for name in members if "/" not in name and not name.startswith(".")}
+    return {"": flat} if flat else {}
 
 
 def other_sensor(recordings: evtouch.Recordings) -> str | None:
@@ -339,40 +355,68 @@ def other_sensor(recordings: evtouch.Recordings) -> str | None:
     return f"{recordings.source}: has events of taxels 0..{last} only, the network has {recordings.taxels}"
 
 
-def _taxel_notes(source: str, events: EventArray, taxels: int | None) -> list[str]:
-    """A note where nobody says how many `taxels` there are and they seem to count from 1: only the first is silent."""
-    alive = np.asarray(events.any(axis=(0, 2, 3)), np.bool_)
-    if taxels is not None or len(alive) < 4 or alive[0] or not alive[1:].all():
-        return []
-    return [
-        f"{source}: no event at taxel 0, some at each of 1..{len(alive) - 1}: if these count from 1, count from 0"
-    ]
-
-
 def _read(
-    file: Path,
+    name: str,
     opener: Callable[[], IO[Any]],
     where: str,
-    bin_s: float,
+    bins: _Bins,
     taxels: int | None,
-    listed: int | None,
-) -> _Recording:
-    """One recording; `listed` is its class in a table of labels."""
-    if file.suffix.lower() == ".npy":
-        grid = evtouch.parse_bins(where, opener, taxels)
-        busy = np.flatnonzero(grid.any(axis=(0, 1)))
-        gaps = int(np.count_nonzero((np.diff(busy) - 1) * bin_s > GAP_S))
-        sent = int(np.count_nonzero(grid))
-        counts = EventCounts(events=sent, gaps=gaps)
-        label = evtouch.label_in_name(file.name)
+    row: Row,
+) -> Single:
+    """One recording, and what a table says of it."""
+    binned = read_binned(name, opener, where, taxels)
+    if binned is not None:
+        found = _rebinned(binned, where, bins, row.duration_s)
     else:
-        stream = read_stream(file, taxels=taxels, where=where)
-        if len(stream.time_s):
-            grid, counts = bin_events(stream, bin_s, taxels=taxels)
-        else:
-            grid = np.zeros((taxels or 1, 2, 0), np.uint8)
-            counts = EventCounts(events=0)
-        label = stream.label
-    if listed is not None and label not in (evtouch.UNLABELLED, listed):
-        raise DataError(f"{where}: label {label}, and {listed} in its table; fix one of them")
-    return _Recording(where, grid, label if listed is None else listed, counts)
+        stream = read_stream(name, taxels=taxels, where=where, opener=opener)
+        found = _from_events(stream, where, bins.of_events, taxels, row.duration_s)
+    if row.label is None or found.label == row.label:
+        return found
+    if found.label is not None:
+        raise DataError(f"{where}: label {found.label}, and {row.label} in its table; fix one of them")
+    return replace(found, label=row.label)
+
+
+def _rebinned(binned: Binned, where: str, bins: _Bins, duration_s: float | None) -> Single:
+    """A recording from an array, in bins as wide as wanted; its table says how long it is where it has no steps."""
+    own = binned.bin_s or bins.stated
+    count, width = bins_joined(own, bins.asked, bins.default, where)
+    grid = join_bins(binned.events, count) if count > 1 and binned.events.size else binned.events
+    busy = np.flatnonzero(grid.any(axis=(0, 1)))
+    counts = EventCounts(
+        events=int(np.count_nonzero(binned.events)),
+        out_of_order=0,
+        duplicates=int(np.count_nonzero(binned.events)) - int(np.count_nonzero(grid)),
+        gaps=int(np.count_nonzero((np.diff(busy) - 1) * (width or BIN_S) > GAP_S)),
+    )
+    steps = grid.shape[2] or _steps(duration_s or 0.0, width or BIN_S, where)
+    return Single(where, grid, binned.label, counts, steps, width, assumed=own is None)
+
+
+def _from_events(
+    stream: EventStream, where: str, bin_s: float, taxels: int | None, duration_s: float | None
+) -> Single:
+    """A recording from events, as long as its table says."""
+    if len(stream.time_s):
+        grid, counts = bin_events(stream, bin_s, taxels=taxels)
+    else:
+        grid = np.zeros((taxels or 1, 2, 0), np.uint8)
+        counts = EventCounts(events=0, out_of_order=0, duplicates=0, gaps=0)
+    steps = grid.shape[2]
+    if duration_s is not None:
+        last = float(stream.time_s.max(initial=0.0))
+        steps = max(steps, _steps(duration_s, bin_s, where))
+        if last > duration_s:
+            raise DataError(
+                f"{where}: an event at {last:g} s, its table says {duration_s:g} s; fix one of them"
+            )
+    return Single(where, grid, stream.label, counts, steps, bin_s)
+
+
+def _steps(duration_s: float, bin_s: float, where: str) -> int:
+    """Bins of a recording that is so long."""
+    if duration_s / bin_s > MAX_STEPS:
+        raise DataError(
+            f"{where}: {duration_s:g} s in its table are past {MAX_STEPS} bins of {bin_s:g} s; use wider bins"
+        )
+    return math.ceil(duration_s / bin_s - _EDGE)

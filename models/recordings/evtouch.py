@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import IO, Any, Self
 
 import numpy as np
@@ -40,7 +40,6 @@ SUFFIXES = (".npy", ".npz", ".csv")
 WIDTH = "bins.npy"
 """File beside the splits that holds one number, seconds of a bin; the released recordings have none."""
 
-_LABEL = re.compile(r"_label_([0-9]{1,6})(?![0-9])")
 _GIVE = "give the folder or zip that holds train/ and test/"
 
 Members = Mapping[str, Callable[[], IO[Any]]]
@@ -62,6 +61,7 @@ class Recordings:
     lengths: IntArray | None = None
     counts: EventCounts | None = None  # Anomalies of their events; None where they had bins already
     bin_s: float | None = None  # Seconds of a bin, where somebody said so; of those before any were joined
+    names: tuple[str, ...] | None = None  # Of classes, where their numbers do not say all
     # Value of each recording by group, see :mod:`models.recordings.conditions`
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -99,6 +99,10 @@ class Recordings:
         """Time steps of each recording; (samples,) int64."""
         return np.full(len(self), self.steps) if self.lengths is None else self.lengths
 
+    def class_name(self, label: int) -> str:
+        """What a class is called; its number, where it has no name."""
+        return str(label) if self.names is None else self.names[label]
+
     def steps_of(self, index: int) -> int:
         """Time steps of one recording."""
         return int(self.step_counts[index])
@@ -129,7 +133,7 @@ class Recordings:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Members]:
-    """Openers of the recordings in a folder (two levels deep) or a zip (npy files), by their names with slashes.
+    """What opens each file of recordings in a folder or zip, by its name with slashes; folders two levels deep.
 
     DataError if there is no such folder or zip, or the zip announces more than `MAX_TOTAL_BYTES`.
     """
@@ -143,13 +147,17 @@ def opened(path: Path) -> Iterator[Members]:
     if not path.is_file():
         raise DataError(f"{path}: no such folder or file; {_GIVE}")
     with path.open("rb") as file:
-        with reading(path.name, DataError, f"{_GIVE}, or copy it again"):
-            archive = opened_zip(file)
-            infos = [info for info in archive.infolist() if info.filename.endswith(".npy")]
-        require_memory(
-            path.name, sum(info.file_size for info in infos)
-        )  # no more than that is ever decompressed
-        yield {info.filename: partial(archive.open, info) for info in infos}
+        yield unzipped(path.name, file)
+
+
+def unzipped(name: str, file: IO[bytes]) -> Members:
+    """What opens each file of recordings in an open zip of that name; DataError as of :func:`opened`."""
+    with reading(name, DataError, f"{_GIVE}, or copy it again"):
+        archive = opened_zip(file)
+        infos = [info for info in archive.infolist() if Path(info.filename).suffix.lower() in SUFFIXES]
+    # no more than that is ever decompressed
+    require_memory(name, sum(info.file_size for info in infos))
+    return {info.filename: partial(archive.open, info) for info in infos}
 
 
 def splits_of(source: str, members: Members, splits: set[str]) -> dict[str, dict[str, str]]:
@@ -167,41 +175,40 @@ def splits_of(source: str, members: Members, splits: set[str]) -> dict[str, dict
     return by_split
 
 
-def label_in_name(name: str) -> int:
-    """Class in a file name, `UNLABELLED` if there is none.
-
-    Examples
-    --------
-    >>> label_in_name("sample_12_label_3.npy"), label_in_name("run_label_7_left.csv"), label_in_name("grasp.csv")
-    (3, 7, -1)
-    """
-    match = _LABEL.search(name)
-    return UNLABELLED if match is None else int(match[1])
-
-
-def parse_npy(where: str, opener: Callable[[], IO[Any]]) -> AnyArray:
-    """Numbers or truth values of an npy file of at most `MAX_FILE_BYTES`; DataError if it is none."""
+def read_limited(where: str, opener: Callable[[], IO[Any]], limit: int) -> bytes:
+    """Content of a file of at most `limit` bytes; DataError if it has more, or cannot be read."""
     with reading(where, DataError, "copy or download it again"):
         with opener() as file:
-            data = file.read(MAX_FILE_BYTES + 1)
-        if len(data) > MAX_FILE_BYTES:
-            raise DataError(f"more than {MAX_FILE_BYTES} bytes, the limit of a recording; split it")
+            data: bytes = file.read(limit + 1)
+        if len(data) > limit:
+            raise DataError(f"more than {limit} bytes, the limit of a recording; split it")
+    return data
+
+
+def parse_npy(where: str, opener: Callable[[], IO[Any]], kinds: str = "biuf") -> AnyArray:
+    """Numbers or truth values of an npy file of at most `MAX_FILE_BYTES`; DataError if it is none."""
+    data = read_limited(where, opener, MAX_FILE_BYTES)
+    with reading(where, DataError, "copy or download it again"):
         values: AnyArray = read_npy(data)
-    if values.dtype.kind not in "biuf":
+    if values.dtype.kind not in kinds:
         raise DataError(f"{where}: dtype {values.dtype.str!r}, allowed are numbers; convert it")
     return values
 
 
 def parse_width(source: str, members: Members, recording: str) -> float | None:
-    """Seconds of a bin that stand beside the split of a `recording`, if any do; DataError if they are none."""
-    where = (Path(recording).parent.parent / WIDTH).as_posix()
-    if where not in members:
-        return None
-    seconds = parse_npy(f"{source}: {where}", members[where]).ravel()
+    """Seconds of a bin that stand beside a `recording`, or beside its split, if any do; DataError if they are none."""
+    folder = PurePosixPath(recording).parent
+    where = next(
+        (name for each in (folder, folder.parent) if (name := (each / WIDTH).as_posix()) in members), None
+    )
+    return None if where is None else seconds_in(f"{source}: {where}", members[where])
+
+
+def seconds_in(where: str, opener: Callable[[], IO[Any]]) -> float:
+    """Seconds of a bin in an npy file; DataError if they are none."""
+    seconds = parse_npy(where, opener).ravel()
     if len(seconds) != 1 or not (math.isfinite(seconds[0]) and seconds[0] > 0):
-        raise DataError(
-            f"{source}: {where}: allowed is one number, seconds of a bin; convert the events again"
-        )
+        raise DataError(f"{where}: allowed is one number, seconds of a bin; convert the events again")
     return float(seconds[0])
 
 
@@ -211,11 +218,10 @@ def other_taxels(found: int, wanted: int) -> str:
     return f"has {found} taxels, the network has {wanted}; {remedy}"
 
 
-def parse_bins(where: str, opener: Callable[[], IO[Any]], taxels: int | None) -> EventArray:
-    """Events (taxels, polarities, steps) of an npy file; DataError if it holds anything else, or not the `taxels`."""
-    values = parse_npy(where, opener)
+def require_bins(where: str, values: AnyArray, taxels: int | None) -> EventArray:
+    """An array as events (taxels, polarities, steps); DataError if it is anything else, or not of the `taxels`."""
     shape = values.shape
-    if len(shape) != 3 or 0 in shape or shape[1] > MAX_POLARITIES:
+    if len(shape) != 3 or 0 in shape[:2] or shape[1] > MAX_POLARITIES:
         raise DataError(
             f"{where}: shape {shape}, allowed is (taxels, polarities, steps); one recording per file"
         )

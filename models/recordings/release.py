@@ -16,6 +16,7 @@ import numpy as np
 from spikeloom.compiler.archive import ZIP_DATE, npy_bytes
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.files import beside, write_atomically
+from spikeloom.models.recordings.classes import class_in_name
 from spikeloom.models.recordings.events import need_labels
 from spikeloom.models.recordings.evtouch import WIDTH, Recordings, require_polarities
 
@@ -67,19 +68,28 @@ def _members(splits: Sequence[Recordings], bin_s: float | None) -> Iterator[tupl
             yield f"{recordings.split}/{_name(recordings, index)}", npy_bytes(events.astype(np.float32))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["split", "file", "source"])
+    named = any(recordings.names for recordings in splits)
+    writer.writerow(["split", "file", "source", *(["class"] if named else [])])
     for recordings in splits:
         for index, file in enumerate(recordings.files):
-            safe = f"'{file}" if file[:1] in "=+-@\t\r" else file
-            writer.writerow([recordings.split, _name(recordings, index), safe])
+            row = [recordings.split, _name(recordings, index), _no_formula(file)]
+            name = recordings.class_name(int(recordings.labels[index]))
+            writer.writerow([*row, *([_no_formula(name)] if named else [])])
     yield SOURCES, text.getvalue().encode()
     if bin_s is not None:
         yield WIDTH, npy_bytes(np.array([bin_s]))
 
 
+def _no_formula(cell: str) -> str:
+    """A cell that no spreadsheet takes for a formula."""
+    return f"'{cell}" if cell[:1] in "=+-@\t\r" else cell
+
+
 def _name(recordings: Recordings, index: int) -> str:
     width = len(str(len(recordings) - 1))
-    return f"sample_{index:0{width}}_label_{recordings.labels[index]}.npy"
+    label = int(recordings.labels[index])
+    safe = all(class_in_name(f"_label_{name}.npy") == name for name in recordings.names or ())
+    return f"sample_{index:0{width}}_label_{recordings.class_name(label) if safe else label}.npy"
 
 
 def write_event_lines(path: str | os.PathLike[str], splits: Sequence[Recordings], bin_s: float) -> None:

@@ -62,6 +62,7 @@ class TrainingRecord:
     device: str = "cpu"
     recipe: Mapping[str, Any] | None = field(default=None, metadata={"optional": True})
     bin_s: float | None = field(default=None, metadata={"optional": True})
+    class_names: Sequence[str] | None = field(default=None, metadata={"optional": True})
 
     def to_json(self) -> JsonObject:
         """JSON values."""
@@ -122,4 +123,5 @@ def training_record(
         spikeloom=__version__,
         recipe=recipe,
         bin_s=training.bin_s,
+        class_names=training.names,
     )

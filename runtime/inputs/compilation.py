@@ -7,6 +7,7 @@ from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.storage import Cheapest, Exact, Fixed, Given, Packing, Storage
+from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.inputs.recordings import origin_of
@@ -20,7 +21,9 @@ def provenance(
     request: CompileRequest, asked: LoadedNetwork, *, calibrated: Recordings | None
 ) -> Mapping[str, Any]:
     """What a netlist remembers of its compilation, whose scales the recordings `calibrated` chose, if any did."""
-    seen = {} if calibrated is None else {"data": calibrated.source, "bin_s": calibrated.bin_s}
+    seen: JsonObject = {}
+    if calibrated is not None:
+        seen = {"data": calibrated.source, "bin_s": calibrated.bin_s, "class_names": calibrated.names}
     checkpoint = asked.checkpoint
     cores_for = parse_cores(request.cores_for)
     return {

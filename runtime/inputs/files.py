@@ -12,7 +12,7 @@ from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import beside, write_atomically
 from spikeloom.compiler.formats import NETWORKS, NIR, ONNX
-from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name
+from spikeloom.models.recordings.classes import class_in_name
 from spikeloom.runtime.report.drawing import PICTURES, Drawing
 from spikeloom.runtime.requests.fields import Request
 
@@ -133,7 +133,7 @@ def is_recordings(path: str) -> bool:
     if names is None:
         names = [path] if path.endswith(".csv") and Path(path).is_file() else []
     return any(
-        name.endswith(".csv") or name == "time_s.npy" or label_in_name(name) != UNLABELLED for name in names
+        name.endswith(".csv") or name == "time_s.npy" or class_in_name(name) is not None for name in names
     )
 
 

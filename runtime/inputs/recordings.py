@@ -11,10 +11,10 @@ from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings import events
+from spikeloom.models.recordings.classes import listed, renamed, without_gaps
 from spikeloom.models.recordings.conditions import with_groups
 from spikeloom.models.recordings.counts import number, show_counts
 from spikeloom.models.recordings.evtouch import (
-    BIN_S,
     UNLABELLED,
     WHOLE,
     Recordings,
@@ -51,8 +51,10 @@ def recordings(
     Raises DataError or OptionError if they cannot be used, or do not suit the network.
     """
     trained_bin = (trained or {}).get("bin_s")
+    known = None if classes is None else (trained or {}).get("class_names")
     wanted = None if groups is None else [name.strip() for name in groups.split(",")]
     if isinstance(path, Recordings):
+        path = path if known is None else renamed(path, known)
         require_suited(path, classes=classes, taxels=taxels)
         _require_width(path, trained_bin)
         if limit is not None and limit < 1:
@@ -68,7 +70,8 @@ def recordings(
             path,
             split,
             bin_s=bin_s,
-            default_bin_s=BIN_S if trained_bin is None else trained_bin,
+            default_bin_s=trained_bin,
+            names=known,
             limit=limit,
             classes=classes,
             taxels=taxels,
@@ -85,17 +88,23 @@ def recordings(
         require_suited(data, classes=classes, taxels=taxels)
     if classes is not None:
         _warn_of_others(data, trained or {}, classes, whole=limit is None)
+    elif labels_for is not None:
+        (data,) = without_gaps(data)
     return events.joined_bins(data, bins)
 
 
 def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
-    """What a netlist remembers of the recordings behind a network: their name, and their bins if they were events."""
+    """What a netlist remembers of the recordings behind a network: name, bins and names of classes."""
     kinds = {"data": str, "bin_s": float}
-    return {
+    origin = {
         name: training[name]
         for name, kind in kinds.items()
         if training and isinstance(training.get(name), kind)
     }
+    names = (training or {}).get("class_names")
+    if isinstance(names, list | tuple) and names and all(isinstance(name, str) for name in names):
+        origin["class_names"] = list(names)
+    return origin
 
 
 def _require_width(data: Recordings, own: float | None) -> None:
@@ -119,6 +128,10 @@ def _require_sensor(data: Recordings, split: str, taxels: int | None) -> None:
 
 def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int, *, whole: bool) -> None:
     """Say on stderr where recordings look like other ones than a network was trained on."""
+    if data.names and "class_names" not in trained:
+        tell(
+            f"warning: {data.source}: the network does not know names of classes: {listed(data.names)} are 0, 1, …"
+        )
     name = trained.get("data", data.source)
     known = int(data.labels.max(initial=UNLABELLED))
     fewer = whole and len(data) >= classes and UNLABELLED < known < classes - 1

@@ -48,6 +48,7 @@ class CountersRecord:
     bin_s: float | None = field(
         default=None, metadata=OPTIONAL
     )  # Seconds of a bin, where the recordings were events
+    class_names: tuple[str, ...] | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -103,6 +104,7 @@ def train_counters(
         test_correct=int(np.sum(decisions_of(made, test) == test.labels)),
         test_samples=len(test),
         bin_s=training.bin_s,
+        class_names=training.names,
     )
     known = {name: value for name, value in asdict(record).items() if value is not None}
     sha256 = write_counters(output, made.trained(known))

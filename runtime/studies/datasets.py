@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from spikeloom.models.recordings.classes import listed
 from spikeloom.models.recordings.counts import EventCounts, number
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
 from spikeloom.runtime.report.sections import Section, Table, Text
@@ -41,7 +42,7 @@ class Described:
     duration_s: Mapping[str, float]
     events: int  # Those that share taxel, polarity and bin count once
     found: EventCounts | None
-    labels: Mapping[int, int]
+    labels: Mapping[int | str, int]
     unlabelled: int
     rate: Rate
     dead: tuple[int, ...]
@@ -80,9 +81,10 @@ def describe(recordings: Recordings) -> Described:
     middle = float(np.median(total[alive])) if alive.any() else 0.0
     rate = per_taxel / (lengths.sum() * bin_s)
     totals = {name: float(rate[:, polarity].sum()) for polarity, name in enumerate(("falling", "rising"))}
-    labels = dict(
-        zip(*(found.tolist() for found in np.unique(recordings.labels, return_counts=True)), strict=True)
+    counted = zip(
+        *(found.tolist() for found in np.unique(recordings.labels, return_counts=True)), strict=True
     )
+    labels: dict[int | str, int] = dict(counted)
     ends = {"shortest": lengths.min(), "median": np.median(lengths), "longest": lengths.max()}
     return Described(
         source=recordings.source,
@@ -95,13 +97,18 @@ def describe(recordings: Recordings) -> Described:
         events=int(total.sum()),
         found=recordings.counts,
         unlabelled=labels.pop(UNLABELLED, 0),
-        labels=labels,
+        labels=labels if recordings.names is None else _by_name(labels, recordings.names),
         rate=Rate(**totals, taxels=[dict(zip(totals, each, strict=True)) for each in rate.tolist()]),
         dead=tuple(np.flatnonzero(~alive).tolist()),
         one_sided=tuple(np.flatnonzero((per_taxel > 0).sum(axis=1) == 1).tolist()),
         hot=tuple(np.flatnonzero(total > HOT * middle).tolist()),
         rules=RULES,
     )
+
+
+def _by_name(labels: Mapping[int | str, int], names: Sequence[str]) -> dict[int | str, int]:
+    """Recordings of each class by its name."""
+    return {names[int(label)]: count for label, count in labels.items()}
 
 
 def described_sections(result: Described) -> Iterator[Section]:
@@ -124,6 +131,11 @@ def described_sections(result: Described) -> Iterator[Section]:
         f"{number(result.taxels, 'taxel')}, {lasts} in bins of {result.bin_s:g} s",
         f"  labels: {number(len(labels), 'class') + f', {spread} each' if labels else 'none'}"
         + (f"; {number(result.unlabelled, 'recording')} without" if labels and result.unlabelled else ""),
+        *(
+            [f"  classes: {listed(named)}"]
+            if (named := [each for each in labels if isinstance(each, str)])
+            else []
+        ),
         f"  events: {result.events:,} after binning; {rate.falling:.1f} falling and {rate.rising:.1f} rising "
         "per second",
     ]

@@ -14,7 +14,7 @@ is used.
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 
@@ -62,6 +62,7 @@ class Watch:
     # Says from a chip step and the votes after it whether the grasp is decided, see :func:`exits.live`
     may_end: Callable[[int, IntArray], bool] | None
     column: EventArray  # Inputs of the open bin, (channels,)
+    names: Sequence[str] | None = None  # Of classes
     origin: Decimal | None = None  # Of the grasp; None between two grasps
     epoch: float = 0.0  # Wall clock at the origin
     decided: bool = False
@@ -137,7 +138,7 @@ class Watch:
         if step.counts.any() and step.decision != self.shown:
             self.shown = step.decision
             elapsed = f"{self.bin_s * (step.index + 1):f} s"
-            line = f"{elapsed:>10}  {_standing(step)}"
+            line = f"{elapsed:>10}  {_standing(step, self.names)}"
         self._show(line, "bin", self.found.grasps + 1, step.index + 1, step)
         if step.index + 1 == self.bins:
             self._decide()
@@ -165,7 +166,9 @@ class Watch:
             self.found.early += early
         self.shown = None
         after = f"after {number(bins, 'bin')} ({self.bin_s * bins:f} s)"
-        line = f"grasp {self.found.grasps}: {_standing(last)}{', sure' if early else ''}, {after}"
+        line = (
+            f"grasp {self.found.grasps}: {_standing(last, self.names)}{', sure' if early else ''}, {after}"
+        )
         self._show(
             line, "grasp", self.found.grasps, bins, last, {} if self.may_end is None else {"early": early}
         )
@@ -177,18 +180,20 @@ class Watch:
         if self.as_json:
             standing = {"kind": kind, "grasp": grasp, "bins": bins, "time_s": float(self.bin_s * bins)}
             standing |= {"decision": step.decision, "margin": step.margin, "counts": step.counts.tolist()}
+            standing |= {} if self.names is None else {"class_name": self.names[step.decision]}
             line = json.dumps(standing | (more or {}))
         if line:
             sys.stdout.write(f"{line}\n")
             sys.stdout.flush()
 
 
-def _standing(step: Step) -> str:
+def _standing(step: Step, names: Sequence[str] | None) -> str:
     """The decision and what it rests on, for people."""
+    decision = step.decision if names is None else names[step.decision]
     if not step.counts.any():
-        return f"class {step.decision}, no votes"
+        return f"class {decision}, no votes"
     ahead = f"{step.margin} ahead" if step.margin else "a tie"
-    return f"class {step.decision}, {number(int(step.counts.max()), 'vote')}, {ahead}"
+    return f"class {decision}, {number(int(step.counts.max()), 'vote')}, {ahead}"
 
 
 def sections(found: Summary) -> list[Section]:

@@ -2,7 +2,7 @@
 
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -16,6 +16,7 @@ from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.base import Machine, Run
 from spikeloom.runtime.report.console import Progress
+from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 from spikeloom.runtime.report.shown import Shown
@@ -30,6 +31,7 @@ class Decisions(Shown):
     labels: IntArray
     predictions: IntArray
     counts: IntArray
+    class_names: tuple[str, ...] | None = field(default=None, metadata=OPTIONAL)
 
     json_properties: ClassVar[tuple[str, ...]] = ("samples", "labelled", "accuracy")
 
@@ -61,7 +63,13 @@ def run(request: RunRequest) -> Outcome:
     votes = np.concatenate([done.votes for done in _runs("running", machine, data)])
     if request.spikes is not None:
         _write_spikes(request.spikes, machine, data)
-    decisions = Decisions(files=data.files, labels=data.labels, predictions=vote(votes), counts=votes)
+    decisions = Decisions(
+        files=data.files,
+        labels=data.labels,
+        predictions=vote(votes),
+        counts=votes,
+        class_names=data.names,
+    )
     return Outcome(decisions, sections)
 
 
@@ -91,6 +99,11 @@ def _write_spikes(path: str, machine: Machine, data: Recordings) -> None:
 
 def sections(found: Decisions) -> Iterator[Section]:
     """Accuracy, recordings that went wrong; decisions where no label is known."""
+    names = found.class_names
+
+    def named(label: int) -> str:
+        return str(label) if names is None else names[label]
+
     rows = list(
         zip(
             found.files,
@@ -109,12 +122,13 @@ def sections(found: Decisions) -> Iterator[Section]:
         blocks.append(Text(f"chip accuracy: {percent(known - len(wrong), known)}{without}"))
     if wrong:
         cells = [
-            [file, *map(str, (label, made, votes[label], votes[made]))] for file, label, made, votes in wrong
+            [file, named(label), named(made), str(votes[label]), str(votes[made])]
+            for file, label, made, votes in wrong
         ]
         blocks.append(
             Table(["decided wrongly", "label", "decision", "votes for label", "for decision"], cells)
         )
     if unknown:
-        cells = [[file, str(chosen), str(votes[chosen])] for file, _, chosen, votes in unknown]
+        cells = [[file, named(chosen), str(votes[chosen])] for file, _, chosen, votes in unknown]
         blocks.append(Table(["without a label" if known else "recording", "decision", "votes"], cells))
     yield Section("Decisions", blocks)

@@ -89,8 +89,9 @@ def _onnx(request: ExportRequest) -> Export:
 
 def _nir(request: ExportRequest) -> Export:
     netlist = read_netlist(request.source)
-    width = origin_of(netlist.provenance).get("bin_s")
-    dt = (width or BIN_S) * netlist.bins if request.dt is None else request.dt
+    known = origin_of(netlist.provenance)
+    kept = {name: known[name] for name in ("bin_s", "class_names") if name in known}
+    dt = (known.get("bin_s") or BIN_S) * netlist.bins if request.dt is None else request.dt
     facts = NirFacts(
         neurons=sum(layer.neurons for layer in netlist.layers),
         synapses=netlist.n_synapses,
@@ -99,9 +100,7 @@ def _nir(request: ExportRequest) -> Export:
     )
     lines = (f"in steps of {dt:g} s ({facts.convention})",)
     with reading(request.source, FormatError, "compile it again"):
-        content = nir.export(
-            lift(netlist), dt, origin=None if width is None else json.dumps({"bin_s": width})
-        )
+        content = nir.export(lift(netlist), dt, origin=json.dumps(kept) if kept else None)
     return Export(content=[content], facts=facts, lines=lines)
 
 

@@ -82,6 +82,7 @@ class FinetuneRecord:
     last: ReachedLast
     history: Sequence[Sequence[float]]
     bin_s: float | None = field(default=None, metadata=OPTIONAL)
+    class_names: Sequence[str] | None = field(default=None, metadata=OPTIONAL)
 
     def to_json(self) -> JsonObject:
         """JSON values, without a bin width that was not given."""
@@ -208,6 +209,7 @@ def _record(
         data=training.source,
         data_sha256=data_digest(training, test),
         bin_s=training.bin_s,
+        class_names=training.names,
         test_samples=len(test),
         before=Reached(correct=tuned.before, accuracy=tuned.before / len(test)),
         last=ReachedLast(

@@ -28,6 +28,7 @@ KEPT = (
     "data",
     "data_sha256",
     "bin_s",
+    "class_names",
     "test_samples",
     "fine_tuned_from",
 )
@@ -82,6 +83,8 @@ def _common_origin(towers: Sequence[Mapping[str, Any]]) -> JsonObject:
         raise ModelError(
             f"join: networks of bins of {widths[0]:g} s and {widths[-1]:g} s; give those of one width"
         )
+    if any(origin.get("class_names") != origins[0].get("class_names") for origin in origins):
+        raise ModelError("join: networks whose classes have other names; give those of the same classes")
     return origins[0]
 
 

@@ -12,6 +12,7 @@ from spikeloom.compiler.targets.native import DEFAULT_COPIES
 from spikeloom.compiler.targets.native import SYSTEM as NATIVE
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.graphs import CHOICES, Graph
+from spikeloom.models.recordings.classes import without_gaps
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.models.systems import sensor_grid, taxels_alone
@@ -47,6 +48,7 @@ def both_splits(
             )
         raise
     progress("")
+    training, test = without_gaps(training, test)
     _require_classes(training, test)
     return training, test
 
@@ -56,13 +58,15 @@ def _require_classes(training: Recordings, test: Recordings) -> None:
     highest = int(training.labels.max())
     seen = set(training.labels.tolist())
     if missing := sorted({label for label in test.labels.tolist() if label <= highest} - seen):
-        tell(f"warning: {training.source}: no recordings to train class {', '.join(map(str, missing))} on")
+        named = ", ".join(map(training.class_name, missing))
+        tell(f"warning: {training.source}: no recordings to train class {named} on")
     if test.labels.max() > highest:
         first = int((test.labels > highest).argmax())
         where = f"{test.source}: {test.split}/{test.files[first]}"
+        last = f"0..{highest}" if test.names is None else f"{highest + 1} others"
         raise DataError(
-            f"{where}: label {test.labels[first]}, the training recordings have 0..{highest}; add some of it to them, "
-            "or omit it from the test split"
+            f"{where}: label {test.class_name(int(test.labels[first]))}, the training recordings have {last}; "
+            "add some of it to them, or omit it from the test split"
         )
 
 

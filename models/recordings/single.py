@@ -1,0 +1,61 @@
+"""One recording as it was read, and what is worth a second look in several of them."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spikeloom.compiler.types import EventArray
+from spikeloom.models.recordings.counts import EventCounts, number
+from spikeloom.models.recordings.evtouch import BIN_S, WIDTH
+
+_RELEASED = re.compile(r"sample_[0-9]+_label_")
+
+
+@dataclass(frozen=True, slots=True)
+class Single:
+    """One recording in bins, (taxels, 2, steps), and what messages call it."""
+
+    where: str
+    grid: EventArray
+    label: str | None
+    counts: EventCounts
+    steps: int  # Its length; 0 where it has no events, and nothing says how long it is
+    bin_s: float | None  # Seconds of a bin, where somebody said so
+    assumed: bool = False  # Whether an array does not say it
+
+
+def unit_notes(read: Sequence[Single]) -> list[str]:
+    """One line for all recordings whose times look wrong."""
+    odd = [(each.where, note) for each in read for note in each.counts.notes]
+    others = f" (and {len(odd) - 1} more)" if len(odd) > 1 else ""
+    return [f"{place}{others}: {note}" for place, note in odd[:1]]
+
+
+def silent_notes(read: Sequence[Single], source: str) -> list[str]:
+    """One line for all recordings without events."""
+    silent = [each for each in read if not each.grid.any()]
+    unknown = sum(each.steps == 0 for each in silent)
+    line = f"{source}: {number(len(silent), 'recording')} without events"
+    taken = "taken" if unknown == len(silent) else f"{unknown} of them taken"
+    return [f"{line}: {taken} as long as the others" if unknown else line] if silent else []
+
+
+def width_notes(read: Sequence[Single], names: Sequence[str], source: str) -> list[str]:
+    """What bins arrays have that do not say it; in the released layout they are known."""
+    guessed = [
+        name for each, name in zip(read, names, strict=True) if each.assumed and not _RELEASED.match(name)
+    ]
+    line = f"{source}: nothing says how long a bin of its arrays is: {BIN_S:g} s is assumed"
+    return [f"{line}; write the seconds to {WIDTH} beside them"] if guessed else []
+
+
+def taxel_notes(source: str, events: EventArray) -> list[str]:
+    """Taxels that count from 1 leave the first silent, and no other."""
+    alive = np.asarray(events.any(axis=(0, 2, 3)), np.bool_)
+    if len(alive) < 4 or alive[0] or not alive[1:].all():
+        return []
+    return [
+        f"{source}: no event at taxel 0, some at each of 1..{len(alive) - 1}: if these count from 1, count from 0"
+    ]
