@@ -75,7 +75,8 @@ def recordings(source: str | os.PathLike[str], *, bin: float | None = None) -> D
     source : str or path
         As of ``--data``.
     bin : float, optional
-        Seconds of a time bin, for files of single events; 0.02 where it is not given.
+        Seconds of a time bin, which events are put into and bins of arrays are joined to; 0.02 for events where it
+        is not given.
 
     Raises
     ------

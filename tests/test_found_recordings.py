@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import as_json, refusal, run
-from made_files import CLASSES, events
+from made_files import CLASSES, events, own_file
 from oracles import refused
 
 from spikeloom.compiler.errors import DataError, OptionError
@@ -106,9 +106,7 @@ def test_bins_are_joined_to_what_is_asked_for(textures):
         np.testing.assert_array_equal(coarse.events[index], expected)
     assert coarse.bin_s == 0.02
     said = refused(OptionError, "", load_data, textures, bin_s=0.0015)
-    assert said == (
-        "--bin 0.0015: own: speed0_texture00.npz holds bins of 0.001 s; give a multiple of that, or omit --bin"
-    )
+    assert said == ("--bin 0.0015: own holds bins of 0.001 s; give a multiple of that, or omit --bin")
     # a network that was trained on wider bins gets them
     assert load_data(textures, default_bin_s=0.02).sha256 == coarse.sha256
     assert load_data(textures, default_bin_s=0.0015).bin_s == 0.001
@@ -314,3 +312,32 @@ def test_the_textures_of_another_laboratory(request, tmp_path):
     assert found.groups == {"speed": ("1200",) * 3, "force": ("0.0", "0.5", "1.0")}
     with np.load(io.BytesIO(zipfile.ZipFile(shared).read(found.files[0]))) as archive:
         np.testing.assert_array_equal(found.events[0, :, 1, : len(archive["spikes"])].T, archive["spikes"])
+
+
+def test_watch_says_names(scene):
+    assert run(*COUNT)[0] == 0
+    assert run("compile", "net.pt", "-o", "net.loom")[0] == 0
+    Path("live.csv").write_text(f"{HEADER}0,5,1\n0.1,5,1\n")
+    said = run("watch", "net.loom", "--input", "live.csv")[1]
+    (grasp,) = [line for line in said.splitlines() if line.startswith("grasp 1: class ")]
+    assert grasp.split()[3].rstrip(",") in scene
+    lines = run("watch", "net.loom", "--input", "live.csv", "--json")[1].splitlines()
+    decided = json.loads(lines[-2])
+    assert decided["class_name"] == scene[decided["decision"]]
+
+
+def test_names_survive_joining_and_nir(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for file, names in (("a.pt", "abcd"), ("b.pt", "abcd"), ("c.pt", "abdc")):
+        own_file(tmp_path / file, training={"seed": 0, "class_names": list(names)})
+    assert refusal("join", "a.pt", "c.pt", "-o", "j.pt") == (
+        "join: networks whose classes have other names; give those of the same classes"
+    )
+    assert run("join", "a.pt", "b.pt", "-o", "j.pt")[0] == 0
+    assert run("compile", "j.pt", "--weight-bits", "8", "-o", "j.loom")[0] == 0
+    assert run("export", "j.loom", "--to", "nir", "-o", "j.nir")[0] == 0
+    assert run("compile", "j.nir", "--weight-bits", "8", "-o", "again.loom")[0] == 0
+    np.save("x_label_c.npy", events(1, samples=1)[0])
+    for netlist in ("j.loom", "again.loom"):
+        found = as_json("run", netlist, "--data", "x_label_c.npy")
+        assert (found["class_names"], found["labels"]) == (list("abcd"), [2])

@@ -247,11 +247,12 @@ class Listed:
 
 
 def rows_beside(members: Members, files: Sequence[str], source: str) -> Listed:
-    """Rows of tables at the top of a data set, or beside its `files`, which are named as `members` are."""
+    """Rows of tables at the top of a data set, beside its splits or its `files`, which are named as `members` are."""
     known: dict[str, Row] = {}
     classes: set[str] = set()
     notes = []
-    folders = dict.fromkeys([PurePosixPath(), *(PurePosixPath(file).parent for file in files)])
+    parents = {PurePosixPath(file).parent: None for file in files}
+    folders = dict.fromkeys([PurePosixPath(), *(folder.parent for folder in parents), *parents])
     for folder in folders:
         for table in sorted(
             name for name in members if is_table(name) and PurePosixPath(name).parent == folder

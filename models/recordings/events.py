@@ -1,8 +1,8 @@
-"""Recordings in any form that we read: the released layout, files of events, single recordings, or a name.
+"""Recordings in any form that we read: the released layout, files of events or arrays, one of them, or a name.
 
-Events are put into time bins of one width. Nothing is corrected silently: what came out of order, what fell
-on an event of the same taxel, polarity and bin, and long silences are counted. Each recording counts for its
-own length.
+Events are put into time bins of one width, and the bins of arrays joined to it. Nothing is corrected silently:
+what came out of order, what fell on an event of the same taxel, polarity and bin, and long silences are counted. Each
+recording counts for its own length.
 """
 
 import math
@@ -46,6 +46,7 @@ _EDGE = 1e-9
 class _Bins:
     """Which width bins are to have: as asked for, else as a network was trained on, else as stated beside arrays."""
 
+    source: str
     asked: float | None
     default: float | None
     stated: float | None
@@ -90,7 +91,7 @@ def load_data(
         chosen = sorted(splits[folder].items())[:limit]
         files = [member for _, member in chosen]
         stated = evtouch.parse_width(source, members, files[0])
-        bins = _Bins(asked=bin_s, default=default_bin_s, stated=stated)
+        bins = _Bins(source=source, asked=bin_s, default=default_bin_s, stated=stated)
         table = rows_beside(members, files, source)
         released = bool(folder) and all(name.lower().endswith(".npy") for name, _ in chosen)
         size = 0
@@ -380,7 +381,8 @@ def _read(
 def _rebinned(binned: Binned, where: str, bins: _Bins, duration_s: float | None) -> Single:
     """A recording from an array, in bins as wide as wanted; its table says how long it is where it has no steps."""
     own = binned.bin_s or bins.stated
-    count, width = bins_joined(own, bins.asked, bins.default, where)
+    place = where if binned.bin_s else bins.source
+    count, width = bins_joined(own, bins.asked, bins.default, place)
     grid = join_bins(binned.events, count) if count > 1 and binned.events.size else binned.events
     busy = np.flatnonzero(grid.any(axis=(0, 1)))
     counts = EventCounts(

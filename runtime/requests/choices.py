@@ -18,9 +18,12 @@ if TYPE_CHECKING:
 NETWORK_FILES = "CKPT|NET.onnx|NET.nir"
 """What a float network is read from."""
 
-BIN_HELP = f"width of a time bin for event files (default: the one that the network was trained on, else {BIN_S:g} s)"
+BIN_HELP = f"width of a bin of events or arrays (default: the one that the network was trained on, else {BIN_S:g} s)"
 
-DATA_HELP = "recordings: released layout, event files (csv, npz), one recording, 'synthetic', 'objects' or 'containers'"
+DATA_HELP = (
+    "recordings: released layout, events (csv, npz), arrays (npy, npz), one of them, 'synthetic', 'objects' or "
+    "'containers'"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
