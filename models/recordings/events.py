@@ -94,19 +94,12 @@ def load_data(
         bins = _Bins(source=source, asked=bin_s, default=default_bin_s, stated=stated)
         table = rows_beside(members, files, source)
         released = bool(folder) and all(name.lower().endswith(".npy") for name, _ in chosen)
-        size = 0
-        read: list[Single] = []
         rows = [table.rows.get(member, NOTHING) for member in files]
-        for (name, member), row in zip(chosen, rows, strict=True):
-            where = (
-                source
-                if place.is_file() and member == source
-                else f"{source}: {Path(folder, name).as_posix()}"
-            )
-            read.append(_read(member, members[member], where, bins, taxels, row))
-            _require_alike(read[-1], read[0], released)
-            size += read[-1].grid.size
-            evtouch.require_memory(source, size)
+        single = place.is_file() and files == [source]
+        where = [source if single else f"{source}: {Path(folder, name).as_posix()}" for name, _ in chosen]
+        read = _read_all(
+            [(member, members[member]) for member in files], where, rows, bins, taxels, released=released
+        )
     labels, names = numbered([each.label for each in read], table.classes, names, source)
     for each, label in zip(read, labels.tolist(), strict=True):
         evtouch.require_class(each.where, label, classes)
@@ -170,6 +163,26 @@ def _sum_counts(read: Sequence[Single], steps: IntArray, notes: Sequence[str]) -
     names = ("events", "out_of_order", "duplicates", "gaps")
     sums = {name: sum(getattr(each.counts, name) for each in read) for name in names}
     return EventCounts(**sums, shorter=int(np.count_nonzero(steps < steps.max())), notes=tuple(notes))
+
+
+def _read_all(
+    files: Sequence[tuple[str, Callable[[], IO[Any]]]],
+    where: Sequence[str],
+    rows: Sequence[Row],
+    bins: _Bins,
+    taxels: int | None,
+    *,
+    released: bool,
+) -> list[Single]:
+    """All recordings; refused as soon as they are too large together."""
+    read: list[Single] = []
+    size = 0
+    for (name, opener), place, row in zip(files, where, rows, strict=True):
+        read.append(_read(name, opener, place, bins, taxels, row))
+        _require_alike(read[-1], read[0], released)
+        size += read[-1].grid.size
+        evtouch.require_memory(bins.source, size)
+    return read
 
 
 def _require_alike(read: Single, first: Single, released: bool) -> None:

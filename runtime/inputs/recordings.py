@@ -51,21 +51,16 @@ def recordings(
     Raises DataError or OptionError if they cannot be used, or do not suit the network.
     """
     trained_bin = (trained or {}).get("bin_s")
-    known = None if classes is None else (trained or {}).get("class_names")
+    known = None if classes is None else names_of(trained, classes)
     wanted = None if groups is None else [name.strip() for name in groups.split(",")]
     if isinstance(path, Recordings):
-        path = path if known is None else renamed(path, known)
-        require_suited(path, classes=classes, taxels=taxels)
-        _require_width(path, trained_bin)
-        if limit is not None and limit < 1:
-            raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
-        data = with_groups(path.part(slice(limit)), wanted)
+        given = path if known is None else renamed(path, known)
+        require_suited(given, classes=classes, taxels=taxels)
+        _require_width(given, trained_bin)
+        data = with_groups(_first(given, limit), wanted)
         return events.joined_bins(data if labels_for is None else events.need_labels(data, labels_for), bins)
     if path != SYNTHETIC:
-        if trained_bin is not None and bin_s not in (None, trained_bin):
-            raise OptionError(
-                f"--bin {bin_s:g}: the network was trained on bins of {trained_bin:g} s; omit --bin"
-            )
+        _require_asked(bin_s, trained_bin)
         data = events.load_data(
             path,
             split,
@@ -93,6 +88,19 @@ def recordings(
     return events.joined_bins(data, bins)
 
 
+def _first(data: Recordings, limit: int | None) -> Recordings:
+    """So many recordings; OptionError if that is none."""
+    if limit is not None and limit < 1:
+        raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
+    return data.part(slice(limit))
+
+
+def names_of(training: Mapping[str, Any] | None, classes: int) -> list[str] | None:
+    """Names of the classes of a network, if it knows one for each."""
+    names: list[str] | None = origin_of(training).get("class_names")
+    return names if names is None or len(names) == classes else None
+
+
 def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
     """What a netlist remembers of the recordings behind a network: name, bins and names of classes."""
     kinds = {"data": str, "bin_s": float}
@@ -105,6 +113,12 @@ def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
     if isinstance(names, list | tuple) and names and all(isinstance(name, str) for name in names):
         origin["class_names"] = list(names)
     return origin
+
+
+def _require_asked(bin_s: float | None, own: float | None) -> None:
+    """Refuse another width than the network's."""
+    if own is not None and bin_s is not None and bin_s != own:
+        raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {own:g} s; omit --bin")
 
 
 def _require_width(data: Recordings, own: float | None) -> None:

@@ -30,7 +30,7 @@ REQUEST = WatchRequest
 
 def run(request: WatchRequest) -> Outcome:
     """Run the command; its result is the summary, everything else was printed before."""
-    from spikeloom.runtime.inputs.recordings import origin_of
+    from spikeloom.runtime.inputs.recordings import names_of
     from spikeloom.runtime.machines.backends import machine_for
 
     _require_length(request)
@@ -56,7 +56,7 @@ def run(request: WatchRequest) -> Outcome:
             real=request.speed == "real",
             may_end=_ending(request, machine),
             found=Summary(early=early),
-            names=origin_of(netlist.provenance).get("class_names"),
+            names=names_of(netlist.provenance, netlist.classes),
         )
         session.run()
     if not session.found.events and not session.found.interrupted:
