@@ -7,7 +7,6 @@ from typing import Any
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets import DEFAULT_TARGET
 from spikeloom.compiler.types import JsonObject
-from spikeloom.models.recordings.evtouch import BIN_S
 from spikeloom.runtime.requests.fields import Request
 
 NETWORK = ("graph", "taxels", "edges", "directed", "run", "weights", "beta", "theta")
@@ -28,7 +27,6 @@ PLACING = ("keep_all", "cores_for", "chips", "free_running")
 USUAL: Mapping[str, object] = {
     "run": 0,
     "target": DEFAULT_TARGET,
-    "bin": BIN_S,
     "chips": 1,
     "engine": "spikeloom",
     **dict.fromkeys(
@@ -42,7 +40,7 @@ def words(options: Mapping[str, Any]) -> list[str]:
     """Options as they are typed; those that are None or False are omitted, as is what is usual.
 
     >>> words({"weight_bits": "4,8", "directed": True, "run": 0, "beta": 0.0, "planes": None, "bin": 0.02})
-    ['--weight-bits', '4,8', '--directed', '--beta', '0.0']
+    ['--weight-bits', '4,8', '--directed', '--beta', '0.0', '--bin', '0.02']
     """
     typed: list[str] = []
     for name, value in options.items():

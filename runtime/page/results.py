@@ -179,11 +179,11 @@ def provenance(
         | {f"time, {table.name}": table.title for table in target.time},
         versions={"spikeloom": __version__, "python": platform.python_version()}
         | {name: metadata.version(name) for name in PACKAGES},
-        commands=_commands(request, recording, data.seconds),
+        commands=_commands(request, recording, data.bin_s),
     )
 
 
-def _commands(request: ReportRequest, recording: str, bin_s: float) -> dict[str, str]:
+def _commands(request: ReportRequest, recording: str, bin_s: float | None) -> dict[str, str]:
     """What to type, and what each is for; how the netlist was compiled is among its facts."""
 
     def name(given: Any) -> str:

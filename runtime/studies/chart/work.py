@@ -26,7 +26,7 @@ from spikeloom.compiler.targets.compartments import (
 from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.recordings.conditions import by_condition
 from spikeloom.models.recordings.events import joined_bins, of_length
-from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part
+from spikeloom.models.recordings.evtouch import BIN_S, WHOLE, Recordings, first_part
 from spikeloom.runtime.equivalence.reference import votes_so_far
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import parse_cores, provenance, storage_of
@@ -126,10 +126,11 @@ def commands(work: Measurement, layout: str, window: int) -> tuple[str, ...]:
     data = work.data
     parts = [network.name, *storage.label().split(), *([] if layout == FEWEST else [layout])]
     file = "-".join(parts).replace(":", "").replace("+", "-") + ".loom"
-    calibrated = {"calibrate": data.path, "bin": data.bin_s}
+    bin_s = None if data.bin_s == BIN_S else data.bin_s
+    calibrated = {"calibrate": data.path, "bin": bin_s}
     stored = repeat.words(dict(network.options) | storage.options() | calibrated | _layout_options(layout))
     part = None if window == WHOLE else f"{window}%"
-    read = repeat.words({"data": data.path, "bin": data.bin_s, "window": part})
+    read = repeat.words({"data": data.path, "bin": bin_s, "window": part})
     return (
         repeat.command("compile", network.path, *stored, "-o", file),
         repeat.command("run", file, *read),
