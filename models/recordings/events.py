@@ -342,7 +342,9 @@ def _data_set(
             for name, member in members.items()
             if not is_table(name) and PurePosixPath(name).name != evtouch.WIDTH
         }
-        splits = evtouch.splits_of(source, plain, {*SPLITS, split}) or _flat(plain)
+        splits = evtouch.splits_of(source, plain, {*SPLITS, split})
+        if not splits and (path.is_dir() or path.suffix.lower() == ".zip"):  # networks are zips, too
+            splits = _flat(plain)
         if not splits:
             raise DataError(
                 f"{source}: no recordings (train/ or test/ with .csv, .npz or sample_N_label_L.npy); "
