@@ -379,7 +379,7 @@ NIR_WORDS += (
     "\x1b[31m",
     "ä" * 200,
 )
-NETX_WORDS = ("conv", "dense", "dense_rec", "flatten", "input")
+NETX_WORDS = ("conv", "dense", "dense_rec", "flatten", "input", "recurrent")
 TOML_WORDS = ("[energy.x]", "[time.y]", "hops = 1", 'hop = { value = inf, unit = "pJ", source = "x" }')
 TOML_WORDS += ("a.b = {}", "", "[")
 CELLS = ("x", "label", "-1", "1e9", "nan", "", "#", "\x1b")

@@ -12,7 +12,7 @@ from oracles import refused
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats import hdf5
-from spikeloom.compiler.formats.netx.reader import integers_of, read_netx
+from spikeloom.compiler.formats.netx.reader import RECURRENT, integers_of, read_netx
 from spikeloom.compiler.formats.sensor_layout import sensor_layout
 from spikeloom.compiler.targets.loihi1.integers import run_integer, verify
 from spikeloom.compiler.targets.loihi1.lift import lift
@@ -41,6 +41,8 @@ REFUSED = [
     ("0 (dense): wgtExp is 1, allowed is 0", [dense(W, neuron=neuron(wgtExp=1))]),
     ("0 (dense): has neurons of type 'SDNN', allowed are CUBA", [dense(W, neuron=neuron(kind="SDNN"))]),
     ("0 (dense_rec): weight_rec has the shape [4, 6], wanted [4, 4]", [recurrent(weight_rec=W)]),
+    ("0 (recurrent): has no recWeight", [recurrent(weight_rec=np.eye(4), type=["recurrent"])]),
+    ("0 (recurrent): refDelay is 2", [recurrent(type=["recurrent"], neuron=neuron(refDelay=2))]),
     ("0 (conv): the shape of its input is nowhere", [{"type": ["conv"], "shape": [1, 2, 2]}]),
     (
         "1 (conv): gives [2, 4, 5], the file says [2, 5, 4]",
@@ -150,11 +152,12 @@ def test_odd_weights_are_exact(tmp_path, most, exponents):
     )
 
 
+@pytest.mark.parametrize(("kind", "entry"), [*RECURRENT.items()])
 @pytest.mark.parametrize("most", [60, 127, 250])
-def test_a_recurrent_block(tmp_path, most):
+def test_a_recurrent_block(tmp_path, most, kind, entry):
     rng = np.random.default_rng(8)
     first, own, last = even(rng, 12, 6), rng.integers(-most, most + 1, (12, 12)), even(rng, 5, 12)
-    block = dense(first) | {"type": ["dense_rec"], "weight_rec": own.astype(np.float32)}
+    block = dense(first) | {"type": [kind], entry: own.astype(np.float32)}
     found = read_netx(write(tmp_path / "a.net", block, dense(last)))
     given_ = events(rng, 6)
     hidden = lif(first, 0, given_, own=own)

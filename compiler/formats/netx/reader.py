@@ -1,14 +1,18 @@
-"""Read a network from lava-dl's ``.net`` files as what it is: integers, registers and all.
+"""Read a network from ``.net`` files of lava-dl and SLAYER as what it is: integers, registers and all.
 
 ``layer/0`` … each have ``type`` and ``shape``; ``dense`` and ``conv`` have ``weight`` (to, from) or
 (filters, channels, height, width), maybe ``bias``, and ``neuron`` with ``iDecay``, ``vDecay``, ``vThMant``,
-``refDelay``. Shapes of images are (channels, height, width), as torch has them, and kernels are not turned
-round. Numbers are the chip's registers, but for three: ``iDecay`` is one more than the register of the
-current's decay, biases count whole weight steps, and weights of both signs are even.
+``refDelay``. A layer fed by its own spikes of the step before is ``dense_rec`` with ``weight_rec`` in lava-dl,
+``recurrent`` with ``recWeight`` in SLAYER's files, both (to, from). Shapes of images are (channels, height,
+width), as torch has them, and kernels are not turned round. Numbers are the chip's registers, but for three:
+``iDecay`` is one more than the register of the current's decay, biases count whole weight steps, and weights
+of both signs are even.
 
 References
 ----------
 .. [1] lava-dl 0.6.0, ``netx/README.md``, ``netx/hdf5.py`` and ``slayer/block/base.py``.
+.. [2] SLAYER for Loihi: slayerPytorch 01beeeb, ``src/slayerLoihi.py`` and ``src/cuda/spikeLoihiKernels.h``; what puts
+   its files on the chip: intel-nrc-ecosystem/models 3dc53bf, ``slayer_rec/src/s2lWrapper.py`` and ``slayer2loihi.py``.
 """
 
 import math
@@ -56,7 +60,12 @@ REGISTERS = {
 }
 """Least and largest value of an entry of a neuron; it may lack the last two."""
 
-ALLOWED = "input, flatten, dense, dense_rec and conv"
+RECURRENT = {"dense_rec": "weight_rec", "recurrent": "recWeight"}
+"""Types of layers that their own spikes feed, and the entry of those weights."""
+
+DENSE = ("dense", *RECURRENT)
+
+ALLOWED = "input, flatten, dense, dense_rec, recurrent and conv"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -128,9 +137,9 @@ def integers_of(
         post = len(populations)
         populations.append(_population(block, math.prod(shape), shape))
         sources = {post - 1 if post else ir.INPUT: weight if post else weight[:, positions]}
-        if block.type == "dense_rec":
+        if block.type in RECURRENT:
             neurons = populations[-1].size
-            sources[post] = sparse.csr_array(_matrix(block, "weight_rec", neurons, neurons))
+            sources[post] = sparse.csr_array(_matrix(block, RECURRENT[block.type], neurons, neurons))
         stored = {pre: _planes(block, part) for pre, part in sources.items()}
         projections += [
             IntegerProjection(pre=pre, post=post, weight=plane, exponent=exponent, bits=8)
@@ -155,7 +164,7 @@ def integers_of(
 def _input_shape(first: Block) -> tuple[int, ...]:
     if first.type == "input":
         return first.sizes()
-    if first.type in ("dense", "dense_rec"):
+    if first.type in DENSE:
         weight = first.integers("weight")
         if weight.ndim == 2 and weight.size:
             return (weight.shape[1],)
@@ -177,7 +186,7 @@ def _synapses(block: Block, shape: tuple[int, ...]) -> tuple[ir.Sparse, tuple[in
         ), shape
     if isinstance(block.values.get("weight"), dict):
         raise block.fail("has complex weights, allowed are real ones; use CUBA neurons")
-    if block.type in ("dense", "dense_rec"):
+    if block.type in DENSE:
         neurons = math.prod(block.sizes())
         return sparse.csr_array(_matrix(block, "weight", neurons, math.prod(shape))), (neurons,)
     if block.type == "conv":
@@ -303,6 +312,6 @@ def _fact(block: Block, population: IntegerPopulation, planes: int) -> str:
     )
     if block.type == "input":
         fact += "; it turns events into currents"
-    if block.type == "dense_rec":
+    if block.type in RECURRENT:
         fact += "; it is recurrent, fed by its own spikes of the step before"
     return fact + ("; odd weights are stored twice" if planes > 1 else "")
