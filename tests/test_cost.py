@@ -222,6 +222,17 @@ def test_the_report_says_power_and_pace(small, found):
     assert sum(core["energy_j"]["sanafe"] for core in report["cores"]) == pytest.approx(energy.mean())
 
 
+def test_a_host_adds_to_each_step(small, found):
+    netlist, _ = small
+    _, cost = found["counts"]
+    host = cost_report(netlist, LOIHI, cost, bin_s=0.02).host
+    steps = (LENGTHS + netlist.max_depth).mean()
+    for step, inference, energy in zip(host.step_s, host.inference_s, host.energy_j, strict=True):
+        assert inference == pytest.approx(steps * step)
+        assert energy == pytest.approx(inference * LOIHI.host["awake"].value * 1e-3)
+    assert cost_report(netlist, dataclasses.replace(LOIHI, host={}), cost, bin_s=0.02).host is None
+
+
 def test_the_range_names_both_ends(small, found):
     netlist, _ = small
     _, cost = found["counts"]

@@ -8,7 +8,7 @@ import math
 import os
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,9 @@ FLOOR = "floor"
 
 CROSSBAR_EVENTS = ("synaptic_event", FLOOR)
 """What an energy table of crossbars may price; a synaptic event is a spike that meets a set crossing point."""
+
+HOST = {"step_least": "ms", "step_most": "ms", "awake": "mW"}
+"""What a host adds to a step, least and most, and the power of a chip that a host has woken and that does nothing."""
 
 LINK_BUFFER = "link_buffer"
 
@@ -117,6 +120,10 @@ class Target:
     energy: tuple[EnergyTable, ...]
     time: tuple[TimeTable, ...]
     static: Mapping[str, Quantity]  # Power of a chip, whether it computes or not
+    host: Mapping[str, Quantity] = field(
+        default_factory=dict
+    )  # What feeding it adds, of ``HOST``, where known
+    measured: str = ""  # How far these prices were from measured chips
     cores: str = COMPARTMENTS  # or ``CROSSBARS``, which have neither choices nor time tables
 
     def limit(self, rule: str) -> int:
@@ -147,6 +154,8 @@ def read_target(path: str | os.PathLike[str]) -> Target:
             energy=energy,
             time=time,
             static=_quantities("static", raw.get("static", {})),
+            host=_quantities("host", raw.get("host", {}), HOST),
+            measured=raw.get("measured", ""),
         )
 
 
@@ -154,7 +163,8 @@ def with_tables(target: Target, name: str) -> Target:
     """Choose the tables that price and time a run: of the target by `name`, or of a TOML file of that name.
 
     The file has ``[energy.NAME]`` or ``[time.NAME]`` sections as a target file has; what it lacks stays the
-    target's. OptionError if there is no such table, or the file is wrong.
+    target's, but for what measured chips say of its prices. OptionError if there is no such table, or the
+    file is wrong.
     """
     energy = tuple(table for table in target.energy if table.name == name)
     time = tuple(table for table in target.time if table.name == name)
@@ -171,6 +181,7 @@ def with_tables(target: Target, name: str) -> Target:
                     f"holds {', '.join(raw) or 'nothing'}, wanted is [energy.NAME] or [time.NAME] alone"
                 )
             energy, time = _cost_tables(raw, target.cores)
+            target = replace(target, measured="")
     return replace(target, energy=energy or target.energy, time=time or target.time)
 
 

@@ -128,6 +128,16 @@ class Static:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Host:
+    """What feeding the chip from outside adds, least and most: to a step, a mean inference, and its energy at rest."""
+
+    step_s: tuple[float, float]
+    inference_s: tuple[float, float]
+    awake_w: float
+    energy_j: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CostReport:
     """Costs of a batch of recordings.
 
@@ -149,6 +159,8 @@ class CostReport:
     time: tuple[Times, ...]
     pace: Pace
     static: tuple[Static, ...]
+    host: Host | None
+    measured: str
     not_modelled: tuple[str, ...]
     not_priced: tuple[str, ...]
 
@@ -198,6 +210,8 @@ def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: flo
             )
             for name, power in target.static.items()
         ),
+        host=_host(target, float(found.steps.mean()) + netlist.max_depth, chips),
+        measured=target.measured,
         not_modelled=(
             *(f"{name}: no price for {', '.join(events)}" for name, events in costs.unpriced.items()),
             *_links(chips, costs),
@@ -246,6 +260,20 @@ def _links(chips: int, costs: Costs) -> list[str]:
         f"links between the {chips} chips: {left:,.0f} of {sent:,.0f} packets of an inference leave their chip; their "
         "hops and latency are left out, and so are all times (no public figures)"
     ]
+
+
+def _host(target: Target, steps: float, chips: int) -> Host | None:
+    """What a host adds to so many chip steps; None where nobody measured it."""
+    if not target.host:
+        return None
+    least, most = (target.host[name].value * 1e-3 for name in ("step_least", "step_most"))
+    awake = chips * target.host["awake"].value * 1e-3
+    return Host(
+        step_s=(least, most),
+        inference_s=(steps * least, steps * most),
+        awake_w=awake,
+        energy_j=(steps * least * awake, steps * most * awake),
+    )
 
 
 def _models(found: Estimate) -> Iterator[tuple[str, str, StepTimes]]:

@@ -1,6 +1,6 @@
 """Costs laid out for people: the mean inference and its range, where energy and time go."""
 
-from spikeloom.runtime.machines.loihi1.costs.result import Amounts, CostReport
+from spikeloom.runtime.machines.loihi1.costs.result import Amounts, CostReport, Host
 from spikeloom.runtime.report.numbers import dominant, si
 from spikeloom.runtime.report.sections import Section, Table, Text
 
@@ -124,5 +124,20 @@ def _lines(report: CostReport) -> list[str]:
         lines.append(
             dominant([each.real_time_j for each in report.static], report.per_inference.energy_j.values())
         )
+    if report.host is not None:
+        lines.append(_host_line(report.host))
+    if report.measured:
+        lines.append(f"against measured chips: {report.measured}")
     lines += [f"not modelled: {line}" for line in report.not_modelled]
     return [*lines, *(f"not priced: {line}" for line in report.not_priced)]
+
+
+def _host_line(host: Host) -> str:
+    step, inference = (
+        " to ".join(si(each, "s") for each in ends) for ends in (host.step_s, host.inference_s)
+    )
+    energy = " to ".join(si(each, "J") for each in host.energy_j)
+    return (
+        f"fed by a host: times are the cores' alone; spikes through a chip's x86 cores added {step} to a step, which "
+        f"makes {inference} an inference, and {energy} with these awake ({si(host.awake_w, 'W')})"
+    )
