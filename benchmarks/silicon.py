@@ -1,6 +1,6 @@
 """What our prices say of networks that a Loihi 1 was measured with: ``python benchmarks/silicon.py FOLDER OUT.json``.
 
-FOLDER holds ``netLoihi_rec_th10.net`` and ``ntidigits.net`` of github.com/intel-nrc-ecosystem/models, commit 3dc53bf. The
+FOLDER holds ``netLoihi_rec_th10.net`` and ``ntidigits.net`` of github.com/intel-nrc-ecosystem/models (3dc53bf). The
 keyword spotter and its scaled family (github.com/abr/power_benchmarks) are drawn here from the distributions that are
 stated there. Nothing measured is read and nothing is fitted: what is not known spans an interval, and no figure is
 compared.
@@ -254,7 +254,8 @@ def main() -> None:
     }
     head = json.dumps(content, indent=2)[:-2]
     lines = ",\n".join("    " + json.dumps(row) for row in rows)
-    write_atomically(out, f'{head},\n  "rows": [\n{lines}\n  ]\n}}\n'.encode())
+    with write_atomically(out) as file:
+        file.write(f'{head},\n  "rows": [\n{lines}\n  ]\n}}\n'.encode())
 
 
 if __name__ == "__main__":
