@@ -43,6 +43,7 @@ containers_zip = _released("data/Ev-Containers.zip")
 released_checkpoint = _released("checkpoints/objects_manual.t7")  # trained on Objects with the manual graph
 checkpoints = _released("checkpoints")
 braille_net = _released("data/silicon/braille_rec_th1_6.net")  # it ran on a Loihi
+power_logs = _released("data/silicon/loihi-power-logs.zip")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
