@@ -14,7 +14,7 @@ from spikeloom.runtime.machines.core_map import Core, CoreMap, Fill, Mesh, Way
 from spikeloom.runtime.machines.loihi1.costs.result import CostReport
 from spikeloom.runtime.report.drawing import bars
 from spikeloom.runtime.report.numbers import si
-from spikeloom.runtime.report.sections import Block, Figure, Table
+from spikeloom.runtime.report.sections import Block, Figure, Table, Text
 
 FILLS = ("core.compartments", "core.synapse_words", "core.axons_in", "core.axons_out")
 """Limits of which the fullest says how full a core is: those that a larger network uses up."""
@@ -78,7 +78,9 @@ def _traffic(netlist: Netlist, target: Target, fired: FloatArray) -> tuple[Way, 
 def figures(found: CostReport) -> list[Block]:
     """Energy by layer and part, time by core."""
     tables = list(found.per_inference.energy_j)
-    blocks: list[Block] = []
+    blocks: list[Block] = (
+        [Text(f"How far this is from silicon: {found.measured}.")] if found.measured else []
+    )
     if tables:
         layers = {layer.name: list(layer.amounts.energy_j.values()) for layer in found.layers}
         title = "Dynamic energy of a mean inference by layer"

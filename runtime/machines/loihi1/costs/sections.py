@@ -127,7 +127,7 @@ def _lines(report: CostReport) -> list[str]:
     if report.host is not None:
         lines.append(_host_line(report.host))
     if report.measured:
-        lines.append(f"against measured chips: {report.measured}")
+        lines.append(report.measured)
     lines += [f"not modelled: {line}" for line in report.not_modelled]
     return [*lines, *(f"not priced: {line}" for line in report.not_priced)]
 
