@@ -9,7 +9,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-DRAWN = {"growth", "skins", "fuzz", "public", "convolutions"}  # results of made recordings or damages
+DRAWN = {"growth", "skins", "fuzz", "public", "convolutions", "silicon-predictions"}
+"""Results of made recordings or damages."""
 
 
 @pytest.fixture(scope="module")
