@@ -48,7 +48,7 @@ class CertifyRequest(NetlistChoice, RecordingsChoice):
     """Which decisions no small change of a recording alters: proven, not sampled."""
 
     shift: int = option("largest shift to try", default=25, metavar="BINS")
-    most: int = option("largest number of changed events to look for a proof for", default=16, metavar="N")
+    most: int = option("largest number of changed events that a proof is tried for", default=16, metavar="N")
     jobs: int | None = option("recordings at a time (default: one a core)", metavar="N")
     picture: str | None = option("draw how many decisions depend on each taxel", metavar="OUT.png|svg|pdf")
     output: str | None = option("write what --json prints", metavar="OUT.json", flags=("-o", "--output"))

@@ -21,8 +21,8 @@ NETWORK_FILES = "CKPT|NET.onnx|NET.nir"
 BIN_HELP = f"width of a bin of events or arrays (default: the one that the network was trained on, else {BIN_S:g} s)"
 
 DATA_HELP = (
-    "recordings: released layout, events (csv, npz), arrays (npy, npz), one of them, 'synthetic', 'objects' or "
-    "'containers'"
+    "recordings: a folder or zip of the released layout, events (csv, npz) or arrays (npy, npz), one such file, "
+    "'synthetic', 'objects' or 'containers'"
 )
 
 
@@ -43,15 +43,24 @@ class SensorChoice(Request):
         metavar="N|COORDS.csv",
         group="network",
     )
-    edges: str | None = option("your own graph: source,target", metavar="EDGES.csv", group="network")
-    directed: bool = option("take --edges as they are, one way", default=False, group="network")
+    edges: str | None = option(
+        "your own graph: a file of edges source,target", metavar="EDGES.csv", group="network"
+    )
+    directed: bool = option(
+        "each of --edges goes one way, from source to target", default=False, group="network"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckpointChoice(SensorChoice):
     """How a checkpoint is read."""
 
-    run: int = option("which run of a released file", default=0, metavar="N", group="network")
+    run: int = option(
+        "which training run of a file that TactileSGNet's authors released",
+        default=0,
+        metavar="N",
+        group="network",
+    )
     weights: str | None = option(
         "epoch, if a checkpoint holds several (default: the first of these that it holds)",
         choices=WEIGHTS,
@@ -66,7 +75,7 @@ class NetworkChoice(CheckpointChoice):
     """How a network of any format is read."""
 
     polarities: int | None = option(
-        "polarities of an ONNX or NIR input, if its shape is flat", metavar="N", group="network"
+        "number of polarities of an ONNX or NIR input, if its shape is flat", metavar="N", group="network"
     )
     polarities_first: bool | None = option(
         "whether polarities are the first axis, if the shape of an ONNX or NIR input does not say",

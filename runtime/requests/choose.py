@@ -62,7 +62,9 @@ class ChartRequest(CheckpointChoice, ShownConditionChoice, DataChoice):
         default=(),
         metavar="WHAT=LIMIT",
     )
-    table: str | None = option("energy table to choose and draw by (default: the first)", metavar="NAME")
+    table: str | None = option(
+        "energy table to choose and draw by: davies2018 or sanafe (default: davies2018)", metavar="NAME"
+    )
     jobs: int | None = option("processes at a time (default: one a core)", metavar="N")
     output: str = option("folder of the chart", required=True, metavar="FOLDER", flags=("-o", "--output"))
 
@@ -72,14 +74,12 @@ class LeanRequest(NetworkChoice, RecordingsChoice):
     """Which neurons, taxels and hops its recordings do not need, and a netlist without them."""
 
     checkpoint: str = option("trained network", positional=True, metavar=NETWORK_FILES)
-    differ: float = option(
-        "share of training decisions that the netlist may change", default=0.01, metavar="X"
-    )
+    differ: float = option("share of training decisions that may change", default=0.01, metavar="X")
     output: str | None = option(
         "write the netlist without what is not needed", metavar="OUT.loom", flags=("-o", "--output")
     )
     network: str | None = option(
-        "write the float network without dense neurons that are not needed", metavar="OUT.pt"
+        "write the float network without neurons of dense layers that are not needed", metavar="OUT.pt"
     )
 
 
@@ -91,10 +91,12 @@ class AnytimeRequest(NetlistChoice, RecordingsChoice):
         "recordings whose training split sets when a vote is sure", metavar="PATH"
     )
     held_out: bool = option(
-        "the network was not trained on --calibrate: use its decisions, not races for second place",
+        "the network was not trained on --calibrate: set that by its decisions, not by its races for second place",
         default=False,
     )
-    differ: float | None = option("share of these that may end otherwise (default: 0)", metavar="X")
+    differ: float | None = option(
+        "share of these races, or decisions, that may end otherwise (default: 0)", metavar="X"
+    )
     output: str | None = option(
         "write the result with figures of every recording", metavar="OUT.json", flags=("-o", "--output")
     )

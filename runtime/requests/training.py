@@ -35,7 +35,7 @@ class TrainRequest(SensorChoice, DataChoice):
     """Train networks, and report the last, best and clean epoch."""
 
     groups: str | None = option(
-        f"train again without each condition and without parts at random: {GROUPS_HELP}",
+        f"train again without each value of these conditions, and without random parts: {GROUPS_HELP}",
         metavar="NAME[,NAME]",
         group="recordings",
     )
@@ -54,18 +54,20 @@ class TrainRequest(SensorChoice, DataChoice):
         choices=tuple(PADDINGS),
     )
     recipe: str = option(
-        "training recipe: as released, with lasting currents and clocks, or for small networks that decide by rates",
+        "released: as TactileSGNet was; timed: lasting currents and clocks; rates: for small networks",
         default=RELEASED.name,
         choices=tuple(RECIPES),
     )
     current_decay: str | None = option(
-        "share of the synaptic current kept by each step: fc1=0.95", metavar="LAYER=X[,…]"
+        "share of the synaptic current that each step keeps, as in fc1=0.95", metavar="LAYER=X[,…]"
     )
     membrane_decay: str | None = option(
-        "share of the membrane kept by each step (default: 0.2): fc1=0.5", metavar="LAYER=X[,…]"
+        "share of the membrane that each step keeps, as in fc1=0.5 (default: 0.2)", metavar="LAYER=X[,…]"
     )
     clocks: int | None = option("clock inputs: each is active in one K-th of the recording", metavar="K")
-    features: int | None = option("features of the first layer at each place", metavar="N")
+    features: int | None = option(
+        "neurons of the first layer for each taxel, or each position of a window", metavar="N"
+    )
     hops: int | None = option("hops of a tactilesgnet's graph convolution (default: 3)", metavar="K")
     hidden: str | None = option(
         "neurons of each dense layer but the last, or none (default: 128,256)", metavar="N[,N]"
@@ -77,11 +79,17 @@ class TrainRequest(SensorChoice, DataChoice):
         "event counts at which counters spike (default: 1,4,16,64)", metavar="K[,K]", group="counters"
     )
     parts: int | None = option(
-        "parts of a recording that are counted separately (default: 1)", metavar="N", group="counters"
+        "equal parts of a recording that are counted separately (default: 1)", metavar="N", group="counters"
     )
-    ramp: int | None = option("silent steps of the read-out (default: 32)", metavar="N", group="counters")
+    ramp: int | None = option(
+        "steps after the recording in which sums rise until one reaches the threshold (default: 32)",
+        metavar="N",
+        group="counters",
+    )
     levels: int | None = option(
-        "every N consecutive classes are levels of one object (default: 1)", metavar="N", group="counters"
+        "every N classes in a row are levels of one thing, as of a container's fill (default: 1)",
+        metavar="N",
+        group="counters",
     )
     weight_bits: int | None = option(
         "bits of a weight, 2 to 8 (default: 8; truenorth holds up to 5)", metavar="N", group="counters"
@@ -89,10 +97,11 @@ class TrainRequest(SensorChoice, DataChoice):
     window: str | None = option("train on this first part of each recording", metavar="PERCENT")
     batch: int | None = option("recordings per optimizer step", metavar="N")
     spike_penalty: float | None = option(
-        "penalty for spikes: the loss added if every synapse carried a spike in every step", metavar="X"
+        "penalty for spikes: what the loss grows by if every synapse carries a spike in every step",
+        metavar="X",
     )
     robust: float | None = option(
-        "probability that an event is lost while training, and that a taxel is: 0.1", metavar="X"
+        "probability with which training drops each event and each taxel, as in 0.1", metavar="X"
     )
     epochs: int | None = option(f"passes over the training recordings (default: {EPOCHS})", metavar="N")
     decay_epochs: int | None = option(
@@ -122,8 +131,10 @@ class FinetuneRequest(NetworkChoice, DataChoice):
         "storage width, for all layers or one each: 2 to 6 or 8 (default: as compile --calibrate chooses)",
         metavar="N[,N]",
     )
-    scale_groups: int | None = option("scales per layer, at that width (default: 8)", metavar="N")
-    robust: float | None = option("probability that an event is lost, and that a taxel is: 0.1", metavar="X")
+    scale_groups: int | None = option("scales in a layer, with --weight-bits (default: 8)", metavar="N")
+    robust: float | None = option(
+        "probability with which training drops each event and each taxel, as in 0.1", metavar="X"
+    )
     epochs: int = option("passes over the training recordings", default=40, metavar="N")
     seed: int = option("seed of the order of recordings", default=0, metavar="N")
     resume: bool = option("resume an interrupted fine-tuning with the same options", default=False)
@@ -140,7 +151,7 @@ class JoinRequest(Request):
     """Join trained networks into one whose votes add up."""
 
     checkpoints: tuple[str, ...] = option(
-        "networks of one system, graph and timing", positional=True, metavar="CKPT"
+        "networks of the same system, graph, decays and bins", positional=True, metavar="CKPT"
     )
     weights: str | None = option(
         "epoch to take from each (default: the first of these that it holds)", choices=WEIGHTS

@@ -17,9 +17,10 @@ from spikeloom.runtime.studies.anytime.sections import sections
 from spikeloom.runtime.studies.anytime.study import study
 
 NOTES = """\
-By proof: stop once no further spike can change the vote. With --calibrate also: stop once the leader is ahead by a
-times the root of the steps left, where a is the smallest factor that lets no more than --differ of the training split's
-races for second place end otherwise, or of its decisions with --held-out. Figures are of --split.
+By proof: stop once no further spike can change the decision. With --calibrate also: stop once the leading class is
+ahead by a times the root of the steps left. On recordings that a network was trained on its classes lead by too far, so
+a is the smallest factor that lets no more than --differ of the training split's races for second place end otherwise,
+or of its decisions with --held-out. Figures are of --split.
 """
 
 ALLOWED = (0.0, 0.005, 0.01, 0.02, 0.05)

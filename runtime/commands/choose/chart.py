@@ -17,11 +17,13 @@ from spikeloom.runtime.studies.search.budgets import parse_budgets
 from spikeloom.runtime.studies.search.results import chosen_by, data_of
 
 NOTES = """\
-Axes of the grid: bits (2-6, 8, or one a layer as in 8+4+4+8), planes (1-3), groups (1-8), prune (0, 1), cores (cores,
-or LAYER:N as in fc1:6+conv1:4), window (per cent of each recording, 25-100% is every quarter,
-25-100%:5 every twentieth). The choice, the cheapest point that is at most a point less accurate than the best, is made
-on the training split, the test split is reported. A chart that was interrupted goes on with the same command; netlists
-and figures are kept in FOLDER: delete it to measure anew. The exit code is 1 if no point fits a budget.
+Axes of the grid: bits (of a weight, 2-6, 8, or one a layer as in 8+4+4+8), planes (synapses that hold a weight, 1-3),
+groups (scales in a layer, 1-8), prune (1 leaves out neurons that did not fire on training recordings, 0 does not),
+cores (cores, the fewest, or at least so many for a layer, as in fc1:6+conv1:4), window (first part of each recording,
+25-100% is every quarter, 25-100%:5 every twentieth). The choice, the cheapest point that is at most a point less
+accurate than the best, is made on the training split, the test split is reported. A chart that was interrupted goes on
+with the same command; netlists and figures are kept in FOLDER: delete it to measure anew. The exit code is 1 if no
+point fits a budget.
 """
 
 

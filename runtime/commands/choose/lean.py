@@ -24,9 +24,9 @@ from spikeloom.runtime.studies.pruning.study import study
 from spikeloom.runtime.studies.pruning.trials import narrowed
 
 NOTES = """\
-Everything is chosen on the training split and reported on --split: how many decisions change, what is right,
-operations, energy and time. What -o writes is what takes least energy on the training split, without neurons, without
-taxels or without hops.
+Everything is chosen on the training split and reported on --split: how many decisions change, how many are right,
+operations, energy and time. Neurons, taxels or hops are left out, one kind at a time; -o writes the network that takes
+least energy on the training split.
 """
 
 

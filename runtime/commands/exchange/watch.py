@@ -18,11 +18,11 @@ from spikeloom.runtime.requests.exchange import WatchRequest
 from spikeloom.runtime.studies.watching import Summary, Watch, sections
 
 NOTES = """\
-Lines come in the order of their times: an event whose bin is over, since a later one came, is counted as late, said at
-once and not used; what comes after a grasp's decision is counted apart. What follows a # is a comment, and a grasp may
-begin with a header that names the columns, in any order. An empty line or the line "reset" ends a grasp. Polarity is
-0 and 1, or -1 and 1. --json prints one object a line: kind "bin" for every bin, "grasp" for every decision, and "end"
-last. TrueNorth runs whole recordings only.
+Lines come in the order of their times. An event of a bin that is over, since one of a later bin came, is not used, but
+reported and counted as late; events after a grasp's decision are counted apart. What follows a # is a comment, and a
+grasp may begin with a header that names the columns, in any order. An empty line or the line "reset" ends a grasp.
+Polarity is 0 and 1, or -1 and 1. --json prints one object a line: kind "bin" for every bin, "grasp" for every decision,
+and "end" last. TrueNorth runs whole recordings only.
 """
 
 REQUEST = WatchRequest
