@@ -4,7 +4,8 @@
 
 The zip holds ``textureNN_speedS_forceF.npz`` with ``spikes`` (steps, 10), a step a millisecond, of which nine columns
 are taxels: the recordings of github.com/LIMB-UCF/NTP. Silent ones are omitted. Beside the choice stands a quadratic
-ridge on counts and rates, whose penalty is chosen by the same folds.
+ridge on counts and rates, whose penalty is chosen by the same folds, and the best network at any price, trained on all
+of the training split.
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ import io
 import json
 import os
 import re
+import subprocess
+import sys
 import tempfile
+import time
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -28,6 +32,7 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.studies.smallest.baselines import RIDGE, features, machine
 from spikeloom.runtime.studies.smallest.space import Candidate
+from spikeloom.runtime.studies.smallest.work import RUNGS
 
 NAME = re.compile(r"texture(?P<texture>[0-9]+)_speed(?P<speed>[0-9]+)_force(?P<force>[0-9.]+)\.npz")
 TAXELS = 9
@@ -58,6 +63,13 @@ def write_events(archive: Path, folder: Path, condition: str) -> None:
                 (split / f"{Path(name).stem}_label_{label}.csv").write_text(text)
 
 
+def write_taxels(file: Path) -> Path:
+    """Places of the taxels, on a square of three by three."""
+    places = [f"{index // 3 * 2},{index % 3 * 2}" for index in range(TAXELS)]
+    file.write_text("\n".join(["x,y", *places]))
+    return file
+
+
 def about(name: str) -> dict[str, str]:
     """Texture, speed and force of a file."""
     match = NAME.fullmatch(name)
@@ -65,8 +77,11 @@ def about(name: str) -> dict[str, str]:
     return match.groupdict()
 
 
-def row_of(condition: str, found: Any, train: Recordings, test: Recordings) -> dict[str, Any]:
+def row_of(condition: str, found: Any, folder: Path, sensor: list[str]) -> dict[str, Any]:
     """What stands in the result, of the JSON of a search."""
+    train, test = (
+        recordings(str(folder), split, classes=None, taxels=TAXELS) for split in ("train", "test")
+    )
     tried = found["tried"]
     chosen = tried[found["choice"]["cheapest"]["davies2018"] - 1]
     best = tried[found["choice"]["best"] - 1]
@@ -79,13 +94,27 @@ def row_of(condition: str, found: Any, train: Recordings, test: Recordings) -> d
         "left_out": condition.replace("=", " "),
         "test": found["data"]["test"],
         "chosen": side_of(chosen) | {"right": found["checked"]["right"]["correct"]},
-        "best": side_of(best),
+        "best": side_of(best) | {"right": right_fully_trained(best, folder, sensor)},
         "counters": side_of(counters),
         "ridge": {"accuracy": ridge["accuracy"], "right": right_by_ridge(ridge["setting"], train, test)},
         "at_random": found.get("at_random"),
+        "last_rung": [side_of(each) | {"behind": each["behind"]} for each in tried if each["rung"] >= RUNGS],
         "families": found["families"],
         "sha256": found["data"]["sha256"],
     }
+
+
+def right_fully_trained(tried: Any, folder: Path, sensor: list[str]) -> int:
+    """Right decisions of the chip in the test split, by a candidate that is trained on all of the training split."""
+    about = dict(word.split("=", 1) for word in tried["name"].split()[1:])
+    words = [word for name, value in about.items() for word in (f"--{name.replace('_', '-')}", value)]
+    with tempfile.TemporaryDirectory() as scratch:
+        network = f"{scratch}/best.pt"
+        words += ["--system", tried["system"], "--epochs", f"{tried['setting']:g}", "--keep", "last"]
+        command = ["train", "--data", str(folder), *sensor, *words, "-o", network]
+        subprocess.run([sys.executable, "-m", "spikeloom", *command], check=True, stdout=subprocess.DEVNULL)
+        made = spikeloom.compile(network, calibrate=str(folder), weight_bits=8).run(str(folder))
+        return int(np.count_nonzero(made.predictions == made.labels))
 
 
 def side_of(tried: Any) -> dict[str, Any]:
@@ -93,6 +122,7 @@ def side_of(tried: Any) -> dict[str, Any]:
     return {
         "name": tried["name"],
         "accuracy": tried["accuracy"],
+        "epochs": tried["setting"],
         "energy_j": tried["costs"]["energy_j"]["davies2018"],
         "conditions": tried["conditions"],
     }
@@ -118,19 +148,17 @@ def main() -> None:
     options = parser.parse_args()
     rows = json.loads(options.output.read_text())["rows"] if options.output.exists() else []
     with tempfile.TemporaryDirectory() as scratch:
-        taxels = Path(scratch, "taxels.csv")
-        places = [f"{index // 3 * 2},{index % 3 * 2}" for index in range(TAXELS)]
-        taxels.write_text("\n".join(["x,y", *places]))
+        taxels = write_taxels(Path(scratch, "taxels.csv"))
         for condition in options.only:
             folder = Path(scratch, condition)
             write_events(options.archive, folder, condition)
             about = {"groups": "speed,force", "taxels": str(taxels), "graph": "knn:4", "time": options.time}
+            begun = time.monotonic()
             found = spikeloom.smallest(str(folder), f"{folder}.loom", jobs=options.jobs, **about)
-            splits = [
-                recordings(str(folder), split, classes=None, taxels=TAXELS) for split in ("train", "test")
-            ]
+            seconds = round(time.monotonic() - begun)
             head = {"command": COMMAND, "spikeloom": __version__, "data_sha256": sha256_of(options.archive)}
-            row = row_of(condition, json.loads(found.to_json()), *splits)
+            sensor = ["--taxels", str(taxels), "--graph", "knn:4"]
+            row = row_of(condition, json.loads(found.to_json()), folder, sensor) | {"seconds": seconds}
             row["how"] = f"--time {options.time}, {options.jobs or os.cpu_count()} processes"
             rows = [*(each for each in rows if each["left_out"] != condition), row]
             options.output.write_text(json.dumps(head | {"rows": rows}, indent=1) + "\n")

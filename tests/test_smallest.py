@@ -181,9 +181,11 @@ def test_candidates_can_all_be_trained():
     for each, bits in ((every[0], (8, 5, 4)), (few, (5, 4, 3))):
         assert tuple(other.plan().bits for other in (each, *space.variants(each, 2))) == bits
     systems = ("tactilesgnet", "mlp", "gcn", "grid-cnn")
-    trained = list(space.networks(250, systems))
-    assert len({each.name for each in trained}) == len(trained) > 30
+    first = list(space.networks(250, systems))
+    trained = [*first, *(other for each in first for other in space.other_ways(each, 250))]
+    assert len({each.name for each in trained}) == len(trained) > 50
     assert {each.system for each in trained} == set(systems)
+    assert {each.options["join"] for each in trained} == {2, 5, 10}
     assert {each.options["join"] for each in space.networks(30, systems)} == {1}
     for each in trained:
         recipe_of(request_of(TrainRequest, [*each.words, "--data", "d", "-o", "o.pt"]))
@@ -250,9 +252,9 @@ def test_the_command(few, monkeypatch, target, table):
 def trained(few, monkeypatch):
     """Two networks that are trained by gradients, for a few epochs, and no others."""
     monkeypatch.setattr(smallest, "counting", lambda *_: [])
-    monkeypatch.setattr(space, "SIZES", (("mlp", 8, None, "8"), ("mlp", 4, None, "none")))
+    monkeypatch.setattr(space, "SIZES", (("mlp", 8, None, "8", 0.0), ("mlp", 4, None, "none", 0.0)))
     monkeypatch.setattr(space, "STEPS", (10, 10))
-    monkeypatch.setattr(space, "LASTING", ())
+    monkeypatch.setattr(study, "other_ways", lambda *_: [])
     for module in (space, study, work):
         monkeypatch.setattr(module, "EPOCHS", (2, 4, 8, 12))
     return few
@@ -293,9 +295,13 @@ def test_networks_that_are_trained_by_gradients(trained, monkeypatch):
     assert "The smallest network for synthetic" in written
 
 
-def test_a_crippled_network_is_not_called_tried_to_the_end(trained, monkeypatch):
+@pytest.mark.parametrize(
+    ("far", "why"), [(1.0, "more epochs still helped"), (0.0, "it was dropped, or time was short")]
+)
+def test_a_crippled_network_is_not_called_tried_to_the_end(trained, monkeypatch, far, why):
     monkeypatch.setattr(study, "TRAINED", {1: 1, 2: 1, 3: 1})
-    monkeypatch.setattr(space, "SIZES", (("gcn", 4, None, "none"), ("mlp", 4, None, "none")))
+    monkeypatch.setattr(study, "FAR", far)
+    monkeypatch.setattr(space, "SIZES", (("gcn", 4, None, "none", 0.0), ("mlp", 4, None, "none", 0.0)))
     measure = work.measure
 
     def cripple(job):
@@ -309,7 +315,7 @@ def test_a_crippled_network_is_not_called_tried_to_the_end(trained, monkeypatch)
     status, text, _ = run(*WORDS, "--graph", "manual")
     assert status == 0
     assert "mlp: not tried to the end" in text
-    assert "more epochs still helped" in text
+    assert why in text
 
 
 @pytest.mark.usefixtures("trained")

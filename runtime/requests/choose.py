@@ -33,7 +33,7 @@ class SmallestRequest(SensorChoice, ConditionChoice):
         metavar="WHAT=LIMIT[,…]",
     )
     time: str | None = option(
-        "start nothing new after this time, as in 30m; the same command continues (default: 20m)",
+        "start nothing new after this time, as in 30m; the same command continues (default: 15m)",
         metavar="TIME",
     )
     store: str | None = option(

@@ -42,7 +42,7 @@ from spikeloom.runtime.studies.training.plan import both_splits
 
 SENSOR = ("graph", "taxels", "edges", "directed")
 
-DEFAULT_TIME = "20m"
+DEFAULT_TIME = "15m"
 
 GRAPH = "manual"
 """Of the built-in sensor, unless another is named."""
@@ -51,10 +51,10 @@ NOTES = """\
 Candidates are counting networks and networks trained by gradients, of many sizes. They are cross-validated inside the
 training split, in rungs: what a cheaper one beats is dropped early, the others are trained for longer. If recordings
 have groups, such as speed, each of their values is left out in turn; else parts at random are, which says nothing of
-other conditions. Taken is the cheapest whose accuracy is at most 1.5 % and a standard error below the best, recording
-by recording; it is trained on the whole training split, compiled and verified, and read on the test split once. Results
-are kept in the store; the same command goes on from there, other budgets ask it again; delete it to measure anew. The
-exit code is 1 if no candidate fits a budget.
+other conditions. Taken is the cheapest whose accuracy is at most 2 % below the best, and not shown to be lower by a
+paired test, recording by recording; it is trained on the whole training split, compiled and verified, and read on the
+test split once. Results are kept in the store; the same command goes on from there, other budgets ask it again; delete
+it to measure anew. The exit code is 1 if no candidate fits a budget.
 """
 
 

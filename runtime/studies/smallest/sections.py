@@ -169,6 +169,26 @@ def _conditions(result: Smallest) -> Iterator[str]:
             "with parts at random left out, so that all conditions are known, it reaches "
             f"{100 * result.at_random:.1f} %: expect {100 * chosen.accuracy:.1f} % where a condition is new"
         )
+    if spans := list(_spans(result.conditions)):
+        yield f"not tested: {', '.join(spans)}; expect less there"
+
+
+def _spans(conditions: Sequence[str]) -> Iterator[str]:
+    """What lies beyond the conditions that are numbers.
+
+    >>> list(_spans(["speed=10", "speed=9", "hand=left", "force=1"]))
+    ['speed below 9 or above 10']
+    """
+    values: dict[str, list[str]] = {}
+    for group, value in (each.split("=", 1) for each in conditions if "=" in each):
+        values.setdefault(group, []).append(value)
+    for group, known in values.items():
+        try:
+            ordered = sorted(known, key=float)
+        except ValueError:
+            continue
+        if len(ordered) > 1:
+            yield f"{group} below {ordered[0]} or above {ordered[-1]}"
 
 
 def _needless(result: Smallest) -> str:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -33,26 +33,26 @@ EPOCHS = (12, 24, 48, 96)
 """Of networks that are trained by gradients, by rung."""
 
 SIZES = (
-    (TACTILESGNET, 64, 3, "128,256"),
-    (TACTILESGNET, 16, 1, "64,128"),
-    (TACTILESGNET, 32, 1, "128"),
-    (TACTILESGNET, 32, 2, "64"),
-    (TACTILESGNET, 16, 1, "64"),
-    (TACTILESGNET, 32, 1, "none"),
-    (TACTILESGNET, 16, 1, "32"),
-    (TACTILESGNET, 8, 1, "64"),
-    (TACTILESGNET, 8, 1, "32"),
-    (TACTILESGNET, 16, 1, "none"),
-    (TACTILESGNET, 4, 1, "16"),
-    (MLP, 64, None, "128,256"),
-    (MLP, 32, None, "64"),
-    (GCN, 32, None, "64"),
-    (GRID_CNN, 32, None, "64"),
+    (TACTILESGNET, 64, 3, "128,256", 0.0),
+    (TACTILESGNET, 64, 3, "64", 0.3),
+    (TACTILESGNET, 32, 3, "128", 0.3),
+    (TACTILESGNET, 32, 3, "64", 0.1),
+    (TACTILESGNET, 16, 1, "64", 0.3),
+    (TACTILESGNET, 32, 1, "none", 0.0),
+    (TACTILESGNET, 16, 1, "32", 0.0),
+    (TACTILESGNET, 8, 3, "32", 0.0),
+    (TACTILESGNET, 4, 1, "16", 0.0),
+    (MLP, 64, None, "128,256", 0.0),
+    (MLP, 64, None, "128", 0.0),
+    (MLP, 64, None, "64", 0.0),
+    (MLP, 32, None, "32", 0.0),
+    (GCN, 32, None, "64", 0.0),
+    (GRID_CNN, 32, None, "64", 0.0),
 )
-"""System, features, hops and dense layers of these, the largest first: they take longest."""
+"""System, features, hops, dense layers and penalty on spikes, the largest of a system first: they take longest."""
 
-LASTING = (3, 6)
-"""Those of them, by place, that are also trained with currents that last and clocks."""
+USUAL_STEPS = 60
+"""Steps near which the bins of a network are joined at first."""
 
 STEPS = (25, 130)
 """Steps that a usual recording has in these, at least and at most, by the bins that are joined."""
@@ -112,22 +112,43 @@ def networks(steps: int, systems: Collection[str]) -> Iterator[Candidate]:
     """Networks of some systems that are trained by gradients, for recordings that usually have so many bins.
 
     >>> {each.options["join"] for each in networks(250, ["mlp"])}
-    {2, 10, 5}
+    {5}
     """
+    join = min(_joins(steps), key=lambda join: abs(math.log(steps / join / USUAL_STEPS)))
+    for system, features, hops, hidden, penalty in SIZES:
+        options = {
+            "recipe": "rates",
+            "join": join,
+            "features": features,
+            "hops": hops,
+            "hidden": hidden,
+            "spike_penalty": penalty or None,
+        }
+        if system in systems:
+            given = {name: value for name, value in options.items() if value is not None}
+            yield Candidate(system=system, options=given)
+
+
+def _joins(steps: int) -> list[int]:
+    """Bins that may be joined, so that recordings keep as many steps as these networks need."""
     least, most = STEPS
-    joins = [join for join in JOINS if least <= steps / join <= most] or [1]
-    for place, (system, features, hops, hidden) in enumerate(SIZES):
-        for join in joins if system in systems else ():
-            for recipe in ("rates", "timed") if place in LASTING else ("rates",):
-                options = {
-                    "recipe": recipe,
-                    "join": join,
-                    "features": features,
-                    "hops": hops,
-                    "hidden": hidden,
-                }
-                given = {name: value for name, value in options.items() if value is not None}
-                yield Candidate(system=system, options=given)
+    return [join for join in JOINS if least <= steps / join <= most] or [1]
+
+
+def other_ways(candidate: Candidate, steps: int) -> list[Candidate]:
+    """The same network in other bins, and with currents that last and clocks.
+
+    >>> few = Candidate(system="mlp", options={"recipe": "rates", "join": 5, "hidden": "32"})
+    >>> for each in other_ways(few, 50):
+    ...     print(each.name)
+    mlp recipe=rates join=1 hidden=32
+    mlp recipe=rates join=2 hidden=32
+    mlp recipe=timed join=5 hidden=32
+    """
+    options = candidate.options
+    others = [join for join in _joins(steps) if join != options["join"]]
+    changes: list[dict[str, Any]] = [*({"join": join} for join in others), {"recipe": "timed"}]
+    return [replace(candidate, options={**options, **each}) for each in changes]
 
 
 def _counters(**options: Any) -> Candidate:

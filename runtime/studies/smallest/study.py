@@ -5,7 +5,7 @@ with more strengths, and from there to five rounds. Networks that are trained by
 many epochs on each rung, from where they stopped; the best of each system goes on in any case, and those whose
 learning curve still rises on the last rung get one more. What is left out in turn are conditions, if the
 recordings have any. Everything happens on the training split but the last look at the choice. Taken is the
-cheapest that is at most `MARGIN` and a standard error behind the best.
+cheapest that is at most `MARGIN` behind the best and not shown to be worse.
 """
 
 import shutil
@@ -28,12 +28,12 @@ from spikeloom.models.training.folds import every, folds_of
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.jobs import sweep
 from spikeloom.runtime.studies.search.budgets import SHARES, Budget, excess
-from spikeloom.runtime.studies.search.choice import NEAR, choose, front, is_worse, lead
+from spikeloom.runtime.studies.search.choice import NEAR, choose, front, lead
 from spikeloom.runtime.studies.search.results import chosen_by, titles_of
 from spikeloom.runtime.studies.smallest import work
 from spikeloom.runtime.studies.smallest.baselines import baselines
 from spikeloom.runtime.studies.smallest.results import Checked, Choice, Family, Smallest, Tried
-from spikeloom.runtime.studies.smallest.space import EPOCHS, Candidate, variants
+from spikeloom.runtime.studies.smallest.space import EPOCHS, Candidate, other_ways, variants
 from spikeloom.runtime.studies.smallest.work import RUNGS, Measured, Scene
 
 POINT = 0.01
@@ -45,14 +45,23 @@ LIMITS = ("energy", "time", "operations", "cores", "accuracy", "certified")
 KEPT = {1: 20, 2: 14, 3: 14}
 """Candidates that go on from a rung."""
 
-TRAINED = {1: 9, 2: 6, 3: 3}
+TRAINED = {1: 6, 2: 4, 3: 2}
 """The same of networks that are trained by gradients; beside them goes the best of each system."""
 
-MARGIN = 0.015
-"""Accuracy that the choice may be behind the best."""
+FAR = 0.1
+"""Accuracy behind the best from which a system goes no further; the answer says that it was not tried to the end."""
+
+MARGIN = 0.02
+"""Accuracy that the choice may be behind the best, if a paired test does not show that it is worse."""
+
+CONFIDENT = 1.96
+"""Standard errors of a difference that show it: 95 % of a normal distribution are within."""
 
 VARIED = {1: 12, 2: 4}
 """Those of them, the first, of which variants go on, too."""
+
+VARIED_NETWORKS = 2
+"""Networks trained by gradients, the most accurate, beside which others go on in other bins after the first rung."""
 
 BEST = 50
 """How much more it weighs to be behind a cheaper one than behind the best: the front goes on, down to cheap ones."""
@@ -119,7 +128,8 @@ def smallest(
     folds = list(every(folds_of(training, 1)))
     scene.states.mkdir(exist_ok=True)
     beside = search(baselines(), most_accurate, scene, work_on)
-    tried = try_all(counters, networks, len(folds), budgets, scene, work_on)
+    steps = int(np.median(training.step_counts))
+    tried = try_all(counters, networks, len(folds), budgets, scene, work_on, steps)
     taken = pick(tried, budgets)
     best = tried[taken.best - 1]
     tried = [_beside(each, best, tried) for each in tried]
@@ -155,10 +165,11 @@ def try_all(
     budgets: Sequence[Budget],
     scene: Scene,
     work_on: Work,
+    steps: int,
 ) -> list[Tried]:
     """Counting networks, then those that are trained by gradients; OptionError if time was too short for any."""
     tried = search(counters, partial(promote, budgets=budgets), scene, work_on)
-    trained = train_all(networks, folds, budgets, scene, work_on)
+    trained = train_all(networks, folds, budgets, scene, work_on, steps)
     tried += [replace(each, number=len(tried) + each.number) for each in trained]
     if not any(each.rung >= RUNGS or each.refused for each in tried):
         raise OptionError(
@@ -196,9 +207,17 @@ def search(
 
 
 def train_all(
-    candidates: Sequence[Candidate], folds: int, budgets: Sequence[Budget], scene: Scene, work_on: Work
+    candidates: Sequence[Candidate],
+    folds: int,
+    budgets: Sequence[Budget],
+    scene: Scene,
+    work_on: Work,
+    steps: int,
 ) -> list[Tried]:
-    """The same for networks that are trained by gradients, of which as many epochs are asked as rungs are climbed."""
+    """The same for networks that are trained by gradients, for more epochs on each rung.
+
+    Recordings usually have so many `steps`: beside the first that go on are the same in other bins.
+    """
     known: dict[str, Tried] = {}
     alive = list(candidates)
     for rung, epochs in enumerate(EPOCHS, 1):
@@ -213,7 +232,11 @@ def train_all(
                 number_of = len(known) + 1 if before is None else before.number
                 known[each.name] = _grown(before, _tried(number_of, each, rung, measured))
         came = [known[each.name] for each in alive if each.name in known and known[each.name].rung == rung]
-        alive = [each.candidate for each in climbing(came, rung, budgets)]
+        on = climbing(came, rung, budgets)
+        alive = [each.candidate for each in on]
+        if rung == 1:
+            best = sorted(on, key=lambda each: -each.accuracy)[:VARIED_NETWORKS]
+            alive += [other for each in best for other in other_ways(each.candidate, steps)]
     return list(known.values())
 
 
@@ -228,9 +251,9 @@ def climbing(tried: Sequence[Tried], rung: int, budgets: Sequence[Budget]) -> li
     likely = promote(tried, rung, budgets, BEST if enough else NEAR_BEST)
     on = {each.number: each for each in likely[: TRAINED[rung]]}
     if rung < RUNGS:
-        for system in dict.fromkeys(each.candidate.system for each in tried):
-            same = [each for each in tried if each.candidate.system == system and each.costs is not None]
-            on |= {each.number: each for each in sorted(same, key=lambda each: -each.accuracy)[:1]}
+        able = sorted((each for each in tried if each.costs is not None), key=lambda each: -each.accuracy)
+        first = {each.candidate.system: each for each in reversed(able)}
+        on |= {each.number: each for each in first.values() if each.accuracy >= able[0].accuracy - FAR}
     else:
         on = {number: each for number, each in on.items() if not each.finished}
     return [on[number] for number in sorted(on)]
@@ -341,7 +364,7 @@ def energy(tried: Tried, table: str | None = None) -> float:
 def pick(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
     """The cheapest of the last rung, by each table, that fits the budgets and is about as accurate as the best.
 
-    Its accuracy may be lower by `MARGIN` and by a standard error of the difference, recording by recording.
+    Its accuracy may be lower by `MARGIN`, and is not shown to be lower by a paired test, recording by recording.
     Where an accuracy is wanted, all that reach it are good enough. Where no candidate of the last rung fits,
     earlier ones may.
     """
@@ -380,8 +403,9 @@ def _cheaper(pool: Sequence[Tried], chosen: Tried) -> int | None:
 
 
 def worse(best: Tried, other: Tried) -> bool:
-    """Whether one is more than the margin or a standard error less accurate than another."""
-    return is_worse(best.shares, other.shares) or lead(best.shares, other.shares)[0] > MARGIN + NEAR
+    """Whether one is more than the margin less accurate than another, or shown to be so, recording by recording."""
+    ahead, error = lead(best.shares, other.shares)
+    return ahead > min(MARGIN, CONFIDENT * error) + NEAR
 
 
 def values(tried: Tried) -> dict[str, float]:

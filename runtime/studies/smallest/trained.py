@@ -45,7 +45,8 @@ def plan_of(candidate: Candidate, sensor: Sensor, training: Recordings) -> Plan:
     options = candidate.options
     recipe = RECIPES[options["recipe"]]
     sizes = {name: options[name] for name in ("features", "hops") if name in options}
-    recipe = replace(recipe, **sizes, hidden=hidden_sizes(options["hidden"]))
+    penalty = options.get("spike_penalty", 0.0)
+    recipe = replace(recipe, **sizes, hidden=hidden_sizes(options["hidden"]), penalty=penalty)
     layers = recipe.layers
     recipe = replace(
         recipe,
