@@ -244,6 +244,19 @@ for words, allowed in json.loads(sys.argv[1]).items():
     subprocess.run([sys.executable, "-c", code, json.dumps(table)], check=True, cwd=tmp_path)
 
 
+def test_inspect_loads_nothing_that_compiles_or_reads_recordings(tmp_path, spikeloom):
+    path = tmp_path / "g.loom"
+    assert spikeloom("compile", "pretrained:grasps", "-o", path)[0] == 0
+    code = f"""
+import sys
+from spikeloom.runtime import cli
+assert cli.main(["inspect", {str(path)!r}]) == 0
+for name in ("compiler.targets.loihi1.bounds", "compiler.passes.prune", "models.recordings.events"):
+    assert "spikeloom." + name not in sys.modules, name
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, stdout=subprocess.DEVNULL)
+
+
 @pytest.mark.usefixtures("spikeloom")
 def test_progress_goes_to_a_terminal_only(monkeypatch, capsys):
     class Terminal(io.StringIO):

@@ -24,7 +24,7 @@ from spikeloom.compiler.arrays import frozen, read_only, read_only_float
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.files import FileFault, reading
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.types import IntArray, JsonObject
 
 N = TypeVar("N")
 
@@ -38,6 +38,26 @@ COMMON: dict[str, archive.Kind] = {
     **dict.fromkeys(("taxels", "polarities", "classes"), (1, MOST)),
 }
 """Entries of every manifest."""
+
+
+def names_of(training: Mapping[str, Any] | None, classes: int) -> list[str] | None:
+    """Names of the classes of a network, if it knows one for each."""
+    names: list[str] | None = origin_of(training).get("class_names")
+    return names if names is None or len(names) == classes else None
+
+
+def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
+    """What a netlist remembers of the recordings behind a network: name, bins and names of classes."""
+    kinds = {"data": str, "bin_s": float}
+    origin = {
+        name: training[name]
+        for name, kind in kinds.items()
+        if training and isinstance(training.get(name), kind)
+    }
+    names = (training or {}).get("class_names")
+    if isinstance(names, list | tuple) and names and all(isinstance(name, str) for name in names):
+        origin["class_names"] = list(names)
+    return origin
 
 
 class Netlist:

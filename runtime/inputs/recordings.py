@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.targets.netlist_file import Netlist
-from spikeloom.compiler.types import JsonObject
+from spikeloom.compiler.targets.netlist_file import Netlist, origin_of
 from spikeloom.models.recordings import events
 from spikeloom.models.recordings.classes import listed, renamed, without_gaps
 from spikeloom.models.recordings.conditions import with_groups
@@ -93,26 +92,6 @@ def _first(data: Recordings, limit: int | None) -> Recordings:
     if limit is not None and limit < 1:
         raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
     return data.part(slice(limit))
-
-
-def names_of(training: Mapping[str, Any] | None, classes: int) -> list[str] | None:
-    """Names of the classes of a network, if it knows one for each."""
-    names: list[str] | None = origin_of(training).get("class_names")
-    return names if names is None or len(names) == classes else None
-
-
-def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
-    """What a netlist remembers of the recordings behind a network: name, bins and names of classes."""
-    kinds = {"data": str, "bin_s": float}
-    origin = {
-        name: training[name]
-        for name, kind in kinds.items()
-        if training and isinstance(training.get(name), kind)
-    }
-    names = (training or {}).get("class_names")
-    if isinstance(names, list | tuple) and names and all(isinstance(name, str) for name in names):
-        origin["class_names"] = list(names)
-    return origin
 
 
 def _require_asked(bin_s: float | None, own: float | None) -> None:

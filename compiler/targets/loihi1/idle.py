@@ -14,7 +14,6 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.targets.loihi1.bounds import reach
 from spikeloom.compiler.targets.loihi1.netlist import MOST_BLANK, Netlist
 from spikeloom.compiler.targets.loihi1.registers import CURRENT_MAX, DECAY_ONE, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.types import IntArray
@@ -43,6 +42,8 @@ class Forgotten:
 
 def forgotten(netlist: Netlist) -> Forgotten:
     """Bound a netlist's registers step by step; OptionError if some never decay, or take too long."""
+    from spikeloom.compiler.targets.loihi1.bounds import reach
+
     n = netlist.n_compartments
     sent = netlist.axon_source[netlist.axon_of_synapse()] - netlist.n_inputs
     inner = sent >= 0

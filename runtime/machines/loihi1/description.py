@@ -15,9 +15,9 @@ from spikeloom.compiler.targets.loihi1.layout.place import chip_count
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, words_of_axons
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.targets.loihi1.registers import kept_shares
+from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.counts import number
-from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 from spikeloom.runtime.report.shown import Shown

@@ -12,8 +12,8 @@ from spikeloom.compiler.formats.onnx import writer as onnx
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
+from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.models.recordings.evtouch import BIN_S
-from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.machines.exports import Export, Facts, Format
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.requests.exchange import ExportRequest

@@ -14,12 +14,13 @@ from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.netlist import write_netlist
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import Compilation, compile_network
+from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.types import BoolArray, EventArray
 from spikeloom.models.recordings.events import of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.compilation import parse_cores, provenance, storage_of
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
-from spikeloom.runtime.inputs.recordings import origin_of, recordings
+from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.inputs.repeat import LAYOUT, NETWORK, ROUNDING, command, refuse, typed
 from spikeloom.runtime.machines.backend import Lowered
 from spikeloom.runtime.machines.base import Model

@@ -10,11 +10,11 @@ import numpy as np
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.native import BASES, SYSTEM, highest_level
 from spikeloom.compiler.targets.truenorth.native_file import Trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars
-from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 from spikeloom.runtime.report.shown import Shown

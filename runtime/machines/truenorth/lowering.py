@@ -8,13 +8,13 @@ from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.counters import read_counters
 from spikeloom.compiler.ir import Network
+from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Options, Source, compile_crossbars
 from spikeloom.compiler.types import JsonObject
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import COUNTING, load_network
-from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
 from spikeloom.runtime.machines.backend import Lowered, Reference
 from spikeloom.runtime.machines.truenorth.description import describe
