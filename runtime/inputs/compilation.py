@@ -7,10 +7,10 @@ from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.storage import Cheapest, Exact, Fixed, Given, Packing, Storage
+from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
-from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.requests.main_job import CompileRequest
 
 STORED = ("weight_bits", "planes", "scale_groups", "spike_exact", "keep")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.targets.netlist_file import Netlist, origin_of
+from spikeloom.compiler.targets.netlist_file import Netlist, names_of, origin_of
 from spikeloom.models.recordings import events
 from spikeloom.models.recordings.classes import listed, renamed, without_gaps
 from spikeloom.models.recordings.conditions import with_groups

@@ -1,22 +1,26 @@
 """A chip: how it lowers networks, reads and runs netlists; all are listed in :mod:`machines.backends`."""
 
+from __future__ import annotations
+
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.netlist_file import Netlist
-from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.machines.base import Machine, Model
 from spikeloom.runtime.machines.exports import Format
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.choices import ComparisonChoice
 from spikeloom.runtime.requests.main_job import CompileRequest, InspectRequest
+
+if TYPE_CHECKING:
+    from spikeloom.runtime.inputs.network import LoadedNetwork
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -112,6 +116,8 @@ class Backend(ABC):
 
     def reference(self, request: ComparisonChoice, netlist: Any) -> Reference:
         """Read the network that `verify` was given beside a netlist; by default a network of floats."""
+        from spikeloom.runtime.inputs.network import load_network
+
         loaded = load_network(request.checkpoint, request, netlist)
         return Reference(
             network=loaded.network,

@@ -6,18 +6,23 @@ References
    Nature Communications 16, 1545, 2025; definitions as in the package neurobench 2.3.0.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from spikeloom.compiler.interpret import channels_last, cut
 from spikeloom.compiler.ir import INPUT
-from spikeloom.compiler.targets.compartments import IntegerNetwork
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.capabilities import Comparable
 from spikeloom.runtime.report.encode import key
 from spikeloom.runtime.report.sections import Section, Table, Text
+
+if TYPE_CHECKING:
+    from spikeloom.compiler.targets.compartments import IntegerNetwork
 
 BIAS_BITS = 16
 

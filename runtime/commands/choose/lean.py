@@ -8,13 +8,14 @@ from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.storage import Fixed, Given
 from spikeloom.compiler.targets.compartments import write_netlist
+from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.models.recordings.events import of_length
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.checkpoint import load_graph
 from spikeloom.runtime.inputs.compilation import remembered
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
-from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
+from spikeloom.runtime.inputs.recordings import recordings, require_splits
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import Outcome

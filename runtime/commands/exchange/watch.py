@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
-from spikeloom.compiler.targets.netlist_file import Netlist
+from spikeloom.compiler.targets.netlist_file import Netlist, names_of, origin_of
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.eventlines import EventLines
 from spikeloom.runtime.machines.base import Machine
@@ -30,7 +30,6 @@ REQUEST = WatchRequest
 
 def run(request: WatchRequest) -> Outcome:
     """Run the command; its result is the summary, everything else was printed before."""
-    from spikeloom.runtime.inputs.recordings import names_of
     from spikeloom.runtime.machines.backends import machine_for
 
     _require_length(request)
@@ -97,7 +96,6 @@ def _bins(request: WatchRequest, netlist: Netlist) -> int | None:
 def _step_seconds(request: WatchRequest, netlist: Netlist) -> Decimal:
     """Length of a step, which may join several bins of the recordings."""
     from spikeloom.models.recordings.evtouch import BIN_S
-    from spikeloom.runtime.inputs.recordings import origin_of
 
     bin_s = None if request.bin is None else _duration(request.bin)
     trained = origin_of(netlist.provenance).get("bin_s")

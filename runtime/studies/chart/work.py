@@ -23,6 +23,7 @@ from spikeloom.compiler.targets.compartments import (
     to_integers,
     write_netlist,
 )
+from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.recordings.conditions import by_condition
 from spikeloom.models.recordings.events import joined_bins, of_length
@@ -31,7 +32,7 @@ from spikeloom.runtime.equivalence.reference import votes_so_far
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.compilation import parse_cores, provenance, storage_of
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
-from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
+from spikeloom.runtime.inputs.recordings import recordings, require_splits
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.report.encode import encode

@@ -18,6 +18,7 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.base import COMPARTMENTS, Target
 from spikeloom.compiler.targets.compartments import check_packings, round_to_forms
+from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import BIN_S, Recordings, data_digest
@@ -28,7 +29,7 @@ from spikeloom.runtime.inputs.checkpoint import load_graph
 from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
-from spikeloom.runtime.inputs.recordings import origin_of, recordings, require_splits
+from spikeloom.runtime.inputs.recordings import recordings, require_splits
 from spikeloom.runtime.machines.backends import backend_of
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL

@@ -10,10 +10,10 @@ from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
 from spikeloom.compiler.formats.own_checkpoint import save_again
 from spikeloom.compiler.formats.tensors import join as side_by_side
+from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.types import JsonObject
 from spikeloom.runtime.inputs.checkpoint import load_checkpoint
 from spikeloom.runtime.inputs.files import require_place, shipped
-from spikeloom.runtime.inputs.recordings import origin_of
 from spikeloom.runtime.report.checkpoints import LayerSize, tower_line
 from spikeloom.runtime.report.sections import Section, Text
 from spikeloom.runtime.report.shown import Shown
