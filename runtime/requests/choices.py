@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 NETWORK_FILES = "CKPT|NET.onnx|NET.nir"
 """What a float network is read from."""
 
-BIN_HELP = f"width of a bin of events or arrays (default: the one that the network was trained on, else {BIN_S:g} s)"
+BIN_HELP = (
+    f"seconds in a bin of events or arrays (default: those that the network was trained on, else {BIN_S:g})"
+)
 
 DATA_HELP = (
     "recordings: a folder or zip of the released layout, events (csv, npz) or arrays (npy, npz), one such file, "
@@ -66,7 +68,9 @@ class CheckpointChoice(SensorChoice):
         choices=WEIGHTS,
         group="network",
     )
-    beta: float | None = option("membrane decay, if the file does not say (default: 0.2)", group="network")
+    beta: float | None = option(
+        "share of a membrane that a step keeps, if the file does not say (default: 0.2)", group="network"
+    )
     theta: float | None = option("threshold, if the file does not say (default: 0.5)", group="network")
 
 

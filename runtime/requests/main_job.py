@@ -41,13 +41,19 @@ class CompileRequest(NetworkChoice):
     )
     target: str = option("chip: loihi1, or truenorth", default=DEFAULT_TARGET)
     weight_bits: str | None = option(
-        "storage width, one or one a layer: 2 to 6 or 8 (default: 8)", metavar="N[,N]", group="storage"
+        "bits of a stored weight, for all layers or one each: 2 to 6 or 8 (default: 8)",
+        metavar="N[,N]",
+        group="storage",
     )
     planes: str | None = option(
-        "synapses that together hold a weight, 1 to 3 (default: 1)", metavar="N[,N]", group="storage"
+        "synapses that together store one weight more finely, 1 to 3 (default: 1)",
+        metavar="N[,N]",
+        group="storage",
     )
     scale_groups: str | None = option(
-        "scales in a layer, 1 to 8 (default: 1)", metavar="N[,N]", group="storage"
+        "groups of neurons in a layer that have a scale of their own, 1 to 8 (default: 1)",
+        metavar="N[,N]",
+        group="storage",
     )
     spike_exact: bool = option(
         "add planes and scales until the training spikes are the float model's",
@@ -69,7 +75,7 @@ class CompileRequest(NetworkChoice):
         "recordings whose training split chooses storage and scales", metavar="PATH", group="storage"
     )
     keep: float | None = option(
-        f"share of equal decisions on held-out training recordings that storage has to keep (default: {KEEP:g})",
+        f"share of the float model's decisions, on held-out training recordings, to keep (default: {KEEP:g})",
         metavar="X",
         group="storage",
     )
@@ -118,11 +124,12 @@ class VerifyRequest(ComparisonChoice, WindowChoice):
         "onnx: onnxruntime runs the integer graph beside our engine", default=ENGINES[0], choices=ENGINES
     )
     min_agreement: float | None = option(
-        f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})", metavar="X"
+        f"share of equal decisions that is enough to pass (default: {MIN_AGREEMENT:g})", metavar="X"
     )
     require: str | None = option(
-        "levels to pass instead: E0 specification = engine, E2 share of spikes in each layer, E3 share of decisions",
-        metavar="E0,E2=X,E3=X",
+        "levels to pass instead: E0 specification = engine, E1 chip = model trained in integers, E2 share of equal "
+        "spikes in each layer, E3 share of equal decisions",
+        metavar="E0,E1,E2=X,E3=X",
     )
     spec_samples: int = option(
         "recordings on which specification and engine are compared", default=3, metavar="N"
@@ -134,7 +141,7 @@ class EstimateRequest(NetlistChoice, RecordingsChoice, WindowChoice):
     """Synaptic operations, energy and time of an inference."""
 
     detail: str = option(
-        "counts: events, energy, simple time model; cycle: the time of every message too",
+        "counts: events, energy and simple times; cycle: also the time of every message",
         default="counts",
         choices=("counts", "cycle"),
         group="depth and prices",
@@ -148,7 +155,7 @@ class EstimateRequest(NetlistChoice, RecordingsChoice, WindowChoice):
         "train a linear rule for a small processor on the same recordings, and compare its costs",
         default=False,
     )
-    neurobench: bool = option("NeuroBench's metrics of the network as the chip holds it", default=False)
+    neurobench: bool = option("add NeuroBench's metrics of the network as the chip holds it", default=False)
 
 
 @dataclass(frozen=True, kw_only=True)

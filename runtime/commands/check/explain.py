@@ -20,8 +20,8 @@ from spikeloom.runtime.requests.check import ExplainRequest
 
 NOTES = """\
 An entry (neuron and step) that differs is a root if no input of the neuron differed since the last step in which both
-sides fired; everything else follows from roots. Without --sample the first recording that differs is explained, of
-the first ten or the first --limit. The reference is the float model in float64.
+sides fired; everything else follows from roots. Without --sample the first recording that differs is explained, if
+it is among the first ten (or --limit). The reference is the float model in float64.
 """
 
 LIMIT = 10

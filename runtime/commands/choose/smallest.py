@@ -49,12 +49,12 @@ GRAPH = "manual"
 
 NOTES = """\
 Candidates are counting networks and networks trained by gradients, of many sizes. They are cross-validated inside the
-training split, in rungs: what a cheaper one beats is dropped early, the others are trained for longer. If recordings
-have groups, such as speed, each of their values is left out in turn; else parts at random are, which says nothing of
-other conditions. Taken is the cheapest whose accuracy is at most 2 % below the best, and not shown to be lower by a
-paired test, recording by recording; it is trained on the whole training split, compiled and verified, and read on the
-test split once. Results are kept in the store; the same command goes on from there, other budgets ask it again; delete
-it to measure anew. The exit code is 1 if no candidate fits a budget.
+training split, in rounds: those that a cheaper one beats are dropped, the others are trained for longer. If recordings
+have groups, such as speed, each of their values is left out in turn; else random parts are, which says nothing of
+other conditions. Taken is the cheapest that is at most 2 % behind the best, and not shown to be worse by a paired
+test, recording by recording; it is trained on the whole training split, compiled and verified, and read on the test
+split once. Results are kept in the store, from which the same command goes on, with another budget too; delete it to
+measure anew. The exit code is 1 if no candidate fits a budget.
 """
 
 
