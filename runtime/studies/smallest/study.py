@@ -49,7 +49,7 @@ TRAINED = {1: 6, 2: 4, 3: 2}
 """The same of networks that are trained by gradients; beside them goes the best of each system."""
 
 FAR = 0.1
-"""Accuracy behind the best from which a system goes no further; the answer says that it was not tried to the end."""
+"""Behind the best by this, 10 points, a system goes no further; the answer says that it was not tried to the end."""
 
 MARGIN = 0.02
 """Accuracy that the choice may be behind the best, if a paired test does not show that it is worse."""
