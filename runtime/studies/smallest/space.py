@@ -29,7 +29,7 @@ MOST_COUNTERS = {100: 50, 50: 20}
 """Counters of a channel at most, by window: what is larger gains little and takes minutes."""
 
 
-EPOCHS = (12, 24, 48, 96)
+EPOCHS = (12, 24, 48, 72)
 """Of networks that are trained by gradients, by rung."""
 
 SIZES = (

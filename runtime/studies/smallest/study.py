@@ -23,7 +23,6 @@ from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.targets.base import Target
 from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.training.counters import FOLDS
 from spikeloom.models.training.folds import every, folds_of
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.studies.jobs import sweep
@@ -47,6 +46,9 @@ KEPT = {1: 20, 2: 14, 3: 14}
 
 TRAINED = {1: 6, 2: 4, 3: 2}
 """The same of networks that are trained by gradients; beside them goes the best of each system."""
+
+AT_RANDOM = 3
+"""Parts at random that the choice is trained without, of networks that are trained by gradients, beside conditions."""
 
 FAR = 0.1
 """Behind the best by this, 10 points, a system goes no further; the answer says that it was not tried to the end."""
@@ -275,7 +277,7 @@ def accuracy_at_random(each: Tried, scene: Scene, work_on: Work) -> float | None
     if each.candidate.system == COUNTING:
         works = [work.trial(each.candidate, each.rung, each.setting, scene, **about)]
     else:
-        works = work.trials(each.candidate, each.rung, scene, FOLDS, **about)
+        works = work.trials(each.candidate, each.rung, scene, AT_RANDOM, **about)
     found = work_on.measure(works, "parts at random")
     parts = [found[job.key] for job in works if job.key in found]
     return accuracy(work.merged(parts)) if len(parts) == len(works) else None
