@@ -128,7 +128,7 @@ class FinetuneRequest(NetworkChoice, DataChoice):
     )
     target: str = option("chip", default=DEFAULT_TARGET)
     weight_bits: str | None = option(
-        "storage width, for all layers or one each: 2 to 6 or 8 (default: as compile --calibrate chooses)",
+        "bits of a stored weight, for all layers or one each: 2 to 6 or 8 (default: as compile --calibrate chooses)",
         metavar="N[,N]",
     )
     scale_groups: int | None = option("scales in a layer, with --weight-bits (default: 8)", metavar="N")
