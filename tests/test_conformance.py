@@ -67,8 +67,8 @@ data:
     bin_s dead duration_s events found hot labels one_sided rate recordings rules source split steps taxels
     unlabelled
 estimate:
-    chip_steps cores detail energy_by_part_j energy_range_j layers max min not_modelled not_priced pace
-    per_inference prices samples static time
+    chip_steps cores detail energy_by_part_j energy_range_j host layers max measured min not_modelled not_priced
+    pace per_inference prices samples static time
 estimate, crossbars:
     cores cores_of_chip energy layers max min not_priced pace per_inference samples static_w
 explain:
@@ -100,7 +100,7 @@ report:
 run:
     accuracy counts files labelled labels predictions samples
 stress:
-    classes clean missed not_applicable perturbations provenance recordings required seeds
+    classes clean missed not_applicable perturbations provenance recordings required seeds conditions?
 train:
     protocols runs
 verify:

@@ -286,7 +286,7 @@ def test_a_netlist_remembers_bins_and_data(tmp_path, monkeypatch):
     said = "--bin 0.02: the network was trained on bins of 0.1 s; omit --bin"
     for words in ("run x.loom --data taps", "lean net.pt --data taps", f"watch x.loom --input {tap}"):
         assert said in run(*words.split(), "--bin", "0.02")[2]
-    for width, code in (("0.1", 0), ("0.05", 2)):
+    for width, code in (("0.1", 0), ("0.05", 0), ("0.04", 2)):  # two bins of 0.05 s are joined
         assert run("data", "convert", "taps", "--bin", width, "-o", f"binned{width}")[0] == 0
         assert run("run", "x.loom", "--data", f"binned{width}")[0] == code
         assert as_json("data", "describe", f"binned{width}")["bin_s"] == float(width)
