@@ -102,7 +102,7 @@ run:
 stress:
     classes clean missed not_applicable perturbations provenance recordings required seeds conditions?
 train:
-    protocols runs
+    protocols runs left_out?
 verify:
     accuracy breakdowns decision_agreement engine engine_different first_divergence ladder levels membranes_saturated
     missed model netlist not_compared same_checkpoint samples spec_different spec_equals_engine spec_samples spikes
