@@ -20,7 +20,7 @@ from typing import IO, Any
 import numpy as np
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.files import plain, reading, require_size
+from spikeloom.compiler.files import plain, read_whole, reading, require_size
 from spikeloom.compiler.types import FloatArray
 from spikeloom.models.recordings.classes import class_of
 from spikeloom.models.recordings.counts import number
@@ -69,7 +69,7 @@ def read_table(
     where = where or Path(path).name
     known = (*required, *optional)
     expected = ", ".join(required) + "".join(f"[, {name}]" for name in optional)
-    lines, rows = _rows(read_text(opener or partial(Path(path).open, "rb"), where), known)
+    lines, rows = _rows(read_text(opener or partial(_opened, Path(path)), where), known)
     names = tuple(_cells(rows[0].lower())) if rows else ()
     if names and not any(map(_is_number, names)):
         if not (set(required) <= set(names) <= set(known) and len(set(names)) == len(names)):
@@ -120,6 +120,11 @@ def _with_words(
         raise _fault(where, lines, numbers, others) from None
     columns = {name: np.ascontiguousarray(values[:, index]) for index, name in enumerate(others)}
     return Table(where=where, columns=columns, lines=lines, words=taken)
+
+
+def _opened(path: Path) -> IO[Any]:
+    """A file, which is no pipe: these would be waited for."""
+    return io.BytesIO(read_whole(path, "table", MAX_TABLE_BYTES))
 
 
 def read_text(opener: Callable[[], IO[Any]], where: str) -> str:
