@@ -12,14 +12,16 @@ from numpy.testing import assert_allclose, assert_array_equal
 from random_networks import chain as network_chain
 from random_networks import float_networks
 from timed_networks import events_of
-from zoo import specimen
+from zoo import LAYERED, over, specimen
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.nir import writer as nir_export
 from spikeloom.compiler.formats.nir.reader import read_nir
 from spikeloom.compiler.interpret import run_float
 from spikeloom.compiler.ir import recurrent
+from spikeloom.compiler.storage import Given
 from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.runtime.machines.loihi1 import engine
 
@@ -351,3 +353,28 @@ def test_a_membrane_that_keeps_all_is_an_if(tmp_path):
     graph = nir.read(path)
     assert [type(node).__name__ for node in graph.nodes.values()].count("IF") == 1
     assert read_nir(path, dt=0.02).network.populations[0].beta == 1
+
+
+@over(LAYERED)
+def test_what_a_netlist_exports_compiles_to_its_own_integers(name, tmp_path):
+    netlist, path = specimen(name).machine.netlist, tmp_path / "net.nir"
+    path.write_bytes(nir_export.export(lift(netlist), 0.02))
+    found = read_nir(path).network
+    assert found.forms is not None
+    back = compile_network(found, Options(storage=Given(found.forms), keep_all=True)).netlist
+    assert (back.clocks, back.bins, back.polarities) == (netlist.clocks, netlist.bins, netlist.polarities)
+    for ours, theirs in zip(lift(back).projections, lift(netlist).projections, strict=True):
+        assert (ours.pre, ours.post) == (theirs.pre, theirs.post)
+        assert not (ours.effective() != theirs.effective()).nnz
+    for ours, theirs in zip(lift(back).populations, lift(netlist).populations, strict=True):
+        assert_array_equal(ours.threshold, theirs.threshold)
+        assert_array_equal(ours.bias, theirs.bias)
+        assert (ours.decay_u, ours.decay_v) == (theirs.decay_u, theirs.decay_v)
+
+
+def test_relays_of_clocks_come_back_as_relays(tmp_path):
+    netlist, path = specimen("timed").machine.netlist, tmp_path / "net.nir"
+    path.write_bytes(nir_export.export(lift(netlist), 0.02))
+    found = read_nir(path).network
+    assert found.populations[0].relays == netlist.clocks.channels > 0
+    assert [one.relays for one in found.populations[1:]] == [0] * (len(found.populations) - 1)

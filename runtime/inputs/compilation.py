@@ -60,7 +60,7 @@ def storage_of(request: CompileRequest, forms: Sequence[Form] | None = None) -> 
     if forms is not None:
         if packings is not None or request.spike_exact:
             omitted = "omit --weight-bits, --planes, --scale-groups and --spike-exact"
-            raise OptionError(f"compile: the checkpoint was fine-tuned for its own storage; {omitted}")
+            raise OptionError(f"compile: the network has storage of its own; {omitted}")
         return Given(forms)
     _require_held_out(request, chosen=packings is not None or request.spike_exact)
     if request.spike_exact:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.arrays import read_only
-from spikeloom.compiler.dynamics import MOST_STEPS, RELAY_WEIGHT, Clocks
+from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, RELAY_WEIGHT, Clocks
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import reading
 from spikeloom.compiler.formats.affine import scaled, shifted
@@ -94,15 +94,13 @@ def network_of(
         raise entry.fail(
             f"has the shape {list(shape[:AXES])}, allowed are up to {ELEMENTS} values; export it again"
         )
-    sensor, positions, words = sensor_layout(shape, polarities=polarities, polarities_first=polarities_first)
+    sensor, positions, words = _sensor(graph, shape, polarities, polarities_first)
     spiking, result = _walk(graph, steps, shape)
     if not spiking:
         raise ModelError("has no spiking neurons, so nothing can be counted; export a spiking network")
     voters, label = _readout(end, result, spiking)
-    layers, constant = _layers(spiking, positions)
+    layers, constant = _layers(spiking, positions, sensor.clocks.channels)
     layers, sensor = _with_held(layers, constant, sensor)
-    bins, length = (stages.stated_steps(graph, name) for name in ("bins", "length"))
-    sensor = replace(sensor, bins=bins or 1, clocks=replace(sensor.clocks, length=length))
     network = assemble(layers, sensor, voters, label)
     facts = _facts(graph, steps, spiking, f"input {printable(entry.name)}: {words}", sensor)
     facts.append(
@@ -116,6 +114,32 @@ def network_of(
         read_as=asdict(steps),
         training=training if isinstance(training, dict) else None,
     )
+
+
+def _sensor(
+    graph: Graph, shape: tuple[int, ...], polarities: int | None, first: bool | None
+) -> tuple[Input, IntArray, str]:
+    """As of :func:`sensor_layout.sensor_layout`, with what the file says of polarities, bins and clocks, which come last."""
+    said = {name: stages.stated_steps(graph, name) for name in ("polarities", "bins", "length", "clock_steps")}
+    channels = stages.stated_steps(graph, "clocks") or 0
+    if channels and (channels > MOST_CLOCKS or len(shape) > 1 or shape[0] <= channels):
+        raise ModelError(f"has {channels} clocks in an input of shape {list(shape)}; {AGAIN}")
+    sensed = (shape[0] - channels,) if channels else shape
+    sensor, positions, words = sensor_layout(
+        sensed, polarities=polarities or said["polarities"], polarities_first=first
+    )
+    clocks = Clocks(channels=channels, steps=said["clock_steps"] or 1, length=said["length"])
+    positions = np.append(positions, np.arange(sensor.size, sensor.size + channels))
+    words += f", then {channels} clocks of {clocks.steps} steps" if channels else ""
+    return replace(sensor, bins=said["bins"] or 1, clocks=clocks), positions, words
+
+
+def _relays(weight: Sparse, bias: FloatArray, clocks: int) -> int:
+    """How many neurons at the end of a layer relay a clock each, and nothing else: all clocks have one, or none."""
+    last = weight[-clocks:].tocoo()
+    own = last.col - last.row == weight.shape[1] - clocks
+    found = clocks and weight.shape[0] >= clocks == last.nnz and own.all() and not bias[-clocks:].any()
+    return clocks if found else 0
 
 
 def _forms(spiking: Sequence[Neurons], network: Network) -> tuple[Form, ...] | None:
@@ -175,8 +199,10 @@ def _walk(graph: Graph, steps: stages.Steps, shape: tuple[int, ...]) -> tuple[li
     return neurons, values[only(graph.nodes, OUTPUT_NODE).name]
 
 
-def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer], list[Sparse | None]]:
-    """A layer for each node, and what flows into its currents in every step, (neurons, 1)."""
+def _layers(
+    spiking: Sequence[Neurons], positions: IntArray, clocks: int
+) -> tuple[list[Layer], list[Sparse | None]]:
+    """A layer for each node, the last channels of the input being clocks, and what flows into its currents in every step, (neurons, 1)."""
     layers: list[Layer] = []
     constant = []
     for place, (one, name) in enumerate(
@@ -194,8 +220,17 @@ def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer
             sources[INPUT] = sources[INPUT][:, positions]
         reached = {source: weight for source, weight in sources.items() if weight.nnz}
         sources = reached if reached.keys() - {place} else sources
+        relays = _relays(sources[INPUT], value.bias, clocks) if INPUT in sources else 0
         layers.append(
-            Layer(name=name, beta=one.beta, theta=theta, bias=value.bias, sources=sources, alpha=value.alpha)
+            Layer(
+                name=name,
+                beta=one.beta,
+                theta=theta,
+                bias=value.bias,
+                sources=sources,
+                alpha=value.alpha,
+                relays=relays,
+            )
         )
     return layers, constant
 
@@ -205,6 +240,8 @@ def _with_held(layers: list[Layer], held: list[Sparse | None], sensor: Input) ->
     lasting = [index for index, channel in enumerate(held) if channel is not None]
     if not lasting:
         return layers, sensor
+    if sensor.clocks.channels:
+        raise ModelError("has clocks, and biases that go through currents, which need a channel of their own")
     depth = {index: deep for deep, ready in enumerate(by_depth(layers)) for index in ready}
 
     def with_channel(size: int, weight: Sparse | None, channel: Sparse | None) -> Sparse:
@@ -231,7 +268,7 @@ def _with_held(layers: list[Layer], held: list[Sparse | None], sensor: Input) ->
         extended.append(
             Layer(name=name, beta=0.0, theta=1.0, bias=np.zeros(1), sources={source: weight}, relays=1)
         )
-    return extended, replace(sensor, clocks=Clocks(channels=1, steps=MOST_STEPS))
+    return extended, replace(sensor, clocks=replace(sensor.clocks, channels=1, steps=MOST_STEPS))
 
 
 def _readout(end: Node, result: stages.Value, spiking: Sequence[Neurons]) -> tuple[int, IntArray]:
@@ -351,7 +388,7 @@ def _facts(
             f"drift: r is tau / {written:g} in every neuron, as of a file written in steps of {written:g} s; in steps "
             f"of {steps.dt:g} s its decays and gains are others than there"
         )
-    if clocked.clocks.channels:
+    if clocked.clocks.steps == MOST_STEPS:
         facts.append(
             "biases that go through a synaptic current come from a channel that always has an event"
         )

@@ -38,20 +38,18 @@ DENSE_LIMIT = 2**28
 Float32 = npt.NDArray[np.float32]
 
 
-def export(
-    network: IntegerNetwork, dt: float, *, training: str | None = None, origin: str | None = None
-) -> bytes:
+def export(network: IntegerNetwork, dt: float, *, training: str | None = None) -> bytes:
     """Content of the file, for steps of `dt` seconds; equal networks give equal bytes.
 
-    With `training`, how the network was fine-tuned, the file says how each layer is stored, too: it compiles
-    to these very integers. `origin` is what it keeps of the recordings behind any other network.
+    The file says how each layer is stored, so that it compiles to these very integers. `training` is how the
+    network was made, as JSON, or what is known of its recordings.
 
     Raises ModelError if NIR cannot say what the network does, OptionError if there is no such time step.
     """
     require_step(dt)
     # what separates names in a file becomes an underscore
     names = plain_names(
-        [population.name for population in network.populations], taken=["input", "output", "votes"]
+        [population.name for population in network.populations], taken=["input", "output", "class_counts"]
     )
     always = int(network.input.clocks == Clocks(channels=1, steps=MOST_STEPS))
     nodes: dict[str, Tree] = {"input": {"type": "Input", "shape": np.array([network.input.size - always])}}
@@ -73,9 +71,8 @@ def export(
                 nodes[synapses] |= {"type": "Affine", "bias": added.astype(np.float32)}
             edges += [(source, synapses), (synapses, name)]
         nodes[name] = _neurons(population, bias, dt)
-        if training is not None:
-            form = network.forms[post]
-            nodes[name]["metadata"] = {"bits": np.array(form.bits), "exponents": np.array(form.exponents)}
+        form = network.forms[post]
+        nodes[name]["metadata"] = {"bits": np.array(form.bits), "exponents": np.array(form.exponents)}
     voters = names[network.readout.population]
     label = network.readout.label
     if np.array_equal(label, np.arange(network.classes)):
@@ -83,16 +80,17 @@ def export(
     else:
         votes = np.zeros((network.classes, len(label)), np.float32)
         votes[label, np.arange(len(label))] = 1
-        nodes["votes"] = {"type": "Linear", "weight": votes}
-        edges += [(voters, "votes"), ("votes", "output")]
+        nodes["class_counts"] = {"type": "Linear", "weight": votes}
+        edges += [(voters, "class_counts"), ("class_counts", "output")]
     nodes["output"] = {"type": "Output", "shape": np.array([network.classes])}
-    said: Tree = {"dt": np.array(dt), "writer": "spikeloom"}
+    said: Tree = {"dt": np.array(dt), "writer": "spikeloom", "polarities": np.array(network.input.polarities)}
     bins = network.input.bins
-    length = network.input.clocks.length
+    clocks = network.input.clocks
     said |= {"bins": np.array(bins)} if bins > 1 else {}
-    said |= {"length": np.array(length)} if length is not None else {}
-    if (known := training or origin) is not None:
-        said["training"] = known
+    said |= {"length": np.array(clocks.length)} if clocks.length is not None else {}
+    if clocks.channels and not always:
+        said |= {"clocks": np.array(clocks.channels), "clock_steps": np.array(clocks.steps)}
+    said |= {"training": training} if training is not None else {}
     graph = {"type": "NIRGraph", "edges": edges, "metadata": said, "nodes": nodes}
     return hdf5_bytes({"version": VERSION, "node": graph})
 

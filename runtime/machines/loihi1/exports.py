@@ -100,7 +100,7 @@ def _nir(request: ExportRequest) -> Export:
     )
     lines = (f"in steps of {dt:g} s ({facts.convention})",)
     with reading(request.source, FormatError, "compile it again"):
-        content = nir.export(lift(netlist), dt, origin=json.dumps(kept) if kept else None)
+        content = nir.export(lift(netlist), dt, training=json.dumps(kept) if kept else None)
     return Export(content=[content], facts=facts, lines=lines)
 
 
