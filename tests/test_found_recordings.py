@@ -336,7 +336,7 @@ def test_names_survive_joining_and_nir(tmp_path, monkeypatch):
     assert run("join", "a.pt", "b.pt", "-o", "j.pt")[0] == 0
     assert run("compile", "j.pt", "--weight-bits", "8", "-o", "j.loom")[0] == 0
     assert run("export", "j.loom", "--to", "nir", "-o", "j.nir")[0] == 0
-    assert run("compile", "j.nir", "--weight-bits", "8", "-o", "again.loom")[0] == 0
+    assert run("compile", "j.nir", "-o", "again.loom")[0] == 0
     np.save("x_label_c.npy", events(1, samples=1)[0])
     for netlist in ("j.loom", "again.loom"):
         found = as_json("run", netlist, "--data", "x_label_c.npy")

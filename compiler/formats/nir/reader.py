@@ -119,8 +119,10 @@ def network_of(
 def _sensor(
     graph: Graph, shape: tuple[int, ...], polarities: int | None, first: bool | None
 ) -> tuple[Input, IntArray, str]:
-    """As of :func:`sensor_layout.sensor_layout`, with what the file says of polarities, bins and clocks, which come last."""
-    said = {name: stages.stated_steps(graph, name) for name in ("polarities", "bins", "length", "clock_steps")}
+    """As :func:`sensor_layout.sensor_layout`, with polarities, bins and clocks that the file names; clocks are last."""
+    said = {
+        name: stages.stated_steps(graph, name) for name in ("polarities", "bins", "length", "clock_steps")
+    }
     channels = stages.stated_steps(graph, "clocks") or 0
     if channels and (channels > MOST_CLOCKS or len(shape) > 1 or shape[0] <= channels):
         raise ModelError(f"has {channels} clocks in an input of shape {list(shape)}; {AGAIN}")
@@ -202,7 +204,7 @@ def _walk(graph: Graph, steps: stages.Steps, shape: tuple[int, ...]) -> tuple[li
 def _layers(
     spiking: Sequence[Neurons], positions: IntArray, clocks: int
 ) -> tuple[list[Layer], list[Sparse | None]]:
-    """A layer for each node, the last channels of the input being clocks, and what flows into its currents in every step, (neurons, 1)."""
+    """A layer for each node, and what flows into its currents in every step, (neurons, 1); clocks are last."""
     layers: list[Layer] = []
     constant = []
     for place, (one, name) in enumerate(
@@ -241,7 +243,9 @@ def _with_held(layers: list[Layer], held: list[Sparse | None], sensor: Input) ->
     if not lasting:
         return layers, sensor
     if sensor.clocks.channels:
-        raise ModelError("has clocks, and biases that go through currents, which need a channel of their own")
+        raise ModelError(
+            "has clocks, and biases that go through currents, which need a channel of their own"
+        )
     depth = {index: deep for deep, ready in enumerate(by_depth(layers)) for index in ready}
 
     def with_channel(size: int, weight: Sparse | None, channel: Sparse | None) -> Sparse:

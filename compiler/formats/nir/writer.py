@@ -83,7 +83,11 @@ def export(network: IntegerNetwork, dt: float, *, training: str | None = None) -
         nodes["class_counts"] = {"type": "Linear", "weight": votes}
         edges += [(voters, "class_counts"), ("class_counts", "output")]
     nodes["output"] = {"type": "Output", "shape": np.array([network.classes])}
-    said: Tree = {"dt": np.array(dt), "writer": "spikeloom", "polarities": np.array(network.input.polarities)}
+    said: Tree = {
+        "dt": np.array(dt),
+        "writer": "spikeloom",
+        "polarities": np.array(network.input.polarities),
+    }
     bins = network.input.bins
     clocks = network.input.clocks
     said |= {"bins": np.array(bins)} if bins > 1 else {}
