@@ -135,14 +135,12 @@ def test_groups_fill_the_axons_of_a_core():
         taxels=39, classes=20, hops=3, features=15, copies=2, clocks=clocks_over(8, 325)
     )
     assert (found.groups, found.hidden) == (5, (120, 120))
+    sensor = {"taxels": 39, "classes": 20, "hops": 3, "features": 16}
     refused(
         OptionError,
         "--copies 4: 78 input channels with 4 axons each, | has 256",
         truenorth.size_network,
-        taxels=39,
-        classes=20,
-        hops=3,
-        features=16,
+        **sensor,
         copies=4,
         clocks=clocks_over(5, 325),
     )
@@ -150,10 +148,7 @@ def test_groups_fill_the_axons_of_a_core():
         OptionError,
         "--features 16: | 39 taxels and 60 clocks to cores of 85 inputs",
         truenorth.size_network,
-        taxels=39,
-        classes=20,
-        hops=3,
-        features=16,
+        **sensor,
         copies=3,
         clocks=clocks_over(60, 325),
     )
