@@ -125,7 +125,7 @@ def compile(
         If something cannot be used, or the network does not fit; the message says what to do.
     """
     given = dict(locals())
-    source = _network("compile", network, example)
+    source = _network("compile", network, example, polarities, polarities_first)
     if storage is not None:
         from spikeloom.runtime.inputs.compilation import options_of
 
@@ -205,7 +205,9 @@ def finetune(
     given = dict(locals())
     from spikeloom.runtime.commands.training import finetune as command
 
-    given |= _place(data, bin) | {"checkpoint": _network("finetune", network, example)}
+    given |= _place(data, bin) | {
+        "checkpoint": _network("finetune", network, example, polarities, polarities_first)
+    }
     request = checked(FinetuneRequest, given)
     tuned: Finetuned = command.run(request).result
     if tuned.netlist is None:
@@ -362,7 +364,11 @@ def _place(data: Source, bin: float | None) -> dict[str, object]:
 
 
 def _network(
-    what: str, network: str | os.PathLike[str] | nn.Module | Network, example: Tensor | None
+    what: str,
+    network: str | os.PathLike[str] | nn.Module | Network,
+    example: Tensor | None,
+    polarities: int | None,
+    polarities_first: bool | None,
 ) -> str | Network:
     """File of a network, or what a module means."""
     if isinstance(network, str | os.PathLike):
@@ -378,4 +384,4 @@ def _network(
         raise OptionError(
             f"{what}: a module needs the input of one step; give example=torch.zeros(1, CHANNELS)"
         )
-    return module_network(network, example)
+    return module_network(network, example, polarities=polarities, polarities_first=polarities_first)

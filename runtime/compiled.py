@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.requests.check import CertifyRequest, StressRequest
+from spikeloom.runtime.requests.check import CertifyRequest, ExplainRequest, StressRequest
 from spikeloom.runtime.requests.choices import ComparisonChoice, NetworkChoice
 from spikeloom.runtime.requests.choose import AnytimeRequest
+from spikeloom.runtime.requests.exchange import ExportRequest
 from spikeloom.runtime.requests.fields import Request, checked, documented
 from spikeloom.runtime.requests.main_job import (
     ENGINES,
@@ -27,7 +28,9 @@ from spikeloom.runtime.requests.main_job import (
 if TYPE_CHECKING:
     from spikeloom.compiler.ir import Network
     from spikeloom.models.recordings.evtouch import Recordings
+    from spikeloom.runtime.commands.exchange.export import Written
     from spikeloom.runtime.commands.main_job.run import Decisions
+    from spikeloom.runtime.equivalence.explanation.results import Explained
     from spikeloom.runtime.equivalence.verdict import Verdict
     from spikeloom.runtime.machines.base import Price, Stream
     from spikeloom.runtime.machines.netlist_check import NetlistCheck
@@ -269,13 +272,58 @@ class Compiled:
         result: Anytime = anytime.run(self._question(AnytimeRequest, locals())).result
         return result
 
+    @documented(ExplainRequest)
+    def explain(
+        self,
+        data: Source | Recordings,
+        *,
+        split: str = "test",
+        limit: int | None = None,
+        sample: str | int | None = None,
+        top: int = 10,
+    ) -> Explained:
+        """Say why chip and float model differ on one recording: roots, their causes, and what removes them.
+
+        Raises SpikeloomError as :meth:`verify` does.
+        """
+        from spikeloom.runtime.commands.check import explain
+
+        result: Explained = explain.run(self._comparison(ExplainRequest, locals())).result
+        return result
+
+    @documented(ExportRequest)
+    def export(
+        self,
+        output: str,
+        to: str,
+        *,
+        form: str | None = None,
+        data: Source | Recordings | None = None,
+        split: str | None = None,
+        recording: int | None = None,
+        dt: float | None = None,
+    ) -> Written:
+        """Write the netlist in the format of another program.
+
+        Raises SpikeloomError if that cannot say what the netlist does, or the file cannot be written.
+        """
+        from spikeloom.runtime.commands.exchange import export
+
+        given = dict(locals())
+        given |= {"source": str(self.path), "data": recordings_of(given, split or "test")}
+        result: Written = export.run(checked(ExportRequest, given)).result
+        return result
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the netlist, a ``.loom`` file."""
         require_place(os.fspath(path), "save", kinds=["loom"])
         shutil.copyfile(self.path, path)
 
     def stream(self) -> Stream:
-        """Open a live stream: ``step(events)`` takes one bin (taxels, 2), and gives the votes so far."""
+        """Open a live stream: ``step(events)`` takes one bin (taxels, 2), and gives the votes so far.
+
+        Its ``decision`` ends the grasp, and is that of :meth:`run`; the votes of a step are not final.
+        """
         from spikeloom.runtime.machines.backends import machine_for
 
         return machine_for(self.path).stream()

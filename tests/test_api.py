@@ -86,6 +86,24 @@ def test_modules_come_in_as_they_are(data, tmp_path, monkeypatch):
     assert "written: tuned.nir, tuned.loom" in str(tuned)
 
 
+def test_polarities_of_a_module_are_those_that_are_given():
+    module = nn.Sequential(nn.Linear(2 * TAXELS, 4), api.LIF())
+    example = torch.zeros(1, 2 * TAXELS)
+    one, first, last = (
+        api.compile(module, example=example, **given)
+        for given in ({"polarities": 1}, {"polarities_first": True}, {})
+    )
+    assert (one.facts.taxels, first.facts.taxels) == (2 * TAXELS, TAXELS)
+    assert first.path.read_bytes() != last.path.read_bytes()
+
+
+def test_a_compiled_network_explains_itself_and_leaves(data, net, tmp_path):
+    assert net.explain(data, sample=0).recording == 0
+    written = net.export(str(tmp_path / "net.nir"), "nir", dt=0.02)
+    assert (written.format, (tmp_path / "net.nir").stat().st_size) == ("nir", written.bytes)
+    refused(OptionError, "is for nir", net.export, str(tmp_path / "net.onnx"), "onnx", dt=0.02)
+
+
 def test_what_does_not_suit_is_refused(data, net):
     refused(TypeError, "wieght_bits", api.compile, "pretrained:grasps", wieght_bits="4")
     assert len(net.run(data.test, limit=2).files) == 2

@@ -284,7 +284,7 @@ def test_events_that_come_too_late_are_said(trained, tmp_path):
         assert not run(command, netlist, *words, "--data", data)[2]
 
 
-def test_live_it_runs_to_the_end_of_the_ramp(trained, tmp_path):
+def test_live_it_runs_to_the_end_of_the_ramp(trained, tmp_path, capsys):
     _, netlist, data = trained
     decided = as_json("run", netlist, "--data", data)
     events = load_data(data, "test").events
@@ -296,9 +296,18 @@ def test_live_it_runs_to_the_end_of_the_ramp(trained, tmp_path):
         *rest, last = stream.finish()
         assert (last.counts.tolist(), rest[39].index) == (decided["counts"][sample], 79)
         stream.reset()
+    for column in np.moveaxis(events[1], -1, 0):
+        step = stream.step(column)
+    assert "not final" in str(step)
+    assert (stream.decision, stream.decision) == (decided["decisions"][1], decided["decisions"][1])
+    stream.reset()
+    refused(DataError, "no decision found", lambda: spikeloom.load(str(netlist)).stream().decision)
     for _ in range(80):
-        stream.step(events[0, ..., 0])
-    refused(DataError, "a step after the network's 80 found; call finish()", stream.step, events[0, ..., 0])
+        step = stream.step(events[0, ..., 0])
+    assert stream.step(np.zeros_like(events[0, ..., 0])).counts.tolist() == step.counts.tolist()
+    assert not capsys.readouterr().err
+    assert stream.step(events[0, ..., 0] | 1).index == 79
+    assert "events after the network's 80 steps: not used" in capsys.readouterr().err
     lines = [
         f"{t * 0.02:.2f},{taxel},{polarity}\n"
         for t, taxel, polarity in np.argwhere(events[0].transpose(2, 0, 1))

@@ -139,5 +139,8 @@ def read_network(path: str | os.PathLike[str]) -> ReadNetwork[Network]:
         f"{counters.ramp} to read out"
     )
     return ReadNetwork(
-        network=counting_network(counters), facts=(fact,), sha256=sha256, training=counters.training
+        network=counting_network(counters),
+        facts=(fact,),
+        sha256=sha256,
+        training={**counters.training, "steps": counters.steps},
     )

@@ -47,12 +47,14 @@ def names_of(training: Mapping[str, Any] | None, classes: int) -> list[str] | No
 
 
 def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
-    """What a netlist remembers of the recordings behind a network: name, bins and names of classes."""
-    kinds = {"data": str, "bin_s": float}
+    """What a netlist remembers of the recordings behind a network.
+
+    Their name, their bins if they were events, per cent of each or steps that trained it if not all did, where
+    the taxels were and how classes are called, if that was said.
+    """
+    kinds = {"data": str, "bin_s": float, "window": int, "steps": int, "positions_mm": list}
     origin = {
-        name: training[name]
-        for name, kind in kinds.items()
-        if training and isinstance(training.get(name), kind)
+        name: training[name] for name, kind in kinds.items() if training and type(training.get(name)) is kind
     }
     names = (training or {}).get("class_names")
     if isinstance(names, list | tuple) and names and all(isinstance(name, str) for name in names):

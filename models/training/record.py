@@ -63,6 +63,8 @@ class TrainingRecord:
     recipe: Mapping[str, Any] | None = field(default=None, metadata={"optional": True})
     bin_s: float | None = field(default=None, metadata={"optional": True})
     class_names: Sequence[str] | None = field(default=None, metadata={"optional": True})
+    window: int | None = field(default=None, metadata={"optional": True})  # Per cent of each that trained
+    positions_mm: Sequence[Sequence[float]] | None = field(default=None, metadata={"optional": True})
 
     def to_json(self) -> JsonObject:
         """JSON values."""
@@ -86,8 +88,10 @@ def training_record(
     command: str,
     seed: int,
     recipe: Mapping[str, Any] | None = None,
+    window: int | None = None,
+    positions_mm: Sequence[Sequence[float]] | None = None,
 ) -> TrainingRecord:
-    """Record of a training; `recipe` where it is not the released one.
+    """Record of a training; `recipe`, `window` and `positions_mm` where they are not the released ones.
 
     The best epoch is chosen on the test split, as the published figures are; the clean one on a part of the
     training split; the last one is not chosen at all.
@@ -124,4 +128,6 @@ def training_record(
         recipe=recipe,
         bin_s=training.bin_s,
         class_names=training.names,
+        window=window,
+        positions_mm=positions_mm,
     )

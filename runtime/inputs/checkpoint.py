@@ -1,6 +1,7 @@
 """A checkpoint on the graph that the options name."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,25 @@ def sensor_places(taxels: str | None) -> FloatArray:
         return NEUTOUCH
     count, places = read_layout(taxels)
     return np.arange(float(count))[:, None] if places is None else places
+
+
+def given_places(taxels: str | None) -> list[list[float]] | None:
+    """Positions that ``--taxels`` gives, for the record of a training; None where it gives none."""
+    places = None if taxels is None else read_layout(taxels)[1]
+    return None if places is None else places.tolist()
+
+
+def places_of(taxels: str | None, origin: Mapping[str, Any], count: int) -> FloatArray | None:
+    """Positions (count, 2 or 3) in millimetres: of ``--taxels``, of the training, of the built-in sensor, or None."""
+    if taxels is not None:
+        return read_layout(taxels)[1]
+    if "positions_mm" not in origin:
+        return NEUTOUCH if count == len(NEUTOUCH) else None
+    with suppress(ValueError, TypeError, OverflowError):  # of a file that says something else
+        known = np.array(origin["positions_mm"], np.float64)
+        if known.shape in ((count, 2), (count, 3)) and np.isfinite(known).all():
+            return known
+    return None
 
 
 def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tuple[str, FloatArray]:

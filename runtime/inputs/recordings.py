@@ -1,5 +1,6 @@
 """Recordings that a user names, held against a network."""
 
+import hashlib
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
@@ -44,8 +45,8 @@ def recordings(
     Counts of disorder in event files go to stderr. `bins` of them make a step of the network. `labels_for`
     names what needs the label of every recording. `trained` is what is known of the recordings that the
     network was trained on, see :func:`origin_of`: events come in its bins, others are refused, and what
-    looks like other recordings is warned of. `groups` are names of conditions, see
-    :mod:`models.recordings.conditions`.
+    looks like other recordings is warned of; of each comes the part that trained it. `groups` are
+    names of conditions, see :mod:`models.recordings.conditions`.
 
     Raises DataError or OptionError if they cannot be used, or do not suit the network.
     """
@@ -56,7 +57,7 @@ def recordings(
         given = path if known is None else renamed(path, known)
         require_suited(given, classes=classes, taxels=taxels)
         _require_width(given, trained_bin)
-        data = with_groups(_first(given, limit), wanted)
+        data = first_part(with_groups(_first(given, limit), wanted), (trained or {}).get("window", WHOLE))
         return events.joined_bins(data if labels_for is None else events.need_labels(data, labels_for), bins)
     if path != SYNTHETIC:
         _require_asked(bin_s, trained_bin)
@@ -84,7 +85,7 @@ def recordings(
         _warn_of_others(data, trained or {}, classes, whole=limit is None)
     elif labels_for is not None:
         (data,) = without_gaps(data)
-    return events.joined_bins(data, bins)
+    return events.joined_bins(first_part(data, (trained or {}).get("window", WHOLE)), bins)
 
 
 def _first(data: Recordings, limit: int | None) -> Recordings:
@@ -148,6 +149,21 @@ def require_splits(path: str | Recordings) -> None:
         )
 
 
+def warn_of_shared(training: Recordings, test: Recordings) -> None:
+    """Say on stderr how many test recordings are training recordings, too: silent ones may well be alike."""
+
+    def digests(data: Recordings) -> list[bytes]:
+        parts = (each[..., : data.steps_of(index)] for index, each in enumerate(data.events))
+        return [hashlib.sha256(part.tobytes()).digest() if part.any() else b"" for part in parts]
+
+    seen = set(digests(training)) - {b""}
+    if count := sum(each in seen for each in digests(test)):
+        tell(
+            f"warning: {test.source}: {count} of {len(test)} test recordings are training recordings, too; what is "
+            "reached on these says nothing of others"
+        )
+
+
 def require_suited(data: Recordings, *, classes: int | None, taxels: int | None) -> None:
     """Refuse recordings of another sensor, or of more classes than a network has; DataError naming both."""
     if taxels is not None and data.taxels != taxels:
@@ -175,10 +191,13 @@ def load_recordings(
 ) -> Recordings:
     """Recordings of a source that a request names, held against a netlist; as `recordings` otherwise.
 
-    In steps of the network if `joined`, as long a part of each as a ``--window`` says, as long as the
-    network needs; else whole, in their own bins.
+    In steps of the network if `joined`, as long a part of each as a ``--window`` says, or as the network was
+    trained on, as long as the network needs; else in their own bins.
     """
     window = parse_window(getattr(request, "window", "100%"))
+    trained = origin_of(netlist.provenance)
+    if window < WHOLE:
+        trained.pop("window", None)
     progress("reading the recordings")
     data = recordings(
         source,
@@ -188,7 +207,7 @@ def load_recordings(
         taxels=netlist.taxels,
         bin_s=request.bin,
         labels_for=labels_for,
-        trained=origin_of(netlist.provenance),
+        trained=trained,
         groups=getattr(request, "groups", None),
     )
     return in_steps(data, netlist, window) if joined else data
@@ -198,8 +217,14 @@ def in_steps(data: Recordings, netlist: Netlist, window: int = WHOLE) -> Recordi
     """Recordings in steps of a network: the first `window` per cent of each, as long as the network needs."""
     data = first_part(events.joined_bins(data, netlist.bins), window)
     length = netlist.clocks.length
-    if length is not None and (late := int(data.events[..., length:].sum(dtype=np.int64))):
-        tell(f"warning: {data.source}: {number(late, 'event')} after the network's {length} steps: not used")
+    steps = origin_of(netlist.provenance).get("steps", length)
+    if length is not None and (late := int(data.events[..., steps:].sum(dtype=np.int64))):
+        read = (
+            "" if steps == length else f", read out until step {length}: till then they may move votes, then"
+        )
+        tell(
+            f"warning: {data.source}: {number(late, 'event')} after the network's {steps} steps{read}: not used"
+        )
     return events.of_length(data, length)
 
 

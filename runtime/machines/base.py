@@ -121,6 +121,12 @@ class Step:
     index: int  # From 0; while events come in, also the index of the bin
     spikes: tuple[BoolArray, ...]  # Who spiked in it, by layer and neuron; read-only
     counts: IntArray  # (classes,) int64; votes since the grasp began; read-only
+    final: bool = False  # Whether the grasp ended with it
+
+    def __str__(self) -> str:
+        """What it decides, and whether that may change."""
+        so_far = "" if self.final else "; not final, as layers lag and bins may follow: see Stream.decision"
+        return f"step {self.index}: class {self.decision}, {self.margin} votes ahead{so_far}"
 
     @property
     def decision(self) -> int:
@@ -182,6 +188,10 @@ class Stream(Protocol):
 
     def finish(self) -> tuple[Step, ...]:
         """End the grasp: the steps by which the slowest layer lags behind the data."""
+
+    @property
+    def decision(self) -> int:
+        """Class of the grasp, which ends with this."""
 
     def reset(self) -> None:
         """Begin the next grasp, from rest."""

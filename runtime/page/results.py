@@ -19,7 +19,7 @@ from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.verdict import Verdict
 from spikeloom.runtime.inputs import repeat
-from spikeloom.runtime.inputs.checkpoint import sensor_places
+from spikeloom.runtime.inputs.checkpoint import places_of
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.base import Machine, Price
 from spikeloom.runtime.machines.capabilities import Comparable
@@ -117,8 +117,7 @@ def taxels(
     `counts` are those of the chip's :class:`Run`; `sensor` is what the user named by ``--taxels``.
     """
     netlist = machine.netlist
-    places = sensor_places(sensor)
-    known = len(places) == netlist.taxels and places.shape[1] > 1
+    places = places_of(sensor, netlist.provenance, netlist.taxels)
     checkpoint = loaded.checkpoint
     edges: IntArray = np.zeros((0, 2), np.int64)
     spikes: FloatArray | None = None
@@ -133,8 +132,8 @@ def taxels(
         fired = np.bincount(taxel, counts.mean(axis=0)[ids], netlist.taxels)
         spikes = fired[: netlist.taxels].astype(np.float64)
     return Taxels(
-        sensor="NeuTouch" if sensor is None and known and np.array_equal(places, NEUTOUCH) else None,
-        positions_mm=places[:, :2] if known else None,
+        sensor="NeuTouch" if places is NEUTOUCH else None,
+        positions_mm=None if places is None else places[:, :2],
         graph=loaded.graph if has_graph else None,
         edges=edges,
         events=data.events.sum(axis=(2, 3), dtype=np.int64).mean(axis=0),

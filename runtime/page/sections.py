@@ -223,7 +223,7 @@ def _taxels(taxels: Taxels) -> list[Block]:
         spikes = [] if taxels.spikes is None else [f"{taxels.spikes[taxel]:,.1f}"]
         rows.append([str(taxel), str(near), f"{taxels.events[taxel]:,.1f}", *spikes])
     graph = "no taxel graph" if taxels.graph is None else f"graph {taxels.graph} with {len(edges)} edges"
-    unknown = "; drawn on a circle, as positions are not known: add --taxels COORDS.csv and the --graph of training"
+    unknown = "; drawn on a circle, as positions are not known: train with --taxels COORDS.csv"
     where = unknown if taxels.positions_mm is None else ""
     caption = "Discs grow with what a taxel sends, and with what its first-layer neurons fire where there is a graph."
     table = Table(head, rows, "Activity in a mean recording, the busiest first", most=LISTED)

@@ -134,6 +134,14 @@ def scale(axes: Any, unit: str) -> None:
     axes.set_major_formatter(lambda value, _: si(value, unit) if unit else counted(value))
 
 
+def plain_logarithm(axis: Any) -> None:
+    """Numbers of a logarithmic axis as plain text, since names may hold a dollar and formulas are not read."""
+    from matplotlib.ticker import LogFormatter
+
+    axis.set_major_formatter(LogFormatter())
+    axis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
+
+
 @styled()
 def bars(title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str], unit: str = "") -> Drawing:
     """Horizontal bars, one for each series in each row, with their values beside them."""

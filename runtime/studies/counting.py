@@ -49,6 +49,7 @@ class CountersRecord:
         default=None, metadata=OPTIONAL
     )  # Seconds of a bin, where the recordings were events
     class_names: tuple[str, ...] | None = field(default=None, metadata=OPTIONAL)
+    positions_mm: list[list[float]] | None = field(default=None, metadata=OPTIONAL)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -81,8 +82,12 @@ def train_counters(
     command: str,
     output: str,
     folds: Sequence[Fold] = (),
+    positions_mm: list[list[float]] | None = None,
 ) -> CountersReport:
-    """Train a counting network, write it, and read the test split; `folds` are conditions to leave out."""
+    """Train a counting network, write it, and read the test split.
+
+    `folds` are conditions to leave out, `positions_mm` those of the taxels where they were given.
+    """
     progress("cross-validation")
     classes = int(training.labels.max()) + 1
     data = run_counters(training, plan)
@@ -105,6 +110,7 @@ def train_counters(
         test_samples=len(test),
         bin_s=training.bin_s,
         class_names=training.names,
+        positions_mm=positions_mm,
     )
     known = {name: value for name, value in asdict(record).items() if value is not None}
     sha256 = write_counters(output, made.trained(known))

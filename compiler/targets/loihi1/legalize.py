@@ -3,6 +3,7 @@
 Nothing is changed. Every violated limit is listed, with its owner and what would make it fit.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -158,10 +159,47 @@ def violation(target: Target, owner: str, rule: str, used: int) -> Violation:
     return target.exceeded(owner, rule, used, REMEDIES[rule])
 
 
+def _faults(netlist: Netlist, target: Target) -> Iterator[Violation]:
+    """Rules that are no amounts on a core: tiles, formats, and what lists of these formats cannot hold."""
+    again = "compile it again"
+    tiles = np.bincount(netlist.core_tile)
+    for tile in np.flatnonzero(tiles > target.limit("mesh.tile_cores")).tolist():
+        yield target.exceeded(f"tile {tile}", "mesh.tile_cores", int(tiles[tile]), again)
+    columns = {
+        "synapse.weight_bits": netlist.format_weight_bits,
+        "synapse.index_bits": netlist.format_index_bits,
+        "synapse.exponent": netlist.format_exponent,
+    }
+    for rule, values in columns.items():
+        allowed = target.choices[rule]
+        for value in np.setdiff1d(values, allowed).tolist():
+            name = f"{target.name}.{rule}"
+            words = ", ".join(map(str, allowed))
+            yield Violation(owner="synapse formats", rule=name, used=str(value), allowed=words, remedy=again)
+    form = netlist.axon_format[netlist.axon_of_synapse()]
+    step = 1 << WEIGHT_BITS - netlist.format_weight_bits[form]
+    index = netlist.format_index_bits[form]
+    wide = netlist.synapse_weight % step != 0
+    far = (index > 0) & (netlist.synapse_target >> index > 0)
+    for rule, broken, values in (
+        ("synapse.weight_bits", wide, netlist.synapse_weight),
+        ("synapse.index_bits", far, netlist.synapse_target),
+    ):
+        if broken.any():
+            first = int(np.argmax(broken))
+            yield Violation(
+                owner=f"synapse {first} (and {np.count_nonzero(broken) - 1} more)",
+                rule=f"{target.name}.{rule}",
+                used=str(values[first]),
+                allowed=f"what {columns[rule][form[first]]} bits hold",
+                remedy=again,
+            )
+
+
 def require_legal(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
     """Measure every limit; CapacityError lists every one that is broken."""
     uses = measure(netlist, target)
-    violations = []
+    violations = [*_faults(netlist, target)]
     for use in uses:
         if use.used > use.allowed:
             owner = "chip"

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from spikeloom.compiler.errors import require_least
 from spikeloom.models.recordings.counts import number
+from spikeloom.runtime.inputs.checkpoint import places_of
 from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
@@ -39,7 +40,8 @@ def run(request: CertifyRequest) -> Outcome:
     singles = int(data.step_counts.sum()) * data.taxels * data.events.shape[2]
     tell(f"trying {singles:,} single events of {number(len(data), 'recording')}, then every other change")
     certificates = certify(machine, data, shift=request.shift, most=request.most, jobs=request.jobs)
-    result = replace(certificates, provenance=Provenance.of(request, data.sha256))
+    places = places_of(None, machine.netlist.provenance, data.taxels)
+    result = replace(certificates, provenance=Provenance.of(request, data.sha256), places=places)
     write_picture(request.picture, lambda: taxel_map(result))
     write_json(request.output, result)
     return Outcome(result, sections)

@@ -12,7 +12,7 @@ from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.idle import Forgotten, forgotten
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count
-from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, words_of_axons
+from spikeloom.compiler.targets.loihi1.legalize import LimitUse, require_legal, words_of_axons
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.targets.loihi1.registers import kept_shares
 from spikeloom.compiler.targets.netlist_file import origin_of
@@ -85,10 +85,10 @@ class NetlistFacts(Shown):
 
 
 def inspect(path: str | os.PathLike[str]) -> Outcome:
-    """What a netlist file holds, with its layout; raises as :func:`netlist.read_netlist` does."""
+    """What a netlist file holds, with its layout; raises as :func:`machine.load` does."""
     netlist = read_netlist(path)
     return Outcome(
-        describe(netlist, measure(netlist, load_target(netlist.target)), sha256_of(path)), sections
+        describe(netlist, require_legal(netlist, load_target(netlist.target)), sha256_of(path)), sections
     )
 
 

@@ -11,10 +11,10 @@ from spikeloom.compiler.formats.nir import writer as nir
 from spikeloom.compiler.formats.onnx import writer as onnx
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
-from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.models.recordings.evtouch import BIN_S
 from spikeloom.runtime.machines.exports import Export, Facts, Format
+from spikeloom.runtime.machines.loihi1.machine import load
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.requests.exchange import ExportRequest
 
@@ -47,7 +47,7 @@ class NirFacts(Facts):
 
 
 def _sanafe(request: ExportRequest) -> Export:
-    netlist = read_netlist(request.source)
+    netlist = load(request.source).netlist
     target = load_target(netlist.target)
     places = sanafe.cores(netlist, target)
     facts = SanafeFacts(
@@ -72,7 +72,7 @@ def _sanafe(request: ExportRequest) -> Export:
 
 
 def _onnx(request: ExportRequest) -> Export:
-    netlist = read_netlist(request.source)
+    netlist = load(request.source).netlist
     form = request.form or "scan"
     content, *ports = onnx.export(netlist, form)
     inputs, outputs = ([str(port) for port in side] for side in ports)
@@ -88,10 +88,9 @@ def _onnx(request: ExportRequest) -> Export:
 
 
 def _nir(request: ExportRequest) -> Export:
-    netlist = read_netlist(request.source)
-    known = origin_of(netlist.provenance)
-    kept = {name: known[name] for name in ("bin_s", "class_names") if name in known}
-    dt = (known.get("bin_s") or BIN_S) * netlist.bins if request.dt is None else request.dt
+    netlist = load(request.source).netlist
+    origin = origin_of(netlist.provenance)
+    dt = origin.get("bin_s", BIN_S) * netlist.bins if request.dt is None else request.dt
     facts = NirFacts(
         neurons=sum(layer.neurons for layer in netlist.layers),
         synapses=netlist.n_synapses,
@@ -100,7 +99,7 @@ def _nir(request: ExportRequest) -> Export:
     )
     lines = (f"in steps of {dt:g} s ({facts.convention})",)
     with reading(request.source, FormatError, "compile it again"):
-        content = nir.export(lift(netlist), dt, training=json.dumps(kept) if kept else None)
+        content = nir.export(lift(netlist), dt, training=json.dumps(origin) if origin else None)
     return Export(content=[content], facts=facts, lines=lines)
 
 

@@ -318,5 +318,7 @@ class Loihi(Damageable, Explainable, Stoppable):
 
 
 def load(path: str | os.PathLike[str]) -> Loihi:
-    """Read a netlist file; raises as :func:`netlist.read_netlist` does."""
-    return Loihi(read_netlist(path), Path(path).name)
+    """Read a netlist file and hold it against every limit of its chip; FormatError or CapacityError."""
+    machine = Loihi(read_netlist(path), Path(path).name)
+    machine.legal()
+    return machine

@@ -3,8 +3,8 @@
     stream = machine_for("net.loom").stream()
     for events in bins:                     # each (taxels, polarities), values 0 and 1
         step = stream.step(events)
-        print(step.decision, step.margin)
-    total = stream.finish()[-1]             # the counts that `spikeloom run` prints
+        print(step.decision, step.margin)   # so far
+    print(stream.decision)                  # ends the grasp: what `spikeloom run` decides
     stream.reset()                          # the next grasp
 
 The bins are steps of the network: where these join several bins of the recordings, an event in any of them
@@ -15,6 +15,8 @@ on the bins up to ``t - d`` of the layer that is read out; :meth:`Stream.finish`
 by step, all spikes and counts equal those of :func:`engine.simulate` on the whole recording, bit for bit.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -23,6 +25,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.base import Step
 from spikeloom.runtime.machines.loihi1.engine import NO_END, Engine, advance, start
 from spikeloom.runtime.machines.votes import class_counts
+from spikeloom.runtime.report.console import tell
 
 
 class Stream:
@@ -31,7 +34,7 @@ class Stream:
     Streams of one engine share nothing that changes: several may take turns, or run in a thread each.
     """
 
-    __slots__ = ("_bounds", "_column", "_ended", "_engine", "_place", "_state")
+    __slots__ = ("_bounds", "_column", "_ended", "_engine", "_last", "_place", "_state")
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
@@ -43,6 +46,7 @@ class Stream:
         self._column = np.zeros((engine.netlist.n_inputs, 1), np.uint8)
         self._state = start(engine)
         self._ended = False
+        self._last: Step | None = None
         # loads or compiles the kernel now, not within the first bin
         advance(engine, self._state, self._column, length=NO_END, steps=0)
 
@@ -56,8 +60,9 @@ class Stream:
 
         `events` (taxels, polarities), or flat with channel ``taxel * polarities + polarity``, are 1 where a
         taxel sent an event of that polarity within the bin, else 0, of any number type or bool; the
-        network's clocks tick by themselves. Raises DataError for another shape or other values, or after the
-        end, NumericRangeError if a register would overflow; that ends the stream.
+        network's clocks tick by themselves. Where a network says how long a recording is run, later events are
+        not used, as in a run. Raises DataError for another shape or other values, or after the end,
+        NumericRangeError if a register would overflow; that ends the stream.
         """
         if self._ended:
             raise DataError(
@@ -65,11 +70,11 @@ class Stream:
                 "call reset() to begin the next grasp"
             )
         netlist = self._engine.netlist
-        if self.index == netlist.clocks.length:
-            raise DataError(
-                f"stream: a step after the network's {self.index} found; call finish() for the decision"
-            )
         bin_ = _one_bin(netlist, events)
+        if self.index == netlist.clocks.length and self._last is not None:
+            if bin_.any():
+                tell(f"warning: stream: events after the network's {self.index} steps: not used")
+            return self._last
         self._column[: len(bin_), 0] = bin_
         self._column[len(bin_) :] = netlist.clocks.events(1, first=self.index)
         return self._advance(NO_END)
@@ -91,12 +96,25 @@ class Stream:
         self._ended = True
         self._column[:] = 0
         length = self.index
-        return (*rest, *(self._advance(length) for _ in range(netlist.max_depth)))
+        steps = (*rest, *(self._advance(length) for _ in range(netlist.max_depth)))
+        if self._last is not None:
+            self._last = replace(self._last, final=True)
+        return (*steps[:-1], self._last) if steps and self._last is not None else steps
+
+    @property
+    def decision(self) -> int:
+        """Class of the grasp, which ends with this if it has not: what a run of the same bins decides."""
+        if not self._ended:
+            self.finish()
+        if self._last is None:
+            raise DataError("stream: no decision found, as no bin came or a register overflowed; give bins")
+        return self._last.decision
 
     def reset(self) -> None:
         """Begin the next grasp, from rest; whatever was left of the last one is dropped."""
         self._state = start(self._engine)
         self._ended = False
+        self._last = None
 
     def _advance(self, length: int) -> Step:
         """Run one chip step on the events in the column."""
@@ -107,14 +125,16 @@ class Stream:
             advance(self._engine, state, self._column, length=length)
         except NumericRangeError:
             self._ended = True
+            self._last = None
             raise
         spikes = np.zeros(self._bounds[-1][1], np.bool_)
         spikes[self._place[state.fired[: state.counter[1]]]] = True
         counts = class_counts(netlist, state.spikes[None])[0]
         spikes.flags.writeable = counts.flags.writeable = False
-        return Step(
+        self._last = Step(
             index=index, spikes=tuple([spikes[begin:end] for begin, end in self._bounds]), counts=counts
         )
+        return self._last
 
 
 def _one_bin(netlist: Netlist, events: npt.ArrayLike) -> npt.NDArray[np.generic]:

@@ -8,12 +8,10 @@ import numpy as np
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.targets.compartments import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.conditions import by_condition
 from spikeloom.models.recordings.events import fitted, join_bins
-from spikeloom.models.sensors import read_layout
 from spikeloom.runtime.equivalence.reference import require_match
-from spikeloom.runtime.inputs.checkpoint import load_graph
+from spikeloom.runtime.inputs.checkpoint import load_graph, places_of
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
@@ -96,7 +94,7 @@ def bench_of(request: StressRequest) -> tuple[Bench, LoadedNetwork, str]:
     data = load_recordings(request.data, request, netlist, labels_for="stress", joined=False)
     bench = Bench(
         pair=Pair(netlist=netlist, network=loaded.network),
-        distance=_distances(request, loaded.checkpoint, netlist.taxels),
+        distance=_distances(request, loaded.checkpoint, netlist),
         events=data.events,
         labels=data.labels,
         files=data.files,
@@ -106,12 +104,12 @@ def bench_of(request: StressRequest) -> tuple[Bench, LoadedNetwork, str]:
     return bench, loaded, data.sha256
 
 
-def _distances(request: StressRequest, checkpoint: Checkpoint | None, taxels: int) -> FloatArray:
+def _distances(request: StressRequest, checkpoint: Checkpoint | None, netlist: Netlist) -> FloatArray:
     """Distances between taxels, as far as anything is known of their places."""
-    if request.taxels is not None:
-        return distances(taxels, read_layout(request.taxels)[1], None)
-    if taxels == len(NEUTOUCH) and not request.edges:
-        return distances(taxels, NEUTOUCH, None)
+    taxels = netlist.taxels
+    places = places_of(request.taxels, netlist.provenance, taxels)
+    if request.taxels is not None or (places is not None and not request.edges):
+        return distances(taxels, places, None)
     graph = None if checkpoint is None else checkpoint.edges
     if graph is None and checkpoint is not None:
         given = load_graph(request, checkpoint.system)

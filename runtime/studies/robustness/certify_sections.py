@@ -8,7 +8,6 @@ from itertools import product
 import numpy as np
 
 from spikeloom.compiler.types import FloatArray, IntArray
-from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.runtime.report.drawing import GREY, Drawing, sheet, styled
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Section, Table, Text
@@ -97,10 +96,11 @@ def hanging_on(result: Certificates) -> dict[str, IntArray]:
     return hanging
 
 
-def _places(taxels: int) -> FloatArray:
+def _places(result: Certificates) -> FloatArray:
     """Where taxels lie: on the sensor that is known, else on a circle."""
-    if taxels == len(NEUTOUCH):
-        return NEUTOUCH[:, :2]
+    if result.places is not None:
+        return result.places[:, :2]
+    taxels = result.taxels
     turn = 2 * np.pi * np.arange(taxels) / taxels
     return np.stack([np.cos(turn), np.sin(turn)], axis=1)
 
@@ -116,7 +116,7 @@ def taxel_map(result: Certificates) -> Drawing:
     title = f"{name}decisions, of {count}, that change if one taxel …"
     drawing = sheet(title, 4.2)
     drawing.figure.suptitle(title, fontsize=10)
-    points = _places(result.taxels)
+    points = _places(result)
     panels = drawing.figure.subplots(1, len(PANELS))
     for axes, (kind, values) in zip(panels, hanging_on(result).items(), strict=True):
         colours = ScalarMappable(Normalize(0, max(int(values.max()), 1)), "YlOrRd")

@@ -7,8 +7,9 @@ from typing import Any, Self
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.files import sha256_of
+from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.inputs.recordings import name_of
-from spikeloom.runtime.report.encode import OPTIONAL, key
+from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL, key
 from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.requests.check import CertifyRequest, StressRequest
 from spikeloom.runtime.studies.robustness.definition import Level
@@ -203,6 +204,8 @@ class Certificates(Shown):
     most: int
     certificates: tuple[Certificate, ...]
     provenance: Provenance | None = None
+    # (taxels, 2 or 3) millimetres, as far as they are known
+    places: FloatArray | None = field(default=None, metadata=HIDDEN)
 
     def certified(self, events: int) -> int:
         """Recordings whose decision no change of up to so many events alters."""

@@ -29,7 +29,7 @@ from spikeloom.runtime.inputs.checkpoint import load_graph
 from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
-from spikeloom.runtime.inputs.recordings import recordings, require_splits
+from spikeloom.runtime.inputs.recordings import recordings, require_splits, warn_of_shared
 from spikeloom.runtime.machines.backends import backend_of
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
@@ -152,6 +152,7 @@ def _splits(request: FinetuneRequest, loaded: LoadedNetwork) -> tuple[Recordings
         )
         for split in ("train", "test")
     )
+    warn_of_shared(training, test)
     return training, test
 
 
@@ -267,7 +268,7 @@ def _write_checkpoint(
     changed = replace(
         checkpoint, graph=loaded.graph, edges=edges, forms=net.forms, **layers_of(net.tensors())
     )
-    save_again(output, changed, training=record.to_json())
+    save_again(output, changed, training=origin_of(loaded.training) | record.to_json())
     round_to_forms(
         expand(read_checkpoint(output), convolution.propagation), net.forms
     )  # it compiles, or says why not
@@ -281,7 +282,8 @@ def _write_nir(
 
     integer, _ = round_to_forms(net.expanded(), net.forms)
     dt = loaded.read_as.get("dt", (record.bin_s or BIN_S) * integer.input.bins)
-    content = writer.export(integer, dt, training=json.dumps(record.to_json()))
+    training = origin_of(loaded.training) | record.to_json()
+    content = writer.export(integer, dt, training=json.dumps(training))
     with write_atomically(request.output) as file:
         file.write(content)
     netlist = Path(request.output).with_suffix(".loom")

@@ -12,6 +12,7 @@ from spikeloom.compiler.formats.own_checkpoint import save_again
 from spikeloom.compiler.formats.tensors import join as side_by_side
 from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.types import JsonObject
+from spikeloom.models.recordings.evtouch import WHOLE
 from spikeloom.runtime.inputs.checkpoint import load_checkpoint
 from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.report.checkpoints import LayerSize, tower_line
@@ -29,6 +30,8 @@ KEPT = (
     "data_sha256",
     "bin_s",
     "class_names",
+    "window",
+    "positions_mm",
     "test_samples",
     "fine_tuned_from",
 )
@@ -76,8 +79,13 @@ def join(request: JoinRequest) -> Joined:
 
 
 def _common_origin(towers: Sequence[Mapping[str, Any]]) -> JsonObject:
-    """What the first was trained on; ModelError if the widths of their bins differ."""
+    """What the first was trained on; ModelError if the widths of their bins, or the parts of recordings, differ."""
     origins = [origin_of(tower) for tower in towers]
+    windows = sorted({origin.get("window", WHOLE) for origin in origins})
+    if len(windows) > 1:
+        raise ModelError(
+            f"join: networks of {windows[0]} % and {windows[-1]} % of each recording; give those of one --window"
+        )
     widths = sorted({origin["bin_s"] for origin in origins if "bin_s" in origin})
     if len(widths) > 1:
         raise ModelError(

@@ -13,15 +13,15 @@ from spikeloom.compiler.targets.native import SYSTEM as NATIVE
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.graphs import CHOICES, Graph
 from spikeloom.models.recordings.classes import without_gaps
-from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.evtouch import Recordings, parse_window
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.models.systems import sensor_grid, taxels_alone
 from spikeloom.models.training.plan import Plan
 from spikeloom.models.training.recipes import RELEASED, STEPS, Recipe, check_recipe, parse_decays
 from spikeloom.runtime.inputs import repeat
-from spikeloom.runtime.inputs.checkpoint import load_graph, sensor_places
+from spikeloom.runtime.inputs.checkpoint import given_places, load_graph, sensor_places
 from spikeloom.runtime.inputs.compilation import whole_numbers
-from spikeloom.runtime.inputs.recordings import recordings, require_splits
+from spikeloom.runtime.inputs.recordings import recordings, require_splits, warn_of_shared
 from spikeloom.runtime.report.console import progress, tell
 from spikeloom.runtime.requests.training import TrainRequest
 from spikeloom.runtime.studies.training.seeds import Job, output_of
@@ -50,6 +50,7 @@ def both_splits(
     progress("")
     training, test = without_gaps(training, test)
     _require_classes(training, test)
+    warn_of_shared(training, test)
     return training, test
 
 
@@ -100,6 +101,8 @@ def plan_jobs(request: TrainRequest, training: Recordings, test: Recordings) -> 
             keep=tuple(dict.fromkeys(request.keep or WEIGHTS)),
             command=f"{command} --seed {seed}",
             position=position,
+            window=None if request.window is None else parse_window(request.window),
+            positions_mm=given_places(request.taxels),
         )
         for position, seed in enumerate(range(request.seed, request.seed + request.seeds))
     ]

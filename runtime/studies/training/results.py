@@ -10,7 +10,7 @@ import numpy as np
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.models.training.recipes import MSE
 from spikeloom.models.training.record import Reached, TrainingRecord
-from spikeloom.runtime.report.drawing import COLOURS, Drawing, sheet, styled
+from spikeloom.runtime.report.drawing import COLOURS, Drawing, plain_logarithm, sheet, styled
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.numbers import wilson
 from spikeloom.runtime.report.sections import Section, Table, Text
@@ -111,6 +111,7 @@ def picture(records: Sequence[Finished]) -> Drawing:
     left.set(xlabel="epoch", ylabel=measured, title="loss: training solid, test dashed")
     right.set(xlabel="epoch", ylabel="test accuracy (%)", title="accuracy; circle: clean epoch")
     right.legend(loc="lower right")
+    plain_logarithm(left.yaxis)
     for axes in (left, right):
         axes.locator_params(axis="x", integer=True)
         axes.grid()

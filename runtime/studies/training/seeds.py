@@ -32,6 +32,8 @@ class Job:
     keep: tuple[str, ...]  # Which of ``last``, ``best`` and ``clean`` to write
     command: str  # That repeats it
     position: int  # Row of the progress bar
+    window: int | None  # Per cent of each recording that trains, where it is a part
+    positions_mm: list[list[float]] | None  # Of the taxels, where they were given
 
     @property
     def state(self) -> Path:
@@ -83,6 +85,8 @@ def run_job(job: Job) -> Finished:
         command=job.command,
         seed=job.seed,
         recipe=None if plan.recipe == RELEASED else plan.recipe.to_json(),
+        window=job.window,
+        positions_mm=job.positions_mm,
     )
     trained = reported.trained
     assert trained.kept is not None, "the clean epoch is one of the epochs"

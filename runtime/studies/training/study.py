@@ -9,11 +9,10 @@ from spikeloom.models.recordings.evtouch import WHOLE, first_part, parse_window
 from spikeloom.models.training.counters import Plan
 from spikeloom.models.training.recipes import RELEASED
 from spikeloom.runtime.inputs import repeat
-from spikeloom.runtime.inputs.checkpoint import sensor_places
+from spikeloom.runtime.inputs.checkpoint import given_places, sensor_places
 from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
 from spikeloom.runtime.inputs.recordings import require_bins
-from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.requests.training import TrainRequest
 from spikeloom.runtime.studies.counting import CountersReport, train_counters
 from spikeloom.runtime.studies.left_out import announce, condition_folds, networks_left_out
@@ -57,10 +56,6 @@ def train_networks(request: TrainRequest) -> TrainingReport:
     if request.groups is not None:
         folds = condition_folds(training, request.groups)
         announce(request.groups, folds)
-    if percent < WHOLE:
-        tell(
-            f"note: of every recording the first {percent} % train; give --window {percent}% to what runs the network"
-        )
     jobs = plan_jobs(request, training, test)
     runs = train_seeds(jobs, resume=request.resume)
     write_picture(request.picture, lambda: picture(runs))
@@ -98,7 +93,9 @@ def train_counting(request: TrainRequest) -> CountersReport:
     if request.groups is not None:
         folds = condition_folds(training, request.groups)
         announce(request.groups, folds, parts=0)
-    return train_counters(plan, training, test, repeat.command("train", *typed), request.output, folds)
+    command = repeat.command("train", *typed)
+    places = given_places(request.taxels)
+    return train_counters(plan, training, test, command, request.output, folds, places)
 
 
 def _counting_plan(bins: int, options: dict[str, Any]) -> Plan:

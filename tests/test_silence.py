@@ -1,0 +1,105 @@
+"""What networks keep of their training and sensor, and what is said where recordings are others than these."""
+
+import shutil
+
+import numpy as np
+import pytest
+from commands import as_json, run
+from made_files import TAXELS, recordings_folder
+
+from spikeloom.compiler.targets.netlist_file import origin_of
+from spikeloom.runtime.inputs.checkpoint import places_of
+from spikeloom.runtime.machines.backends import machine_for
+
+PLACES = [[float(taxel), 2.0 * (taxel % 2)] for taxel in range(TAXELS)]
+STEPS = 20
+SMALL = ("--features", "2", "--hidden", "4", "--epochs", "1")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("silence")
+    train, test = (np.random.default_rng(seed).random((12, TAXELS, 2, STEPS)) < 0.2 for seed in (1, 2))
+    recordings_folder(place / "data", train=train, test=test)
+    longer = (np.random.default_rng(3).random((12, TAXELS, 2, STEPS + 40)) < 0.2 for _ in range(2))
+    recordings_folder(place / "longer", train=next(longer), test=next(longer))
+    (place / "coords.csv").write_text("x,y\n" + "".join(f"{x},{y}\n" for x, y in PLACES))
+    return place
+
+
+@pytest.fixture(scope="module")
+def half(folder):
+    """A network that was trained on the first half of each recording, its netlist, and what training reached."""
+    sensor = ("--taxels", folder / "coords.csv", "--graph", "knn:2")
+    network = folder / "half.pt"
+    given = ("--data", folder / "data", *sensor, *SMALL, "--window", "50%", "-o", network)
+    made = as_json("train", *given)
+    assert run("compile", network, "-o", folder / "half.loom")[0] == 0
+    return network, folder / "half.loom", made
+
+
+def test_the_part_of_recordings_that_trained_a_network_is_what_runs_it(folder, half):
+    _, netlist, _ = half
+    given = ("estimate", netlist, "--data", folder / "data")
+    own = as_json(*given)
+    assert own == as_json(*given, "--window", "50%")
+    assert own != as_json(*given, "--window", "90%")
+    origin = origin_of(machine_for(netlist).netlist.provenance)
+    assert origin["window"] == 50
+    assert run("export", netlist, "--to", "nir", "-o", folder / "half.nir")[0] == 0
+    assert run("compile", folder / "half.nir", "-o", folder / "back.loom")[0] == 0
+    assert origin_of(machine_for(folder / "back.loom").netlist.provenance) == origin
+
+
+def test_positions_of_taxels_go_with_the_network(folder, half):
+    network, netlist, _ = half
+    origin = machine_for(netlist).netlist.provenance
+    assert np.array_equal(places_of(None, origin, TAXELS), PLACES)
+    given = ("--checkpoint", network, "--data", folder / "data", "--limit", "2", "-o", folder / "page.html")
+    page = as_json("report", netlist, *given, codes=(0, 1))
+    assert page["taxels"]["positions_mm"] == PLACES
+    assert "positions are not known" not in (folder / "page.html").read_text()
+
+
+@pytest.mark.parametrize(
+    "said", [PLACES[:-1], [[0.0], [1.0, 2.0]], [["x", "y"]] * TAXELS, [[1e999, 0.0]] * TAXELS]
+)
+def test_positions_that_are_none_are_not_taken(said):
+    assert places_of(None, {"positions_mm": said}, TAXELS) is None
+
+
+def test_events_after_the_steps_that_counters_were_trained_for_are_said(folder):
+    given = ("--data", folder / "data", "--system", "counters", "--thresholds", "1,2")
+    assert run("train", *given, "-o", folder / "count.pt")[0] == 0
+    assert run("compile", folder / "count.pt", "-o", folder / "count.loom")[0] == 0
+    assert "after the network's" not in run("run", folder / "count.loom", "--data", folder / "data")[2]
+    said = run("run", folder / "count.loom", "--data", folder / "longer")[2]
+    assert f"after the network's {STEPS} steps, read out until step {STEPS + 32}" in said
+
+
+def test_test_recordings_that_trained_are_said(folder):
+    shutil.copytree(folder / "data", folder / "twice")
+    for name in ("sample_0_label_0.npy", "sample_1_label_1.npy"):
+        shutil.copy(folder / "twice/train" / name, folder / "twice/test" / name)
+    given = ("--system", "counters", "--thresholds", "1,2", "-o", folder / "twice.pt")
+    said = run("train", "--data", folder / "twice", *given)[2]
+    assert "2 of 12 test recordings are training recordings, too" in said
+    assert "training recordings, too" not in run("train", "--data", folder / "data", *given)[2]
+
+
+def test_a_picture_of_a_training_has_numbers_beside_its_axis(folder):
+    given = (
+        "--taxels",
+        TAXELS,
+        "--system",
+        "mlp",
+        "--hidden",
+        "4",
+        "--epochs",
+        "2",
+        "-o",
+        folder / "shown.pt",
+    )
+    code, _, err = run("train", "--data", folder / "data", *given, "--picture", folder / "shown.svg")
+    assert code == 0, err
+    assert "mathdefault" not in (folder / "shown.svg").read_text()
