@@ -139,7 +139,11 @@ def read_npy(content: bytes) -> Array:
     """
     file = io.BytesIO(content)
     headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    shape, fortran, dtype = headers[np.lib.format.read_magic(file)](file)
+    read_header = headers[np.lib.format.read_magic(file)]
+    try:
+        shape, fortran, dtype = read_header(file)
+    except MemoryError:  # what Python's parser raises of a header that nests too deeply
+        raise FileFault("has a damaged header") from None
     size = len(content) - file.tell()
     wanted = math.prod(shape) * dtype.itemsize
     if dtype.hasobject or min(shape, default=1) < 0 or size != wanted:
@@ -159,11 +163,12 @@ def stated(path: Path, name: str) -> str | None:
     try:
         if not path.is_file():  # a pipe would wait for ever
             return None
-        with zipfile.ZipFile(path) as archive, archive.open("manifest.npy") as member:
-            manifest = json.loads(str(np.lib.format.read_array(member, allow_pickle=False)))
-    except (
-        Exception
-    ):  # zipfile and numpy raise whatever they meet; a header may announce more than the memory holds
+        with zipfile.ZipFile(path) as archive:
+            info = archive.getinfo("manifest.npy")
+            if info.compress_type != zipfile.ZIP_STORED or info.file_size > path.stat().st_size:
+                return None  # no archive of ours, and more than the memory may hold
+            manifest = json.loads(str(read_npy(archive.read(info))))
+    except Exception:  # zipfile and numpy raise whatever they meet
         return None
     value = manifest.get(name) if isinstance(manifest, dict) else None
     return value if isinstance(value, str) else None
@@ -173,6 +178,9 @@ def is_netlist(path: str | os.PathLike[str]) -> bool:
     """Whether a file claims to be a netlist: an archive with a manifest, or a name that ends in ``.loom``."""
     return str(path).endswith(".loom") or stated(Path(path), "format") not in (None, COUNTERS)
 
+
+DEPTH = 16
+"""How deep lists and objects of a manifest may nest."""
 
 LETTERS = 1000
 """Maximum length of a text in a manifest, such as the name of a layer."""
@@ -209,6 +217,12 @@ def array_faults(
             shape = ("list", "table", "block")[due - 1]
             faults.append(f"{name} is no {shape} of {'numbers' if kind == 'f' else 'integers'}")
     return faults
+
+
+def _is_shallow(value: Any, depth: int) -> bool:
+    """Whether lists and objects nest no deeper."""
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return depth > 0 and all(_is_shallow(each, depth - 1) for each in inside)
 
 
 def _is(value: Any, kind: Kind) -> bool:  # noqa: PLR0911 - one for each kind
@@ -254,6 +268,8 @@ def read_archive(
     written = str(members.pop("sha256"))
     manifest = json.loads(str(text))
     kind = manifest.get("format") if isinstance(manifest, dict) else None
+    if not _is_shallow(manifest, DEPTH):
+        raise FileFault(f"has a manifest of lists more than {DEPTH} deep")
     if isinstance(kind, str) and kind in FORMATS and kind != wanted:
         raise FileFault(f"holds {FORMATS[kind]}, this is for {FORMATS.get(wanted, wanted)}")
     if kind != wanted:

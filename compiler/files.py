@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterator
@@ -17,6 +18,9 @@ SIZE_LIMIT = 2**28
 
 MOST_SAID = 300
 """Maximum length of a message about a file, without the folders before its name."""
+
+MOST_FOLDERS = 1000
+"""Letters of the folders in a message that do not count."""
 
 RANDOM = 8
 """Random hex digits in the name of a file that is still being written."""
@@ -103,6 +107,18 @@ def _shortened(said: str, room: int) -> str:
     """A message in one line, its middle left out where it is long: the end is the remedy."""
     said = plain(" ".join(said.split()))
     return said if len(said) <= room else f"{said[: max(room // 2, 60)]} … {said[-max(room // 2 - 3, 60) :]}"
+
+
+def one_line(text: str) -> str:
+    r"""A message to people, whatever names of files put in it: in one line of `MOST_SAID` letters, folders aside.
+
+    >>> len(one_line("a" * 999)), len(one_line("b" * 9 + "/a")), one_line("a\nspikeloom: warning: b")
+    (300, 11, 'a spikeloom: warning: b')
+    """
+    said = " ".join(plain(text).split())
+    folders = sum(map(len, re.findall(r"\S*/", said)))
+    room = MOST_SAID + min(folders, MOST_FOLDERS)
+    return _shortened(said, room)
 
 
 def plain(text: str) -> str:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from spikeloom.compiler import __version__
-from spikeloom.compiler.errors import OptionError, SpikeloomError, UnfinishedError
+from spikeloom.compiler.errors import CapacityError, OptionError, SpikeloomError, UnfinishedError
 from spikeloom.compiler.files import WRITTEN
 
 if TYPE_CHECKING:
@@ -162,15 +162,17 @@ def _written() -> str:
     return ", ".join(path for path in WRITTEN if Path(path).exists())
 
 
-def _mistake(error: Exception) -> str:
+def _mistake(error: Exception) -> list[str]:
     """Lines for a user: one, or one per violated limit."""
+    if isinstance(error, CapacityError):
+        return [*map(str, error.violations), *getattr(error, "__notes__", ())]
     if isinstance(error, OSError) and error.strerror:
         where = error.filename or "a file"
         left = f"; written before: {_written()}" if _written() else ""
-        return f"{where}: {error.strerror}; check space and permissions{left}"
+        return [f"{where}: {error.strerror}; check space and permissions{left}"]
     if isinstance(error, MemoryError):
-        return f"out of memory ({error or 'no size known'}); give fewer recordings with --limit"
-    return " ".join([str(error), *(f"({note})" for note in getattr(error, "__notes__", ()))])
+        return [f"out of memory ({error or 'no size known'}); give fewer recordings with --limit"]
+    return [" ".join([str(error), *(f"({note})" for note in getattr(error, "__notes__", ()))])]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -199,9 +201,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         progress("")
         if "--debug" in words:
             raise
-        tell(_mistake(error))
+        for line in _mistake(error):
+            tell(line)
         if isinstance(error, UnfinishedError):
-            tell(f"go on with: {shlex.join(['spikeloom', *words])}")
+            sys.stderr.write(f"spikeloom: go on with: {shlex.join(['spikeloom', *words])}\n")
             return 1
         return 2
     except KeyboardInterrupt as interrupt:

@@ -18,6 +18,7 @@ from torch import nn
 import spikeloom as api
 from spikeloom.compiler.errors import CapacityError, DataError, ModelError, OptionError
 from spikeloom.compiler.storage import Cheapest, Exact, Fixed, Packing
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.runtime.inputs.compilation import STORED, options_of, storage_of
 from spikeloom.runtime.requests.check import CertifyRequest, StressRequest
 from spikeloom.runtime.requests.choices import NetworkChoice
@@ -93,7 +94,7 @@ def test_polarities_of_a_module_are_those_that_are_given():
         api.compile(module, example=example, **given)
         for given in ({"polarities": 1}, {"polarities_first": True}, {})
     )
-    assert (one.facts.taxels, first.facts.taxels) == (2 * TAXELS, TAXELS)
+    assert [read_netlist(net.path).taxels for net in (one, first)] == [2 * TAXELS, TAXELS]
     assert first.path.read_bytes() != last.path.read_bytes()
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from spikeloom.compiler import archive, invariants
 from spikeloom.compiler.arrays import frozen, read_only, read_only_float
-from spikeloom.compiler.dynamics import Clocks
+from spikeloom.compiler.dynamics import MOST_STEPS, Clocks
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.files import FileFault, reading
 from spikeloom.compiler.types import IntArray, JsonObject
@@ -60,6 +60,34 @@ def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
     if isinstance(names, list | tuple) and names and all(isinstance(name, str) for name in names):
         origin["class_names"] = list(names)
     return origin
+
+
+PROVENANCE: dict[str, archive.Kind] = {
+    **dict.fromkeys(
+        ("spikeloom", "checkpoint_sha256", "format", "graph", "weights", "convention", "data"), str
+    ),
+    **dict.fromkeys(("run", "towers", "chips"), (0, MOST)),
+    **dict.fromkeys(("dt", "bin_s"), float),
+    **dict.fromkeys(("keep_all", "prune_unused", "spike_exact", "calibrated"), bool),
+    "window": (1, 100),
+    "steps": (1, MOST_STEPS),
+    "compensated": [str],
+}
+"""What else is read of a provenance, where it says so; ``digests`` are those of each layer by what they are of."""
+
+
+def provenance_faults(provenance: Mapping[str, Any]) -> list[str]:
+    """Entries of a provenance that are of another kind."""
+    said = {name: kind for name, kind in PROVENANCE.items() if provenance.get(name) is not None}
+    digests = provenance.get("digests") or {}
+    layers = digests.values() if isinstance(digests, dict) else [None]
+    texts = all(
+        isinstance(each, dict) and all(isinstance(one, str) for one in each.values()) for each in layers
+    )
+    return [
+        *archive.entry_faults(provenance, said),
+        *([] if texts else ["the provenance has no usable digests"]),
+    ]
 
 
 class Netlist:
@@ -178,6 +206,7 @@ class NetlistFile(Generic[N]):
             )
             further = {name: kind for name, kind in self.optional.items() if name in manifest}
             archive.require_none(archive.entry_faults(manifest, further))
+            archive.require_none(provenance_faults(manifest["provenance"]))
             if manifest["taxels"] * manifest["polarities"] > MOST:
                 raise FileFault(f"has more than {MOST} input channels")
             archive.require_none(archive.array_faults(members, dict.fromkeys(self.tables, 2), self.floats))

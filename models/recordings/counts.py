@@ -4,7 +4,7 @@ import sys
 from dataclasses import dataclass, field
 from functools import cache
 
-from spikeloom.compiler.files import plain
+from spikeloom.compiler.files import one_line
 
 GAP_S = 0.5
 """A silence longer than this, between two events, counts as a gap; seconds."""
@@ -38,14 +38,14 @@ class EventCounts:
 def show_counts(source: str, split: str, counts: EventCounts | None) -> None:
     """Say on stderr, once, what was counted and is worth a second look; the released layout has nothing to say."""
     if counts is not None:
-        sys.stderr.write(plain(f"{source}, {split}: {counts}\n"))
+        sys.stderr.write(one_line(f"{source}, {split}: {counts}") + "\n")
         show_notes(counts)
 
 
 def show_notes(counts: EventCounts | None) -> None:
     """Say on stderr what is worth a second look."""
     if counts is not None:
-        sys.stderr.writelines(plain(f"spikeloom: warning: {note}\n") for note in counts.notes)
+        sys.stderr.writelines(f"{one_line(f'spikeloom: warning: {note}')}\n" for note in counts.notes)
 
 
 def number(count: int, noun: str) -> str:

@@ -199,7 +199,9 @@ NOTHING = Row(label=None, duration_s=None, groups={})
 
 def _read_rows(opener: Callable[[], IO[Any]], where: str) -> dict[str, Row] | None:
     """Rows by name of file of a table of recordings; None if it is another kind of table."""
-    rows = list(csv.reader(io.StringIO(read_text(opener, where), newline="")))
+    text = read_text(opener, where)
+    with reading(where, DataError, "save it as CSV in UTF-8"):
+        rows = list(csv.reader(io.StringIO(text, newline="")))
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     files = [index for index, name in enumerate(header) if name in _FILE]
     classes = [name for name in header if name in _LABEL]

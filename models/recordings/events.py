@@ -259,7 +259,7 @@ def bin_events(
     step = np.floor(stream.time_s / bin_s + _EDGE).astype(np.int64)
     steps = int(step.max()) + 1
     n = int(stream.taxel.max()) + 1 if taxels is None else taxels
-    evtouch.require_memory(stream.name, n * 2 * steps)
+    evtouch.require_memory(stream.name, n * 2 * steps, evtouch.MAX_FILE_BYTES)
     grid = np.zeros((n, 2, steps), dtype=np.uint8)
     grid[stream.taxel, stream.polarity, step] = 1
     sent = len(stream.time_s)

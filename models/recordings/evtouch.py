@@ -26,7 +26,7 @@ from spikeloom.models.recordings.counts import EventCounts
 MAX_POLARITIES = 8
 """Most polarities of a taxel; an array with more has its axes in another order."""
 
-MAX_TOTAL_BYTES = 4 << 30
+MAX_TOTAL_BYTES = 2 << 30
 MAX_FILE_BYTES = 64 << 20  # the released recordings have 0.1 MB
 
 BIN_S = 0.02
@@ -239,10 +239,15 @@ def require_bins(where: str, values: AnyArray, taxels: int | None) -> EventArray
     return events.view(np.uint8)
 
 
-def require_memory(source: str, size: int) -> None:
-    """Refuse a data set that would fill the memory."""
-    if size > MAX_TOTAL_BYTES:
-        raise DataError(f"{source}: recordings of {size} bytes, limit {MAX_TOTAL_BYTES}; split the data set")
+def require_memory(source: str, size: int, limit: int | None = None) -> None:
+    """Refuse a data set that would fill the memory, or a recording of more than its own `limit`."""
+    if size > (limit or MAX_TOTAL_BYTES):
+        what, remedy = (
+            ("recordings", "the data set") if limit is None else ("a recording", "it, or use wider bins")
+        )
+        raise DataError(
+            f"{source}: {what} of {size} bytes, limit {limit or MAX_TOTAL_BYTES}; split {remedy}"
+        )
 
 
 def require_class(where: str, label: int, classes: int | None) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.files import beside, write_atomically
+from spikeloom.compiler.files import beside, remove_leftovers, write_atomically
 from spikeloom.compiler.formats import NETWORKS, NIR, ONNX
 from spikeloom.models.recordings.classes import class_in_name
 from spikeloom.runtime.report.drawing import PICTURES, Drawing
@@ -76,6 +76,7 @@ def require_place(
         raise OptionError(f"{option} {path}: {why} another")
     if place.exists() and not place.is_file():
         raise OptionError(f"{option} {path}: is not a regular file; give the name of a file to write")
+    remove_leftovers(place)
     part = beside(place.resolve())
     try:
         part.open("xb").close()

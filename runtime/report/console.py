@@ -4,7 +4,7 @@ import os
 import sys
 import time
 
-from spikeloom.compiler.files import plain
+from spikeloom.compiler.files import one_line, plain
 
 
 def progress(label: str) -> None:
@@ -15,8 +15,8 @@ def progress(label: str) -> None:
 
 
 def tell(text: str) -> None:
-    """Say something to people, line by line on standard error."""
-    sys.stderr.writelines(f"spikeloom: {line}\n" for line in plain(text).splitlines())
+    """Say something to people, in one line on standard error."""
+    sys.stderr.write(f"spikeloom: {one_line(text)}\n")
 
 
 class Progress:

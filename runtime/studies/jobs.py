@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, UnfinishedError, require_least
-from spikeloom.compiler.files import WRITTEN, FileFault, reading, remove_leftovers
+from spikeloom.compiler.files import WRITTEN, FileFault, reading, remove_leftovers, require_size
 from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.report.encode import decode
 
@@ -82,6 +82,7 @@ def sweep(
         for folder in own:
             remove_leftovers(folder)
         with reading(store, DataError, "give another output, or delete it"):
+            require_size(store.stat().st_size if store.exists() else 0, "store of measurements", STORE_LIMIT)
             rows = _rows_of(kept)
             WRITTEN[str(store)] = None
             results = {key: decode(kind, _unsealed(key, rows[key])) for key in keys if key in rows}
@@ -114,9 +115,24 @@ def sweep(
         return {key: results[key] for key in keys if key in results}
 
 
+TABLE = "CREATE TABLE results (key TEXT PRIMARY KEY, result TEXT)"
+"""All that a store has."""
+
+STORE_LIMIT = 1 << 30
+"""Bytes of a store."""
+
+
 def _rows_of(kept: sqlite3.Connection) -> dict[str, str]:
-    """Results of a store, which may be new, by key; FileFault if it is damaged."""
-    kept.execute("CREATE TABLE IF NOT EXISTS results (key TEXT PRIMARY KEY, result TEXT)")
+    """Results of a store, which may be new, by key; FileFault if it is damaged, or no table of ours alone.
+
+    Rows of that table take no more than its file has: views, triggers and functions are what could.
+    """
+    kept.execute("PRAGMA trusted_schema = OFF")
+    found = kept.execute("SELECT substr(sql, 1, 999) FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
+    if found not in ([], [(TABLE,)]):
+        raise FileFault("is no store of measurements, or holds more than these")
+    if not found:
+        kept.execute(TABLE)
     if (said := kept.execute("PRAGMA quick_check").fetchone()) != ("ok",):
         raise FileFault(f"is damaged ({said})")
     return dict(kept.execute("SELECT key, result FROM results"))

@@ -1,4 +1,35 @@
-"""A netlist as an integer ONNX graph: the chip's arithmetic, to be run by any program that reads the format.
+"""A netlist as an integer ONNX graph: :data:`ABOUT`, which stands in the file, says what goes in and comes out."""
+
+import hashlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.names import plain_names
+from spikeloom.compiler.formats.onnx.builder import (
+    Model,
+    Nodes,
+    Port,
+    model_bytes,
+    one_each,
+    whole_recordings,
+)
+from spikeloom.compiler.ir import INPUT
+from spikeloom.compiler.targets.loihi1.bounds import Reach, reach
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, netlist_bytes
+from spikeloom.compiler.targets.loihi1.registers import (
+    ACCUMULATOR_MAX,
+    CURRENT_MAX,
+    DECAY_ONE,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+)
+from spikeloom.compiler.types import IntArray
+
+ABOUT = """A netlist as an integer ONNX graph: the chip's arithmetic, to be run by any program that reads the format.
 
 Spikes are uint8 zeros and ones; membranes and currents are registers, int32 where no input can bring a product or a
 sum beyond it and int64 otherwise. A layer is called by its name (``conv1``, ``fc1`` …), its neurons are those that the
@@ -32,35 +63,7 @@ Form ``scan``: whole recordings of the same length, a loop over the form ``step`
 ``class``              (batch,)                int64, most votes, the lowest on a tie
 ====================== ======================= ========================================================================
 """
-
-import hashlib
-from dataclasses import dataclass, replace
-
-import numpy as np
-import numpy.typing as npt
-from scipy import sparse
-
-from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.names import plain_names
-from spikeloom.compiler.formats.onnx.builder import (
-    Model,
-    Nodes,
-    Port,
-    model_bytes,
-    one_each,
-    whole_recordings,
-)
-from spikeloom.compiler.ir import INPUT
-from spikeloom.compiler.targets.loihi1.bounds import Reach, reach
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, netlist_bytes
-from spikeloom.compiler.targets.loihi1.registers import (
-    ACCUMULATOR_MAX,
-    CURRENT_MAX,
-    DECAY_ONE,
-    MEMBRANE_MAX,
-    MEMBRANE_SHIFT,
-)
-from spikeloom.compiler.types import IntArray
+"""What a file says of itself; no docstring, which Python may leave out."""
 
 SIZE_LIMIT = 2**31 - 2**20
 """Bytes of weights that a file of this format can hold, a little below protobuf's 2 GiB."""
@@ -200,7 +203,7 @@ def export(netlist: Netlist, form: str) -> tuple[bytes, list[Port], list[Port]]:
     content = model_bytes(
         model,
         name=f"spikeloom-{form}",
-        about=__doc__ or "",
+        about=ABOUT,
         facts={
             "netlist_sha256": hashlib.sha256(netlist_bytes(netlist)).hexdigest(),
             "form": form,

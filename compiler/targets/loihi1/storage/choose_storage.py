@@ -244,7 +244,7 @@ def choose_storage(
     To `share_lists`, errors cancel only in layers whose weights do not repeat, see
     :func:`legalize.stored_once`. ``calibrate.FEW`` recordings of the calibration choose, several planes use
     ``MANY``; without it scales come from the weights and the proven bounds alone. OptionError if there are
-    no such packings; ModelError, with a line for each, if populations have no usable scale.
+    no such packings; ModelError if populations have no usable scale.
     """
     packings = check_packings(packings, len(network.populations), target)
     layers = []
@@ -268,7 +268,7 @@ def choose_storage(
         layers.append(layer)
         chosen.append(best)
     if faults:
-        raise ModelError("\n".join(faults))
+        raise ModelError("; ".join(faults))
     return assemble(network, chosen), tuple(map(explain_choice, layers, chosen))
 
 
