@@ -126,6 +126,8 @@ def stored_members(content: bytes) -> dict[str, bytes]:
     """Members of a zip that stores them plainly and claims no more bytes than it has, else FileFault or of zipfile."""
     with opened_zip(io.BytesIO(content)) as opened:
         infos = opened.infolist()
+        if any("/code/__torch__" in info.filename for info in infos):
+            raise FileFault("is a TorchScript program, which tells what it does only when it runs")
         declared = sum(info.file_size for info in infos)
         if declared > len(content) or any(info.compress_type != zipfile.ZIP_STORED for info in infos):
             raise FileFault(f"has compressed members, {len(content)} bytes claim to hold {declared}")

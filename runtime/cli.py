@@ -71,7 +71,10 @@ class Parser(argparse.ArgumentParser):
         """Refuse an unknown option first, so that the near one of the same command can be named."""
         if self._subparsers is None:
             known = list(self._option_string_actions)
+            places = {action.dest: action.metavar for action in self._actions if not action.option_strings}
             for word in args:
+                if word.startswith("--") and word not in known and (place := places.get(word[2:])):
+                    raise OptionError(f"{word}: {place} stands alone, without it; see {self.prog} --help")
                 if word.startswith("--") and not any(
                     name.startswith(word.partition("=")[0]) for name in known
                 ):

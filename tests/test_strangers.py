@@ -1,4 +1,4 @@
-"""Files from strangers: what states a size is believed up to that size, what is read is what is declared, said in a line."""
+"""Files from strangers: sizes are checked before anything is read, and what is wrong is said in one line."""
 
 import json
 import sqlite3
@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from commands import refusal, run
 from made_files import recordings_folder
 from oracles import refused
@@ -66,6 +67,11 @@ def test_a_manifest_that_is_compressed_is_not_inflated(tmp_path):
         assert archive.stated(path, "format") == found
 
 
+def test_a_program_of_torch_is_called_so(tmp_path):
+    torch.jit.script(torch.nn.Linear(3, 2)).save(str(tmp_path / "net.pt"))
+    assert "is a TorchScript program" in refusal("compile", tmp_path / "net.pt", "-o", tmp_path / "net.loom")
+
+
 def test_a_header_of_signs_is_damaged():
     header = b"{'descr':'<f8','fortran_order':False,'shape':(" + b"-" * 9900 + b"1,)}\n"
     content = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
@@ -111,7 +117,7 @@ def test_a_table_with_a_huge_cell_is_refused(tmp_path):
 
 def test_few_events_make_no_large_array(tmp_path):
     (tmp_path / "grasp.csv").write_text("time_s,taxel,polarity\n19999,2000,1\n")
-    assert "a recording of 4002" in refusal("data", "describe", tmp_path / "grasp.csv")
+    assert "a recording of 4001803902 bytes, limit" in refusal("data", "describe", tmp_path / "grasp.csv")
 
 
 def test_what_names_hold_is_said_in_one_short_line():

@@ -113,8 +113,9 @@ def fetch_data(name: str, *, url: str | None = None) -> Fetched:
     try:
         store.fetch(data.file, downloader=download)
     except requests.RequestException as error:
+        why = type(error).__name__ if error.response is None else error.response.status_code
         raise DataError(
-            f"{url}: cannot be fetched ({error}); try later, or give another address with --url"
+            f"{url}: cannot be fetched ({why}); try later, or give another address with --url"
         ) from error
     except ValueError as error:
         raise DataError(

@@ -46,6 +46,9 @@ def words(options: Mapping[str, Any]) -> list[str]:
     for name, value in options.items():
         if value is None or value is False or value in ((), USUAL.get(name, ())):
             continue
+        if isinstance(value, tuple | list):
+            typed += [word for each in value for word in words({name: each})]
+            continue
         typed.append(f"--{name.replace('_', '-')}")
         if value is not True:
             typed.append(f"{value:g}" if name == "bin" else str(getattr(value, "source", value)))

@@ -107,10 +107,10 @@ def _calibrate(done: Compilation) -> Compilation:
         return done
     if not (isinstance(storage, Exact) or done.options.prune_unused):
         several = isinstance(storage, Fixed) and any(packing.planes > 1 for packing in storage.packings)
-        some = calibration.evenly_spaced(
-            np.arange(len(events)), calibration.MANY if several else calibration.FEW
-        )
-        events = events[held_out.split(len(events))[0] if isinstance(storage, Cheapest) else some]
+        # of one plane the same, whether the width was given or found on the others
+        few = held_out.split(len(events))[0]
+        many = calibration.evenly_spaced(np.arange(len(events)), calibration.MANY)
+        events = events[many if several else few]
     calibrated = calibration.calibrate(done.network, channels_last(events, done.network.input.clocks))
     return replace(done, calibration=calibrated, rates=calibrated.rates)
 

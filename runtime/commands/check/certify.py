@@ -15,7 +15,7 @@ from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.check import CertifyRequest
 from spikeloom.runtime.studies.robustness.certify_sections import sections, taxel_map
-from spikeloom.runtime.studies.robustness.exhaustive import certify
+from spikeloom.runtime.studies.robustness.exhaustive import certify, expected_seconds
 from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
 from spikeloom.runtime.studies.robustness.results import Provenance
 
@@ -26,6 +26,9 @@ On each recording every change of these kinds is tried, none is sampled: {KINDS}
 For several changed events it reports how many are proven to alter nothing, and how many are shown to suffice.
 """
 
+
+TOLD_S = 60
+"""Seconds from which on it is said how long it takes."""
 
 REQUEST = CertifyRequest
 
@@ -38,7 +41,11 @@ def run(request: CertifyRequest) -> Outcome:
     machine = machine_for(request.netlist)
     data = load_recordings(request.data, request, machine.netlist, labels_for="certify", joined=False)
     singles = int(data.step_counts.sum()) * data.taxels * data.events.shape[2]
-    tell(f"trying {singles:,} single events of {number(len(data), 'recording')}, then every other change")
+    seconds = expected_seconds(machine, data, request.jobs)
+    lasting = "" if seconds is None or seconds < TOLD_S else f", about {seconds / 60:,.0f} min"
+    tell(
+        f"trying {singles:,} single events of {number(len(data), 'recording')}{lasting}, then every other change"
+    )
     certificates = certify(machine, data, shift=request.shift, most=request.most, jobs=request.jobs)
     places = places_of(None, machine.netlist.provenance, data.taxels)
     result = replace(certificates, provenance=Provenance.of(request, data.sha256), places=places)

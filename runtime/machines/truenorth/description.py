@@ -15,6 +15,7 @@ from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.native import BASES, SYSTEM, highest_level
 from spikeloom.compiler.targets.truenorth.native_file import Trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars
+from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 from spikeloom.runtime.report.shown import Shown
@@ -126,7 +127,7 @@ def sections(found: Description) -> list[Section]:
     ticks = found.ticks_per_step
     head = (
         f"{found.target}: {found.neurons:,} neurons, {found.axons:,} axons, {found.crossing_points:,} crossing points, "
-        f"{found.cores:,} cores; {ticks} tick{'s' * (ticks > 1)} a data step, {found.drain_ticks} more to drain"
+        f"{number(found.cores, 'core')}; {ticks} tick{'s' * (ticks > 1)} a data step, {found.drain_ticks} more to drain"
         + (f"; a step joins {found.bins} bins" if found.bins else "")
         + (
             f"; trained on bins of {origin['bin_s']:g} s"

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import time
 from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
 from joblib import delayed
 
+from spikeloom.compiler.passes.calibrate import evenly_spaced
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import Machine
@@ -25,6 +28,26 @@ from spikeloom.runtime.studies.robustness.proofs.entries import (
 )
 from spikeloom.runtime.studies.robustness.results import PHASES, Certificate, Certificates, Decided
 from spikeloom.runtime.studies.robustness.threads import in_threads
+
+PROBED = 64
+"""Single events whose time tells that of all."""
+
+
+def expected_seconds(machine: Machine, data: Recordings, jobs: int | None) -> float | None:
+    """About how long the single events of recordings take; None for counters, which need few of them."""
+    if tally_of(machine) is not None:
+        return None
+    longest = int(data.step_counts.argmax())
+    events = data.events[longest : longest + 1, ..., : data.steps_of(longest)]
+    channels = channels_of(events, machine.netlist)[0]
+    cells = cells_of(events[0], machine.netlist).cells
+    chosen = cells[evenly_spaced(np.arange(len(cells)), PROBED)]
+    machine.effects(channels, single(chosen[:1]))  # which prepares what the first needs
+    begun = time.perf_counter()
+    machine.effects(channels, single(chosen))
+    each = (time.perf_counter() - begun) / len(chosen)
+    beside = min(jobs or os.cpu_count() or 1, len(data))
+    return each * len(cells) * float(data.step_counts.sum() / data.steps_of(longest)) / beside
 
 
 def certify(
