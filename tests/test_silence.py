@@ -8,6 +8,7 @@ from commands import as_json, run
 from made_files import TAXELS, recordings_folder
 
 from spikeloom.compiler.targets.netlist_file import origin_of
+from spikeloom.runtime.commands.check import certify
 from spikeloom.runtime.inputs.checkpoint import places_of
 from spikeloom.runtime.machines.backends import machine_for
 
@@ -103,3 +104,19 @@ def test_a_picture_of_a_training_has_numbers_beside_its_axis(folder):
     code, _, err = run("train", "--data", folder / "data", *given, "--picture", folder / "shown.svg")
     assert code == 0, err
     assert "mathdefault" not in (folder / "shown.svg").read_text()
+
+
+def test_the_time_of_a_certificate_is_told_before(folder, half, monkeypatch):
+    _, netlist, _ = half
+    monkeypatch.setattr(certify, "TOLD_S", 0)
+    given = ("--data", folder / "data", "--limit", "1", "--most", "1")
+    assert ", about 0 min, then every other change" in run("certify", netlist, *given)[2]
+
+
+def test_a_width_that_was_found_and_one_that_was_given_are_one_netlist(folder, half):
+    network, _, _ = half
+    own = ("compile", network, "--calibrate", folder / "data")
+    assert run(*own, "--keep", "0", "-o", folder / "found.loom")[0] == 0
+    assert run(*own, "--weight-bits", "8", "-o", folder / "given.loom")[0] == 0
+    one, other = (machine_for(folder / name).netlist for name in ("found.loom", "given.loom"))
+    assert one.provenance["digests"] == other.provenance["digests"]
