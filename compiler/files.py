@@ -4,6 +4,7 @@ import hashlib
 import os
 import re
 import secrets
+import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -61,7 +62,10 @@ def remove_leftovers(path: str | os.PathLike[str]) -> None:
     path = Path(path).resolve()
     folder, name = (path, "*") if path.is_dir() else (path.parent, escape(path.name))
     for file in folder.glob(f".{name}.{'?' * RANDOM}.part"):
-        file.unlink(missing_ok=True)
+        if file.is_dir() and not file.is_symlink():
+            shutil.rmtree(file)
+        else:
+            file.unlink(missing_ok=True)
 
 
 def beside(path: Path) -> Path:

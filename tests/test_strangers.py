@@ -1,5 +1,6 @@
 """Files from strangers: sizes are checked before anything is read, and what is wrong is said in one line."""
 
+import errno
 import json
 import sqlite3
 import subprocess
@@ -115,6 +116,16 @@ def test_a_table_with_a_huge_cell_is_refused(tmp_path):
     assert len(said) < 300
 
 
+def test_a_full_disk_is_said_with_the_name_of_what_was_written(tmp_path, monkeypatch):
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    said = refusal("data", "convert", specimen("mlp").data, "-o", tmp_path / "out")
+    assert f"{tmp_path}/out: No space left on device" in said
+    assert not [*tmp_path.iterdir()]
+
+
 def test_few_events_make_no_large_array(tmp_path):
     (tmp_path / "grasp.csv").write_text("time_s,taxel,polarity\n19999,2000,1\n")
     assert "a recording of 4001803902 bytes, limit" in refusal("data", "describe", tmp_path / "grasp.csv")
@@ -130,10 +141,11 @@ def test_what_names_hold_is_said_in_one_short_line():
 
 
 def test_half_written_files_of_a_killed_run_go(tmp_path):
-    left = tmp_path / ".net.loom.0123abcd.part"
-    left.touch()
+    left = [tmp_path / f".net.loom.{number}123abcd.part" for number in (0, 1)]
+    left[0].touch()
+    left[1].mkdir()  # as of a folder of recordings
     assert run("compile", specimen("mlp").network, "-o", tmp_path / "net.loom")[0] == 0
-    assert not left.exists()
+    assert not any(each.exists() for each in left)
 
 
 def test_an_exported_file_is_the_same_without_docstrings(tmp_path):

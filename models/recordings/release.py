@@ -56,8 +56,10 @@ def write_released(
             (part / name).parent.mkdir(exist_ok=True)
             (part / name).write_bytes(content)
         part.rename(path)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(part, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         raise
 
 
