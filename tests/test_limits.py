@@ -24,7 +24,7 @@ def netlist():
     return read_netlist(specimen("counters").netlist)
 
 
-@pytest.mark.parametrize("rule", CHIP.limits.keys() - UNITS)
+@pytest.mark.parametrize("rule", sorted(CHIP.limits.keys() - UNITS))
 def test_a_chip_with_less_of_it_refuses(rule, netlist):
     used = {use.name: use.used for use in sorted(measure(netlist, CHIP), key=lambda use: use.used)}
     used["mesh.tile_cores"] = int(np.bincount(netlist.core_tile).max())

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from commands import as_json, run
+from commands import as_json, refusal, run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_files import TAXELS, csv_folder, events, own_file, small_checkpoint, state_dict, weights
@@ -87,7 +87,7 @@ DAMAGES = {
     "axon dropped": (without_axon, WEIGHTS),
     "axon of another source": (changed("axon_source", PAIR, np.flip), WEIGHTS),
     "targets": (changed("synapse_target", unlike_targets, np.flip), WEIGHTS),
-    "exponent": (changed("format_exponent", 0, plus(1)), "limit|weights"),
+    "exponent": (changed("format_exponent", 0, plus(1)), WEIGHTS),
     "threshold": (changed("threshold", 0, plus(1)), r"conv1 neuron 0 has threshold (\d+) instead of \d+$"),
     "decay of a layer": (
         changed("decay_v", of_layer(2), plus(1)),
@@ -104,10 +104,6 @@ DAMAGES = {
     "classes": (lambda netlist: dataclasses.replace(netlist, classes=5), "it has 5 classes, the network 4"),
     "window": (layer_with(depth=1), "conv1 has a window from step 1 instead of 0"),
     "theta": (layer_with(theta=0.6), "conv1 has theta 0.6 instead of 0.5"),
-    "limit": (
-        changed("threshold", slice(9), plus(np.arange(9))),
-        "12 used, 8 allowed .loihi1.core.threshold_slots",
-    ),
 }
 
 
@@ -132,6 +128,18 @@ def test_verify_names_every_damage_and_fails(place, netlists, tmp_path, name, ro
     assert re.search(f"^EN  NOT what this network is lowered to: .*({named})", out, re.MULTILINE)
     assert ("\nmissed: EN: NOT what" in out) == bool(recordings)
     assert run("verify", place / f"{rounded}.loom", *words)[0] == 0
+
+
+@pytest.mark.parametrize("rounded", ["nearest", "calibrated"])
+def test_a_netlist_beyond_a_limit_is_refused(place, netlists, tmp_path, rounded):
+    damage = changed("threshold", slice(9), plus(np.arange(9)))
+    write_netlist(damage(netlists[rounded]), tmp_path / "x.loom")
+    line = "12 used, 8 allowed (loihi1.core.threshold_slots)"
+    for words in (
+        ("verify", tmp_path / "x.loom", "--checkpoint", place / "net.pt"),
+        ("inspect", tmp_path / "x.loom"),
+    ):
+        assert line in refusal(*words)
 
 
 def random_network(kind, seed, folder):
