@@ -62,7 +62,9 @@ def test_the_cheapest_that_keeps_enough_is_chosen_and_what_was_tried_is_counted(
     known, found = channels_last(events[few]), []
     sent = [known, *run_float(network, known).spikes]
     for trial, packing in zip(done.trials, LADDER, strict=False):
-        training = events[several] if packing.planes > 1 else events  # of which a width that is given takes few
+        training = (
+            events[several] if packing.planes > 1 else events
+        )  # of which a width that is given takes few
         one = compile_network(network, Options(storage=Fixed((packing,)), training_events=training))
         equal = (decisions(run_integer(one.integer, thinned).spikes[-1])[0] == wanted) & voted
         assert (trial.equal, trial.decisions) == (equal.sum(), voted.sum())

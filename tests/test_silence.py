@@ -75,7 +75,7 @@ def test_events_after_the_steps_that_counters_were_trained_for_are_said(folder):
     assert run("compile", folder / "count.pt", "-o", folder / "count.loom")[0] == 0
     assert "after the network's" not in run("run", folder / "count.loom", "--data", folder / "data")[2]
     said = run("run", folder / "count.loom", "--data", folder / "longer")[2]
-    assert f"after the network's {STEPS} steps, read out until step {STEPS + 32}" in said
+    assert f"after the network's {STEPS} steps: they may move votes until step {STEPS + 32}" in said
 
 
 def test_test_recordings_that_trained_are_said(folder):

@@ -219,12 +219,12 @@ def in_steps(data: Recordings, netlist: Netlist, window: int = WHOLE) -> Recordi
     length = netlist.clocks.length
     steps = origin_of(netlist.provenance).get("steps", length)
     if length is not None and (late := int(data.events[..., steps:].sum(dtype=np.int64))):
-        read = (
-            "" if steps == length else f", read out until step {length}: till then they may move votes, then"
+        used = (
+            "not used"
+            if steps == length
+            else f"they may move votes until step {length}, later ones are not used"
         )
-        tell(
-            f"warning: {data.source}: {number(late, 'event')} after the network's {steps} steps{read}: not used"
-        )
+        tell(f"warning: {data.source}: {number(late, 'event')} after the network's {steps} steps: {used}")
     return events.of_length(data, length)
 
 
