@@ -300,7 +300,7 @@ def test_live_it_runs_to_the_end_of_the_ramp(trained, tmp_path, capsys):
     for column in np.moveaxis(events[1], -1, 0):
         step = stream.step(column)
     assert "not final" in str(step)
-    assert (stream.decision, stream.decision) == (decided["decisions"][1], decided["decisions"][1])
+    assert (stream.decision, stream.decision) == (decided["predictions"][1], decided["predictions"][1])
     stream.reset()
     refused(DataError, "no decision found", lambda: spikeloom.load(str(netlist)).stream().decision)
     for _ in range(80):

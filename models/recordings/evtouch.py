@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, Self
+from typing import IO, Any, Self, SupportsIndex, overload
 
 import numpy as np
 
@@ -78,6 +78,23 @@ class Recordings:
     def __len__(self) -> int:
         """Return the number of recordings."""
         return len(self.files)
+
+    @overload
+    def __getitem__(self, index: SupportsIndex) -> tuple[EventArray, int]: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Self: ...
+
+    def __getitem__(self, index: SupportsIndex | slice) -> tuple[EventArray, int] | Self:
+        """Events (taxels, polarities, steps) of one recording, as long as it is, and its label; or a slice of all."""
+        if isinstance(index, slice):
+            return self.part(index)
+        place = range(len(self))[index]
+        return self.events[place, ..., : self.steps_of(place)], int(self.labels[place])
+
+    def __iter__(self) -> Iterator[tuple[EventArray, int]]:
+        """Events and label of each recording."""
+        return map(self.__getitem__, range(len(self)))
 
     @property
     def seconds(self) -> float:

@@ -1,6 +1,6 @@
 """Write recordings in the released layout: ``SPLIT/sample_N_label_L.npy``, float32 (taxels, 2, steps).
 
-A table beside the splits says which file each of them was.
+Each is as long as it was. A table beside the splits says which file each of them was.
 """
 
 import csv
@@ -66,7 +66,7 @@ def write_released(
 def _members(splits: Sequence[Recordings], bin_s: float | None) -> Iterator[tuple[str, bytes]]:
     """Name and content of every file; in the table nothing begins as a formula."""
     for recordings in splits:
-        for index, events in enumerate(recordings.events):
+        for index, (events, _) in enumerate(recordings):
             yield f"{recordings.split}/{_name(recordings, index)}", npy_bytes(events.astype(np.float32))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

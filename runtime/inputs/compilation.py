@@ -10,6 +10,7 @@ from spikeloom.compiler.storage import Cheapest, Exact, Fixed, Given, Packing, S
 from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.inputs.checkpoint import given_places
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.requests.main_job import CompileRequest
 
@@ -26,11 +27,13 @@ def provenance(
         seen = {"data": calibrated.source, "bin_s": calibrated.bin_s, "class_names": calibrated.names}
     checkpoint = asked.checkpoint
     cores_for = parse_cores(request.cores_for)
+    places = given_places(request.taxels)
     return {
         "spikeloom": __version__,
         "checkpoint_sha256": asked.sha256,
         **asked.origin(request.run),
         **(origin_of(asked.training) or origin_of(seen)),
+        **({"positions_mm": places} if places else {}),
         **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
         **remembered(storage_of(request, asked.network.forms)),
         "spike_exact": request.spike_exact,

@@ -17,6 +17,7 @@ from spikeloom.models.recordings.counts import number, show_counts
 from spikeloom.models.recordings.evtouch import (
     UNLABELLED,
     WHOLE,
+    WIDTH,
     Recordings,
     first_part,
     other_taxels,
@@ -56,7 +57,7 @@ def recordings(
     if isinstance(path, Recordings):
         given = path if known is None else renamed(path, known)
         require_suited(given, classes=classes, taxels=taxels)
-        _require_width(given, trained_bin)
+        _require_width(given, trained_bin, f"read them with recordings(…, bin={trained_bin})")
         data = first_part(with_groups(_first(given, limit), wanted), (trained or {}).get("window", WHOLE))
         return events.joined_bins(data if labels_for is None else events.need_labels(data, labels_for), bins)
     if path != SYNTHETIC:
@@ -72,7 +73,10 @@ def recordings(
             taxels=taxels,
             groups=wanted,
         )
-        _require_width(data, trained_bin)
+        said = f"write their seconds to {WIDTH} beside them, or give --bin {trained_bin}"
+        _require_width(
+            data, trained_bin, said if data.bin_s is None else "give the events that they were made of"
+        )
         _require_sensor(data, split, taxels)
         show_counts(data.source, data.split, data.counts)
         if labels_for is not None:
@@ -81,6 +85,7 @@ def recordings(
         events.require_events(SYNTHETIC, bin_s)
         data = with_groups(synthetic_split(split, limit=limit), wanted)
         require_suited(data, classes=classes, taxels=taxels)
+        _require_width(data, trained_bin, "give recordings in such bins")
     if classes is not None:
         _warn_of_others(data, trained or {}, classes, whole=limit is None)
     elif labels_for is not None:
@@ -101,13 +106,14 @@ def _require_asked(bin_s: float | None, own: float | None) -> None:
         raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {own:g} s; omit --bin")
 
 
-def _require_width(data: Recordings, own: float | None) -> None:
-    """Refuse recordings whose bins are not those of the network."""
-    if own is not None and data.bin_s not in (None, own):
-        raise DataError(
-            f"{data.source}: bins of {data.bin_s:g} s, the network was trained on bins of {own:g} s; give the events "
-            "that they were made of"
-        )
+def _require_width(data: Recordings, own: float | None, remedy: str) -> None:
+    """Refuse recordings whose bins are not those of the network, or are not known to be."""
+    if own is None or data.seconds == own:
+        return
+    assumed = " as nothing says another width" if data.bin_s is None else ""
+    raise DataError(
+        f"{data.source}: bins of {data.seconds:g} s{assumed}, the network was trained on bins of {own:g} s; {remedy}"
+    )
 
 
 def _require_sensor(data: Recordings, split: str, taxels: int | None) -> None:

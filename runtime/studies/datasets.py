@@ -163,8 +163,7 @@ def converted_sections(result: Converted) -> Iterator[Section]:
     yield Section("Converted", [Text("\n".join(lines))])
 
 
-def padded(recordings: Recordings, taxels: int, steps: int) -> Recordings:
-    """Silence for the taxels and the time that only another split has."""
-    events = np.zeros((len(recordings), taxels, 2, steps), dtype=np.uint8)
-    events[:, : recordings.taxels, :, : recordings.steps] = recordings.events
-    return replace(recordings, events=events, lengths=None)
+def padded(recordings: Recordings, taxels: int) -> Recordings:
+    """Silence for the taxels that only another split has."""
+    missing = taxels - recordings.taxels
+    return replace(recordings, events=np.pad(recordings.events, [(0, 0), (0, missing), (0, 0), (0, 0)]))

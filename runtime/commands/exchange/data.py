@@ -80,7 +80,7 @@ def _convert(request: ConvertRequest) -> Outcome:
     if lines:
         write_event_lines(request.output, loaded, bins * loaded[0].seconds)
     else:
-        grown = [padded(recordings, taxels, steps) for recordings in loaded]
+        grown = [padded(recordings, taxels) for recordings in loaded]
         known = loaded[0].bin_s is not None or bins > 1
         write_released(request.output, grown, round(bins * loaded[0].seconds, 12) if known else None)
     result = Converted(
