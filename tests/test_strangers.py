@@ -21,6 +21,7 @@ from spikeloom.compiler import archive
 from spikeloom.compiler.errors import CapacityError, DataError, Violation
 from spikeloom.compiler.files import FileFault, one_line
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist, write_netlist
+from spikeloom.models.recordings import evtouch
 from spikeloom.runtime.cli import _mistake
 from spikeloom.runtime.studies.jobs import Job, sweep
 
@@ -129,6 +130,20 @@ def test_a_full_disk_is_said_with_the_name_of_what_was_written(tmp_path, monkeyp
 def test_few_events_make_no_large_array(tmp_path):
     (tmp_path / "grasp.csv").write_text("time_s,taxel,polarity\n19999,2000,1\n")
     assert "a recording of 4001803902 bytes, limit" in refusal("data", "describe", tmp_path / "grasp.csv")
+
+
+def test_recordings_of_silence_are_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr(evtouch, "MAX_SILENT_BYTES", 10_000)
+    silent, lively = np.zeros((2, 50, 2, 51), np.uint8), np.zeros((2, 50, 2, 51), np.uint8)
+    lively[0, 0, 0, 0] = 1
+    recordings_folder(tmp_path / "data", train=silent, test=lively)
+    said = refusal("data", "describe", tmp_path / "data", "--split", "train")
+    assert "0 events in 10200 bytes of bins, limit 10000 and 4096 for each" in said
+    assert run("data", "describe", tmp_path / "data")[0] == 0
+    (tmp_path / "long").mkdir()
+    (tmp_path / "long" / "a.csv").write_text("time_s,taxel,polarity\n0.01,50,1\n")
+    (tmp_path / "long" / "recordings.csv").write_text("file,duration_s\na.csv,10\n")
+    assert "1 events in 51000 bytes" in refusal("data", "describe", tmp_path / "long")
 
 
 def test_what_names_hold_is_said_in_one_short_line():

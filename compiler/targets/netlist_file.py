@@ -40,6 +40,10 @@ COMMON: dict[str, archive.Kind] = {
 """Entries of every manifest."""
 
 
+ORIGIN = ("data", "bin_s", "window", "steps")
+"""What a netlist remembers of the recordings behind a network, beside names and places."""
+
+
 def names_of(training: Mapping[str, Any] | None, classes: int) -> list[str] | None:
     """Names of the classes of a network, if it knows one for each."""
     names: list[str] | None = origin_of(training).get("class_names")
@@ -50,13 +54,17 @@ def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
     """What a netlist remembers of the recordings behind a network.
 
     Their name, their bins if they were events, per cent of each or steps that trained it if not all did, where
-    the taxels were and how classes are called, if that was said.
+    the taxels were and how classes are called, if that was said; no value that a netlist may not have.
     """
-    kinds = {"data": str, "bin_s": float, "window": int, "steps": int, "positions_mm": list}
-    origin = {
-        name: training[name] for name, kind in kinds.items() if training and type(training.get(name)) is kind
-    }
-    names = (training or {}).get("class_names")
+    said = training or {}
+    usable = [name for name in ORIGIN if not archive.entry_faults(said, {name: PROVENANCE[name]})]
+    origin = {name: said[name] for name in usable}
+    places = said.get("positions_mm")
+    if isinstance(places, list) and all(
+        isinstance(each, list) and {*map(type, each)} <= {int, float} for each in places
+    ):
+        origin["positions_mm"] = places
+    names = said.get("class_names")
     if isinstance(names, list | tuple) and names and all(isinstance(name, str) for name in names):
         origin["class_names"] = list(names)
     return origin

@@ -152,6 +152,7 @@ def _stack(read: Sequence[Single], source: str) -> tuple[EventArray, IntArray]:
     steps[steps == 0] = round(float(np.median(steps[steps > 0])))
     shape = max(each.grid.shape[0] for each in read), read[0].grid.shape[1], int(steps.max())
     evtouch.require_memory(source, len(read) * math.prod(shape))
+    evtouch.require_lively(source, len(read) * math.prod(shape), sum(each.counts.events for each in read))
     events = np.zeros((len(read), *shape), dtype=np.uint8)
     for index, each in enumerate(read):
         events[index, : each.grid.shape[0], :, : each.grid.shape[2]] = each.grid
@@ -176,12 +177,14 @@ def _read_all(
 ) -> list[Single]:
     """All recordings; refused as soon as they are too large together."""
     read: list[Single] = []
-    size = 0
+    size = sent = 0
     for (name, opener), place, row in zip(files, where, rows, strict=True):
         read.append(_read(name, opener, place, bins, taxels, row))
         _require_alike(read[-1], read[0], released)
         size += read[-1].grid.size
+        sent += read[-1].counts.events
         evtouch.require_memory(bins.source, size)
+        evtouch.require_lively(bins.source, size, sent)
     return read
 
 

@@ -29,6 +29,11 @@ MAX_POLARITIES = 8
 MAX_TOTAL_BYTES = 2 << 30
 MAX_FILE_BYTES = 64 << 20  # the released recordings have 0.1 MB
 
+MAX_SILENT_BYTES = 256 << 20
+"""Most bytes of bins that hold no event, beside `EVENT_BYTES` for each event: a small file may announce many."""
+
+EVENT_BYTES = 4096
+
 BIN_S = 0.02
 """Width of a bin in seconds, as in the released recordings."""
 
@@ -264,6 +269,15 @@ def require_memory(source: str, size: int, limit: int | None = None) -> None:
         )
         raise DataError(
             f"{source}: {what} of {size} bytes, limit {limit or MAX_TOTAL_BYTES}; split {remedy}"
+        )
+
+
+def require_lively(source: str, size: int, events: int) -> None:
+    """Refuse recordings of so many bytes that hardly hold events: a DataError."""
+    if size > MAX_SILENT_BYTES + EVENT_BYTES * events:
+        raise DataError(
+            f"{source}: {events} events in {size} bytes of bins, limit {MAX_SILENT_BYTES} and {EVENT_BYTES} for each; "
+            "leave out silent recordings, or use wider bins"
         )
 
 

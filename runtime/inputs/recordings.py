@@ -135,9 +135,9 @@ def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int, 
     name = trained.get("data", data.source)
     known = int(data.labels.max(initial=UNLABELLED))
     fewer = whole and len(data) >= classes and UNLABELLED < known < classes - 1
-    same = (
-        name.partition(", seed")[0] == data.source.partition(", seed")[0]
-    )  # splits of synthetic ones differ in these
+    named = bool(data.names) and "class_names" in trained  # each of them is a class of the network
+    # splits of synthetic ones differ in their seed
+    same = named or name.partition(", seed")[0] == data.source.partition(", seed")[0]
     origin = "" if same else f"the network was trained on {name}; "
     if fewer:
         tell(f"warning: {data.source}: {origin}their classes are 0..{known}, the network's 0..{classes - 1}")
