@@ -143,7 +143,7 @@ def test_recordings_of_silence_are_bounded(tmp_path, monkeypatch):
     (tmp_path / "long").mkdir()
     (tmp_path / "long" / "a.csv").write_text("time_s,taxel,polarity\n0.01,50,1\n")
     (tmp_path / "long" / "recordings.csv").write_text("file,duration_s\na.csv,10\n")
-    assert "1 events in 51000 bytes" in refusal("data", "describe", tmp_path / "long")
+    assert "1 event in 51000 bytes" in refusal("data", "describe", tmp_path / "long")
 
 
 def test_what_names_hold_is_said_in_one_short_line():

@@ -21,7 +21,7 @@ from spikeloom.compiler.arrays import frozen
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.files import reading
 from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, IntArray
-from spikeloom.models.recordings.counts import EventCounts
+from spikeloom.models.recordings.counts import EventCounts, number
 
 MAX_POLARITIES = 8
 """Most polarities of a taxel; an array with more has its axes in another order."""
@@ -276,7 +276,7 @@ def require_lively(source: str, size: int, events: int) -> None:
     """Refuse recordings of so many bytes that hardly hold events: a DataError."""
     if size > MAX_SILENT_BYTES + EVENT_BYTES * events:
         raise DataError(
-            f"{source}: {events} events in {size} bytes of bins, limit {MAX_SILENT_BYTES} and {EVENT_BYTES} for each; "
+            f"{source}: {number(events, 'event')} in {size} bytes of bins, limit {MAX_SILENT_BYTES} and {EVENT_BYTES} for each; "
             "leave out silent recordings, or use wider bins"
         )
 
