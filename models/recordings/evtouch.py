@@ -276,8 +276,8 @@ def require_lively(source: str, size: int, events: int) -> None:
     """Refuse recordings of so many bytes that hardly hold events: a DataError."""
     if size > MAX_SILENT_BYTES + EVENT_BYTES * events:
         raise DataError(
-            f"{source}: {number(events, 'event')} in {size} bytes of bins, limit {MAX_SILENT_BYTES} and {EVENT_BYTES} for each; "
-            "leave out silent recordings, or use wider bins"
+            f"{source}: {number(events, 'event')} in {size} bytes of bins, limit {MAX_SILENT_BYTES} and {EVENT_BYTES} "
+            "for each; leave out silent recordings, or use wider bins"
         )
 
 
