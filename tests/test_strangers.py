@@ -69,6 +69,7 @@ def test_a_manifest_that_is_compressed_is_not_inflated(tmp_path):
         assert archive.stated(path, "format") == found
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")  # as all who have such files
 def test_a_program_of_torch_is_called_so(tmp_path):
     torch.jit.script(torch.nn.Linear(3, 2)).save(str(tmp_path / "net.pt"))
     assert "is a TorchScript program" in refusal("compile", tmp_path / "net.pt", "-o", tmp_path / "net.loom")
