@@ -104,7 +104,7 @@ class Stream:
     @property
     def decision(self) -> int:
         """Class of the grasp, which ends with this if it has not: what a run of the same bins decides."""
-        if not self._ended:
+        if not self._ended and self.index:
             self.finish()
         if self._last is None:
             raise DataError("stream: no decision found, as no bin came or a register overflowed; give bins")
