@@ -126,7 +126,7 @@ class Compiled:
         *,
         split: str = "test",
         limit: int | None = None,
-        window: str = "100%",
+        window: str | None = None,
         original: str | None = None,
         engine: str = ENGINES[0],
         min_agreement: float | None = None,
@@ -153,7 +153,7 @@ class Compiled:
         *,
         split: str = "test",
         limit: int | None = None,
-        window: str = "100%",
+        window: str | None = None,
         detail: str = "counts",
         table: str | None = None,
     ) -> Price:
@@ -172,7 +172,7 @@ class Compiled:
         *,
         split: str = "test",
         limit: int | None = None,
-        window: str = "100%",
+        window: str | None = None,
         spikes: str | None = None,
     ) -> Decisions:
         """Decisions of recordings, bit for bit the chip's.

@@ -23,7 +23,7 @@ from spikeloom.compiler.storage import Fixed
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.models.recordings.events import load_data
-from spikeloom.models.recordings.evtouch import data_digest
+from spikeloom.models.recordings.evtouch import data_digest, first_part
 from spikeloom.runtime.studies.chart import results, study
 from spikeloom.runtime.studies.chart import work as chart_work
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
@@ -88,6 +88,24 @@ def test_every_point_of_the_grid_is_there(made, place):
     assert (place / "out" / "chart.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert (place / "out" / "chart.svg").read_text("utf-8").startswith("<?xml")
     assert (place / "out" / "chart.html").read_text("utf-8").startswith("<!DOCTYPE html>")
+
+
+def test_windows_are_of_whole_recordings_whatever_part_trained_the_network(as_json, place):
+    splits = (load_data(place / "data", split) for split in ("train", "test"))
+    known = {"window": 50, "data_sha256": data_digest(*(first_part(each, 50) for each in splits))}
+    own_file(place / "half.pt", training=known)
+    grid = "bits=4,window=50-100%:50,cores=cores"
+    found = as_json("chart", "half.pt", "--data", "data", "--grid", grid, "--jobs", "1", "-o", "halves")
+    half, whole = found["points"]
+    for point in (half, whole):
+        compiled, ran, priced = (shlex.split(command) for command in point["commands"])
+        as_json(*compiled[1:])
+        assert (place / compiled[-1]).read_bytes() == (place / "halves" / point["netlist"]).read_bytes()
+        assert as_json(*ran[1:])["accuracy"] == point["test"]["accuracy"]
+        assert as_json(*priced[1:])["per_inference"]["synaptic_operations"] == point["test"]["operations"]
+    assert half["test"]["operations"] < whole["test"]["operations"]
+    usual = as_json("estimate", compiled[-1], "--data", "data")["per_inference"]["synaptic_operations"]
+    assert usual == half["test"]["operations"]
 
 
 @pytest.mark.parametrize("number", [4, 7])

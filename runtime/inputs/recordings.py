@@ -200,9 +200,10 @@ def load_recordings(
     In steps of the network if `joined`, as long a part of each as a ``--window`` says, or as the network was
     trained on, as long as the network needs; else in their own bins.
     """
-    window = parse_window(getattr(request, "window", "100%"))
+    said = getattr(request, "window", None)
+    window = WHOLE if said is None else parse_window(said)
     trained = origin_of(netlist.provenance)
-    if window < WHOLE:
+    if said is not None:
         trained.pop("window", None)
     progress("reading the recordings")
     data = recordings(

@@ -160,8 +160,10 @@ class SplitChoice(Request):
 class WindowChoice(SplitChoice):
     """Which part of them."""
 
-    window: str = option(
-        "first part of every recording, as in 50%%", default="100%", metavar="PERCENT", group="recordings"
+    window: str | None = option(
+        "first part of every recording, as in 50%%; by default the part that trained the network",
+        metavar="PERCENT",
+        group="recordings",
     )
 
 

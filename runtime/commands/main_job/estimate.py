@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.models.recordings.evtouch import Recordings, first_part, parse_window
+from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part, parse_window
 from spikeloom.models.training.counters import BITS
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
@@ -81,7 +81,7 @@ def _against_processor(request: EstimateRequest, machine: Machine, ran: Run, pri
         raise OptionError(
             "against_processor: needs the training split beside these; give the place of the recordings"
         )
-    window = parse_window(request.window)
+    window = WHOLE if request.window is None else parse_window(request.window)
     training, test = (
         load_recordings(request.data, each, machine.netlist, labels_for="--against-processor", joined=False)
         for each in (replace(request, split="train", limit=None), request)

@@ -13,8 +13,9 @@ from spikeloom.compiler.ir import Form
 from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.compartments import check_packings
+from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.types import JsonObject
-from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.evtouch import WHOLE, Recordings, data_digest, first_part
 from spikeloom.models.systems import NO_GRAPH
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.checkpoint import load_checkpoint, load_graph, propagation
@@ -90,6 +91,12 @@ class NetworkFile:
         if not isinstance(counts, Mapping) or not counts.get("samples"):
             return None
         return float(counts["correct"] / counts["samples"])
+
+    @property
+    def window(self) -> int:
+        """Per cent of each recording that trained it."""
+        window: int = origin_of(self.training).get("window", WHOLE)
+        return window
 
     @property
     def identity(self) -> JsonObject:
@@ -197,7 +204,9 @@ def require_suited(networks: Sequence[NetworkFile], splits: Mapping[str, Recordi
                 f"{network.path}: was trained on bins of {own:g} s, {first.path} reads bins of {width:g} s; chart "
                 "networks of one width at a time"
             )
-        if network.training.get("data_sha256") not in (None, digest):
+        parts = [first_part(splits[split], network.window) for split in ("train", "test")]
+        trained = digest if network.window == WHOLE else data_digest(*parts)
+        if network.training.get("data_sha256") not in (None, trained):
             raise ModelError(
                 f"{network.path}: was trained on other recordings ({network.training.get('data', 'others')}) "
                 f"than {splits['test'].source}; give those, or a checkpoint that was trained on these"

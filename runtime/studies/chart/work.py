@@ -130,7 +130,7 @@ def commands(work: Measurement, layout: str, window: int) -> tuple[str, ...]:
     bin_s = None if data.bin_s == BIN_S else data.bin_s
     calibrated = {"calibrate": data.path, "bin": bin_s}
     stored = repeat.words(dict(network.options) | storage.options() | calibrated | _layout_options(layout))
-    part = None if window == WHOLE else f"{window}%"
+    part = None if window == network.window == WHOLE else f"{window}%"
     read = repeat.words({"data": data.path, "bin": bin_s, "window": part})
     return (
         repeat.command("compile", network.path, *stored, "-o", file),
@@ -142,18 +142,29 @@ def commands(work: Measurement, layout: str, window: int) -> tuple[str, ...]:
 def read_splits(
     path: str, bin_s: float | None, network: NetworkFile, groups: str | None = None
 ) -> dict[str, Recordings]:
-    """Training and test recordings by split, in bins."""
+    """Whole training and test recordings by split, in bins."""
     shared: dict[str, Any] = {"classes": network.classes, "taxels": network.taxels, "labels_for": "chart"}
-    shared |= {"trained": origin_of(network.training), "groups": groups}
+    shared |= {"trained": {**origin_of(network.training), "window": WHOLE}, "groups": groups}
     require_splits(path)
     return {split: recordings(path, split, bin_s=bin_s, **shared) for split in SPLITS}
 
 
 @lru_cache(maxsize=2)
+def _read(data: Data, network: NetworkFile, groups: Groups) -> dict[str, Recordings]:
+    return read_splits(data.path, data.bin_s, network, groups.words)
+
+
+@lru_cache(maxsize=2)
 def _in_steps(data: Data, network: NetworkFile, groups: Groups) -> dict[str, Recordings]:
     """The same in the steps of a network that joins bins."""
-    splits = read_splits(data.path, data.bin_s, network, groups.words)
-    return {split: joined_bins(each, network.bins) for split, each in splits.items()}
+    return {split: joined_bins(each, network.bins) for split, each in _read(data, network, groups).items()}
+
+
+def _calibration(work: Measurement) -> Recordings:
+    """The part of the training recordings that ``compile`` calibrates on, in steps of the network."""
+    network = work.network
+    training = first_part(_read(work.data, network, work.groups)["train"], network.window)
+    return of_length(joined_bins(training, network.bins), network.length)
 
 
 @lru_cache(maxsize=2)
@@ -208,11 +219,7 @@ def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
     request = _compile_request(work, layout)
     placing = Options(
         cores_for=parse_cores(request.cores_for),
-        provenance=provenance(
-            request,
-            _loaded(work.network),
-            calibrated=_in_steps(work.data, work.network, work.groups)["train"],
-        ),
+        provenance=provenance(request, _loaded(work.network), calibrated=_calibration(work)),
     )
     try:
         netlist = lay_out_again(stored, placing).netlist
@@ -245,9 +252,7 @@ def _rounded(work: Measurement, loaded: LoadedNetwork) -> Compilation:
     options = Options(
         storage=storage_of(request, work.network.forms),
         prune_unused=request.prune_unused,
-        training_events=_part(
-            work.network, _in_steps(work.data, work.network, work.groups)["train"], WHOLE
-        ).events,
+        training_events=_calibration(work).events,
     )
     return to_integers(loaded.network, options, load_target(request.target))
 
