@@ -289,7 +289,7 @@ def test_verify_holds_every_network_to_its_file(name):
         name: each["different"] for name, each in found["spikes"].items()
     }
     first = next(iter(found["spikes"].values()))
-    assert first["different"] < 0.1 * first["float"] + 5
+    assert first["different"] <= 0.1 * first["float"] + 6  # of 4 bits, chosen on four recordings
 
 
 @over(MAKERS)
