@@ -77,6 +77,16 @@ def test_what_no_netlist_may_have_is_not_remembered():
     assert origin_of(kept) == kept
 
 
+def test_counters_know_the_places_of_their_taxels(folder):
+    given = ("--data", folder / "data", "--system", "counters", "--thresholds", "1,2")
+    sensor = ("--taxels", folder / "coords.csv")
+    made = as_json("train", *given, *sensor, "-o", folder / "placed.pt")
+    assert f"--taxels {folder / 'coords.csv'}" in made["record"]["command"]
+    assert run("compile", folder / "placed.pt", "-o", folder / "placed.loom")[0] == 0
+    origin = machine_for(folder / "placed.loom").netlist.provenance
+    assert np.array_equal(places_of(None, origin, TAXELS), PLACES)
+
+
 @pytest.mark.parametrize(
     "said", [PLACES[:-1], [[0.0], [1.0, 2.0]], [["x", "y"]] * TAXELS, [[1e999, 0.0]] * TAXELS]
 )

@@ -81,9 +81,8 @@ def train_counting(request: TrainRequest) -> CountersReport:
     }
     if request.window is not None:
         options["window"] = parse_window(request.window)
-    typed = repeat.words(
-        {"data": Path(request.data).name, "system": COUNTING, "bin": request.bin, **options}
-    )
+    data = {"data": Path(request.data).name, "system": COUNTING, "bin": request.bin}
+    typed = repeat.words({**data, "taxels": request.taxels, **options})
     if request.join > 1:
         typed += ["--join", str(request.join)]
     plan = _counting_plan(request.join, options)
