@@ -78,7 +78,8 @@ class Recordings:
 
     def __repr__(self) -> str:
         """One line instead of the arrays."""
-        return f"{self.source}, {self.split}: {len(self)} recordings, {self.taxels} taxels, up to {self.steps} steps"
+        held = f"{number(len(self), 'recording')}, {number(self.taxels, 'taxel')}"
+        return f"{self.source}, {self.split}: {held}, up to {number(self.steps, 'step')}"
 
     def __len__(self) -> int:
         """Return the number of recordings."""

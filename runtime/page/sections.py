@@ -202,8 +202,8 @@ def _cores(cores: CoreMap) -> list[Block]:
         ],
     )
     used = (
-        f"{len(cores.cores)} cores on {len(tiles)} of {len(chips) * mesh.width * mesh.height} tiles (a chip has "
-        f"{mesh.width} by {mesh.height}, of {mesh.tile_cores} cores each); only the used part is drawn"
+        f"{number(len(cores.cores), 'core')} on {len(tiles)} of {len(chips) * mesh.width * mesh.height} tiles (a chip "
+        f"has {mesh.width} by {mesh.height}, of {mesh.tile_cores} cores each); only the used part is drawn"
     )
     return [Section("", [Text(used), figure])]
 

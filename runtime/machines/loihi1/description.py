@@ -167,7 +167,7 @@ def sections(facts: NetlistFacts) -> Iterator[Section]:
         channels = facts.clocks.channels
         steps = facts.clocks.steps
         lines.append(
-            f"  {channels} clocks of {steps} steps each, {channels * steps} in all, beside the sensor"
+            f"  {number(channels, 'clock')} of {steps} steps each, {channels * steps} in all, beside the sensor"
         )
     if facts.clocks is not None and facts.clocks.length is not None:
         lines.append(f"  a recording is run for {facts.clocks.length} steps, whatever its own length")

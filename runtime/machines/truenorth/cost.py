@@ -17,6 +17,7 @@ import numpy as np
 from spikeloom.compiler.targets.base import EnergyTable, Target
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.machines.base import Price
 from spikeloom.runtime.machines.truenorth.spec import Counts
 from spikeloom.runtime.report.numbers import dominant, si
@@ -201,7 +202,8 @@ def sections(found: Estimate) -> list[Section]:
     layers = [
         [layer.name, f"{layer.synaptic_events:,.0f}", f"{layer.spikes:,.0f}"] for layer in found.layers
     ]
-    head = f"per inference on {found.cores:,} of {found.cores_of_chip:,} cores, over {found.samples} recordings:"
+    over = number(found.samples, "recording")
+    head = f"per inference on {found.cores:,} of {found.cores_of_chip:,} cores, over {over}:"
     pace = found.pace
     seconds = found.per_inference.time_s / pace.step_s * pace.bin_s
     static = [f"{si(watts, 'W')} ({name})" for name, watts in found.static_w.items()]

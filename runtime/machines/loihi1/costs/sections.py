@@ -1,5 +1,6 @@
 """Costs laid out for people: the mean inference and its range, where energy and time go."""
 
+from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.machines.loihi1.costs.result import Amounts, CostReport, Host
 from spikeloom.runtime.report.numbers import dominant, si
 from spikeloom.runtime.report.sections import Section, Table, Text
@@ -10,7 +11,7 @@ DYNAMIC = "dynamic energy, "
 
 def sections(report: CostReport) -> list[Section]:
     """Amounts, layers, parts of the chip, cores, and what power and times come to."""
-    steps = f"per inference of {report.chip_steps} chip steps, over {report.samples} recordings:"
+    steps = f"per inference of {report.chip_steps} chip steps, over {number(report.samples, 'recording')}:"
     parts = report.energy_by_part_j
     rows = [[table, *(si(value, "J") for value in each.values())] for table, each in parts.items()]
     by_part = [Table(["dynamic energy by part", *next(iter(parts.values()))], rows)] if parts else []
