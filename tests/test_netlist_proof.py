@@ -62,6 +62,13 @@ def smallest(net):
     return int(np.argmin(np.where(net.synapse_weight == 0, 999, np.abs(net.synapse_weight))))
 
 
+def from_layer(layer):
+    """First synapse of the axons of a layer."""
+    return lambda net: np.flatnonzero(
+        np.isin(net.axon_source[net.axon_of_synapse()] - net.n_inputs, net.compartments_of(layer))
+    )[:1]
+
+
 def without_axon(net):
     axon, ends = 3, net.axon_synapses
     gone = slice(ends[axon], ends[axon + 1])
@@ -87,6 +94,10 @@ DAMAGES = {
     "axon dropped": (without_axon, WEIGHTS),
     "axon of another source": (changed("axon_source", PAIR, np.flip), WEIGHTS),
     "targets": (changed("synapse_target", unlike_targets, np.flip), WEIGHTS),
+    "a loop": (
+        changed("synapse_target", from_layer(2), np.zeros_like),
+        "layer conv1: has synapses of layer fc2, which comes after it",
+    ),
     "exponent": (changed("format_exponent", 0, plus(1)), WEIGHTS),
     "threshold": (changed("threshold", 0, plus(1)), r"conv1 neuron 0 has threshold (\d+) instead of \d+$"),
     "decay of a layer": (

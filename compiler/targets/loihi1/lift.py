@@ -93,10 +93,17 @@ def _projections(netlist: Netlist) -> list[IntegerProjection]:
 def lift(netlist: Netlist) -> IntegerNetwork:
     """Collect compartments to populations and axons to projections, one per pair of layers and weight format.
 
-    FormatError if a layer has different decays, or several layers vote, which the network form cannot say.
+    FormatError if a layer has different decays or synapses of a later one, or several layers vote, which the
+    network form cannot say.
     """
     populations = tuple(_population(netlist, index) for index in range(len(netlist.layers)))
     projections = _projections(netlist)
+    for projection in projections:
+        if projection.pre > projection.post:
+            post, pre = (netlist.layers[index].name for index in (projection.post, projection.pre))
+            raise FormatError(
+                f"layer {post}: has synapses of layer {pre}, which comes after it; compile it again"
+            )
     voting = np.unique(netlist.layer[netlist.voters])
     if len(voting) != 1:
         raise FormatError(f"{len(voting)} layers vote for classes, one is allowed; compile it again")
