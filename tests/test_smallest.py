@@ -20,7 +20,7 @@ from spikeloom.runtime.studies.counting import decisions_of
 from spikeloom.runtime.studies.search.budgets import parse_budgets
 from spikeloom.runtime.studies.search.choice import lead
 from spikeloom.runtime.studies.search.results import NetlistCosts
-from spikeloom.runtime.studies.smallest import baselines, space, study, work
+from spikeloom.runtime.studies.smallest import baselines, sections, space, study, work
 from spikeloom.runtime.studies.smallest.results import Tried
 from spikeloom.runtime.studies.smallest.space import Candidate
 from spikeloom.runtime.studies.training.plan import recipe_of
@@ -255,8 +255,7 @@ def trained(few, monkeypatch):
     monkeypatch.setattr(space, "SIZES", (("mlp", 8, None, "8", 0.0), ("mlp", 4, None, "none", 0.0)))
     monkeypatch.setattr(space, "STEPS", (10, 10))
     monkeypatch.setattr(study, "other_ways", lambda *_: [])
-    for module in (space, study, work):
-        monkeypatch.setattr(module, "EPOCHS", (2, 4, 8, 12))
+    monkeypatch.setattr(space, "EPOCHS", (2, 4, 8, 12))
     return few
 
 
@@ -296,11 +295,12 @@ def test_networks_that_are_trained_by_gradients(trained, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("far", "why"), [(1.0, "more epochs still helped"), (0.0, "it was dropped, or time was short")]
+    ("far", "why"), [(1.0, "more epochs still helped"), (0.0, "behind the best then, it went no further")]
 )
 def test_a_crippled_network_is_not_called_tried_to_the_end(trained, monkeypatch, far, why):
     monkeypatch.setattr(study, "TRAINED", {1: 1, 2: 1, 3: 1})
-    monkeypatch.setattr(study, "FAR", far)
+    for module in (study, sections):
+        monkeypatch.setattr(module, "FAR", far)
     monkeypatch.setattr(space, "SIZES", (("gcn", 4, None, "none", 0.0), ("mlp", 4, None, "none", 0.0)))
     measure = work.measure
 
@@ -316,6 +316,25 @@ def test_a_crippled_network_is_not_called_tried_to_the_end(trained, monkeypatch,
     assert status == 0
     assert "mlp: not tried to the end" in text
     assert why in text
+
+
+def test_time_that_is_short_is_shared_by_the_rungs(trained, monkeypatch):
+    """The first rung of networks takes all of its time: those that were measured go on, the other is said."""
+    monkeypatch.setattr(space, "SIZES", (("mlp", 4, None, "none", 0.0), ("gcn", 4, None, "none", 0.0)))
+    clock = [0.0]
+    monkeypatch.setattr(study.time, "monotonic", lambda: clock[0])
+    measure = work.measure
+
+    def slow(job):
+        clock[0] += 25.0 if job.rung == 1 and job.fold is not None else 0.1
+        return measure(job)
+
+    monkeypatch.setattr(work, "measure", slow)
+    words = (*WORDS, "--graph", "manual", "--time", "100s")
+    text = run(*words)[1]
+    assert "not tried, time was short: gcn" in text
+    assert "mlp: " in text
+    assert [each["system"] for each in as_json(*words)["tried"]] == ["mlp", "gcn"]  # it goes on
 
 
 @pytest.mark.usefixtures("trained")

@@ -90,6 +90,7 @@ class Smallest(Shown):
     """A search, its choice and what that reaches.
 
     `conditions` were left out in turn; `at_random` is the accuracy of the choice where parts at random were left out.
+    For candidates that are `untried`, by name, time was too short.
     """
 
     spikeloom: str
@@ -100,6 +101,7 @@ class Smallest(Shown):
     chosen_by: ChosenBy
     conditions: tuple[str, ...]
     tried: tuple[Tried, ...]
+    untried: tuple[str, ...]
     baselines: tuple[Tried, ...]
     choice: Choice
     at_random: float | None

@@ -14,7 +14,7 @@ from spikeloom.runtime.studies.processor import price_table
 from spikeloom.runtime.studies.search.picture import Mark, draw_front
 from spikeloom.runtime.studies.smallest import baselines
 from spikeloom.runtime.studies.smallest.results import Smallest, Tried
-from spikeloom.runtime.studies.smallest.study import energy, worse
+from spikeloom.runtime.studies.smallest.study import FAR, energy, worse
 from spikeloom.runtime.studies.smallest.work import RUNGS
 
 LOWER = 12
@@ -126,28 +126,31 @@ def _why(result: Smallest) -> Iterator[str]:
 
 def _unfinished(result: Smallest) -> str:
     """Which systems were tried to the end: cross-validated on all folds until more epochs no longer helped."""
-    if not result.families:
-        return "not tried: networks trained by gradients"
     lines = []
     for family in result.families:
         best = result.candidate(family.best)
-        if family.system != COUNTING:
-            words = "tried to the end" if family.finished else "not tried to the end"
-            epochs = f"{best.setting:g} epochs"
-            if best.refused:
-                lines.append(f"{family.system}: not tried ({best.refused})")
-            elif family.finished:
-                lines.append(f"{family.system}: {words}, the best is {_named(best)} after {epochs}")
-            else:
-                why = (
-                    "more epochs still helped"
-                    if best.finished is False
-                    else "it was dropped, or time was short"
-                )
-                lines.append(f"{family.system}: {words}, {_named(best)} after {epochs}: {why}")
-    if all(family.system == COUNTING for family in result.families):
-        lines.append("not tried: networks trained by gradients")
-    return "\n".join(lines)
+        known = f"{_named(best)} after {number(int(best.setting), 'epoch')}"
+        if family.system == COUNTING:
+            continue
+        if best.refused:
+            lines.append(f"{family.system}: not tried ({best.refused})")
+        elif family.finished:
+            lines.append(f"{family.system}: tried to the end, the best is {known}")
+        else:
+            why = "more epochs still helped" if best.finished is False else _left(best, result.tried)
+            lines.append(f"{family.system}: not tried to the end, {known}: {why}")
+    if result.untried:
+        more = f" and {number(len(result.untried) - 1, 'other')}" if len(result.untried) > 1 else ""
+        lines.append(f"not tried, time was short: {result.untried[0]}{more}")
+    return "\n".join(lines) if lines else "not tried: networks trained by gradients"
+
+
+def _left(each: Tried, tried: Sequence[Tried]) -> str:
+    """Why a network was trained no longer."""
+    top = max(accuracy for other in tried for epochs, accuracy in other.curve if epochs == each.setting)
+    if top > each.accuracy + FAR:
+        return f"{100 * (top - each.accuracy):.1f} % behind the best then, it went no further"
+    return "time was short"
 
 
 def _conditions(result: Smallest) -> Iterator[str]:

@@ -30,32 +30,46 @@ MOST_COUNTERS = {100: 50, 50: 20}
 
 
 EPOCHS = (12, 24, 48, 72)
-"""Of networks that are trained by gradients, by rung."""
+"""Of networks that are trained by gradients, by rung, where the training split has few recordings."""
+
+MANY = 600
+"""Recordings from which on epochs are fewer, so that as many recordings pass."""
 
 SIZES = (
-    (TACTILESGNET, 64, 3, "128,256", 0.0),
-    (TACTILESGNET, 64, 3, "64", 0.3),
-    (TACTILESGNET, 32, 3, "128", 0.3),
-    (TACTILESGNET, 32, 3, "64", 0.1),
-    (TACTILESGNET, 16, 1, "64", 0.3),
-    (TACTILESGNET, 32, 1, "none", 0.0),
-    (TACTILESGNET, 16, 1, "32", 0.0),
-    (TACTILESGNET, 8, 3, "32", 0.0),
-    (TACTILESGNET, 4, 1, "16", 0.0),
-    (MLP, 64, None, "128,256", 0.0),
-    (MLP, 64, None, "128", 0.0),
-    (MLP, 64, None, "64", 0.0),
     (MLP, 32, None, "32", 0.0),
+    (TACTILESGNET, 4, 1, "16", 0.0),
     (GCN, 32, None, "64", 0.0),
     (GRID_CNN, 32, None, "64", 0.0),
+    (MLP, 64, None, "64", 0.0),
+    (TACTILESGNET, 8, 3, "32", 0.0),
+    (TACTILESGNET, 16, 1, "32", 0.0),
+    (TACTILESGNET, 16, 1, "64", 0.3),
+    (MLP, 64, None, "128", 0.0),
+    (TACTILESGNET, 32, 1, "none", 0.0),
+    (TACTILESGNET, 32, 3, "64", 0.1),
+    (TACTILESGNET, 32, 3, "128", 0.3),
+    (MLP, 64, None, "128,256", 0.0),
+    (TACTILESGNET, 64, 3, "64", 0.3),
+    (TACTILESGNET, 64, 3, "128,256", 0.0),
 )
-"""System, features, hops, dense layers and penalty on spikes, the largest of a system first: they take longest."""
+"""System, features, hops, dense layers and penalty on spikes; the largest, which take longest, are begun last."""
 
 USUAL_STEPS = 60
 """Steps near which the bins of a network are joined at first."""
 
 STEPS = (25, 130)
 """Steps that a usual recording has in these, at least and at most, by the bins that are joined."""
+
+
+def epochs_of(rung: int, count: int) -> int:
+    """Epochs of a rung where so many recordings train: each rung has more than the one before.
+
+    >>> [epochs_of(rung, 576) for rung in (1, 2, 3, 4)]
+    [12, 24, 48, 72]
+    >>> [epochs_of(rung, 6000) for rung in (1, 2, 3, 4)]
+    [1, 2, 5, 7]
+    """
+    return max(rung, round(EPOCHS[rung - 1] * min(1.0, MANY / count)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -32,7 +32,7 @@ from spikeloom.runtime.studies.search.results import chosen_by, titles_of
 from spikeloom.runtime.studies.smallest import work
 from spikeloom.runtime.studies.smallest.baselines import baselines
 from spikeloom.runtime.studies.smallest.results import Checked, Choice, Family, Smallest, Tried
-from spikeloom.runtime.studies.smallest.space import EPOCHS, Candidate, other_ways, variants
+from spikeloom.runtime.studies.smallest.space import Candidate, epochs_of, other_ways, variants
 from spikeloom.runtime.studies.smallest.work import RUNGS, Measured, Scene
 
 POINT = 0.01
@@ -46,6 +46,9 @@ KEPT = {1: 20, 2: 14, 3: 14}
 
 TRAINED = {1: 9, 2: 6, 3: 2}
 """The same of networks that are trained by gradients; beside them goes the best of each system."""
+
+SHARES_OF_TIME = {"baselines": (0.05, 0.08, 0.1), COUNTING: (0.15, 0.2, 0.3), "networks": (0.5, 0.7, 0.95, 0.95)}
+"""Of the time that is given, after which a rung begins nothing new, so that every rung has its part."""
 
 AT_RANDOM = 3
 """Parts at random that the choice is trained without, of networks that are trained by gradients, beside conditions."""
@@ -77,20 +80,26 @@ SLACK = 1.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Work:
-    """How measurements are made: where they are kept, processes, when no more are begun, and whether they certify."""
+    """How measurements are made: where they are kept, processes, seconds from when on, and whether they certify."""
 
     store: Path
     jobs: int | None
-    until: float | None  # By the monotonic clock
+    begun: float  # By the monotonic clock
+    seconds: float | None
     certify: bool
+
+    def until(self, share: float = 1.0) -> float | None:
+        """When no more are begun, after a share of the seconds."""
+        return None if self.seconds is None else self.begun + share * self.seconds
 
     @property
     def time_is_up(self) -> bool:
         """Whether no more are begun."""
-        return self.until is not None and time.monotonic() >= self.until
+        until = self.until()
+        return until is not None and time.monotonic() >= until
 
-    def measure(self, works: Sequence[work.Trial], label: str) -> dict[str, Measured]:
-        """Results by key, of those that were begun in time."""
+    def measure(self, works: Sequence[work.Trial], label: str, share: float = 1.0) -> dict[str, Measured]:
+        """Results by key, of those that were begun before that share of the time had passed."""
         return sweep(
             works,
             work.measure,
@@ -98,12 +107,12 @@ class Work:
             jobs=self.jobs,
             label=label,
             kind=Measured,
-            until=self.until,
+            until=self.until(share),
         )
 
 
 def smallest(
-    counters: Iterable[Candidate],
+    counters: Sequence[Candidate],
     networks: Sequence[Candidate],
     scene: Scene,
     training: Recordings,
@@ -124,12 +133,13 @@ def smallest(
     work_on = Work(
         store=store,
         jobs=jobs,
-        until=None if seconds is None else time.monotonic() + seconds,
+        begun=time.monotonic(),
+        seconds=seconds,
         certify=any(budget.what == "certified" for budget in budgets),
     )
     folds = list(every(folds_of(training, 1)))
     scene.states.mkdir(exist_ok=True)
-    beside = search(baselines(), most_accurate, scene, work_on)
+    beside = search(baselines(), most_accurate, scene, work_on, SHARES_OF_TIME["baselines"])
     steps = int(np.median(training.step_counts))
     tried = try_all(counters, networks, len(folds), budgets, scene, work_on, steps)
     taken = pick(tried, budgets)
@@ -137,6 +147,7 @@ def smallest(
     tried = [_beside(each, best, tried) for each in tried]
     by = chosen_by(target)
     chosen = tried[taken.cheapest[by.energy] - 1]
+    names = {each.candidate.name for each in tried}
     conditions = tuple(fold.condition for fold in folds if fold.condition is not None)
     at_random = accuracy_at_random(chosen, scene, work_on) if conditions else None
     if not work_on.time_is_up:  # else the same command goes on
@@ -151,6 +162,7 @@ def smallest(
         chosen_by=by,
         conditions=conditions,
         tried=tuple(tried),
+        untried=tuple(each.name for each in (*counters, *networks) if each.name not in names),
         baselines=tuple(_beside(each, best, ()) for each in beside),
         choice=taken,
         at_random=at_random,
@@ -170,7 +182,7 @@ def try_all(
     steps: int,
 ) -> list[Tried]:
     """Counting networks, then those that are trained by gradients; OptionError if time was too short for any."""
-    tried = search(counters, partial(promote, budgets=budgets), scene, work_on)
+    tried = search(counters, partial(promote, budgets=budgets), scene, work_on, SHARES_OF_TIME[COUNTING])
     trained = train_all(networks, folds, budgets, scene, work_on, steps)
     tried += [replace(each, number=len(tried) + each.number) for each in trained]
     if not any(each.rung >= RUNGS or each.refused for each in tried):
@@ -185,6 +197,7 @@ def search(
     promote: Callable[[Sequence[Tried], int], Sequence[Tried]],
     scene: Scene,
     work_on: Work,
+    shares_of_time: Sequence[float],
 ) -> list[Tried]:
     """All candidates, as far as each came; `promote` chooses those that go on from a rung."""
     known: dict[str, Tried] = {}
@@ -195,7 +208,7 @@ def search(
             work.trial(each, rung, setting, scene, certify=work_on.certify)
             for each, setting in alive.values()
         ]
-        found = work_on.measure(works, f"rung {rung} of {RUNGS}")
+        found = work_on.measure(works, f"rung {rung} of {RUNGS}", shares_of_time[rung - 1])
         for job in works:
             if job.key in found:
                 number = known[job.label].number if job.label in known else len(known) + 1
@@ -222,10 +235,11 @@ def train_all(
     """
     known: dict[str, Tried] = {}
     alive = list(candidates)
-    for rung, epochs in enumerate(EPOCHS, 1):
+    for rung, share in enumerate(SHARES_OF_TIME["networks"], 1):
         works = {each.name: work.trials(each, rung, scene, folds, certify=work_on.certify) for each in alive}
-        label = f"{number(epochs, 'epoch')} of {number(len(alive), 'network')}"
-        found = work_on.measure([job for jobs in works.values() for job in jobs], label)
+        epochs = number(epochs_of(rung, scene.data.train), "epoch")
+        label = f"{epochs} of {number(len(alive), 'network')}"
+        found = work_on.measure([job for jobs in works.values() for job in jobs], label, share)
         for each in alive:
             parts = [found[job.key] for job in works[each.name] if job.key in found]
             if len(parts) == len(works[each.name]):
@@ -243,7 +257,7 @@ def train_all(
 
 
 def climbing(tried: Sequence[Tried], rung: int, budgets: Sequence[Budget]) -> list[Tried]:
-    """Networks that are trained for longer: those that may be chosen and the best of each system, largest first.
+    """Networks that are trained for longer: those that may be chosen, likely ones first, and the best of each system.
 
     From the last rung on, those of them whose curve still rises.
     """
@@ -258,7 +272,7 @@ def climbing(tried: Sequence[Tried], rung: int, budgets: Sequence[Budget]) -> li
         on |= {each.number: each for each in first.values() if each.accuracy >= able[0].accuracy - FAR}
     else:
         on = {number: each for number, each in on.items() if not each.finished}
-    return [on[number] for number in sorted(on)]
+    return list(on.values())
 
 
 def _grown(before: Tried | None, made: Tried) -> Tried:

@@ -43,7 +43,7 @@ from spikeloom.runtime.studies.search.measure import measure_netlist
 from spikeloom.runtime.studies.search.results import Data, NetlistCosts
 from spikeloom.runtime.studies.smallest import baselines
 from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF, RIDGE
-from spikeloom.runtime.studies.smallest.space import EPOCHS, Candidate
+from spikeloom.runtime.studies.smallest.space import Candidate, epochs_of
 from spikeloom.runtime.studies.smallest.trained import Sensor, plan_of, without
 
 FORMAT = 4
@@ -141,6 +141,8 @@ def trial(
     """Work whose key is of everything that decides the result; from the last rung on it may `certify`."""
     about = scene.identity | {"candidate": encode(candidate), "rung": rung, "setting": setting}
     about |= {"at random": at_random, "fold": fold}
+    if fold is not None:
+        about |= {"epochs": epochs_of(rung, scene.data.train)}
     if certify := certify and rung >= RUNGS:
         about |= {"certified": True}
     return Trial(
@@ -257,7 +259,7 @@ def _network(work: Trial, training: Recordings) -> Measured:
     """A network that is trained by gradients, without a fold: its decisions there, and its costs, of the first fold."""
     assert work.fold is not None, "these are tried fold by fold"
     fold = list(every(folds_of(training, 1, at_random=work.at_random)))[work.fold]
-    epochs = EPOCHS[work.rung - 1]
+    epochs = epochs_of(work.rung, work.scene.data.train)
     right = np.zeros(len(training), np.int64)
     nothing = Measured(right=tuple(right.tolist()), tried=tuple(right.tolist()), setting=epochs)
     known = work.scene.identity | {"candidate": encode(work.candidate), "fold": work.fold}
