@@ -102,7 +102,11 @@ def main() -> None:
     )
     of_window = {window: run_counters(data, replace(plan, window=window)) for window in WINDOWS}
     split = parted(data, training)
-    done = measured_parts(split, arguments.output, lambda rows, held: measured(data, of_window, rows, held))
+    done = measured_parts(
+        split,
+        arguments.output.with_suffix(".parts.json"),
+        lambda rows, held: measured(data, of_window, rows, held),
+    )
     draws = np.random.default_rng(0).integers(0, len(data), (DRAWS, len(data)))
     share = {point: np.zeros(len(data)) for point in done["split"]}
     for name, held in split.items():

@@ -1,14 +1,18 @@
-"""Counting networks and support vector machines in repeated nested cross-validation over all recordings.
+"""Counting networks, a TactileSGNet and support vector machines in nested cross-validation over all recordings.
 
-    python benchmarks/nested.py DATA OUT.json [--levels 5] [--ramp 32] [--again 1]        (needs scikit-learn)
+    python benchmarks/nested.py DATA OUT.json [--levels 5] [--ramp 32] [--again 1] [--jobs 2]     (needs scikit-learn)
 
 Both splits are put together and parted five times five ways. In each training part every plan and strength, kernel and
 constant is tried by cross-validation in five folds, plans within two standard errors of the best `--again` times;
 the test part is decided once by what these chose, counting networks as they spike. `chosen` is the plan of fewest
 neurons x steps whose accuracy is not lower than the best one's by more than a standard error of the difference,
 recording by recording; `best` is the best at any price, its ramp too. `split` has the same for the split as released;
-`rules` are single plans, decided by exact sums. Intervals (95 %) and differences are bootstrapped over recordings.
-Parts that were measured before are not again.
+`rules` are single plans, decided by exact sums. The TactileSGNet is of one size, taken before any result of it on these
+parts was seen; it is trained from another seed in each round, and decides on the chip, in 8 bits. Intervals (95 %) and
+differences are bootstrapped over recordings. A system decides *as well as* another one if the interval of what the
+other has ahead of it ends below `MARGIN`, which was set before, too. Parts that were measured before are not again.
+
+Another sensor, as `write_events` and `write_taxels` of `unseen.py` make it: `--taxels taxels.csv --graph knn:4`.
 """
 
 from __future__ import annotations
@@ -17,16 +21,20 @@ import argparse
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from joblib import Parallel, delayed
 from made import made as made_by
 from sklearn.svm import SVC
 
 from spikeloom.compiler.files import write_atomically
-from spikeloom.models.recordings.events import load_data
+from spikeloom.compiler.systems import TACTILESGNET
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.models.recordings.events import joined_bins, load_data
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.counters import (
     FOLDS,
@@ -39,7 +47,12 @@ from spikeloom.models.training.counters import (
     run_counters,
     split_folds,
 )
+from spikeloom.runtime.inputs.checkpoint import load_graph
+from spikeloom.runtime.requests.choices import SensorChoice
 from spikeloom.runtime.studies.counting import decisions_of
+from spikeloom.runtime.studies.search.measure import decisions
+from spikeloom.runtime.studies.smallest.space import JOINS, USUAL_STEPS, Candidate
+from spikeloom.runtime.studies.smallest.trained import Sensor, plan_of, without
 
 Json = dict[str, Any]
 
@@ -56,6 +69,15 @@ LARGE = [(bins, parts, TWELVE) for bins, parts in product((1, 5), (6, 10))]
 STRENGTHS = (0.03, 0.1, 0.3)
 LONG_RAMP = 256
 
+NETWORK = Candidate(
+    system=TACTILESGNET,
+    options={"recipe": "rates", "features": 32, "hops": 3, "hidden": "128", "spike_penalty": 0.3},
+)
+"""One of the sizes of ``smallest``, in bins that give its usual number of steps."""
+
+EPOCHS = 72
+MARGIN = 0.02
+
 KERNELS = {"linear SVM": (0.003, 0.01, 0.1), "RBF SVM": (1.0, 3.0, 30.0)}
 SVM_PARTS = (1, 3, 10)
 
@@ -66,12 +88,17 @@ def name_of(plan: Plan) -> str:
     return f"bins {plan.bins}, parts {plan.parts}, {len(plan.thresholds)} thresholds{levels}"
 
 
-def whole(path: str) -> tuple[Recordings, int]:
-    """Recordings of both splits, and how many are of the training split."""
-    training, test = (load_data(path, split) for split in ("train", "test"))
+def whole(path: str, taxels: int | None = None) -> tuple[Recordings, int]:
+    """Recordings of both splits, and how many are of the training split; shorter ones end in bins without events."""
+    training, test = (load_data(path, split, taxels=taxels) for split in ("train", "test"))
+    steps = max(training.steps, test.steps)
+    events = [np.pad(each.events, [(0, 0)] * 3 + [(0, steps - each.steps)]) for each in (training, test)]
     both = replace(
         training,
-        events=np.concatenate([training.events, test.events]),
+        events=np.concatenate(events),
+        lengths=None
+        if training.lengths is None is test.lengths
+        else np.concatenate([training.step_counts, test.step_counts]),
         labels=np.concatenate([training.labels, test.labels]),
         files=training.files + test.files,
         split="both",
@@ -89,16 +116,19 @@ def parted(data: Recordings, training: int) -> dict[str, np.ndarray]:
 
 
 def measured_parts(
-    split: Mapping[str, np.ndarray], output: Path, measure: Callable[[np.ndarray, np.ndarray], Json]
+    split: Mapping[str, np.ndarray],
+    store: Path,
+    measure: Callable[[np.ndarray, np.ndarray], Json],
+    jobs: int = 1,
 ) -> Json:
-    """What is found for each part, kept beside the output; parts that were measured before are not again."""
-    store = output.with_suffix(".parts.json")
+    """What is found for each part, so many `jobs` at a time; parts that the store knows are not measured again."""
     done: Json = json.loads(store.read_text()) if store.exists() else {}
-    for name, held in split.items():
-        if name not in done:
-            done[name] = measure(np.flatnonzero(~held), np.flatnonzero(held))
-            store.write_text(json.dumps(done))
-            print(name, flush=True)
+    missing = {name: held for name, held in split.items() if name not in done}
+    work = (delayed(measure)(np.flatnonzero(~held), np.flatnonzero(held)) for held in missing.values())
+    for name, found in zip(missing, Parallel(jobs, return_as="generator")(work), strict=True):
+        done[name] = found
+        store.write_text(json.dumps(done))
+        print(name, flush=True)
     return done
 
 
@@ -180,6 +210,19 @@ def measured(
     return found
 
 
+def network(data: Recordings, sensor: Sensor, seed: int, _: np.ndarray, held: np.ndarray) -> Json:
+    """Decisions on recordings that are held out, of a TactileSGNet trained on the others, on the chip."""
+    steps = float(np.median(data.step_counts))
+    join = min(JOINS, key=lambda join: abs(np.log(steps / join / USUAL_STEPS)))
+    plan = plan_of(replace(NETWORK, options={**NETWORK.options, "join": join}), sensor, data)
+    without_them = np.zeros(len(data), bool)
+    without_them[held] = True
+    netlist = without(plan, data, without_them, EPOCHS, load_target("loihi1"), seed=seed)
+    decided = decisions(netlist, joined_bins(data, plan.bins).part(held))
+    right = (decided == data.labels[held]).astype(int)
+    return {"join": join, "seed": seed, "right": right.tolist()}
+
+
 def machines(data: Recordings, rows: np.ndarray, held: np.ndarray) -> Json:
     """Support vector machines on log(1 + events) of each channel in parts, chosen by the same folds."""
     label, found = data.labels[rows], {}
@@ -244,6 +287,7 @@ def summary(parts: Sequence[Json], tests: Sequence[np.ndarray], samples: int) ->
                     plans[plan] = plans.get(plan, 0) + 1
                 found[kind][name] |= {
                     "ahead_of": ahead,
+                    "as_well_as": [other for other, each in ahead.items() if each[1] > -MARGIN],
                     "plans": dict(sorted(plans.items(), key=lambda p: -p[1])),
                 }
     return found
@@ -259,8 +303,13 @@ def main() -> None:
     )
     parser.add_argument("--again", type=int, default=1, help="cross-validations of plans near the best one")
     parser.add_argument("--ramp", type=int, default=32, help="steps of the read-out; twice for levels")
+    parser.add_argument("--taxels", help="positions of another sensor's taxels")
+    parser.add_argument("--graph", default="manual", help="of the taxels")
+    parser.add_argument("--jobs", type=int, default=1, help="networks that are trained at a time")
     arguments = parser.parse_args()
-    data, training = whole(arguments.recordings)
+    graph = load_graph(SensorChoice(graph=arguments.graph, taxels=arguments.taxels))
+    assert graph is not None, "one is named"
+    data, training = whole(arguments.recordings, len(graph.coordinates))
     plans = [
         Plan(
             bins=bins,
@@ -275,11 +324,19 @@ def main() -> None:
     ]
     all_counted = {name_of(plan): run_counters(data, plan) for plan in plans}
     split = parted(data, training)
+    networks: Json = {}
+    for seed in range(ROUNDS):
+        parts = {name: held for name, held in split.items() if name.startswith((f"{seed}.", "split"))}
+        store = arguments.output.with_suffix(".networks.json")
+        measure = partial(network, data, Sensor(graph=graph), seed)
+        networks |= measured_parts(parts, store, measure, arguments.jobs)
     done = measured_parts(
         split,
-        arguments.output,
+        arguments.output.with_suffix(".parts.json"),
         lambda rows, held: measured(data, all_counted, rows, held, arguments.again),
     )
+    for name, each in networks.items():
+        done[name]["systems"][NETWORK.system] = each
     nested = [name for name in split if name != "split"]
     found: Json = {"rounds": ROUNDS, "folds": FOLDS}
     found["nested"] = summary([done[name] for name in nested], [split[name] for name in nested], len(data))

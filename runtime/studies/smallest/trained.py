@@ -67,11 +67,17 @@ def plan_of(candidate: Candidate, sensor: Sensor, training: Recordings) -> Plan:
 
 
 def without(
-    plan: Plan, training: Recordings, held: BoolArray, epochs: int, target: Target, trunk: Path
+    plan: Plan,
+    training: Recordings,
+    held: BoolArray,
+    epochs: int,
+    target: Target,
+    trunk: Path | None = None,
+    seed: int = 0,
 ) -> Any:
     """The netlist of a network that some recordings are left out of.
 
-    It goes on from what was trained for fewer epochs, see :func:`train.train`.
+    With a `trunk` it goes on from what was trained for fewer epochs, see :func:`train.train`.
     """
     from spikeloom.models.network_kinds import kind_of  # torch, so only here
     from spikeloom.models.training.train import train
@@ -86,6 +92,7 @@ def without(
             seen_by(plan),
             kind.architecture(plan),
             epochs=epochs,
+            seed=seed,
             recipe=plan.recipe,
             trunk=trunk if plan.recipe.schedule == PLATEAU else None,
         )
