@@ -375,7 +375,8 @@ def test_conditions_are_left_out_in_turn(few):
     status, text, _ = run(*words[:3], "--jobs", "1", "-o", "a.loom")
     assert status == 0
     assert "left out in turn: hand=left, hand=right" in text
-    assert "with parts at random left out" in text
+    assert "% where hand is new" in text
+    assert "where all conditions are known it reaches" in text
 
 
 @pytest.mark.usefixtures("few")

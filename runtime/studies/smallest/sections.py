@@ -1,6 +1,6 @@
 """A search for people: the choice and why, the front, what was dropped, baselines, and the commands that repeat it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -167,31 +167,37 @@ def _conditions(result: Smallest) -> Iterator[str]:
         f"left out in turn: {', '.join(result.conditions)}; of these the choice is worst at {shares[0][0]} "
         f"({100 * shares[0][1]:.1f} %) and best at {shares[-1][0]} ({100 * shares[-1][1]:.1f} %)"
     )
+    groups: dict[str, dict[str, float]] = {}
+    for name, share in chosen.conditions.items():
+        group, value = name.split("=", 1)
+        groups.setdefault(group, {})[value] = share
+    new = (
+        f"{100 * sum(known.values()) / len(known):.1f} % where {group} is new"
+        for group, known in groups.items()
+    )
+    yield f"expect {', '.join(new)}"
     if result.at_random is not None:
-        yield (
-            "with parts at random left out, so that all conditions are known, it reaches "
-            f"{100 * result.at_random:.1f} %: expect {100 * chosen.accuracy:.1f} % where a condition is new"
-        )
-    if spans := list(_spans(result.conditions)):
-        yield f"not tested: {', '.join(spans)}; expect less there"
+        yield f"where all conditions are known it reaches {100 * result.at_random:.1f} %, by parts at random"
+    for group, known in groups.items():
+        yield from _beyond(group, known)
 
 
-def _spans(conditions: Sequence[str]) -> Iterator[str]:
-    """What lies beyond the conditions that are numbers.
+def _beyond(group: str, known: Mapping[str, float]) -> Iterator[str]:
+    """What lies beyond the values of a group that are numbers, and the shares of right decisions at their ends.
 
-    >>> list(_spans(["speed=10", "speed=9", "hand=left", "force=1"]))
-    ['speed below 9 or above 10']
+    >>> next(_beyond("speed", {"10": 0.5, "9": 0.75}))
+    'not tested: speed below 9 or above 10; at these ends, when they are new, 75.0 and 50.0 %: expect less beyond'
     """
-    values: dict[str, list[str]] = {}
-    for group, value in (each.split("=", 1) for each in conditions if "=" in each):
-        values.setdefault(group, []).append(value)
-    for group, known in values.items():
-        try:
-            ordered = sorted(known, key=float)
-        except ValueError:
-            continue
-        if len(ordered) > 1:
-            yield f"{group} below {ordered[0]} or above {ordered[-1]}"
+    try:
+        ends = sorted(known, key=float)[:: max(1, len(known) - 1)]
+    except ValueError:
+        return
+    if len(ends) > 1:
+        shares = " and ".join(f"{100 * known[end]:.1f}" for end in ends)
+        yield (
+            f"not tested: {group} below {ends[0]} or above {ends[-1]}; at these ends, when they are new, "
+            f"{shares} %: expect less beyond"
+        )
 
 
 def _needless(result: Smallest) -> str:

@@ -47,7 +47,11 @@ KEPT = {1: 20, 2: 14, 3: 14}
 TRAINED = {1: 9, 2: 6, 3: 2}
 """The same of networks that are trained by gradients; beside them goes the best of each system."""
 
-SHARES_OF_TIME = {"baselines": (0.05, 0.08, 0.1), COUNTING: (0.15, 0.2, 0.3), "networks": (0.5, 0.7, 0.95, 0.95)}
+SHARES_OF_TIME = {
+    "baselines": (0.05, 0.08, 0.1),
+    COUNTING: (0.15, 0.2, 0.3),
+    "networks": (0.5, 0.7, 0.95, 0.95),
+}
 """Of the time that is given, after which a rung begins nothing new, so that every rung has its part."""
 
 AT_RANDOM = 3
