@@ -273,7 +273,8 @@ def rows_beside(members: Members, files: Sequence[str], source: str) -> Listed:
             found = {file: row for file in inside for row in _rows_of(rows, PurePosixPath(file), folder)}
             known |= found
             classes |= {row.label for row in rows.values() if row.label is not None}
-            notes.append(f"{where}: describes {len(found)} of {len(files)} recordings")
+            if len(found) < len(files):
+                notes.append(f"{where}: describes {len(found)} of {len(files)} recordings")
     return Listed(rows=known, classes=frozenset(classes), notes=notes)
 
 
