@@ -14,6 +14,7 @@ from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.errors import CapacityError, DataError, ModelError
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
+from spikeloom.compiler.passes.calibrate import evenly_spaced
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray, JsonObject
 from spikeloom.models.recordings.events import joined_bins, of_length
@@ -43,10 +44,10 @@ from spikeloom.runtime.studies.search.measure import measure_netlist
 from spikeloom.runtime.studies.search.results import Data, NetlistCosts
 from spikeloom.runtime.studies.smallest import baselines
 from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF, RIDGE
-from spikeloom.runtime.studies.smallest.space import Candidate, epochs_of
+from spikeloom.runtime.studies.smallest.space import MANY, Candidate, epochs_of
 from spikeloom.runtime.studies.smallest.trained import Sensor, plan_of, without
 
-FORMAT = 4
+FORMAT = 5
 """Of what is measured; goes up when a figure means something else."""
 
 PRICED = 48
@@ -59,7 +60,13 @@ FEW = {1: 2, 2: 4}
 """Folds of the first rungs, of networks that are trained by gradients."""
 
 ROUNDS = 5
-"""Of cross-validation at random, of what may be chosen; networks that are trained by gradients have one."""
+"""Of cross-validation at random, of what may be chosen; networks that are trained by gradients have one.
+
+Of more than `MANY` recordings there are fewer.
+"""
+
+SEEN = {1: 1000, 2: 2000}
+"""Recordings that the first rungs see at most, evenly spaced; networks that are trained by gradients see all."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -183,8 +190,18 @@ def measure(work: Trial) -> JsonObject:
     """Do one piece of work; the JSON of a :class:`Measured`."""
     kinds = {COUNTING: _counting, LINEAR: _baseline, RBF: _baseline, RIDGE: _baseline}
     training = _training(work.scene)
-    found: JsonObject = encode(kinds.get(work.candidate.system, _network)(work, training))
-    return found
+    if work.fold is not None:
+        return _encoded(_network(work, training))
+    rows = evenly_spaced(np.arange(len(training)), SEEN.get(work.rung, len(training)))
+    found = kinds[work.candidate.system](work, training.part(rows))
+    right, tried = np.zeros((2, len(training)), np.int64)
+    right[rows], tried[rows] = found.right, found.tried
+    return _encoded(replace(found, right=tuple(right.tolist()), tried=tuple(tried.tolist())))
+
+
+def _encoded(found: Measured) -> JsonObject:
+    values: JsonObject = encode(found)
+    return values
 
 
 @lru_cache(maxsize=1)
@@ -247,7 +264,8 @@ def _counting(work: Trial, training: Recordings) -> Measured:
 
 
 def _rounds(work: Trial, training: Recordings) -> list[list[Fold]]:
-    return folds_of(training, ROUNDS if work.rung >= RUNGS else 1, at_random=work.at_random)
+    rounds = max(1, min(ROUNDS, round(ROUNDS * MANY / len(training))))
+    return folds_of(training, rounds if work.rung >= RUNGS else 1, at_random=work.at_random)
 
 
 def _by_condition(folds: Sequence[Fold], right: BoolArray) -> dict[str, float]:
