@@ -16,6 +16,7 @@ from spikeloom.compiler.formats.counters import BLOCK, counting_network, read_co
 from spikeloom.compiler.interpret import channels_last, float_simulation
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.recordings.events import joined_bins, load_data, of_length
+from spikeloom.models.training import counters
 from spikeloom.models.training.counters import (
     Plan,
     counters_of,
@@ -189,9 +190,12 @@ def test_recordings_without_events_are_refused():
     refused(DataError, "none of them spikes", fit, run_counters(silent, PLANS[0]), CLASSES)
 
 
+@pytest.mark.parametrize("most", [2000, 0])
 @pytest.mark.parametrize("plan", PLANS, ids=str)
-def test_rule_is_where_the_loss_is_flat(plan):
-    data = run_counters(made(rate=0.2), plan)
+def test_rule_is_where_the_loss_is_flat(plan, most, monkeypatch):
+    """By the pairs of recordings, and by the counters where recordings are many."""
+    monkeypatch.setattr(counters, "MOST_ALIKE", most)
+    data = run_counters(made(samples=200, rate=0.2), plan)
     for strength, rule in fit_rules(data, CLASSES, [3.0, 0.01, 0.3]).items():
         sign = np.where(data.labels[:, None] == np.arange(CLASSES), 1, -1)
         short = np.maximum(1 - sign * rule.sums(data), 0)

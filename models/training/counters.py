@@ -13,7 +13,7 @@ References
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -44,6 +44,9 @@ MOST = 64
 
 THING = 3
 """Gain of the rules for objects over those for boundaries between their levels."""
+
+MOST_ALIKE = 2000
+"""Recordings up to which each pair of them is compared, 64 MB of numbers."""
 
 NEWTON_STEPS = 100
 LEAST_STEP = 1e-6
@@ -183,23 +186,68 @@ def fit_rules(data: Counted, classes: int, strengths: Iterable[float]) -> dict[f
     used = np.flatnonzero((data.spikes > 0).sum(axis=0) >= LEAST)
     if not len(used):
         raise DataError("counters: none of them spikes; give other --thresholds, or recordings with events")
-    spikes = data.spikes[:, used].astype(np.float32)  # whole numbers: what they have in common is exact
-    alike = (spikes @ spikes.T).astype(np.float64)
+    spikes = data.spikes[:, used].astype(np.float32)
     label = data.labels[:, None]
     each = np.arange(classes)
     here = label // levels == each // levels
     sign = np.where(here & (label >= each), 1.0, np.where(here | (each % levels == 0), -1.0, 0.0))
     ordered = sorted(strengths)  # so that each starts at what the one before has found
-    share = _least_squares(alike, sign, ordered[0])
+    weights = _by_weights if len(spikes) > max(MOST_ALIKE, len(used)) else _by_shares
     rules = {}
-    for strength in ordered:
-        starts = zip(sign.T, share.T, strict=True)
-        share = np.stack([_newton(alike, one, start, strength) for one, start in starts], axis=1)
-        weight = (share.T @ spikes).reshape(-1, levels, len(used))
+    for strength, found in zip(ordered, weights(spikes, sign, ordered), strict=True):
+        weight = found.reshape(-1, levels, len(used))
         if levels > 1:
             weight[:, 0] *= THING
         rules[strength] = Rule(used=used, weight=weight.cumsum(axis=1).reshape(classes, -1))
     return rules
+
+
+def _by_shares(
+    spikes: NDArray[np.float32], sign: FloatArray, strengths: Sequence[float]
+) -> Iterator[FloatArray]:
+    """Weights (classes, counters) for each strength, of the shares of recordings."""
+    alike = (spikes @ spikes.T).astype(np.float64)  # exact, as spikes are whole numbers
+    share = _least_squares(alike, sign, strengths[0])
+    for strength in strengths:
+        starts = zip(sign.T, share.T, strict=True)
+        share = np.stack([_newton(alike, one, start, strength) for one, start in starts], axis=1)
+        yield share.T @ spikes
+
+
+def _by_weights(
+    spikes: NDArray[np.float32], sign: FloatArray, strengths: Sequence[float]
+) -> Iterator[FloatArray]:
+    """The same where recordings are many: no table of pairs of them, and equations of the counters alone."""
+    weight = np.zeros((sign.shape[1], spikes.shape[1]))
+    for strength in strengths:
+        starts = zip(sign.T, weight, strict=True)
+        weight = np.stack([_newton_of_weights(spikes, one, start, strength) for one, start in starts])
+        yield weight
+
+
+def _newton_of_weights(
+    spikes: NDArray[np.float32], sign: FloatArray, weight: FloatArray, strength: float
+) -> FloatArray:
+    """As :func:`_newton`, for the weights of one class."""
+
+    def loss(weight: FloatArray) -> float:
+        missing = np.where(sign == 0, 0.0, np.maximum(1 - sign * (spikes @ weight), 0))
+        return float(0.5 * weight @ weight + strength * (missing**2).sum())
+
+    before = None
+    for _ in range(NEWTON_STEPS):
+        short = _short(sign, spikes @ weight)
+        if before is not None and np.array_equal(short, before):
+            break
+        pull = spikes[short]
+        ridge = (pull.T @ pull).astype(np.float64) + np.eye(len(weight)) / (2 * strength)
+        goal = cho_solve(cho_factor(ridge, overwrite_a=True, check_finite=False), sign[short] @ pull)
+        step = 1.0
+        while step > LEAST_STEP and loss(weight + step * (goal - weight)) > loss(weight):
+            step /= 2
+        weight = weight + step * (goal - weight)
+        before = short if step == 1.0 else None
+    return weight
 
 
 def _least_squares(alike: FloatArray, sign: FloatArray, strength: float) -> FloatArray:
