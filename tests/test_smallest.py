@@ -337,6 +337,12 @@ def test_time_that_is_short_is_shared_by_the_rungs(trained, monkeypatch):
     assert [each["system"] for each in as_json(*words)["tried"]] == ["mlp", "gcn"]  # it goes on
 
 
+def test_a_rung_tries_one_candidate_however_late_it_is(trained, monkeypatch):
+    monkeypatch.setattr(study, "SHARES_OF_TIME", dict.fromkeys(study.SHARES_OF_TIME, (0.0,) * 4))
+    (only,) = as_json(*WORDS)["tried"]
+    assert only["rung"] >= 3
+
+
 @pytest.mark.usefixtures("trained")
 def test_time_that_is_up_is_said():
     assert "--time: was too short" in refusal(*WORDS, "--time", "0.001s")

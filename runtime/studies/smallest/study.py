@@ -103,7 +103,10 @@ class Work:
         return until is not None and time.monotonic() >= until
 
     def measure(self, works: Sequence[work.Trial], label: str, share: float = 1.0) -> dict[str, Measured]:
-        """Results by key, of those that were begun before that share of the time had passed."""
+        """Results by key, of those that were begun before that share of the time had passed; one candidate at least."""
+        until = self.until(share)
+        if works and until is not None and time.monotonic() >= until:
+            works, until = [each for each in works if each.label == works[0].label], self.until()
         return sweep(
             works,
             work.measure,
@@ -111,7 +114,7 @@ class Work:
             jobs=self.jobs,
             label=label,
             kind=Measured,
-            until=self.until(share),
+            until=until,
         )
 
 
