@@ -6,7 +6,7 @@ FOLDER holds ``Ev-Objects.zip`` and ``Ev-Containers.zip``, the released ``object
 Containers, ``containers-knn1.pt`` (``spikeloom train --data Ev-Containers.zip --graph knn:1``), for its processor
 ``containers-200ms.pt``: ``spikeloom train --data Ev-Containers.zip --join 10 --graph manual --recipe timed --keep last
 --current-decay fc1=0.6,fc2=0.6,fc3=0.6``. Each study is a file in benchmarks/results, with the commands, the hash of
-the recordings and the state of the code that made it.
+the recordings and the version that made it.
 """
 
 import argparse
@@ -465,12 +465,6 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("studies", nargs="*", metavar="STUDY", help=", ".join(STUDIES))
     arguments = parser.parse_args()
-    code = subprocess.run(
-        ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"],
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-    )
     for name in arguments.studies or STUDIES:
         with tempfile.TemporaryDirectory() as folder:
             session = Session(arguments.folder, Path(folder))
@@ -486,7 +480,7 @@ def main() -> None:
         found = {
             "command": f"python benchmarks/figures.py FOLDER {name}",
             "commands": session.commands,
-            "spikeloom": f"{spikeloom.compiler.__version__} ({code.stdout.strip()})",
+            "spikeloom": spikeloom.compiler.__version__,
             "data_sha256": hashes,
             "figures": figures,
         }

@@ -1,7 +1,9 @@
-"""Benchmarks: our netlist, references and the rivals' runners agree; the paper's tables are those of its cells."""
+"""Benchmarks: our netlist, references and the rivals' runners agree; results come out again, the paper's tables too."""
 
 import importlib
+import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -132,3 +134,65 @@ def test_every_planned_cell_is_there_and_adds_up(module, cells):
     for cell in cells.values():
         for which in ("last", "best", "clean"):
             assert cell[which]["accuracy"] == cell[which]["correct"] / cell["test_samples"]
+
+
+@pytest.fixture
+def stored(monkeypatch, tmp_path):
+    """The list of stored results, over a copy that a test may change."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS.parent))
+    found = importlib.import_module("benchmarks.__main__")
+    shutil.copytree(found.RESULTS, tmp_path / "results", dirs_exist_ok=True)
+    monkeypatch.setattr(found, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(found, "RUNS", tmp_path / "results" / "runs")
+    return found
+
+
+# 10 s of a quiet core together: one is the whole chain on real recordings, one the statistics that the docs quote
+@pytest.mark.parametrize("name", ["longer-bins.json", "confusion-containers.json"])
+def test_results_come_out_again(stored, name):
+    assert stored.again(name) == []
+
+
+def test_a_result_that_was_edited_differs_and_its_record_is_written(stored):
+    name = "longer-bins.json"
+    file = stored.RESULTS / name
+    true = json.loads(file.read_text())
+    file.write_text(json.dumps(true | {"figures": true["figures"] | {"validation_20ms": [0]}}))
+    (found,) = stored.again(name, write=True)
+    assert found.startswith("/figures/validation_20ms")
+    assert json.loads(file.read_text())["figures"] == true["figures"]
+    assert stored.state(name) == "up to date"
+    read = stored.read(stored.RUNS / name)["files"]
+    expected = {"benchmarks/figures.py", "benchmarks/results/paper/cells.json", "compiler/__init__.py"}
+    assert expected <= read.keys()
+
+
+def test_a_result_is_stale_when_what_its_command_read_does_something_else(stored, monkeypatch, tmp_path):
+    (tmp_path / "code.py").write_text("def double(x):\n    return 2 * x\n")
+    (tmp_path / "prices.toml").write_text("a = 1\n")
+    monkeypatch.setattr(stored, "ROOT", tmp_path)
+    files = ("code.py", "prices.toml")
+    stored.digest.cache_clear()
+    (stored.RUNS / "x.json").parent.mkdir(exist_ok=True)
+    (stored.RUNS / "x.json").write_text(json.dumps({"files": {each: stored.digest(each) for each in files}}))
+    states = []
+    for name, text in [
+        ("code.py", 'def double(x):\n    """Twice."""\n    return 2 * x  # of it\n'),
+        ("code.py", "def double(x):\n    return 3 * x\n"),
+        ("prices.toml", "a = 2\n"),
+    ]:
+        (tmp_path / name).write_text(text)
+        stored.digest.cache_clear()
+        states.append(stored.state("x.json"))
+    stored.digest.cache_clear()
+    assert states == ["up to date", "stale (code.py)", "stale (code.py, prices.toml)"]
+    assert stored.state("fuzz.json") == "not known"
+
+
+def test_the_list_has_every_result(stored, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["benchmarks"])
+    stored.main()
+    text = capsys.readouterr().out
+    assert all(f"{name}: " in text for name in stored.names())
+    assert "anytime-objects.json: " in text
+    assert "\n    python benchmarks/figures.py FOLDER anytime-objects\n" in text
