@@ -62,12 +62,13 @@ LATENCIES = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quantity:
-    """One number of a target, with its unit and where it was read."""
+    """One number of a target, with its unit, where it was read, and what stands there."""
 
     value: float
     unit: str
     source: str
     confidence: str = ""
+    quote: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

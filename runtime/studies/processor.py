@@ -39,9 +39,20 @@ from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Section, Table, Text
 from spikeloom.runtime.studies.search.choice import choose, is_worse
 
-SOLD = "STM32L4R5 (Cortex-M4), data sheet DS12023, typical at 3 V: "
+SOLD = "STM32L4R5 (Cortex-M4), data sheet DS12023, typical at 3 V and 25 °C: "
+
+DECK = "x3beche.github.io/stm32l4r5-deck/low-power, which restates the data sheet"
+"""Where the figures of the data sheet were read."""
 
 ARITHMETIC = "Horowitz, ISSCC 2014, figure 1.1.9 (45 nm, 0.9 V)"
+
+
+def _sold(value: float, unit: str, what: str, quote: str) -> Quantity:
+    """A figure of the data sheet."""
+    return Quantity(
+        value=value, unit=unit, source=f"{SOLD}{what}", confidence="secondary", quote=f"{quote} ({DECK})"
+    )
+
 
 PRICES = {
     "add": Quantity(value=0.1, unit="pJ of 32 bits", source=ARITHMETIC),
@@ -49,13 +60,9 @@ PRICES = {
     "access_8": Quantity(value=10.0, unit="pJ of 64 bits in 8 KiB", source=ARITHMETIC),
     "access_32": Quantity(value=20.0, unit="pJ of 64 bits in 32 KiB", source=ARITHMETIC),
     "access_1024": Quantity(value=100.0, unit="pJ of 64 bits in 1 MiB", source=ARITHMETIC),
-    "cycle": Quantity(value=300.0, unit="pJ", source=f"{SOLD}100 µA/MHz", confidence="secondary"),
-    "asleep": Quantity(
-        value=3.6e-3, unit="mW", source=f"{SOLD}1.2 µA, memory kept (Stop 2)", confidence="secondary"
-    ),
-    "idle": Quantity(
-        value=7.2, unit="mW", source=f"{SOLD}30 µA/MHz at 80 MHz (Sleep)", confidence="secondary"
-    ),
+    "cycle": _sold(300.0, "pJ", "100 µA/MHz", "Run @ 80 MHz | ≈ 100 µA/MHz"),
+    "asleep": _sold(3.6e-3, "mW", "1.2 µA, memory kept (Stop 2)", "Stop 2 | ≈ 1.2 µA | all SRAM + regs"),
+    "idle": _sold(7.2, "mW", "30 µA/MHz at 80 MHz (Sleep)", "Sleep | ≈ 30 µA/MHz | everything"),
 }
 """Of a processor: events in pJ, static power in mW."""
 
