@@ -67,10 +67,10 @@ data:
     bin_s dead duration_s events found hot labels one_sided rate recordings rules source split steps taxels
     unlabelled
 estimate:
-    chip_steps cores detail energy_by_part_j energy_range_j host layers max measured min not_modelled not_priced
-    pace per_inference prices samples static time
+    chip_steps cores detail energy_by_part_j energy_range_j host injection layers max measured min not_modelled
+    not_priced pace per_inference prices samples static time
 estimate, crossbars:
-    cores cores_of_chip energy layers max min not_priced pace per_inference samples static_w
+    cores cores_of_chip energy injection layers max min not_priced pace per_inference samples static_w
 explain:
     causes diagnosis different faults graph layers recording reference roots sample searched split steps top
 export netx:

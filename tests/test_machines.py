@@ -130,6 +130,11 @@ WRONG = [
         'neuron_access = { value = 6.0, unit = "s"',
         "unit is 's'",
     ),
+    (
+        '"x86 cores awake" = { value = 66.6, unit = "mW"',
+        'x86 = { value = 1, unit = "s"',
+        "injection.x86: unit is 's'",
+    ),
     ("link_buffer = {", "#", "time.sanafe: lacks link_buffer"),
     ("barrier.1 = {", "barrier.3 = {", "time.sanafe: lacks barrier.1"),
     ("barrier.2 = {", "barrier.two = {", "time.sanafe: lacks barrier.1, and others with a number"),

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from spikeloom.compiler.targets.base import shipped
-from spikeloom.runtime.studies.processor import CLOCK_HZ, PRICES
+from spikeloom.runtime.machines.injection import injection, input_events, line, rows
+from spikeloom.runtime.machines.microcontroller import CLOCK_HZ, PRICES
 
 LOIHI, TRUENORTH = shipped()["loihi1"], shipped()["truenorth"]
 NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e-\d+)?")
@@ -103,6 +104,12 @@ def test_power_that_grows_with_time_is_that_of_other_measurements():
     # the paper's table against its logs, the x86 off
     assert LOIHI.static["blouw2019"].value == pytest.approx(1000 * spotter["idle_w"]["total"], rel=0.03)
     assert LOIHI.host["awake"].value == pytest.approx(1000 * spotter["after_w"]["total"], rel=1e-3)
+    x86 = LOIHI.injection["x86 cores awake"].value
+    for network in (spotter, largest):
+        assert x86 == pytest.approx(
+            1000 * (network["after_w"]["total"] - network["idle_w"]["total"]), rel=5e-3
+        )
+    assert 1000 * 2.09 / 32 < x86 < 1000 * 2.14 / 32  # Frady 2020, table 1, of another board
     for name, found in {"step_least": spotter, "step_most": largest}.items():
         assert LOIHI.host[name].value == pytest.approx(1000 / 10 / found["inferences_per_s"], rel=2e-3)
 
@@ -121,6 +128,36 @@ def test_prices_of_truenorth_are_those_of_measured_power():
     assert (TRUENORTH.energy[1].joule("synaptic_event"), TRUENORTH.energy[1].floor_w) == pytest.approx(
         tuple(fitted), rel=0.01
     )
+
+
+def test_the_link_of_truenorth_is_its_bits():
+    entry = TRUENORTH.injection["link and periphery"]
+    link, _, periphery, _ = numbers(entry.quote)
+    assert entry.value == 32 * (link + periphery)
+
+
+def test_events_handed_in_are_priced_as_a_range():
+    events = np.array([100, 300])
+    steps = np.array([50, 150])
+    program = 12 * 300e-12
+    found = injection(LOIHI, 2, events, steps, 0.02)
+    assert (found.events, found.least.mean, found.least.max) == pytest.approx(
+        (200, 200 * program, 300 * program)
+    )
+    assert found.most.min == pytest.approx(100 * program + 2 * 66.6e-3)
+    assert found.least.parts == ("a microcontroller's program",)
+    crossbars = injection(TRUENORTH, 1, events, steps, 0.02)
+    assert (crossbars.least.mean, crossbars.most.mean) == pytest.approx(
+        (200 * 896e-12, 200 * (program + 896e-12))
+    )
+    assert "link and periphery, 896 pJ (Merolla" in line(crossbars)
+    assert rows(found)[1] == ["events handed in, most", "266 mJ", "133 mJ", "400 mJ"]
+
+
+def test_events_after_the_end_of_a_recording_are_not_handed_in():
+    channels = np.ones((2, 3, 5), np.uint8)
+    channels[1, 0, :] = 0
+    assert input_events(channels, np.array([5, 2])).tolist() == [15, 4]
 
 
 def test_prices_of_a_microcontroller_are_its_currents_at_three_volts():

@@ -124,6 +124,9 @@ class Target:
     host: Mapping[str, Quantity] = field(
         default_factory=dict
     )  # What feeding it adds, of ``HOST``, where known
+    injection: Mapping[str, Quantity] = field(
+        default_factory=dict
+    )  # What handing in events takes of the chip
     measured: str = ""  # How far these prices were from measured chips
     cores: str = COMPARTMENTS  # or ``CROSSBARS``, which have neither choices nor time tables
 
@@ -156,6 +159,7 @@ def read_target(path: str | os.PathLike[str]) -> Target:
             time=time,
             static=_quantities("static", raw.get("static", {})),
             host=_quantities("host", raw.get("host", {}), HOST),
+            injection=_injection(raw.get("injection", {})),
             measured=raw.get("measured", ""),
         )
 
@@ -230,6 +234,15 @@ def _quantities(
             raise FileFault(f"{where}.{name}: unknown, allowed are {', '.join(units)}")
         quantities[name] = _quantity(f"{where}.{name}", entry, units[name] if units else "")
     return quantities
+
+
+def _injection(table: Mapping[str, Any]) -> dict[str, Quantity]:
+    """Prices of an event, or power for as long as events may come."""
+    found = _quantities("injection", table)
+    for name, price in found.items():
+        if price.unit not in (PRICE_UNIT, POWER_UNIT):
+            raise FileFault(f"injection.{name}: unit is {price.unit!r}, allowed are pJ and mW")
+    return found
 
 
 def _cost_tables(

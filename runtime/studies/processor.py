@@ -5,13 +5,9 @@ weights, as wide as the netlist's, to the sums of the classes, of which the larg
 network that reads its sums exactly. Thresholds and parts of the recording are chosen by cross-validation in
 the training split, the fewest additions that are not shown to be worse than the best.
 
-A decision takes at least its arithmetic and memory accesses [1]_, at most the cycles of a simple program
-[2]_ on a microcontroller that one can buy. In between it sleeps, or idles with all clocks running.
-
-References
-----------
-.. [1] M. Horowitz, "Computing's energy problem (and what we can do about it)", ISSCC 2014, figure 1.1.9.
-.. [2] Arm, "Cortex-M4 Technical Reference Manual", table 3-1: a load takes two cycles, arithmetic and stores one.
+A decision takes at least its arithmetic and memory accesses, at most the cycles of a simple program on a
+microcontroller that one can buy; ``machines/microcontroller.py`` has the prices. In between it sleeps, or idles
+with all clocks running.
 """
 
 import math
@@ -34,44 +30,11 @@ from spikeloom.models.training.counters import (
     run_counters,
 )
 from spikeloom.runtime.machines.base import Price
+from spikeloom.runtime.machines.microcontroller import ADD_CYCLES, CLOCK_HZ, EVENT_CYCLES, PRICES
 from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Section, Table, Text
 from spikeloom.runtime.studies.search.choice import choose, is_worse
-
-SOLD = "STM32L4R5 (Cortex-M4), data sheet DS12023, typical at 3 V and 25 °C: "
-
-DECK = "x3beche.github.io/stm32l4r5-deck/low-power, which restates the data sheet"
-"""Where the figures of the data sheet were read."""
-
-ARITHMETIC = "Horowitz, ISSCC 2014, figure 1.1.9 (45 nm, 0.9 V)"
-
-
-def _sold(value: float, unit: str, what: str, quote: str) -> Quantity:
-    """A figure of the data sheet."""
-    return Quantity(
-        value=value, unit=unit, source=f"{SOLD}{what}", confidence="secondary", quote=f"{quote} ({DECK})"
-    )
-
-
-PRICES = {
-    "add": Quantity(value=0.1, unit="pJ of 32 bits", source=ARITHMETIC),
-    "multiply": Quantity(value=0.2, unit="pJ of 8 bits", source=ARITHMETIC),
-    "access_8": Quantity(value=10.0, unit="pJ of 64 bits in 8 KiB", source=ARITHMETIC),
-    "access_32": Quantity(value=20.0, unit="pJ of 64 bits in 32 KiB", source=ARITHMETIC),
-    "access_1024": Quantity(value=100.0, unit="pJ of 64 bits in 1 MiB", source=ARITHMETIC),
-    "cycle": _sold(300.0, "pJ", "100 µA/MHz", "Run @ 80 MHz | ≈ 100 µA/MHz"),
-    "asleep": _sold(3.6e-3, "mW", "1.2 µA, memory kept (Stop 2)", "Stop 2 | ≈ 1.2 µA | all SRAM + regs"),
-    "idle": _sold(7.2, "mW", "30 µA/MHz at 80 MHz (Sleep)", "Sleep | ≈ 30 µA/MHz | everything"),
-}
-"""Of a processor: events in pJ, static power in mW."""
-
-CLOCK_HZ = 80e6
-
-# Load, raise and store a count, load its threshold, compare, branch; load a weight and a sum, add, store,
-# count on
-EVENT_CYCLES = 12
-ADD_CYCLES = 8
 
 PLANS = tuple(product(((1, 4, 16, 64), (1, 2, 4, 8, 16, 32, 64)), (1, 5, 10)))
 """Thresholds and parts that are tried."""

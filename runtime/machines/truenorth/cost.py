@@ -18,13 +18,15 @@ from spikeloom.compiler.targets.base import EnergyTable, Target
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.counts import number
+from spikeloom.runtime.machines import injection
 from spikeloom.runtime.machines.base import Price
+from spikeloom.runtime.machines.injection import Injection
 from spikeloom.runtime.machines.truenorth.spec import Counts
 from spikeloom.runtime.report.numbers import dominant, si
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 
 NOT_PRICED = (
-    "injection of input events and clocks, read-out of votes (no public figure per event)",
+    "read-out of votes (no public figure)",
     "initial membranes, which every neuron takes before each recording (no public figure)",
     "work off the chip: binning of the sensor's events, joining of bins, making of clocks",
     "spikes and hops by themselves (both prices are per synaptic event and hold them at the measured workload)",
@@ -94,11 +96,14 @@ class Estimate:
     energy: tuple[Reading, ...]
     pace: Pace
     static_w: Mapping[str, float]
+    injection: Injection
     not_priced: tuple[str, ...] = NOT_PRICED
 
 
-def price(netlist: CrossbarNetlist, chip: Target, counts: Counts, bin_s: float) -> Price:
-    """Count and price a batch of recordings: `counts` has one leading axis."""
+def price(
+    netlist: CrossbarNetlist, chip: Target, counts: Counts, inputs: IntArray, steps: IntArray, bin_s: float
+) -> Price:
+    """Count and price recordings; `counts`, `inputs` that come and data `steps` have one leading axis."""
     received, sent = _by_layer(netlist, counts)
     packets = counts.spikes[:, netlist.wire_neuron]
     counted = {
@@ -138,6 +143,7 @@ def price(netlist: CrossbarNetlist, chip: Target, counts: Counts, bin_s: float) 
         energy=tuple(_reading(table, *parts[table.name], energy[table.name], used) for table in chip.energy),
         pace=Pace(bin_s=bin_s, step_s=step_s, real_time=step_s <= bin_s),
         static_w={name: power.value * 1e-3 for name, power in chip.static.items()},
+        injection=injection.injection(chip, 1, inputs, steps, bin_s),
     )
     return Price(
         synaptic_operations=counted["synaptic_events"],
@@ -199,6 +205,7 @@ def sections(found: Estimate) -> list[Section]:
     rows += [
         [f"energy, {name}", *(si(c.energy_j[name], "J") for c in columns)] for name in columns[0].energy_j
     ]
+    rows += injection.rows(found.injection)
     layers = [
         [layer.name, f"{layer.synaptic_events:,.0f}", f"{layer.spikes:,.0f}"] for layer in found.layers
     ]
@@ -214,6 +221,7 @@ def sections(found: Estimate) -> list[Section]:
         f"a data step takes {si(pace.step_s, 's')}: {'keeps' if pace.real_time else 'does not keep'} the sensor's pace "
         f"of {1000 * pace.bin_s:g} ms a step",
         f"static power of a chip: {', '.join(static)}",
+        injection.line(found.injection),
         *([dominant([watts * seconds for watts in found.static_w.values()], events)] if events else []),
         *(f"not priced: {line}" for line in found.not_priced),
     ]

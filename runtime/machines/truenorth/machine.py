@@ -12,6 +12,7 @@ from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_c
 from spikeloom.compiler.targets.truenorth.passes import Source, compile_crossbars
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.machines.base import Done, Machine, Model, Price, Run
+from spikeloom.runtime.machines.injection import input_events
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.truenorth import cost, engine, spec
 from spikeloom.runtime.machines.truenorth.model import model_of
@@ -89,7 +90,11 @@ class TrueNorth(Machine):
     ) -> tuple[Trace, Price]:
         """By synaptic events and ticks."""
         trace = self.simulate(channels, lengths, spikes=False)
-        return trace, cost.price(self.netlist, chip, trace.counts, bin_s * self.netlist.bins)
+        steps = (
+            np.full(len(channels), channels.shape[-1]) if lengths is None else np.asarray(lengths, np.int64)
+        )
+        inputs = input_events(channels, steps)
+        return trace, cost.price(self.netlist, chip, trace.counts, inputs, steps, bin_s * self.netlist.bins)
 
 
 def load(path: str | os.PathLike[str]) -> TrueNorth:

@@ -14,6 +14,7 @@ from spikeloom.compiler.targets.loihi1.layout.place import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import EventArray, FloatArray, IntArray
 from spikeloom.runtime.machines.base import Done
+from spikeloom.runtime.machines.injection import input_events
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost, timing
 from spikeloom.runtime.machines.loihi1.costs.cost import Costs
@@ -30,11 +31,12 @@ HELD = 1 << 27
 class Estimate:
     """Costs of a batch of recordings.
 
-    Events and energies by layer; steps at the sensor's pace, blank ones too; times by table; and, in detail
-    ``cycle`` only, detailed times and joules by table and core.
+    Events and energies by layer; events and clock ticks that come in, (samples,); steps at the sensor's pace,
+    blank ones too; times by table; and, in detail ``cycle`` only, detailed times and joules by table and core.
     """
 
     costs: Costs
+    inputs: IntArray
     steps: IntArray
     simple: Mapping[str, SimpleTimes]
     detailed: Mapping[str, DetailedTimes]
@@ -95,6 +97,7 @@ def estimate(
     by_core = replace(whole, updates=np.concatenate(updates)) if deep else None
     return Trace(counts=whole, spikes=None, membranes=None), Estimate(
         costs=cost.price(cost.prepare(netlist, target), whole, chip_steps),
+        inputs=input_events(events, steps),
         steps=steps + netlist.blank,
         simple={name: _joined(SimpleTimes, times) for name, times in simple.items()},
         detailed={name: _joined(DetailedTimes, times) for name, times in detailed.items()},

@@ -10,6 +10,7 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.place import chip_count
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import FloatArray
+from spikeloom.runtime.machines.injection import Injection, injection
 from spikeloom.runtime.machines.loihi1.costs.cost import NOT_PRICED, Costs, by_part
 from spikeloom.runtime.machines.loihi1.costs.estimate import Estimate
 from spikeloom.runtime.machines.loihi1.costs.timing import DetailedTimes, StepTimes
@@ -160,6 +161,7 @@ class CostReport:
     pace: Pace
     static: tuple[Static, ...]
     host: Host | None
+    injection: Injection
     measured: str
     not_modelled: tuple[str, ...]
     not_priced: tuple[str, ...]
@@ -211,6 +213,7 @@ def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: flo
             for name, power in target.static.items()
         ),
         host=_host(target, float(found.steps.mean()) + netlist.max_depth, chips),
+        injection=injection(target, chips, found.inputs, found.steps, bin_s),
         measured=target.measured,
         not_modelled=(
             *(f"{name}: no price for {', '.join(events)}" for name, events in costs.unpriced.items()),

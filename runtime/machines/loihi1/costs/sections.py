@@ -1,6 +1,7 @@
 """Costs laid out for people: the mean inference and its range, where energy and time go."""
 
 from spikeloom.models.recordings.counts import number
+from spikeloom.runtime.machines import injection
 from spikeloom.runtime.machines.loihi1.costs.result import Amounts, CostReport, Host
 from spikeloom.runtime.report.numbers import dominant, si
 from spikeloom.runtime.report.sections import Section, Table, Text
@@ -36,6 +37,7 @@ def inference_table(report: CostReport) -> Table:
     rows = [[name.replace("_", " "), *counts(name)] for name in known]
     tables = report.per_inference.energy_j
     rows += [[f"{DYNAMIC}{name}", *(si(each.energy_j[name], "J") for each in columns)] for name in tables]
+    rows += injection.rows(report.injection)
     rows += [
         [
             f"time, {each.table}, {each.model} model",
@@ -125,6 +127,7 @@ def _lines(report: CostReport) -> list[str]:
         lines.append(
             dominant([each.real_time_j for each in report.static], report.per_inference.energy_j.values())
         )
+    lines.append(injection.line(report.injection))
     if report.host is not None:
         lines.append(_host_line(report.host))
     if report.measured:
