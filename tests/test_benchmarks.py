@@ -136,6 +136,14 @@ def test_every_planned_cell_is_there_and_adds_up(module, cells):
             assert cell[which]["accuracy"] == cell[which]["correct"] / cell["test_samples"]
 
 
+def test_figures_of_later_work_are_what_its_abstract_gains(module):
+    work = json.loads((module("cells").RESULTS / "later.json").read_text())["works"]["GGT-SNN"]
+    for data, gain in zip(("objects", "containers"), work["gains"], strict=True):
+        paper, _ = module("cells").PUBLISHED[data, module("cells").TACTILESGNET, "manual"]
+        assert work[data] == pytest.approx(paper + gain)
+        assert f"{gain} %" in work["quote"]
+
+
 @pytest.fixture
 def stored(monkeypatch, tmp_path):
     """The list of stored results, over a copy that a test may change."""
