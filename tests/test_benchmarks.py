@@ -144,6 +144,26 @@ def test_figures_of_later_work_are_what_its_abstract_gains(module):
         assert f"{gain} %" in work["quote"]
 
 
+def test_a_price_weighs_as_much_as_its_events(module):
+    more, less = {"synapse_dense": 4.0, "synapse_sparse": 2.0, "neuron": 3.0}, {"neuron": 3.0}
+    ratio = module("sensitivity").ratio
+    assert ratio(more, less, "synapse", 5) == pytest.approx(33 / 3)
+    assert ratio(more, less, "neuron", 5) == pytest.approx(21 / 15)
+
+
+def test_ratios_of_energies_are_those_of_another_result(module):
+    results = module("sensitivity").RESULTS
+    stored = json.loads((results / "sensitivity.json").read_text())["prices"]
+    networks = json.loads((results / "processor-objects.json").read_text())["figures"]
+    (low, high), (least, most) = (
+        networks[name]["chip"]["dynamic_j"] for name in ("TactileSGNet", "counters")
+    )
+    assert stored["TactileSGNet / counters, davies2018"]["usual"] == pytest.approx(low / most)
+    assert stored["TactileSGNet / counters, sanafe"]["usual"] == pytest.approx(high / least)
+    chip, small = (networks["counters"][name]["pace_j"] for name in ("chip", "processor"))
+    assert stored["chip / microcontroller"]["usual"] == pytest.approx(chip[0] / small[1])
+
+
 @pytest.fixture
 def stored(monkeypatch, tmp_path):
     """The list of stored results, over a copy that a test may change."""
