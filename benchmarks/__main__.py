@@ -130,13 +130,17 @@ def again(name: str, write: bool = False, extra: Path | None = None) -> list[str
     """Differences between a stored result and what its command gives now."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder).resolve()
+        began = time.time_ns()
         record = run(name, place, [*SOURCES, *([extra] if extra else [])])
         results = place / "benchmarks" / "results"
         found = sorted(differences(read(RESULTS / name), read(results / name)))
         if write:
             (results / "runs" / name).parent.mkdir(parents=True, exist_ok=True)
             (results / "runs" / name).write_text(json.dumps(record, indent=0) + "\n", "utf-8")
-            shutil.copytree(results, RESULTS, dirs_exist_ok=True)
+            made = (file for file in results.rglob("*.*") if file.stat().st_mtime_ns >= began)
+            for file in made:  # not the copies of others, which may be newer by now
+                (RESULTS / file.relative_to(results)).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(file, RESULTS / file.relative_to(results))
     return found
 
 

@@ -186,7 +186,10 @@ def test_a_result_that_was_edited_differs_and_its_record_is_written(stored):
     file = stored.RESULTS / name
     true = json.loads(file.read_text())
     file.write_text(json.dumps(true | {"figures": true["figures"] | {"validation_20ms": [0]}}))
+    other = stored.RESULTS / "silicon.json"
+    other.write_text("of another run")
     (found,) = stored.again(name, write=True)
+    assert other.read_text() == "of another run"
     assert found.startswith("/figures/validation_20ms")
     assert json.loads(file.read_text())["figures"] == true["figures"]
     assert stored.state(name) == "up to date"
