@@ -169,7 +169,7 @@ def main() -> None:
             sensor = ["--taxels", str(taxels), "--graph", "knn:4"]
             row = row_of(condition, json.loads(found.to_json()), folder, sensor) | {"seconds": seconds}
             row["how"] = f"--time {options.time}, {options.jobs or os.cpu_count()} processes"
-            rows = [*(each for each in rows if each["left_out"] != condition), row]
+            rows = [*(each for each in rows if each["left_out"] != row["left_out"]), row]
             options.output.write_text(json.dumps(head | {"rows": rows}, indent=1) + "\n")
 
 

@@ -96,6 +96,13 @@ def test_the_cheapest_that_is_not_shown_to_be_worse():
     assert study.pick([POOL[0], POOL[3]], ()).cheapest["one"] == 1
 
 
+@pytest.mark.usefixtures("any_margin")
+@pytest.mark.parametrize(("joules", "chosen"), [(10.4 * UJ, 3), (10.6 * UJ, 2)])
+def test_of_energies_that_are_alike_the_most_accurate_is_taken(joules, chosen):
+    pool = [tried(1, 36, 40 * UJ), tried(2, 35, 10 * UJ), tried(3, 36, joules)]
+    assert study.pick(pool, ()).cheapest["one"] == chosen
+
+
 def test_the_difference_is_of_recordings_that_both_decided():
     fold = work.Measured(right=(1, 0, 0, 0), tried=(1, 1, 0, 0), setting=0.1)
     assert study.accuracy(fold) == 0.5

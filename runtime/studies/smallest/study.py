@@ -5,7 +5,8 @@ with more strengths, and from there to five rounds. Networks that are trained by
 many epochs on each rung, from where they stopped; the best of each system goes on in any case, and those whose
 learning curve still rises on the last rung get one more. What is left out in turn are conditions, if the
 recordings have any. Everything happens on the training split but the last look at the choice. Taken is the
-cheapest that is at most `MARGIN` behind the best and not shown to be worse.
+cheapest that is at most `MARGIN` behind the best and not shown to be worse; of those that take `ALIKE` more at most,
+the most accurate.
 """
 
 import shutil
@@ -62,6 +63,9 @@ FAR = 0.1
 
 MARGIN = 0.02
 """Accuracy that the choice may be behind the best, if a paired test does not show that it is worse."""
+
+ALIKE = 0.05
+"""Share of the least energy by which another may exceed it and still counts as cheap: prices are not that exact."""
 
 CONFIDENT = 1.96
 """Standard errors of a difference that show it: 95 % of a normal distribution are within."""
@@ -402,10 +406,7 @@ def pick(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
     allowed = selection.allowed
     assert selection.best.costs is not None, "all of these are priced"
     tables = list(selection.best.costs.energy_j)
-    cheapest = {
-        table: min(allowed, key=lambda each: (energy(each, table), -each.accuracy)).number
-        for table in tables
-    }
+    cheapest = {table: _cheapest(allowed, table).number for table in tables}
     chosen = next(each for each in allowed if each.number == cheapest[tables[0]])
     above = [each for each in pool if each.accuracy >= chosen.accuracy + POINT - NEAR]
     return Choice(
@@ -417,6 +418,13 @@ def pick(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
         ahead=min(above, key=energy).number if above else None,
         cheaper=_cheaper(pool, chosen),
     )
+
+
+def _cheapest(allowed: Sequence[Tried], table: str) -> Tried:
+    """The most accurate of those whose energy is about the least."""
+    most = (1 + ALIKE) * min(energy(each, table) for each in allowed)
+    cheap = [each for each in allowed if energy(each, table) <= most]
+    return max(cheap, key=lambda each: (each.accuracy, -energy(each, table)))
 
 
 def _cheaper(pool: Sequence[Tried], chosen: Tried) -> int | None:
