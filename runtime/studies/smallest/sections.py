@@ -101,7 +101,7 @@ def _why(result: Smallest) -> Iterator[str]:
     whole = f"; to the end {_spent(replace(chosen, costs=chosen.whole))}" if chosen.whole else ""
     yield f"take {_named(chosen)} (95 % interval {_interval(chosen)}), {_spent(chosen)}{whole}"
     if chosen.number == best.number:
-        yield "it is the best of what was tried, and nothing cheaper that was tried is as good"
+        yield "it is the best of what was tried, and what is as good takes about as much or more"
     else:
         low = 100 * (chosen.behind - 1.96 * chosen.behind_error)
         high = 100 * (chosen.behind + 1.96 * chosen.behind_error)
