@@ -19,8 +19,10 @@ from oracles import refused
 from spikeloom.compiler.archive import npy_bytes
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import SIZE_LIMIT
+from spikeloom.compiler.formats import torch_file
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.own_checkpoint import save_checkpoint
+from spikeloom.compiler.formats.torch_file import read_torch_file
 from spikeloom.models.graphs import Graph
 
 TAXELS, FEATURES, HOPS, SIZES, CLASSES = 6, 4, 3, (5, 7), 3
@@ -162,7 +164,11 @@ REFUSED = {
     ),
     "sparse": (
         lambda: changed(fc3__bias=torch.ones(3).to_sparse()),
-        "fc3.bias is a tensor of float32, wanted plain",
+        "is a pickle that calls torch._utils._rebuild_sparse_tensor, allowed are plain tensors",
+    ),
+    "integers": (
+        lambda: changed(fc3__bias=torch.ones(3, dtype=torch.int64)),
+        "fc3.bias is a tensor of int64, wanted plain floating-point",
     ),
     "expanded": (
         lambda: changed(fc3__weight=torch.ones(1).expand(10**6, 10**6)),
@@ -233,13 +239,68 @@ def test_own_format_round_trip(tmp_path):
     assert own() == own() != own(beta=0.3)
 
 
-def test_own_format_needs_neither_torch_nor_pickle(tmp_path):
-    write(tmp_path / "x.pt", own())
+@pytest.mark.parametrize("new", [True, False], ids=["zip", "pre-1.6"])
+def test_parameters_views_and_attributes_are_read_as_torch_does(tmp_path, new):
+    state = tensors()
+    whole = torch.randn(9, 40)
+    module = torch.nn.Module()
+    module.part = torch.nn.Linear(2, 3)
+    content = torch_bytes(
+        [state, module.state_dict(), whole.T[3:30:2], torch.nn.Parameter(whole[2])], new=new
+    )
+    read = read_torch_file(content)
+    assert list(read[0]) == list(state)
+    assert_array_equal(read[1]["part.weight"].array, module.part.weight.detach())
+    assert_array_equal(read[2].array, whole.T[3:30:2])
+    assert_array_equal(read[3].array, whole[2])
+    assert not read[2].array.flags.writeable
+
+
+def torch_zip(pickled: bytes) -> bytes:
+    return zipped({"x/data.pkl": b"\x80\x02" + pickled + b".", "x/data/0": bytes(8)})
+
+
+TENSOR = b"ctorch._utils\n_rebuild_tensor\n((X\x07\0\0\0storagectorch\nFloatStorage\nX\x01\0\0\x000X\0\0\0\0K\x02tQ%btR"
+"""A tensor of two numbers; its offset, sizes and strides are missing."""
+
+MADE_UP = {
+    "beyond its storage": (TENSOR % b"K\x01K\x02\x85K\x01\x85", "reaches beyond its storage"),
+    "negative stride": (TENSOR % b"K\x01K\x02\x85J\xff\xff\xff\xff\x85", "no usable sizes"),
+    "truth values for sizes": (TENSOR % b"K\0\x88\x85\x88\x85", "no usable sizes"),
+    "keys that take for ever": (b"}" + b")q\0" + b"h\0h\0\x86q\0" * 200 + b"Ns", "sets a key"),
+    "a memo of 32 GiB": (b"Nr\xff\xff\xff\xff", "holds neither"),
+    "a text of 4 GiB": (b"X\xff\xff\xff\xff", DAMAGED),
+    "no end of instructions": (b"N0" * 10, DAMAGED),
+    "a list inside itself": (b"]q\0h\0a", "holds neither net_list nor weights of a TactileSGNet, but list"),
+    "other storages": (b"ctorch\nComplexFloatStorage\n", "calls torch.ComplexFloatStorage"),
+}
+
+
+@pytest.mark.parametrize("name", MADE_UP)
+def test_made_up_pickles(tmp_path, name):
+    pickled, words = MADE_UP[name]
+    if pickled.startswith(TENSOR[:9]):
+        pickled = b"}X\x0b\0\0\0conv1.fc1.w%bs" % pickled
+    assert words in refusal(write(tmp_path / "x.t7", torch_zip(pickled)))
+
+
+def test_a_pickle_has_an_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch_file, "MOST_INSTRUCTIONS", 50)
+    assert "more than 50 instructions" in refusal(write(tmp_path / "x.t7", torch_bytes(tensors())))
+
+
+@pytest.mark.parametrize("content", [own(), torch_bytes(tensors())], ids=["own", "released"])
+def test_checkpoints_are_read_without_torch(tmp_path, content):
+    write(tmp_path / "x.pt", content)
     program = (
         "import sys; from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint; "
         f"assert read_checkpoint({str(tmp_path / 'x.pt')!r}).classes == {CLASSES}; assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[1])
+
+
+def test_own_format_needs_no_pickle(tmp_path):
+    write(tmp_path / "x.pt", own())
     with zipfile.ZipFile(tmp_path / "x.pt") as archive:
         manifest = json.loads(archive.read("manifest.json"))
         array = np.lib.format.read_array(io.BytesIO(archive.read("best/fc2.bias.npy")), allow_pickle=False)

@@ -5,25 +5,22 @@ while ``best_acc`` belongs to the best one. It holds no graph, no decay and no t
 are read too, both kinds in torch's zip and in its older format, with the keys of current torch_geometric
 (``conv1.lins.0.weight`` …) or of old releases (``conv1.lin.weight``, the filters of all hops side by side).
 
-torch is imported here only, late, and always with ``weights_only=True``: files that hold code are refused.
+:mod:`torch_file` reads them as data; files that hold code are refused.
 """
 
 import hashlib
-import io
 import math
-import pickle
 import re
-import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.archive import stored_members, zip_bytes
 from spikeloom.compiler.checkpoint import Checkpoint, layers_of
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.tensors import Arrays, Shape, faults_of, taxel_faults, wanted_dense
+from spikeloom.compiler.formats.torch_file import OTHERS, Tensor, read_torch_file
 from spikeloom.compiler.types import JsonObject
 
 CHANNELS = 2
@@ -40,13 +37,15 @@ THETA = 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""
 
 
-OTHERS = "another network comes as ONNX or NIR, or in Python as spikeloom.compile(module, example=…): docs/formats.md"
-"""What to do with a file of torch that holds no network of ours."""
-
-
 def read_torch(content: bytes, run: int) -> Checkpoint:
-    """Read the content of a torch file; raises as :func:`read_checkpoint`."""
-    loaded = load_torch(content)
+    """Read the content of a torch file; raises as :func:`read_checkpoint`.
+
+    The CRCs of a zip are checked. The format before it has no checksum: a bit of a weight that is flipped goes
+    unnoticed.
+    """
+    if content[:2] != b"PK" and content[:1] != b"\x80":
+        raise ModelError(NOT_A_CHECKPOINT)
+    loaded = read_torch_file(content)
     if isinstance(loaded, dict) and "net_list" in loaded:
         states = loaded["net_list"]
         layout = "released"
@@ -70,47 +69,10 @@ def read_torch(content: bytes, run: int) -> Checkpoint:
     )
 
 
-def load_torch(content: bytes) -> Any:
-    """Let torch read the content if it looks like a zip or a pickle.
-
-    The CRCs of a zip are checked here, for torch does not. The format before it has no checksum: a bit of a
-    weight that is flipped goes unnoticed.
-    """
-    if content[:2] != b"PK" and content[:1] != b"\x80":
-        raise ModelError(NOT_A_CHECKPOINT)
-    import torch
-
-    if content[:2] == b"PK":
-        content = zip_bytes(stored_members(content))
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch warns of its own old storage classes
-            return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises nearly anything on damaged files
-        if isinstance(error, pickle.UnpicklingError) and (
-            named := re.search(r"GLOBAL ([\w.]+)", str(error))
-        ):
-            raise ModelError(
-                f"is a pickle that calls {named[1]}, allowed are tensors alone, since code in a file could "
-                f"do anything; save the state_dict of a TactileSGNet and nothing else; {OTHERS}"
-            ) from error
-        if re.search(r"Unsupported operand 1(4\d|5[0-2])\b", str(error)):  # what protocol 4 added
-            raise ModelError(
-                "is pickled with protocol 4 or newer, which torch does not read without running it; "
-                "save it with torch.save as it is by default"
-            ) from error
-        raise
-
-
 def _arrays(state: Any, file_size: int) -> Arrays:
     """Convert the tensors of a state dict to float32 arrays."""
-    import torch
-
-    if not isinstance(state, Mapping) or not any(re.match(r"(conv|fc)\d", str(key)) for key in state):
-        keys = (
-            [printable(str(key)) for key in state] if isinstance(state, Mapping) else [type(state).__name__]
-        )
+    if not isinstance(state, dict) or not any(re.match(r"(conv|fc)\d", str(key)) for key in state):
+        keys = [printable(str(key)) for key in state] if isinstance(state, dict) else [type(state).__name__]
         raise ModelError(
             f"holds neither net_list nor weights of a TactileSGNet, but {', '.join(keys[:5]) or 'nothing'}; {OTHERS}"
         )
@@ -118,21 +80,18 @@ def _arrays(state: Any, file_size: int) -> Arrays:
     faults = [f"{name} {fault}" for name, fault in checked if fault]
     if faults:
         raise ModelError(f"{'; '.join(faults)}; {GIVE_WEIGHTS}")
-    return {str(name): value.detach().to(torch.float32).numpy() for name, value in state.items()}
+    with np.errstate(over="ignore"):  # infinity is refused later, by name
+        return {str(name): value.array.astype(np.float32) for name, value in state.items()}
 
 
 def _tensor_fault(value: Any, file_size: int) -> str | None:
-    import torch
-
-    if not isinstance(value, torch.Tensor):
+    if not isinstance(value, Tensor):
         return f"is a {type(value).__name__}, wanted a tensor"
-    if value.layout != torch.strided or value.device.type != "cpu" or not value.is_floating_point():
-        return (
-            f"is a tensor of {str(value.dtype).removeprefix('torch.')}, wanted plain floating-point numbers"
-        )
+    if "float" not in value.dtype:
+        return f"is a tensor of {value.dtype}, wanted plain floating-point numbers"
     # A tensor may repeat its storage through strides of zero, and so be far larger than the file.
-    if value.numel() * value.element_size() > file_size:
-        return f"claims {value.numel()} values, more than the file holds"
+    if math.prod(value.shape) > file_size:
+        return f"claims {math.prod(value.shape)} values, more than the file holds"
     return None
 
 
@@ -178,17 +137,20 @@ def _training(loaded: Mapping[str, Any], run: int, runs: int) -> JsonObject:
     if isinstance(epochs := loaded.get("num_epochs"), int):
         training["epochs"] = epochs
         # the tensor of a run is listed once per epoch
-        last = _number(lambda: loaded["acc_list"][(run + 1) * epochs - 1][-1])
+        last = _number(loaded.get("acc_list"), (run + 1) * epochs - 1, -1)
         training |= {} if last is None else {"last_acc": last}
-    if (best := _number(lambda: loaded["best_acc"][run])) is not None:
+    if (best := _number(loaded.get("best_acc"), run)) is not None:
         note = "of the best epoch on the test split, not of these weights"
         training |= {"best_acc": best, "best_acc_note": note}
     return training
 
 
-def _number(find: Callable[[], Any]) -> float | None:
+def _number(value: Any, *places: int) -> float | None:
+    """A number in lists and tensors, None where there is none."""
     try:
-        number = round(float(find()), 4)
+        for place in places:
+            value = (value.array if isinstance(value, Tensor) else value)[place]
+        number = round(float(value.array if isinstance(value, Tensor) else value), 4)
     except Exception:  # what is not there, or no number
         return None
     return number if math.isfinite(number) else None

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from spikeloom.compiler.archive import stored_members, zip_bytes
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import FileFault, read_whole, reading, write_atomically
-from spikeloom.compiler.formats.torch_checkpoint import load_torch
 from spikeloom.models.networks.networks import Weights
 
 E = TypeVar("E")
@@ -92,7 +92,8 @@ class Course(Generic[E]):
             content = sealed[:-SEAL_BYTES]
             if _seal(content) != sealed[-SEAL_BYTES:]:
                 raise FileFault("is no training state, or was altered")
-            state = load_torch(content)
+            plain = io.BytesIO(zip_bytes(stored_members(content)))  # whose CRCs torch does not check
+            state = torch.load(plain, map_location="cpu", weights_only=True)
             self._require_same(path, state["options"])
             self.network.load_state_dict(state["network"], strict=False)
             self.optimizer.load_state_dict(state["optimizer"])
