@@ -1,9 +1,11 @@
 """Read an HDF5 file as plain data, trusting nothing in it: no size, no link to elsewhere."""
 
+import contextlib
 import hashlib
 import io
 import os
-import resource
+import subprocess
+import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,8 +99,17 @@ def tree_of(content: bytes) -> Tree:
 
 
 def _require_end(content: bytes) -> None:
-    """Refuse a file on which the HDF5 library spins or dies: a forked process tries first, with so much time."""
-    import h5py
+    """Refuse a file on which the HDF5 library spins or dies: another process tries first, with so much time."""
+    if not (_ends_in_fork if hasattr(os, "fork") else _ends_elsewhere)(content):
+        raise FileFault(
+            f"the HDF5 library dies on it, or takes more than {MOST_SECONDS} s, so it is damaged"
+        )
+
+
+def _ends_in_fork(content: bytes) -> bool:
+    import resource
+
+    import h5py  # noqa: F401 - loaded once, not by each child
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # threads, say of torch: the child uses nothing of theirs
@@ -107,14 +118,36 @@ def _require_end(content: bytes) -> None:
         try:
             resource.setrlimit(resource.RLIMIT_CPU, (MOST_SECONDS, MOST_SECONDS))
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            with h5py.File(io.BytesIO(content), "r") as file:
-                _group(file, [files.SIZE_LIMIT])
+            try_to_read(content)
         finally:
             os._exit(0)
-    if os.WIFSIGNALED(os.waitpid(child, 0)[1]):
-        raise FileFault(
-            f"the HDF5 library dies on it, or takes more than {MOST_SECONDS} s, so it is damaged"
+    return not os.WIFSIGNALED(os.waitpid(child, 0)[1])
+
+
+def _ends_elsewhere(content: bytes) -> bool:
+    """The same where nothing forks (Windows); the time of a new Python counts."""
+    code = f"import sys; from {__name__} import try_to_read; try_to_read(sys.stdin.buffer.read())"
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    try:
+        done = subprocess.run(  # noqa: S603 - the code above
+            [sys.executable, "-c", code],
+            input=content,
+            stderr=subprocess.DEVNULL,
+            env=env,
+            timeout=10 * MOST_SECONDS,
+            check=False,
         )
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0
+
+
+def try_to_read(content: bytes) -> None:
+    """Read all of a file, which may kill this process; what is wrong in it is said by the process that asked."""
+    import h5py
+
+    with contextlib.suppress(Exception), h5py.File(io.BytesIO(content), "r") as file:
+        _group(file, [files.SIZE_LIMIT])
 
 
 def _group(group: Any, room: list[int]) -> Tree:

@@ -14,8 +14,8 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import takewhile
@@ -184,25 +184,33 @@ def side_by_side(
     from joblib.externals.loky.backend import resource_tracker as trackers_of_joblib
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    for tracker in (resource_tracker, trackers_of_joblib):
-        tracker.ensure_running()  # which makes later processes hear signals, so it comes first
+    if os.name == "posix":  # elsewhere there are no such processes
+        for tracker in (resource_tracker, trackers_of_joblib):
+            tracker.ensure_running()  # which makes later processes hear signals, so it comes first
     attempt = delayed(partial(_in_child, os.getpid(), Path.cwd(), run))
     with parallel_config("loky", n_jobs=processes, inner_max_num_threads=1), warnings.catch_warnings():
         # One that has grown is replaced, and nothing lost
         warnings.filterwarnings("ignore", "A worker stopped")
         work = Parallel(return_as="generator_unordered", batch_size=1)
         # Of new processes, until they work
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        before = _mask("SIG_BLOCK", {signal.SIGINT})
         try:
             found = work(attempt(index, payload) for index, payload in due)
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            _mask("SIG_SETMASK", before)
             yield from found
         except TerminatedWorkerError as error:
             raise UnfinishedError(
                 "a process ended early, perhaps for lack of memory; use fewer --jobs"
             ) from error
         finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            _mask("SIG_SETMASK", before)
+
+
+def _mask(how: str, signals: Collection[int]) -> Collection[int]:
+    """Block signals or let them through, and return those that were blocked; Windows has no such thing."""
+    if not hasattr(signal, "pthread_sigmask"):
+        return ()
+    return signal.pthread_sigmask(getattr(signal, how), signals)
 
 
 @contextmanager
@@ -226,7 +234,7 @@ def _in_child(
     _end_with(parent)
     os.chdir(folder)  # the process may be left from earlier work in another one
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # forgets what came before the work
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    _mask("SIG_UNBLOCK", {signal.SIGINT})
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         return index, run(payload)
@@ -235,7 +243,7 @@ def _in_child(
             os._exit(1)
         raise
     finally:
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        _mask("SIG_BLOCK", {signal.SIGINT})
 
 
 @cache
@@ -270,5 +278,6 @@ def only_one(output: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        Path(lock.lock_file).unlink(missing_ok=True)
+        with suppress(PermissionError):  # on Windows, where releasing it removes it
+            Path(lock.lock_file).unlink(missing_ok=True)
         lock.release()

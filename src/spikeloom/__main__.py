@@ -2,6 +2,7 @@
 
 import atexit
 import gc
+import io
 import signal
 import sys
 
@@ -12,6 +13,8 @@ def main() -> int:
     atexit.register(
         gc.freeze
     )  # nobody waits for garbage to be looked for at the end: a fifth of a second with numba
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # help has letters that not every terminal has
     try:
         from spikeloom.runtime.cli import main as command
 
