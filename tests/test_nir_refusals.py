@@ -1,5 +1,7 @@
 """NIR files that cannot be used: the words that each refusal must have."""
 
+import shutil
+import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -228,6 +230,17 @@ def test_a_file_on_which_the_library_spins_is_given_up(monkeypatch):
     monkeypatch.setattr(hdf5, "MOST_SECONDS", 1)
     monkeypatch.setattr(hdf5, "_group", spin)
     assert "dies on it, or takes more than 1 s" in refused(read_nir, GOOD, dt=1.0)
+
+
+@pytest.mark.parametrize("ends", [hdf5._ends_in_fork, hdf5._ends_elsewhere])
+def test_another_process_reads_it_first(ends):
+    assert ends(Path(GOOD).read_bytes())
+    assert ends(b"no HDF5 at all, which its reader says later")
+
+
+def test_a_process_that_ends_badly_is_noticed_where_nothing_forks(monkeypatch):
+    monkeypatch.setattr(sys, "executable", shutil.which("false"))
+    assert not hdf5._ends_elsewhere(Path(GOOD).read_bytes())
 
 
 def test_what_is_no_nir_file(tmp_path, monkeypatch):
