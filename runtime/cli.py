@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 GROUPS: dict[str, dict[str, str]] = {
     "main job": {
         "demo": "the main job on a shipped checkpoint and synthetic grasps; needs no files and no internet",
+        "doctor": "whether this installation works: versions, cores, caches, kernels, shipped files",
         "compile": "compile a trained network to a netlist within the limits of the chip",
         "inspect": "show a netlist (layers, scales, cores, use of each limit) or a checkpoint",
         "run": "run a netlist in the integer arithmetic of the chip",
