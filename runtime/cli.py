@@ -69,8 +69,12 @@ class Parser(argparse.ArgumentParser):
         raise OptionError(f"{message}; see {self.prog} --help")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Refuse an unknown option first, so that the near one of the same command can be named."""
+        """Add what ``--config`` says; refuse an unknown option first, so that the near one can be named."""
         if self._subparsers is None:
+            if any(word.startswith("--config") for word in args):
+                from spikeloom.runtime.commands.config import with_config
+
+                args = with_config(self, args)
             known = list(self._option_string_actions)
             places = {action.dest: action.metavar for action in self._actions if not action.option_strings}
             for word in args:
@@ -192,7 +196,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         from spikeloom.runtime.report.encode import encode  # with numpy, which help need not wait for
 
-        outcome: Outcome = arguments.action(arguments.request.of(vars(arguments)))
+        request = arguments.request.of(vars(arguments))
+        if arguments.write_config is not None:
+            from spikeloom.runtime.commands.config import write_config
+
+            write_config(arguments.write_config, arguments.config_table, request)
+        outcome: Outcome = arguments.action(request)
         text = (
             json.dumps(encode(outcome.result))
             if arguments.json

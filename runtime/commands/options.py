@@ -96,6 +96,11 @@ def group(parser: argparse.ArgumentParser, title: str) -> Any:
 
 def add_common(parser: argparse.ArgumentParser) -> None:
     """Add the options of every command."""
+    parser.set_defaults(config_table=parser.prog.removeprefix("spikeloom "))  # of a file of options
     common = group(parser, "output")
     common.add_argument("--json", action="store_true", help="print the result as JSON")
+    common.add_argument(
+        "--config", metavar="FILE.toml", help="options from the file's table of this command"
+    )
+    common.add_argument("--write-config", metavar="FILE.toml", help="write these options as such a file")
     common.add_argument("--debug", action="store_true", help="show a traceback on errors")
