@@ -256,6 +256,7 @@ def train(
     resume: bool = False,
     keep: str | Sequence[str] = (),
     picture: str | None = None,
+    scheduler: str | None = None,
 ) -> TrainingReport | CountersReport:
     """Train networks of one system, by the released recipe where nothing else is said, and write them.
 
@@ -289,6 +290,7 @@ def smallest(
     taxels: int | str | None = None,
     edges: str | None = None,
     directed: bool = False,
+    scheduler: str | None = None,
 ) -> Smallest:
     """Choose the cheapest of many networks that is about as accurate as the best, and write it.
 
@@ -324,6 +326,7 @@ def chart(
     weights: str | None = None,
     beta: float | None = None,
     theta: float | None = None,
+    scheduler: str | None = None,
 ) -> Chart:
     """Chart accuracy against energy, time and size for a grid of configurations, and say which to deploy.
 

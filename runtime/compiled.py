@@ -217,6 +217,7 @@ class Compiled:
         seeds: int = 5,
         require: str | Sequence[str] = (),
         jobs: int | None = None,
+        scheduler: str | None = None,
         picture: str | None = None,
         output: str | None = None,
     ) -> Stress:
@@ -239,6 +240,7 @@ class Compiled:
         shift: int = 25,
         most: int = 16,
         jobs: int | None = None,
+        scheduler: str | None = None,
         picture: str | None = None,
         output: str | None = None,
     ) -> Certificates:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from spikeloom.runtime.requests.choices import (
+    ClusterChoice,
     ComparisonChoice,
     NetlistChoice,
     RecordingsChoice,
@@ -26,7 +27,7 @@ class ExplainRequest(ComparisonChoice, RecordingsChoice):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StressRequest(ComparisonChoice, ShownConditionChoice, RecordingsChoice):
+class StressRequest(ClusterChoice, ComparisonChoice, ShownConditionChoice, RecordingsChoice):
     """Where float network and chip break: a seeded battery of perturbations, with verdicts and reasons."""
 
     only: str | None = option("perturbations to measure (default: all)", metavar="NAME[,…]")
@@ -44,7 +45,7 @@ class StressRequest(ComparisonChoice, ShownConditionChoice, RecordingsChoice):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CertifyRequest(NetlistChoice, RecordingsChoice):
+class CertifyRequest(ClusterChoice, NetlistChoice, RecordingsChoice):
     """Which decisions no small change of a recording alters: proven, not sampled."""
 
     shift: int = option("largest shift to try", default=25, metavar="BINS")

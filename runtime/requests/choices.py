@@ -29,6 +29,15 @@ DATA_HELP = (
 
 
 @dataclass(frozen=True, kw_only=True)
+class ClusterChoice(Request):
+    """Where work of many parts is done."""
+
+    scheduler: str | None = option(
+        "work on a Dask cluster: the address of its scheduler, or N workers here", metavar="ADDRESS|local:N"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class NetlistChoice(Request):
     """Which compiled network."""
 

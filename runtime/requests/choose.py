@@ -8,6 +8,7 @@ from spikeloom.compiler.targets import DEFAULT_TARGET
 from spikeloom.runtime.requests.choices import (
     NETWORK_FILES,
     CheckpointChoice,
+    ClusterChoice,
     ConditionChoice,
     DataChoice,
     NetlistChoice,
@@ -20,7 +21,7 @@ from spikeloom.runtime.requests.fields import option
 
 
 @dataclass(frozen=True, kw_only=True)
-class SmallestRequest(SensorChoice, ConditionChoice):
+class SmallestRequest(ClusterChoice, SensorChoice, ConditionChoice):
     """The cheapest of many networks that is about as accurate as the best, compiled and verified."""
 
     target: str = option("chip", default=DEFAULT_TARGET)
@@ -47,7 +48,7 @@ class SmallestRequest(SensorChoice, ConditionChoice):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChartRequest(CheckpointChoice, ShownConditionChoice, DataChoice):
+class ChartRequest(ClusterChoice, CheckpointChoice, ShownConditionChoice, DataChoice):
     """Accuracy against energy, time and size for a grid of configurations, and which one to deploy."""
 
     checkpoints: tuple[str, ...] = option(

@@ -16,6 +16,7 @@ from spikeloom.models.training.recipes import RECIPES, RELEASED
 from spikeloom.runtime.requests.choices import (
     GROUPS_HELP,
     NETWORK_FILES,
+    ClusterChoice,
     DataChoice,
     NetworkChoice,
     SensorChoice,
@@ -31,7 +32,7 @@ ALL_SYSTEMS = (*SYSTEMS, NATIVE, COUNTING)
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainRequest(SensorChoice, DataChoice):
+class TrainRequest(ClusterChoice, SensorChoice, DataChoice):
     """Train networks, and report the last, best and clean epoch."""
 
     groups: str | None = option(

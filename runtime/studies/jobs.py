@@ -27,6 +27,7 @@ from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, Un
 from spikeloom.compiler.files import WRITTEN, FileFault, reading, remove_leftovers, require_size
 from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.report.encode import decode
+from spikeloom.runtime.studies.cluster import cluster, spread
 
 APayload = TypeVar("APayload")
 AResult = TypeVar("AResult")
@@ -169,15 +170,20 @@ def side_by_side(
 ) -> Iterator[tuple[int, AResult]]:
     """Work on payloads, begun in this order, in processes of their own in this folder; on a single one here.
 
+    With a `cluster` its workers take them all.
+
     Yields the place of a payload and what `run`, a function of a module, made of it, as they come; none is begun
     from the time `until`. Raises what `run` raised; UnfinishedError, if a process ended while it worked, and with it
     what the others had not finished.
     """
     require_least({"jobs": jobs}, jobs=1)
     due = takewhile(lambda _: until is None or time.monotonic() < until, enumerate(payloads))
+    if cluster() is not None:
+        yield from spread(due, run)
+        return
     processes = min(jobs or os.cpu_count() or 1, len(payloads))
     if processes <= 1:
-        with _one_thread():
+        with one_thread():
             yield from ((index, run(payload)) for index, payload in due)
         return
     from joblib import Parallel, delayed, parallel_config
@@ -214,7 +220,7 @@ def _mask(how: str, signals: Collection[int]) -> Collection[int]:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """As joblib's processes have it, so that the order of float sums is the same here."""
     torch = sys.modules.get("torch")
     threads = 0 if torch is None else torch.get_num_threads()

@@ -14,6 +14,7 @@ from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.check import CertifyRequest
+from spikeloom.runtime.studies.cluster import on_cluster
 from spikeloom.runtime.studies.robustness.certify_sections import sections, taxel_map
 from spikeloom.runtime.studies.robustness.exhaustive import certify, expected_seconds
 from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
@@ -33,6 +34,7 @@ TOLD_S = 60
 REQUEST = CertifyRequest
 
 
+@on_cluster
 def run(request: CertifyRequest) -> Outcome:
     """Run the command."""
     require_place(request.output, "-o", request)

@@ -5,6 +5,7 @@ from spikeloom.runtime.inputs.files import require_picture, require_place, write
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.check import StressRequest
+from spikeloom.runtime.studies.cluster import on_cluster
 from spikeloom.runtime.studies.robustness.curves import parse_requirement
 from spikeloom.runtime.studies.robustness.perturbations import SAMPLED
 from spikeloom.runtime.studies.robustness.sampled import stress
@@ -20,6 +21,7 @@ interval of the clean accuracy.
 REQUEST = StressRequest
 
 
+@on_cluster
 def run(request: StressRequest) -> Outcome:
     """Run the command; exit code 1 where a requirement is missed."""
     require_place(request.output, "-o", request)

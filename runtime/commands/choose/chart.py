@@ -13,6 +13,7 @@ from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.choose import ChartRequest
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
 from spikeloom.runtime.studies.chart.networks import read_networks, require_grid, require_suited
+from spikeloom.runtime.studies.cluster import on_cluster
 from spikeloom.runtime.studies.search.budgets import parse_budgets
 from spikeloom.runtime.studies.search.results import chosen_by, data_of
 
@@ -30,6 +31,7 @@ point fits a budget.
 REQUEST = ChartRequest
 
 
+@on_cluster
 def run(request: ChartRequest) -> Outcome:
     """Run the command; exit code 1 if no point fits a budget."""
     from spikeloom.runtime.studies.chart.sections import printed, write_chart

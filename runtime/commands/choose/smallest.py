@@ -31,6 +31,7 @@ from spikeloom.runtime.requests.choices import SensorChoice
 from spikeloom.runtime.requests.choose import SmallestRequest
 from spikeloom.runtime.requests.main_job import CompileRequest, VerifyRequest
 from spikeloom.runtime.requests.training import TrainRequest
+from spikeloom.runtime.studies.cluster import on_cluster
 from spikeloom.runtime.studies.search.budgets import parse_budgets
 from spikeloom.runtime.studies.search.results import data_of, share
 from spikeloom.runtime.studies.smallest.results import Checked, Tried
@@ -62,6 +63,7 @@ budget.
 REQUEST = SmallestRequest
 
 
+@on_cluster
 def run(request: SmallestRequest) -> Outcome:
     """Run the command; exit code 1 if no candidate fits a budget."""
     from spikeloom.runtime.studies.smallest.sections import page, sections

@@ -3,6 +3,7 @@
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.training import TrainRequest
+from spikeloom.runtime.studies.cluster import on_cluster
 from spikeloom.runtime.studies.counting import counters_sections
 from spikeloom.runtime.studies.training.results import training_sections
 from spikeloom.runtime.studies.training.study import train_counting, train_networks
@@ -10,6 +11,7 @@ from spikeloom.runtime.studies.training.study import train_counting, train_netwo
 REQUEST = TrainRequest
 
 
+@on_cluster
 def run(request: TrainRequest) -> Outcome:
     """Run the command."""
     if request.system == COUNTING:

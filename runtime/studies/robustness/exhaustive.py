@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 
 import numpy as np
-from joblib import delayed
 
 from spikeloom.compiler.passes.calibrate import evenly_spaced
 from spikeloom.compiler.types import IntArray
@@ -59,12 +59,14 @@ def certify(
     DataError for another sensor, NumericRangeError where a register overflows.
     """
     tally = tally_of(machine)
-    recordings = zip(data.events, data.step_counts.tolist(), data.labels.tolist(), data.files, strict=True)
-    calls = (
-        delayed(certificate)(machine, events[..., :length], label, file, shift=shift, most=most, tally=tally)
-        for events, length, label, file in recordings
-    )
-    certificates = in_threads(calls, len(data), "certifying", jobs)
+    recordings = [
+        (events[..., :length], label, file)
+        for events, length, label, file in zip(
+            data.events, data.step_counts.tolist(), data.labels.tolist(), data.files, strict=True
+        )
+    ]
+    prove = partial(certificate, machine, shift=shift, most=most, tally=tally)
+    certificates = in_threads(prove, recordings, "certifying", jobs)
     netlist = machine.netlist
     return Certificates(
         target=netlist.target,
@@ -78,15 +80,17 @@ def certify(
 
 def certificate(
     machine: Machine,
-    events: Events,
-    label: int,
-    file: str,
+    recording: tuple[Events, int, str],
     *,
     shift: int,
     most: int,
     tally: Tally | None,
 ) -> Certificate:
-    """What is known of one recording (taxels, polarities, bins); `tally` is that of a counting network."""
+    """What is known of one recording, (taxels, polarities, bins), its label and its file.
+
+    `tally` is that of a counting network.
+    """
+    events, label, file = recording
     singles = _flip_each(machine, events, most, tally)
     cells = singles.cells
     kinds = {}

@@ -43,6 +43,10 @@ class Pair:
     netlist: Netlist
     network: Network
 
+    def __getstate__(self) -> dict[str, object]:
+        """Without what is prepared, which a worker prepares itself."""
+        return {"netlist": self.netlist, "network": self.network}
+
     @cached_property
     def chip(self) -> Threaded:
         """The netlist, ready to run."""

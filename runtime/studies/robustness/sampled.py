@@ -2,10 +2,10 @@
 
 import zlib
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from joblib import delayed
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.equivalence.breakdowns import undecided
@@ -44,8 +44,7 @@ def stress(request: StressRequest, names: Sequence[str], requirements: Sequence[
         for seed in range(request.seeds if SAMPLED[name].seeded else 1)
     ]
     measured: dict[str, dict[Level, list[Run]]] = {}
-    calls = (delayed(measure)(bench, *point, reference) for point in points)
-    runs = in_threads(calls, len(points), "stress", request.jobs)
+    runs = in_threads(partial(measure, bench, reference), points, "stress", request.jobs)
     for (name, level, _), run in zip(points, runs, strict=True):
         measured.setdefault(name, {}).setdefault(level, []).append(run)
     curves = {name: curve(name, each, undisturbed, recordings, classes) for name, each in measured.items()}
@@ -94,8 +93,9 @@ def _in_conditions(bench: Bench, outcome: Outcome) -> dict[str, InCondition]:
     }
 
 
-def measure(bench: Bench, name: str, level: Level, seed: int, reference: Outcome) -> Run:
+def measure(bench: Bench, reference: Outcome, point: tuple[str, Level, int]) -> Run:
     """One perturbation at one level under one seed; `reference` is of the clean recordings."""
+    name, level, seed = point
     trouble = SAMPLED[name]
     rng = generator(name, seed)
     pair = bench.pair
