@@ -160,7 +160,7 @@ def test_recordings_of_different_length_are_disturbed_within_their_own(bench):
     shorter = replace(bench, events=cut, lengths=lengths)
     reference, _ = clean(shorter)
     for name in ("saturated", "warm_state", "longer"):
-        run = measure(shorter, name, 1, 0, reference)
+        run = measure(shorter, reference, (name, 1, 0))
         assert sum(run.right.values()) <= 16
     alone = engine.simulate(bench.pair.netlist, with_clocks(cut[1:2, ..., :10], bench.pair.netlist.clocks))
     assert_array_equal(reference.votes["chip"][1], class_counts(bench.pair.netlist, alone.counts.spikes)[0])
@@ -184,8 +184,8 @@ def test_every_perturbation_runs_at_its_mildest_and_harshest_the_same_for_a_seed
     levels = SAMPLED[name].levels_of(TAXELS)
     for level in {levels[0], levels[-1]}:
         seeds = [0, 1] if SAMPLED[name].seeded else [0]
-        runs = [measure(bench, name, level, seed, reference) for seed in seeds]
-        assert runs == [measure(bench, name, level, seed, reference) for seed in seeds]
+        runs = [measure(bench, reference, (name, level, seed)) for seed in seeds]
+        assert runs == [measure(bench, reference, (name, level, seed)) for seed in seeds]
         assert [run.seed for run in runs] == seeds
         for run in runs:
             assert run.layers.keys() == undisturbed.layers.keys()

@@ -8,6 +8,7 @@ import hashlib
 import logging
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError
@@ -38,6 +39,8 @@ PATIENCE = 30
 
 AGAIN = 2
 """Seconds after which it is looked whether workers have come or gone."""
+
+ROOMS = ("compiler", "models", "runtime")
 
 LIBRARIES = ("numpy", "scipy", "torch", "numba")
 """What figures are computed with."""
@@ -88,9 +91,10 @@ def cluster() -> Cluster | None:
 def versions() -> Mapping[str, str]:
     """Versions of what computes here, our own code as a hash; threads decide in which order sums are added."""
     running = hashlib.sha256()
-    package = Path(str(resources.files("spikeloom")))
-    for file in sorted(f for ending in ("py", "toml") for f in _files(package) if f.suffix == f".{ending}"):
-        running.update(file.read_bytes())
+    for room in ROOMS:
+        files = _files(Path(str(resources.files(f"spikeloom.{room}"))))
+        for file in sorted(each for each in files if each.suffix in (".py", ".toml")):
+            running.update(file.read_bytes())
     return {
         "spikeloom": running.hexdigest(),
         "Python": platform.python_version(),
@@ -100,7 +104,7 @@ def versions() -> Mapping[str, str]:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """Files in a folder and those below, through links, too."""
+    """Files in a folder and those below."""
     for path in folder.iterdir():
         if path.is_dir():
             yield from _files(path)
@@ -169,14 +173,13 @@ def _joined(address: str) -> Iterator[Any]:
 
     workers = address.removeprefix(LOCAL)
     if workers == address:
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # all of it is raised, too
         try:
-            with Client(address, timeout=PATIENCE) as client:
-                logging.getLogger("distributed.client").setLevel(
-                    logging.CRITICAL
-                )  # all of it is raised, too
-                yield client
+            known = Client(address, timeout=PATIENCE)
         except (OSError, ValueError) as error:
-            raise OptionError(f"--scheduler {address}: {error}") from error
+            raise OptionError(f"--scheduler {address}: {error}; start one: dask scheduler") from error
+        with known as client:
+            yield client
         return
     if not workers.isdigit() or not int(workers):
         raise OptionError(f"--scheduler {address}: allowed are {LOCAL}1 or more, or an address")
@@ -248,8 +251,20 @@ def _work(surroundings: Surroundings, run: Callable[[P], R], payload: P) -> R:
     """Work on a payload, on a worker."""
     from distributed import get_worker
 
-    from spikeloom.runtime.studies.jobs import one_thread
-
     surroundings.require(get_worker().name or get_worker().address)
     with one_thread():
         return run(payload)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """As joblib's processes have it, so that the order of float sums is the same here."""
+    torch = sys.modules.get("torch")
+    threads = 0 if torch is None else torch.get_num_threads()
+    if torch is not None:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        if torch is not None:
+            torch.set_num_threads(threads)

@@ -10,7 +10,6 @@ import json
 import os
 import signal
 import sqlite3
-import sys
 import threading
 import time
 import warnings
@@ -27,7 +26,7 @@ from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, Un
 from spikeloom.compiler.files import WRITTEN, FileFault, reading, remove_leftovers, require_size
 from spikeloom.runtime.report.console import Progress
 from spikeloom.runtime.report.encode import decode
-from spikeloom.runtime.studies.cluster import cluster, spread
+from spikeloom.runtime.studies.cluster import cluster, one_thread, spread
 
 APayload = TypeVar("APayload")
 AResult = TypeVar("AResult")
@@ -217,20 +216,6 @@ def _mask(how: str, signals: Collection[int]) -> Collection[int]:
     if not hasattr(signal, "pthread_sigmask"):
         return ()
     return signal.pthread_sigmask(getattr(signal, how), signals)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """As joblib's processes have it, so that the order of float sums is the same here."""
-    torch = sys.modules.get("torch")
-    threads = 0 if torch is None else torch.get_num_threads()
-    if torch is not None:
-        torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        if torch is not None:
-            torch.set_num_threads(threads)
 
 
 def _in_child(
