@@ -87,6 +87,7 @@ def row_of(condition: str, found: Any, folder: Path, sensor: list[str]) -> dict[
     tried = found["tried"]
     chosen = tried[found["choice"]["cheapest"]["davies2018"] - 1]
     best = tried[found["choice"]["best"] - 1]
+    largest = next(each for each in tried if each["name"] == LARGEST)
     counters = max(
         (each for each in tried if each["system"] == "counters"),
         key=lambda each: (each["rung"], each["accuracy"]),
@@ -97,7 +98,7 @@ def row_of(condition: str, found: Any, folder: Path, sensor: list[str]) -> dict[
         "test": found["data"]["test"],
         "chosen": side_of(chosen) | {"right": found["checked"]["right"]["correct"]},
         "best": side_of(best) | {"right": rights(best["name"], best["setting"], folder, sensor)},
-        "largest": {"name": LARGEST, "right": rights(LARGEST, EPOCHS[-1], folder, sensor)},
+        "largest": side_of(largest) | {"right": rights(LARGEST, EPOCHS[-1], folder, sensor)},
         "counters": side_of(counters),
         "ridge": {"accuracy": ridge["accuracy"], "right": right_by_ridge(ridge["setting"], train, test)},
         "at_random": found.get("at_random"),
