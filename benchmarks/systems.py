@@ -41,7 +41,7 @@ STYLES = {"TactileSGNet": ("o", "#1b6ca8"), "counters": ("s", "#c1440e")}
 
 OTHER = ("D", "#5b7f3b")
 SVM = {"linear": ("linear SVM, no chip", "--"), "rbf": ("RBF SVM, no chip", ":")}
-WORKPLACE = r" --(?:data|store|html|time|jobs) \S+| -o \S+| --json"
+WORKPLACE = r" --(?:data|bin|store|html|time|jobs) \S+| -o \S+| --json"
 """Options of ``smallest`` that say where, not what."""
 
 
