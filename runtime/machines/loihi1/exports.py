@@ -10,11 +10,12 @@ from spikeloom.compiler.formats.nir import CONVENTIONS
 from spikeloom.compiler.formats.nir import writer as nir
 from spikeloom.compiler.formats.onnx import writer as onnx
 from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.models.recordings.evtouch import BIN_S
 from spikeloom.runtime.machines.exports import Export, Facts, Format
-from spikeloom.runtime.machines.loihi1.machine import load
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.requests.exchange import ExportRequest
 
@@ -46,8 +47,15 @@ class NirFacts(Facts):
     convention: str
 
 
+def _legal(path: str) -> Netlist:
+    """A netlist that the chip holds, without the simulator; FormatError or CapacityError."""
+    netlist = read_netlist(path)
+    require_legal(netlist, load_target(netlist.target))
+    return netlist
+
+
 def _sanafe(request: ExportRequest) -> Export:
-    netlist = load(request.source).netlist
+    netlist = _legal(request.source)
     target = load_target(netlist.target)
     places = sanafe.cores(netlist, target)
     facts = SanafeFacts(
@@ -72,7 +80,7 @@ def _sanafe(request: ExportRequest) -> Export:
 
 
 def _onnx(request: ExportRequest) -> Export:
-    netlist = load(request.source).netlist
+    netlist = _legal(request.source)
     form = request.form or "scan"
     content, *ports = onnx.export(netlist, form)
     inputs, outputs = ([str(port) for port in side] for side in ports)
@@ -88,7 +96,7 @@ def _onnx(request: ExportRequest) -> Export:
 
 
 def _nir(request: ExportRequest) -> Export:
-    netlist = load(request.source).netlist
+    netlist = _legal(request.source)
     origin = origin_of(netlist.provenance)
     dt = origin.get("bin_s", BIN_S) * netlist.bins if request.dt is None else request.dt
     facts = NirFacts(
